@@ -1,0 +1,1 @@
+"""What the robot concludes: filters, matching, and its own position."""

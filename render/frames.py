@@ -1,0 +1,130 @@
+"""Measured or simulated frames: range, amplitude, intensity and why a pixel is not valid."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+from typing import TYPE_CHECKING, Literal, Self, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from phasemark import UsageError
+from phasemark.render.sensor import Sensor
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+
+class Flag(IntFlag):
+    """Why a pixel's range is not valid; 0 where it is."""
+
+    NO_RETURN = 1
+    """The amplitude is below the validity threshold: nothing came back. This is data."""
+    MISSING = 2
+    """The pixel says nothing: dead, saturated, or invalid of unknown cause."""
+    SATURATED = 4
+    """A tap reached its full well or the top of the converter; also MISSING."""
+    DEAD = 8
+    """The pixel is known to be dead or hot; also MISSING."""
+
+
+class Frames:
+    """Frames of a camera at rest: n positions, several frames each.
+
+    Parameters
+    ----------
+    range_m : array_like, (n, frames, rows, cols), (frames, rows, cols) or (rows, cols)
+        Range along the ray, metres; NaN where the camera gave none.
+    amplitude_e, intensity_e : array_like, optional
+        Measured amplitude and intensity, electrons per phase image, in the shape of `range_m`.
+    valid : array_like of bool, optional
+        False where the range must not be used; what is NaN is invalid in any case.
+    flags : array_like of int, optional
+        :class:`Flag` of every pixel. Without it an invalid pixel gets the flag that `invalid_means` names.
+    sensor : Sensor
+        The camera that took the frames.
+    invalid_means : {"missing", "no-return"}
+        What an invalid pixel without flags stands for. Unknown cause is "missing".
+
+    Raises
+    ------
+    UsageError
+        The shapes do not agree with each other or with the sensor.
+    """
+
+    def __init__(
+        self,
+        range_m: ArrayLike,
+        amplitude_e: ArrayLike | None = None,
+        intensity_e: ArrayLike | None = None,
+        valid: ArrayLike | None = None,
+        *,
+        sensor: Sensor,
+        flags: ArrayLike | None = None,
+        invalid_means: Literal["missing", "no-return"] = "missing",
+    ) -> None:
+        ranges = np.array(range_m, dtype=np.float64)
+        if ranges.ndim not in (2, 3, 4):
+            raise UsageError(f"'range_m' must have shape (n, frames, rows, cols), got {ranges.shape}")
+        shape = (1,) * (4 - ranges.ndim) + ranges.shape
+        if shape[2:] != (sensor.rows, sensor.cols):
+            raise UsageError(
+                f"the frames have {shape[2]} × {shape[3]} pixels, but the sensor has {sensor.rows} × {sensor.cols}"
+            )
+
+        def like_range(name: str, value: ArrayLike, dtype: type[_Scalar]) -> NDArray[_Scalar]:
+            array: NDArray[_Scalar] = np.array(value, dtype=dtype)
+            if array.shape != ranges.shape:
+                raise UsageError(f"'{name}' has shape {array.shape}, but 'range_m' has {ranges.shape}")
+            return array.reshape(shape)
+
+        amplitude = None if amplitude_e is None else like_range("amplitude_e", amplitude_e, np.float64)
+        intensity = None if intensity_e is None else like_range("intensity_e", intensity_e, np.float64)
+        usable = np.isfinite(ranges).reshape(shape)
+        if valid is not None:
+            usable &= like_range("valid", valid, np.bool_)
+        if flags is None:
+            kind = Flag.NO_RETURN if invalid_means == "no-return" else Flag.MISSING
+            codes = np.where(usable, 0, int(kind)).astype(np.uint8)
+        else:
+            codes = like_range("flags", flags, np.uint8)
+            codes[~usable & (codes == 0)] |= int(Flag.MISSING)
+            usable &= codes == 0
+        ranges = ranges.reshape(shape)
+        ranges[~usable] = np.nan
+        self.range_m: NDArray[np.float64] = ranges
+        self.amplitude_e = amplitude
+        self.intensity_e = intensity
+        self.flags: NDArray[np.uint8] = codes
+        self.sensor = sensor
+
+    def __len__(self) -> int:
+        return len(self.range_m)
+
+    def __getitem__(self, index: slice | NDArray[np.integer]) -> Self:
+        """Return some of the positions."""
+        return type(self)(
+            self.range_m[index],
+            None if self.amplitude_e is None else self.amplitude_e[index],
+            None if self.intensity_e is None else self.intensity_e[index],
+            sensor=self.sensor,
+            flags=self.flags[index],
+        )
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """True where the range may be used, (n, frames, rows, cols)."""
+        return np.equal(self.flags, 0)
+
+    @property
+    def n_frames(self) -> int:
+        """Frames at each position."""
+        return int(self.range_m.shape[1])
+
+    def plot(self, index: int = 0, frame: int = 0) -> Figure:
+        """Draw range, amplitude and flags of one frame for a first look."""
+        from phasemark.render.plot import plot_frame
+
+        return plot_frame(self, index, frame)

@@ -1,0 +1,83 @@
+"""Noise-free images: the phasor a pixel integrates, and what follows from it (PHYSICS section 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.render.sensor import Sensor
+from phasemark.render.view import Views
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def phasor_to_range_m(phasor: NDArray[np.complexfloating], sensor: Sensor) -> NDArray[np.float64]:
+    """Return the range a phasor stands for, (c / 4πf) · arg S in [0, c/2f); NaN where S is zero."""
+    phase = np.angle(phasor) % (2 * np.pi)
+    phase[phase >= 2 * np.pi] = 0.0  # the modulo of a tiny negative angle rounds up to 2π
+    return np.where(phasor == 0, np.nan, sensor.metres_per_radian * phase)
+
+
+@dataclass(frozen=True, eq=False)
+class PhasorImages:
+    """Noise-free images of a batch of views.
+
+    Parameters
+    ----------
+    phasor : (n, rows, cols) complex128
+        S_1: mean over the pixel's active area of amplitude · exp(iφ).
+    intensity : (n, rows, cols) float64
+        Mean amplitude, at least ``abs(phasor)``.
+    coverage : (n, rows, cols) float64
+        Share of the active area that sees the landmark, 0 … 1.
+    sensor : Sensor
+    views : Views
+    harmonics : mapping of int to (n, rows, cols) complex128
+        S_k for the orders k > 1 that were asked for.
+    """
+
+    phasor: NDArray[np.complex128]
+    intensity: NDArray[np.float64]
+    coverage: NDArray[np.float64]
+    sensor: Sensor
+    views: Views
+    harmonics: Mapping[int, NDArray[np.complex128]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.phasor)
+
+    @property
+    def range_m(self) -> NDArray[np.float64]:
+        """Range along the ray, in [0, c/2f), NaN where nothing returns; (n, rows, cols)."""
+        return phasor_to_range_m(self.phasor, self.sensor)
+
+    @property
+    def amplitude(self) -> NDArray[np.float64]:
+        """|S_1|, 1 for albedo 1 facing the camera at 1 m; (n, rows, cols)."""
+        return np.abs(self.phasor)
+
+    def harmonic(self, order: int) -> NDArray[np.complex128]:
+        """Return S_k of one harmonic order, (n, rows, cols).
+
+        Raises
+        ------
+        UsageError
+            The order was not rendered.
+        """
+        if order == 1:
+            return self.phasor
+        if order not in self.harmonics:
+            raise UsageError(f"harmonic {order} was not rendered: ask for it with Renderer(..., harmonics=({order},))")
+        return self.harmonics[order]
+
+    def plot(self, index: int = 0) -> Figure:
+        """Draw range, amplitude and coverage of one view for a first look."""
+        from phasemark.render.plot import plot_phasor_image
+
+        return plot_phasor_image(self, index)

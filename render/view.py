@@ -1,0 +1,100 @@
+"""Where the landmark is seen from: equation (9) of the paper with bearing and height (PHYSICS section 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from phasemark import UsageError
+
+
+@dataclass(frozen=True)
+class Views:
+    """A batch of views of the landmark; four arrays of one length.
+
+    Parameters
+    ----------
+    distance_m : (n,) float64
+        Horizontal distance D from the lens to the landmark's axis.
+    delta_rad : (n,) float64
+        Side δ from which the landmark is seen.
+    bearing_rad : (n,) float64
+        Azimuth b of the landmark's axis in the camera frame.
+    height_m : (n,) float64
+        Height h of the landmark's origin above the optical axis.
+    """
+
+    distance_m: NDArray[np.float64]
+    delta_rad: NDArray[np.float64]
+    bearing_rad: NDArray[np.float64]
+    height_m: NDArray[np.float64]
+
+    @classmethod
+    def broadcast(
+        cls,
+        distance_m: ArrayLike,
+        delta_rad: ArrayLike = 0.0,
+        bearing_rad: ArrayLike = 0.0,
+        height_m: ArrayLike = 0.0,
+    ) -> Views:
+        """Broadcast the arguments against each other and flatten them in C order.
+
+        Raises
+        ------
+        UsageError
+            A value is not finite, a distance is not positive, or the shapes do not broadcast.
+        """
+        names = ("distance_m", "delta_rad", "bearing_rad", "height_m")
+        values = [np.asarray(value, dtype=float) for value in (distance_m, delta_rad, bearing_rad, height_m)]
+        for name, value in zip(names, values, strict=True):
+            bad = value[~np.isfinite(value)]
+            if bad.size:
+                raise UsageError(f"'{name}' must be finite, got {bad.flat[0]}")
+        if values[0].size and values[0].min() <= 0:
+            raise UsageError(f"'distance_m' must be positive, got {values[0].min()}")
+        try:
+            arrays = np.broadcast_arrays(*values)
+        except ValueError:
+            shapes = ", ".join(f"{name} {value.shape}" for name, value in zip(names, values, strict=True))
+            raise UsageError(f"the views' shapes do not broadcast: {shapes}") from None
+        return cls(*(np.ascontiguousarray(array, dtype=float).ravel() for array in arrays))
+
+    def __len__(self) -> int:
+        return len(self.distance_m)
+
+    def __getitem__(self, index: slice | NDArray[np.integer]) -> Views:
+        return Views(self.distance_m[index], self.delta_rad[index], self.bearing_rad[index], self.height_m[index])
+
+    def landmark2cam(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return rotations (n, 3, 3) and translations (n, 3) with p_cam = R · p' + t.
+
+        R = Rz(b) · R(δ) and t = Rz(b) · (D, 0, 0) + (0, 0, h).
+        """
+        angle = self.bearing_rad - self.delta_rad  # R(δ) is Rz(−δ), so the two rotations add
+        rotation = np.zeros((len(self), 3, 3))
+        rotation[:, 0, 0] = rotation[:, 1, 1] = np.cos(angle)
+        rotation[:, 1, 0] = np.sin(angle)
+        rotation[:, 0, 1] = -rotation[:, 1, 0]
+        rotation[:, 2, 2] = 1.0
+        translation = np.stack(
+            [
+                self.distance_m * np.cos(self.bearing_rad),
+                self.distance_m * np.sin(self.bearing_rad),
+                self.height_m,
+            ],
+            axis=-1,
+        )
+        return rotation, translation
+
+    def lens_in_landmark(self) -> NDArray[np.float64]:
+        """Return the lens in the landmark frame, (−D cos δ, −D sin δ, −h), as (n, 3)."""
+        return np.stack(
+            [
+                -self.distance_m * np.cos(self.delta_rad),
+                -self.distance_m * np.sin(self.delta_rad),
+                -self.height_m,
+            ],
+            axis=-1,
+        )
