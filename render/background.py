@@ -71,8 +71,8 @@ class Background:
             bad = np.flatnonzero(lowest < -self.floor_m - 1e-9)
             if bad.size:
                 raise UsageError(
-                    f"the floor {self.floor_m:g} m below the lens is above the landmark's lowest point in view {bad[0]}:"
-                    f" 'floor_m' must be at least {-lowest[bad[0]]:.4g}"
+                    f"the floor {self.floor_m:g} m below the lens is above the landmark's lowest point in view"
+                    f" {bad[0]}: 'floor_m' must be at least {-lowest[bad[0]]:.4g}"
                 )
         if self.wall_m is not None:
             # distance along the horizontal line of sight: D + x' cos δ + y' sin δ

@@ -110,7 +110,7 @@ class MeshTopology:
 
 def _part_by_height(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int8]:
     """Tell the parts of an unlabelled mesh apart by the side of the interface plane their centre lies on."""
-    return (vertices[faces].mean(axis=1)[:, 2] > 0).astype(np.int8)
+    return np.asarray(vertices[faces].mean(axis=1)[:, 2] > 0, dtype=np.int8)
 
 
 def _angle_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -143,7 +143,7 @@ def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool
 
 
 def _components(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Number the connected components of n nodes."""
+    """Give the nodes of each connected component one number."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

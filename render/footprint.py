@@ -17,6 +17,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 MAX_SEGMENTS = 128
 """Edges in a box above which it is quartered rather than swept: crossings are searched pair by pair."""
@@ -32,17 +33,17 @@ _REACH = 0.5
 _PINCH = 1e-6
 """Edges closer than this (pixels) at the end of a slab meet there."""
 
-_G2X = np.array([0.2113248654051871, 0.7886751345948129])
-_G2W = np.array([0.5, 0.5])
-_G3X = np.array([0.1127016653792583, 0.5, 0.8872983346207417])
-_G3W = np.array([0.2777777777777778, 0.4444444444444444, 0.2777777777777778])
-_G4X = np.array([0.06943184420297371, 0.33000947820757187, 0.6699905217924281, 0.9305681557970263])
-_G4W = np.array([0.17392742256872693, 0.32607257743127307, 0.32607257743127307, 0.17392742256872693])
 
-_G5X = np.array([0.046910077030668074, 0.23076534494715845, 0.5, 0.7692346550528415, 0.9530899229693319])
-_G5W = np.array(
-    [0.11846344252809454, 0.23931433524968324, 0.28444444444444444, 0.23931433524968324, 0.11846344252809454]
-)
+def gauss_legendre(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return nodes and weights of the n-point Gauss-Legendre rule on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(n)
+    return 0.5 + 0.5 * nodes, 0.5 * weights
+
+
+_G2X, _G2W = gauss_legendre(2)
+_G3X, _G3W = gauss_legendre(3)
+_G4X, _G4W = gauss_legendre(4)
+_G5X, _G5W = gauss_legendre(5)
 
 
 @njit(cache=True, nogil=True)
@@ -71,8 +72,8 @@ def bin_segments(segments, n_segments, rows, cols, head, link, owner):  # type: 
             ua, va, ub, vb = ub, vb, ua, va
         if vb < -1.0 or va > rows + 1.0 or max(ua, ub) < -1.0 or min(ua, ub) > cols + 1.0:
             continue
-        first = int(math.floor(max(va, -1.0)))
-        last = min(int(math.floor(min(vb, rows + 0.5))), rows)
+        first = math.floor(max(va, -1.0))
+        last = min(math.floor(min(vb, rows + 0.5)), rows)
         slope = (ub - ua) / (vb - va) if vb > va else 0.0
         for r in range(first, last + 1):
             if vb > va and last > first:
@@ -82,8 +83,8 @@ def bin_segments(segments, n_segments, rows, cols, head, link, owner):  # type: 
                 u0, u1 = ua, ub
             if u0 > u1:
                 u0, u1 = u1, u0
-            c0 = int(math.floor(max(u0 - 1e-9, -1.0)))
-            c1 = min(int(math.floor(min(u1 + 1e-9, cols + 0.5))), cols)
+            c0 = math.floor(max(u0 - 1e-9, -1.0))
+            c1 = min(math.floor(min(u1 + 1e-9, cols + 0.5)), cols)
             for c in range(c0, c1 + 1):
                 if n == len(link):
                     return -1
@@ -193,10 +194,9 @@ def sample_pixel(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, work):  # type: ignore[no-untyped-def]
-    """Clip a pixel's segments to a box; rows of `work` are s, x of both ends (s rising) and the limb's side,
-    sorted by where they begin.
+    """Clip a pixel's segments to a box.
 
-    The side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number,
+    Rows of `work` are s, x of both ends (s rising) and the limb's side, sorted by where they begin. The side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number,
     or −1 if there are too many.
     """
     m = 0

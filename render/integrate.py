@@ -14,10 +14,9 @@ from numba import njit
 
 from phasemark.render.background import background_edge, background_hit
 from phasemark.render.edges import project_edges
-from phasemark.render.footprint import bin_segments, sample_pixel
+from phasemark.render.footprint import bin_segments, gauss_legendre, sample_pixel
 
-_BACKGROUND_NODES = np.array([0.06943184420297371, 0.33000947820757187, 0.6699905217924281, 0.9305681557970263])
-_BACKGROUND_WEIGHTS = np.array([0.17392742256872693, 0.32607257743127307, 0.32607257743127307, 0.17392742256872693])
+_NODES, _WEIGHTS = gauss_legendre(4)
 
 SKIPPED = 0
 """Pixel state: no sample can meet the landmark; only the background is seen."""
@@ -237,10 +236,10 @@ def add_background(  # type: ignore[no-untyped-def]
                     continue
                 index = (view * state.shape[1] + r) * cols + c
                 for i in range(4):
-                    v = r + row_range[0] + 0.5 + camera[7] * (_BACKGROUND_NODES[i] - 0.5)
+                    v = r + row_range[0] + 0.5 + camera[7] * (_NODES[i] - 0.5)
                     z = (camera[3] - v) / camera[1]
                     for j in range(4):
-                        u = c + 0.5 + camera[6] * (_BACKGROUND_NODES[j] - 0.5)
+                        u = c + 0.5 + camera[6] * (_NODES[j] - 0.5)
                         y = (camera[2] - u) / camera[0]
                         length = math.sqrt(1.0 + y * y + z * z)
                         dx = level[0, 0] + level[0, 1] * y + level[0, 2] * z
@@ -250,7 +249,7 @@ def add_background(  # type: ignore[no-untyped-def]
                         if t == 0.0:
                             continue
                         distance = t * length
-                        a = _BACKGROUND_WEIGHTS[i] * _BACKGROUND_WEIGHTS[j]
+                        a = _WEIGHTS[i] * _WEIGHTS[j]
                         a *= rho * cos_theta / length / (distance * distance)
                         if vignetting:
                             a /= length * length * length * length
