@@ -196,8 +196,9 @@ def sample_pixel(  # type: ignore[no-untyped-def]
 def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, work):  # type: ignore[no-untyped-def]
     """Clip a pixel's segments to a box.
 
-    Rows of `work` are s, x of both ends (s rising) and the limb's side, sorted by where they begin. The side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number,
-    or −1 if there are too many.
+    Rows of `work` are s, x of both ends (s rising) and the limb's side, sorted by where they begin. The side is +1
+    where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number, or −1 if there
+    are too many.
     """
     m = 0
     while entry >= 0:
