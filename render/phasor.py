@@ -18,7 +18,20 @@ if TYPE_CHECKING:
 
 
 def phasor_to_range_m(phasor: NDArray[np.complexfloating], sensor: Sensor) -> NDArray[np.float64]:
-    """Return the range a phasor stands for, (c / 4πf) · arg S in [0, c/2f); NaN where S is zero."""
+    """Return the range a phasor stands for, (c / 4πf) · arg S in [0, c/2f) (PHYSICS section 3).
+
+    Parameters
+    ----------
+    phasor : (...) complex
+        S_1.
+    sensor : Sensor
+        The camera; its modulation frequency f is what counts.
+
+    Returns
+    -------
+    (...) float64
+        Metres along the ray; NaN where the phasor is zero.
+    """
     phase = np.angle(phasor) % (2 * np.pi)
     phase[phase >= 2 * np.pi] = 0.0  # the modulo of a tiny negative angle rounds up to 2π
     return np.where(phasor == 0, np.nan, sensor.metres_per_radian * phase)
