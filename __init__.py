@@ -24,6 +24,31 @@ class UsageError(PhasemarkError, ValueError):
 
     exit_code = 2
 
+    @classmethod
+    def of_field(
+        cls, location: tuple[int | str, ...], kind: str, message: str, value: object, whole: str = ""
+    ) -> "UsageError":
+        """Put one finding of a pydantic ``ValidationError`` into one line: key, what would be right, value.
+
+        Parameters
+        ----------
+        location, kind, message, value
+            ``loc``, ``type``, ``msg`` and ``input`` of the first entry of the error's ``errors()``.
+        whole : str
+            The key to name when the finding is about the model as a whole.
+        """
+        key = ".".join(str(part) for part in location) or whole
+        if kind == "extra_forbidden":
+            return cls(f"unknown key '{key}'")
+        if kind == "missing":
+            return cls(f"'{key}' is missing")
+        message = message.removeprefix("Value error, ").removeprefix("Input should be ")
+        if message.startswith("'"):  # a nested model has put its own finding into words already
+            return cls(f"{key}: {message}")
+        message = message if message.startswith("must") else f"must be {message}"
+        shown = repr(value)
+        return cls(f"'{key}' {message}, got {shown if len(shown) <= 80 else shown[:77] + '...'}")
+
 
 class InputFileError(PhasemarkError, ValueError):
     """An input file that is missing, damaged or not what it should be (exit code 3)."""

@@ -92,7 +92,10 @@ class Sensor(BaseModel):
         try:
             super().__init__(**data)
         except ValidationError as error:
-            raise UsageError(one_line(error)) from None
+            first = error.errors()[0]
+            raise UsageError.of_field(
+                first["loc"], first["type"], first["msg"], first["input"], whole="principal_point_px"
+            ) from None
 
     @model_validator(mode="after")
     def _principal_point_near_the_image(self) -> Self:
@@ -211,19 +214,6 @@ class Sensor(BaseModel):
         """Return unit ray directions of all pixel centres, level camera frame, (rows, cols, 3)."""
         v, u = np.mgrid[: self.rows, : self.cols] + 0.5
         return self.ray_directions(u, v)
-
-
-def one_line(error: ValidationError) -> str:
-    """Put the first finding of a pydantic error into one line: key, what would be right, value."""
-    first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"]) or "principal_point_px"
-    if first["type"] == "extra_forbidden":
-        return f"unknown key '{key}'"
-    if first["type"] == "missing":
-        return f"'{key}' is missing"
-    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-    message = message if message.startswith("must") else f"must be {message}"
-    return f"'{key}' {message}, got {first['input']!r}"
 
 
 def preset_names() -> list[str]:

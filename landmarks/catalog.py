@@ -1,0 +1,30 @@
+"""The four classes of PHYSICS section 5."""
+
+from __future__ import annotations
+
+from phasemark.landmarks.spec import Box, Cone, Cylinder, LandmarkSpec, Sphere
+
+_BOX = Box(length_m=0.24, width_m=0.16, height_m=0.15)
+_HEIGHT_M = 0.15
+
+
+def catalog() -> dict[str, LandmarkSpec]:
+    """Return the catalogue: ``cylinder``, ``cone``, ``sphere`` and ``post``, each 0.15 m high on the same box.
+
+    Returns
+    -------
+    dict of str to LandmarkSpec
+        A new dictionary, in the order above.
+
+    Examples
+    --------
+    >>> list(catalog())
+    ['cylinder', 'cone', 'sphere', 'post']
+    """
+    uppers = {
+        "cylinder": Cylinder(radius_m=0.06, height_m=_HEIGHT_M),
+        "cone": Cone(radius_m=0.075, height_m=_HEIGHT_M),
+        "sphere": Sphere(radius_m=_HEIGHT_M / 2),
+        "post": Cylinder(radius_m=0.035, height_m=_HEIGHT_M),
+    }
+    return {name: LandmarkSpec(name=name, box=_BOX, upper=upper) for name, upper in uppers.items()}
