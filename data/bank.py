@@ -35,6 +35,12 @@ IMAGE_DIMS = ("row", "col")
 LAYOUT_GROUPS: dict[str, tuple[GroupName, ...]] = {"factored": ("lower", "upper"), "full": ("full",)}
 
 
+def group_rows(group: GroupName, sensor: Sensor) -> tuple[int, int]:
+    """Return first and stop of the image rows that a group holds."""
+    half = sensor.rows // 2
+    return {"lower": (half, sensor.rows), "upper": (0, half), "full": (0, sensor.rows)}[group]
+
+
 class BankGroup:
     """The images of one group; read-only arrays, each read from the file when it is first asked for.
 
@@ -53,18 +59,18 @@ class BankGroup:
         Class names; empty in `lower`, which all classes share.
     """
 
-    def __init__(self, group: h5py.Group, path: Path, sensor: Sensor) -> None:
+    def __init__(self, name: GroupName, group: h5py.Group, path: Path, sensor: Sensor) -> None:
         self._group, self._path = group, path
-        self.name: str = group.name.strip("/")
-        view_dims = VIEW_DIMS[self.name]  # type: ignore[index]
+        self.name: GroupName = name
+        view_dims = VIEW_DIMS[name]
         coordinates = {dim: self._coordinate(dim) for dim in (*view_dims, *PHASOR_DIMS)}
         sizes = {dim: len(values) for dim, values in coordinates.items()}
-        for name, dims in (("phasor", PHASOR_DIMS), ("intensity", IMAGE_DIMS), ("coverage", IMAGE_DIMS)):
-            dataset = _dataset(group, name, self._path)
+        for field, dims in (("phasor", PHASOR_DIMS), ("intensity", IMAGE_DIMS), ("coverage", IMAGE_DIMS)):
+            dataset = _dataset(group, field, self._path)
             expected = tuple(sizes[dim] for dim in (*view_dims, *dims))
             if dataset.shape != expected or dataset.dtype.kind != "f":
                 raise InputFileError(
-                    f"{path}: '{self.name}/{name}' must be floats of shape {expected},"
+                    f"{path}: '{name}/{field}' must be floats of shape {expected},"
                     f" got {dataset.dtype} of shape {dataset.shape}"
                 )
         self.distance_m: NDArray[np.float64] = _frozen(coordinates["distance"])
@@ -118,12 +124,13 @@ class BankGroup:
         dataset = _dataset(self._group, name, self._path)
         is_text = name in ("landmark_class", "iq")
         if dataset.ndim != 1 or not dataset.size or (dataset.dtype.kind == "O") != is_text:
-            raise InputFileError(f"{self._path}: '{self.name}/{name}' must be one row of {'text' if is_text else 'numbers'}")
+            raise InputFileError(
+                f"{self._path}: '{self.name}/{name}' must be one row of {'text' if is_text else 'numbers'}"
+            )
         return np.asarray(dataset.asstr()[...] if is_text else dataset[...].astype(np.float64))
 
     def _check_coordinates(self, sensor: Sensor) -> None:
-        half = sensor.rows // 2
-        rows = {"lower": (half, sensor.rows), "upper": (0, half), "full": (0, sensor.rows)}[self.name]
+        rows = group_rows(self.name, sensor)
         wrong = {
             "distance": self.distance_m[0] <= 0 or not _increases(self.distance_m),
             "delta": not _increases(self.delta_rad),
@@ -167,7 +174,9 @@ class Bank:
         self.plan = BankPlan(**self._json("plan"))
         self.versions: dict[str, str] = self._json("versions")
         self.layout = self.plan.layout
-        groups = {name: BankGroup(_group(file, name, path), path, self.sensor) for name in LAYOUT_GROUPS[self.layout]}
+        groups: dict[str, BankGroup] = {
+            name: BankGroup(name, _group(file, name, path), path, self.sensor) for name in LAYOUT_GROUPS[self.layout]
+        }
         self.lower, self.upper, self.full = groups.get("lower"), groups.get("upper"), groups.get("full")
         classed = self.full or self.upper
         angled = self.full or self.lower
@@ -227,13 +236,21 @@ class Bank:
         with _reading(self.path):
             vertices = group["vertices"][...].astype(np.float64)
             faces = group["faces"][...].astype(np.int64)
+            part = group["part"][...].astype(np.uint8) if "part" in group else None
             period_deg, albedo = float(group.attrs["delta_period_deg"]), float(group.attrs["albedo"])
         if not (vertices.ndim == faces.ndim == 2 and vertices.shape[1:] == faces.shape[1:] == (3,) and faces.size):
             raise InputFileError(f"{self.path}: 'meshes/{class_name}' must hold rows of three, of vertices and faces")
         if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
             raise InputFileError(f"{self.path}: 'meshes/{class_name}' has vertices that are not finite or not there")
-        metadata = {"name": class_name, "symmetry": round(360 / period_deg), "albedo": albedo}
-        return trimesh.Trimesh(vertices, faces, process=False, metadata=metadata)
+        if part is not None and part.shape != faces.shape[:1]:
+            raise InputFileError(f"{self.path}: 'meshes/{class_name}/part' must have one value for each face")
+        return trimesh.Trimesh(
+            vertices,
+            faces,
+            process=False,
+            face_attributes=None if part is None else {"part": part},
+            metadata={"name": class_name, "symmetry": round(360 / period_deg), "albedo": albedo},
+        )
 
     def info(self) -> dict[str, Any]:
         """Return what the bank holds, in plain numbers and text."""
@@ -248,7 +265,7 @@ class Bank:
             "classes": list(self.classes),
             "distance_m": format_grid(self.distance_m),
             "n_distance": len(self.distance_m),
-            "delta_deg": format_grid(np.round(np.rad2deg(self.delta_rad), 9)),
+            "delta_deg": format_grid(self.plan.delta_deg or ()),
             "n_delta": len(self.delta_rad),
             "images": views,
             "harmonics": groups[0].order.tolist(),

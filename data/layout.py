@@ -11,7 +11,7 @@ import io
 import os
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -29,24 +29,30 @@ class SparseMemory(io.RawIOBase):
         self._size = 0
 
     def readable(self) -> bool:
+        """Return True."""
         return True
 
     def writable(self) -> bool:
+        """Return True."""
         return True
 
     def seekable(self) -> bool:
+        """Return True."""
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Move to a position, beyond the end if need be."""
         start = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
         self._position = start + offset
         return self._position
 
     def truncate(self, size: int | None = None) -> int:
+        """Set the size."""
         self._size = self._position if size is None else size
         return self._size
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        """Read from the position on and return how many bytes there were."""
         view = memoryview(buffer).cast("B")
         length = max(0, min(len(view), self._size - self._position))
         done = 0
@@ -60,6 +66,7 @@ class SparseMemory(io.RawIOBase):
         return length
 
     def write(self, data: memoryview) -> int:  # type: ignore[override]
+        """Write at the position and return the number of bytes."""
         view = memoryview(data).cast("B")
         done = 0
         while done < len(view):
@@ -129,7 +136,7 @@ class Layout:
             place(descriptor, offset, page)
 
 
-def place(descriptor: int, offset: int, data: NDArray[np.generic] | memoryview) -> None:
+def place(descriptor: int, offset: int, data: NDArray[Any] | memoryview) -> None:
     """Write an array, or raw bytes, at an offset of an open file; any thread may do so at any time.
 
     Raises
@@ -137,7 +144,7 @@ def place(descriptor: int, offset: int, data: NDArray[np.generic] | memoryview) 
     OSError
         The disk is full or fails.
     """
-    view = memoryview(np.ascontiguousarray(data)).cast("B")
+    view = np.ascontiguousarray(data).reshape(-1).view(np.uint8).data
     while view:
         written = os.pwrite(descriptor, view, offset)
         view, offset = view[written:], offset + written

@@ -129,7 +129,7 @@ class BankPlan(_PlanModel):
     meshes: tuple[MeshPlan, ...] = ()
     sensor: str = "pmd-16x16"
     sensor_overrides: dict[str, Any] = Field(default_factory=dict)
-    distance_m: Annotated[_Grid, AfterValidator(_positive)] = Field(DEFAULT_DISTANCE_M, validate_default=True)  # type: ignore[assignment]
+    distance_m: Annotated[_Grid, AfterValidator(_positive)] = Field(DEFAULT_DISTANCE_M, validate_default=True)
     delta_deg: _Grid | None = None
     model: Literal["ray", "planar"] = "ray"
     layout: Literal["factored", "full"] = "factored"
@@ -155,17 +155,18 @@ class BankPlan(_PlanModel):
             The sensor file cannot be read.
         """
         named = self.classes or (() if self.landmarks or self.meshes else tuple(catalog()))
-        specs = [*(_from_catalog(name) for name in named), *self.landmarks]
-        meshes = list(self.meshes)
+        specs: list[LandmarkSpec] = [*(_from_catalog(name) for name in named), *self.landmarks]
+        meshes: list[MeshPlan] = list(self.meshes)
         if self.albedo is not None:
             specs = [LandmarkSpec(**{**spec.model_dump(), "albedo": self.albedo}) for spec in specs]
             meshes = [MeshPlan(**{**mesh.model_dump(), "albedo": self.albedo}) for mesh in meshes]
-        names = [part.name for part in (*specs, *meshes)]
+        parts: list[LandmarkSpec | MeshPlan] = [*specs, *meshes]
+        names = [part.name for part in parts]
         for name in names:
             if names.count(name) > 1 or name == "none":
                 problem = "stands for no landmark" if name == "none" else "names two landmarks"
                 raise UsageError(f"the class name {name!r} {problem}: give each landmark a name of its own")
-        period_deg = 360 / math.gcd(*(part.symmetry for part in (*specs, *meshes)))
+        period_deg = 360 / math.gcd(*(part.symmetry for part in parts))
         delta_deg = parse_grid(self.delta_deg or f"0:{period_deg!r}:{DEFAULT_DELTA_STEP_DEG}", "delta_deg")
         return BankPlan(
             landmarks=tuple(specs),

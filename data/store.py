@@ -143,11 +143,9 @@ def read_checksum(path: str | os.PathLike[str]) -> str:
     """
     path, beside = Path(path), checksum_path(path)
     try:
-        text = beside.read_text(encoding="utf-8")
+        text = os.fsdecode(beside.read_bytes())
     except OSError as error:
         raise InputFileError(f"{beside}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        text = ""
     match = _CHECKSUM_LINE.fullmatch(text)
     if match is None:
         raise InputFileError(f"{beside}: must be one line '<SHA-256>  {path.name}', as sha256sum writes it")
