@@ -1,17 +1,47 @@
 """How the camera sees the landmark: from a mesh and a sensor to phasor images, and from those to noisy frames."""
 
+from typing import TYPE_CHECKING
+
+from phasemark.render.background import Background
+from phasemark.render.capture import capture
 from phasemark.render.frames import Flag, Frames
-from phasemark.render.phasor import PhasorImages, phasor_to_range_m
+from phasemark.render.noise import measured_range_std, predicted_range_std
+from phasemark.render.phasor import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
+from phasemark.render.renderer import Renderer
 from phasemark.render.sensor import Sensor, preset, preset_names
 from phasemark.render.view import Views
 
+if TYPE_CHECKING:
+    from phasemark.render.plot import PAPER_CMAP, range_picture, terminal_picture
+
 __all__ = [
+    "PAPER_CMAP",
+    "Background",
     "Flag",
     "Frames",
     "PhasorImages",
+    "Renderer",
     "Sensor",
     "Views",
+    "capture",
+    "measured_range_std",
     "phasor_to_range_m",
+    "predicted_range_std",
     "preset",
     "preset_names",
+    "range_picture",
+    "terminal_picture",
+    "wrap_difference_m",
+    "wrap_range_m",
 ]
+
+_PICTURES = ("PAPER_CMAP", "range_picture", "terminal_picture")
+
+
+def __getattr__(name: str) -> object:
+    """Import pictures when they are asked for: matplotlib takes half a second to load."""
+    if name in _PICTURES:
+        from phasemark.render import plot
+
+        return getattr(plot, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -51,7 +51,7 @@ class Frames:
     Raises
     ------
     UsageError
-        The shapes do not agree with each other or with the sensor.
+        The shapes do not agree with each other or with the sensor, or a valid pixel's amplitude or intensity cannot be.
     """
 
     def __init__(
@@ -92,6 +92,16 @@ class Frames:
             codes = like_range("flags", flags, np.uint8)
             codes[~usable & (codes == 0)] |= int(Flag.MISSING)
             usable &= codes == 0
+        for name, measured, least in (("amplitude_e", amplitude, 0.0), ("intensity_e", intensity, -np.inf)):
+            if measured is None:
+                continue
+            wrong = usable & ~(np.isfinite(measured) & (measured >= least))
+            if wrong.any():
+                position, frame, row, col = np.argwhere(wrong)[0]
+                raise UsageError(
+                    f"'{name}' must be finite{' and not negative' if least == 0 else ''} where the range is valid, got "
+                    f"{measured[position, frame, row, col]} at position {position}, frame {frame}, row {row}, col {col}"
+                )
         ranges = ranges.reshape(shape)
         ranges[~usable] = np.nan
         self.range_m: NDArray[np.float64] = ranges

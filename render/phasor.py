@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
 from phasemark.render.sensor import Sensor
@@ -19,9 +19,22 @@ if TYPE_CHECKING:
 
 def phasor_to_range_m(phasor: NDArray[np.complexfloating], sensor: Sensor) -> NDArray[np.float64]:
     """Return the range a phasor stands for, (c / 4πf) · arg S in [0, c/2f); NaN where S is zero."""
-    phase = np.angle(phasor) % (2 * np.pi)
-    phase[phase >= 2 * np.pi] = 0.0  # the modulo of a tiny negative angle rounds up to 2π
-    return np.where(phasor == 0, np.nan, sensor.metres_per_radian * phase)
+    range_m = wrap_range_m(sensor.metres_per_radian * np.angle(phasor), sensor)
+    return np.where(phasor == 0, np.nan, range_m)
+
+
+def wrap_range_m(range_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
+    """Bring ranges into [0, c/2f), metres."""
+    wrapped = np.asarray(range_m, dtype=np.float64) % sensor.unambiguous_range_m
+    # the modulo of a tiny negative range rounds up to the period itself
+    return np.where(wrapped >= sensor.unambiguous_range_m, 0.0, wrapped)
+
+
+def wrap_difference_m(difference_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
+    """Bring differences of ranges into [−c/4f, c/4f), metres; a difference that is there already stays as it is."""
+    difference = np.asarray(difference_m, dtype=np.float64)
+    period = sensor.unambiguous_range_m
+    return difference - period * np.floor(difference / period + 0.5)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,20 @@ _HalfAngleDeg = Annotated[float, Field(gt=0, lt=85)]
 _TiltDeg = Annotated[float, Field(ge=-45, le=45)]
 _PixelCount = Annotated[int, Field(ge=1, le=4096)]
 
+# What an image's rays and phases depend on: cameras that agree in these see the same noise-free image.
+_OPTICS = (
+    "rows",
+    "cols",
+    "half_angle_h_deg",
+    "half_angle_v_deg",
+    "centre_px",
+    "pitch_deg",
+    "roll_deg",
+    "fill_factor",
+    "vignetting",
+    "modulation_hz",
+)
+
 
 class Sensor(BaseModel):
     """A time-of-flight camera (PHYSICS sections 2 and 4).
@@ -162,6 +176,20 @@ class Sensor(BaseModel):
             return cls(**table)
         except UsageError as error:
             raise UsageError(f"{path}: {error}") from None
+
+    def optics_difference(self, other: Sensor) -> str | None:
+        """Say in what the noise-free images of two cameras differ, e.g. ``'rows' is 16 here and 8 there``.
+
+        Returns
+        -------
+        str or None
+            The first field of geometry or modulation that differs; None if they see the same.
+        """
+        for name in _OPTICS:
+            here, there = getattr(self, name), getattr(other, name)
+            if here != there:
+                return f"'{name}' is {here} here and {there} there"
+        return None
 
     @property
     def tan_half_angles(self) -> tuple[float, float]:

@@ -1,0 +1,69 @@
+# Every target sets itself up: a virtual environment in VENV, the package in it (editable), and then the work.
+#   make demo          the paper's experiment, with a report in out/demo
+#   make test          the tests (ARGS="-k name" for some of them)
+#   make lint types    style, import direction, types
+#   make bench soak    speed; the long statistical and fault tables
+#   make wheel-check   what a release would ship, built from a clean clone
+
+VENV ?= .venv
+ARGS ?=
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+
+.PHONY: demo test soak bench lint types wheel-check clean
+
+demo: $(VENV)/.installed
+	$(BIN)/phasemark demo --out out/demo --force
+
+test: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -n 2 -m "not soak" $(ARGS)
+
+soak: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -m soak $(ARGS)
+
+bench: $(VENV)/.installed-bench
+	$(BIN)/python benchmarks/run.py $(ARGS)
+
+lint: $(VENV)/.installed-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+types: $(VENV)/.installed-test
+	mkdir -p .typing
+	ln -sfn .. .typing/phasemark
+	$(BIN)/mypy
+
+wheel-check: $(VENV)/.installed-test
+	$(BIN)/python .ci/wheel_check.py
+
+clean:
+	rm -rf build dist out .typing .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis *.egg-info
+	find __init__.py cli.py landmarks render data matcher tests -name __pycache__ -prune -exec rm -rf {} +
+
+# A name like python3.12 may exist and still not run (version managers leave such shims), so each candidate is tried.
+# PYTHON=/path/to/python overrides the choice. A leftover build/ would be shipped again by the next install.
+$(BIN)/python:
+	@for python in $(PYTHON) python3.13 python3.12 python3.11 python3 python; do \
+	    if "$$python" -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	        echo "creating $(VENV) with $$("$$python" --version)"; \
+	        exec "$$python" -m venv "$(VENV)"; \
+	    fi; \
+	done; \
+	echo "phasemark needs Python 3.11 or newer with its venv module, and found none." \
+	     "On Debian: apt-get install python3 python3-venv. Elsewhere: make $(MAKECMDGOALS) PYTHON=/path/to/python3" >&2; \
+	exit 1
+
+$(VENV)/.installed: pyproject.toml | $(BIN)/python
+	rm -rf build
+	$(PIP) install --editable .
+	touch $@
+
+$(VENV)/.installed-test: pyproject.toml | $(BIN)/python
+	rm -rf build
+	$(PIP) install --editable '.[test]'
+	touch $(VENV)/.installed $@
+
+$(VENV)/.installed-bench: $(VENV)/.installed
+	$(PIP) install --editable '.[bench]' || echo "Open3D cannot be installed here: its rows will be missing" >&2
+	touch $@

@@ -1,0 +1,149 @@
+"""What stands behind the landmark: nothing, a wall, a floor, or both (PHYSICS section 3)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.render.view import Views
+
+
+@dataclass(frozen=True)
+class Background:
+    """A wall, a floor, or both; the nearest is seen.
+
+    Parameters
+    ----------
+    wall_m : float, optional
+        Distance of the vertical plane xc·cos b + yc·sin b = wall_m, perpendicular to the horizontal line from the
+        lens to the landmark's axis.
+    floor_m : float, optional
+        How far the plane zc = −floor_m lies below the lens.
+    wall_albedo, floor_albedo : float
+        Albedo of the Lambertian surfaces, in [0, 1].
+
+    Raises
+    ------
+    UsageError
+        A value is out of range.
+    """
+
+    wall_m: float | None = None
+    floor_m: float | None = None
+    wall_albedo: float = 0.5
+    floor_albedo: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("wall_m", "floor_m"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise UsageError(f"'{name}' must be a positive number of metres, got {value!r}")
+        for name in ("wall_albedo", "floor_albedo"):
+            value = getattr(self, name)
+            if not 0 <= value <= 1:
+                raise UsageError(f"'{name}' must be in [0, 1], got {value!r}")
+
+    def parameters(self) -> NDArray[np.float64]:
+        """Return (wall_m, floor_m, wall_albedo, floor_albedo), 0 for a plane that is not there."""
+        return np.array([self.wall_m or 0.0, self.floor_m or 0.0, self.wall_albedo, self.floor_albedo])
+
+    def check_behind(self, vertices: NDArray[np.float64], views: Views) -> None:
+        """Refuse a wall before, or a floor above, any point of the landmark.
+
+        Parameters
+        ----------
+        vertices : (v, 3) float64
+            Points of the landmark, landmark frame.
+        views : Views
+
+        Raises
+        ------
+        UsageError
+            Naming the view and what would be right.
+        """
+        if self.floor_m is not None:
+            lowest = vertices[:, 2].min() + views.height_m
+            bad = np.flatnonzero(lowest < -self.floor_m - 1e-9)
+            if bad.size:
+                raise UsageError(
+                    f"the floor {self.floor_m:g} m below the lens is above the landmark's lowest point in view"
+                    f" {bad[0]}: 'floor_m' must be at least {-lowest[bad[0]]:.4g}"
+                )
+        if self.wall_m is not None:
+            # distance along the horizontal line of sight: D + x' cos δ + y' sin δ
+            reach = np.hypot(vertices[:, 0], vertices[:, 1]).max()
+            for i in np.flatnonzero(views.distance_m + reach > self.wall_m):
+                cos, sin = math.cos(views.delta_rad[i]), math.sin(views.delta_rad[i])
+                farthest = views.distance_m[i] + (vertices[:, 0] * cos + vertices[:, 1] * sin).max()
+                if farthest > self.wall_m + 1e-9:
+                    raise UsageError(
+                        f"the wall at {self.wall_m:g} m is before the landmark's farthest point in view {i}:"
+                        f" 'wall_m' must be at least {farthest:.4g}"
+                    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def background_hit(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Return the multiple of a ray at which it meets the nearer plane, its albedo, and cos θ times the ray's length.
+
+    The ray starts at the lens in direction (dx, dy, dz) of the level camera frame, of any length; the multiple is 0
+    where nothing is met.
+    """
+    forward = dx * cos_b + dy * sin_b
+    t, albedo, facing = 0.0, 0.0, 0.0
+    if parameters[0] > 0.0 and forward > 0.0:
+        t, albedo, facing = parameters[0] / forward, parameters[2], forward
+    if parameters[1] > 0.0 and dz < 0.0:
+        floor = -parameters[1] / dz
+        if t == 0.0 or floor < t:
+            t, albedo, facing = floor, parameters[3], -dz
+    return t, albedo, facing
+
+
+@njit(cache=True, nogil=True)
+def background_edge(parameters, cos_b, sin_b, level, scale, centre, rows, cols, out):  # type: ignore[no-untyped-def]
+    """Project the line where wall and floor meet, or the floor's horizon, across the image.
+
+    Parameters
+    ----------
+    parameters : (4,)
+        As :meth:`Background.parameters` returns them.
+    cos_b, sin_b : float
+        Of the bearing.
+    level : (3, 3)
+        Rotation from the tilted to the level camera.
+    scale, centre : (2,)
+        u = centre[0] − scale[0] · y, v = centre[1] − scale[1] · z for the ray (1, y, z).
+    rows, cols : int
+    out : (4,), overwritten
+        u, v of both ends.
+
+    Returns
+    -------
+    bool
+        Whether there is such a line in the image.
+    """
+    if parameters[1] == 0.0:
+        return False
+    # points of the line satisfy normal · ray = 0 in the level frame
+    normal = np.array([parameters[1] * cos_b, parameters[1] * sin_b, parameters[0]])
+    if parameters[0] == 0.0:
+        normal = np.array([0.0, 0.0, 1.0])
+    tilted = normal @ level
+    # in image coordinates: k0 + ku · u + kv · v = 0
+    ku, kv = -tilted[1] / scale[0], -tilted[2] / scale[1]
+    k0 = tilted[0] + tilted[1] * centre[0] / scale[0] + tilted[2] * centre[1] / scale[1]
+    if abs(kv) >= abs(ku):
+        if kv == 0.0:
+            return False
+        out[0], out[2] = -1.0, cols + 1.0
+        out[1], out[3] = -(k0 + ku * out[0]) / kv, -(k0 + ku * out[2]) / kv
+    else:
+        out[1], out[3] = -1.0, rows + 1.0
+        out[0], out[2] = -(k0 + kv * out[1]) / ku, -(k0 + kv * out[3]) / ku
+    return True

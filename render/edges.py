@@ -1,0 +1,271 @@
+"""Where the integrand is not smooth: creases and silhouettes of a mesh, projected into the image.
+
+Inside a pixel the light a surface returns is a smooth function of (u, v) except across the images of creases (faces
+that meet at more than 30°, borders of open meshes) and of silhouettes (an edge between a face seen from its front and
+one seen from its back). :class:`MeshTopology` finds what does not depend on the view, once per mesh;
+:func:`project_edges` selects and projects what a view shows.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numba import njit
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+
+CREASE_RAD = math.radians(30.0)
+_COPLANAR_RAD = 1e-7
+_NEAR_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class MeshTopology:
+    """What the renderer needs to know of a mesh, in float64 and contiguous.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float64
+        Distinct points, metres, landmark frame.
+    faces : (f, 3) int32
+    planes : (f, 4) float64
+        Unit normal and offset of each face: n · p = offset on it.
+    corner_normals : (f, 3, 3) float64
+        Shading normal at each corner of each face; zero at an apex, where there is none.
+    flat : (f,) bool
+        Whether the three corner normals are the face's own.
+    patch : (f,) int32
+        Number of the smooth patch, faces joined without a crease between them.
+    part : (f,) int8
+        0 for the landmark's lower part, 1 for the upper one.
+    creases, folds : (e, 4) int32
+        Edges (start, end, face, other face): the creases, −1 where there is no other face, and the edges of smooth
+        regions, which matter where they are silhouettes. An edge runs along the winding of its first face.
+    closed : bool
+        Whether the mesh is watertight and wound outward, so that what faces away is never seen.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    planes: NDArray[np.float64]
+    corner_normals: NDArray[np.float64]
+    flat: NDArray[np.bool_]
+    patch: NDArray[np.int32]
+    part: NDArray[np.int8]
+    creases: NDArray[np.int32]
+    folds: NDArray[np.int32]
+    closed: bool
+
+    @classmethod
+    def from_mesh(cls, mesh: trimesh.Trimesh) -> MeshTopology:
+        """Analyse a mesh; faces without area are dropped, vertices at one point merged.
+
+        Raises
+        ------
+        UsageError
+            The mesh has no face with an area, or a vertex that is not finite.
+        """
+        raw = np.asarray(mesh.vertices, dtype=np.float64)
+        if not np.isfinite(raw).all():
+            raise UsageError("the mesh has a vertex that is not finite")
+        vertices, merged = np.unique(raw + 0.0, axis=0, return_inverse=True)
+        faces = merged.reshape(-1)[np.asarray(mesh.faces, dtype=np.int64)]
+        part = np.asarray(mesh.face_attributes.get("part", _part_by_height(raw, mesh.faces)), dtype=np.int8)
+        a, b, c = (vertices[faces[:, k]] for k in range(3)) if len(faces) else (np.zeros((0, 3)),) * 3
+        normals = np.cross(b - a, c - a)
+        length = np.linalg.norm(normals, axis=1)
+        extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
+        kept = length > 1e-14 * extent**2
+        if not kept.any():
+            raise UsageError("the mesh has no face with an area")
+        faces, part, a = faces[kept], part[kept], a[kept]
+        normals = normals[kept] / length[kept, None]
+        planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, a)])
+        edges, regular = _edges(faces)
+        first, other = edges[:, 2], edges[:, 3]
+        turn = np.where(other >= 0, _angle_between(normals[first], normals[other]), np.inf)
+        crease = ~regular | (turn > CREASE_RAD + 1e-9)
+        fold = ~crease & (turn > _COPLANAR_RAD)
+        patch = _components(len(faces), edges[~crease][:, 2:])
+        corners = _corner_normals(vertices, faces, normals, patch)
+        flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
+        signed_volume = np.einsum("ij,ij->i", a, np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]])).sum() / 6
+        return cls(
+            vertices=np.ascontiguousarray(vertices),
+            faces=np.ascontiguousarray(faces, dtype=np.int32),
+            planes=np.ascontiguousarray(planes),
+            corner_normals=np.ascontiguousarray(corners),
+            flat=np.ascontiguousarray(flat),
+            patch=patch,
+            part=np.ascontiguousarray(part),
+            creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
+            folds=np.ascontiguousarray(edges[fold], dtype=np.int32),
+            closed=bool(regular.all() and signed_volume > 0),
+        )
+
+
+def _part_by_height(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int8]:
+    """Tell the parts of an unlabelled mesh apart by the side of the interface plane their centre lies on."""
+    return np.asarray(vertices[faces].mean(axis=1)[:, 2] > 0, dtype=np.int8)
+
+
+def _angle_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return angles between unit vectors, accurate near 0 where arccos is not."""
+    return np.asarray(2 * np.arctan2(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1)))
+
+
+def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Pair the half edges of a mesh.
+
+    Returns
+    -------
+    edges : (e, 4) int64
+        Start, end, face, other face (−1: none). An edge of more than two faces is listed with the first two.
+    regular : (e,) bool
+        Whether exactly two faces meet, wound alike.
+    """
+    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    owner = np.tile(np.arange(len(faces)), 3)
+    undirected = np.sort(half, axis=1)
+    order = np.lexsort((owner, undirected[:, 1], undirected[:, 0]))
+    half, owner, undirected = half[order], owner[order], undirected[order]
+    starts = np.flatnonzero(np.concatenate([[True], (undirected[1:] != undirected[:-1]).any(axis=1)]))
+    count = np.diff(np.append(starts, len(half)))
+    second = np.minimum(starts + 1, len(half) - 1)
+    other = np.where(count > 1, owner[second], -1)
+    opposed = half[starts, 0] == half[second, 1]
+    edges = np.column_stack([half[starts], owner[starts], other])
+    return edges, (count == 2) & opposed
+
+
+def _components(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Give the nodes of each connected component one number."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
+
+
+def _corner_normals(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    normals: NDArray[np.float64],
+    patch: NDArray[np.int32],
+) -> NDArray[np.float64]:
+    """Average, at each corner, the normals of the vertex's faces that lie within 30° of the corner's own face.
+
+    Weighted by the angle of the face at the vertex, which makes the average independent of how a quadrilateral is
+    split. A vertex whose faces fan out further without a crease between them is an apex, as a cone has one: no normal
+    serves there, and the corner gets none (zero), so that the other two are blended along its generatrices.
+    """
+    corner_of = np.argsort(faces.ravel(), kind="stable")
+    start = np.searchsorted(faces.ravel()[corner_of], np.arange(len(vertices) + 1))
+    return np.asarray(_average_corners(vertices, faces, normals, patch, corner_of, start, math.cos(CREASE_RAD + 1e-9)))
+
+
+@njit(cache=True)
+def _average_corners(vertices, faces, normals, patch, corner_of, start, cos_limit):  # type: ignore[no-untyped-def]
+    n_faces = len(faces)
+    weight = np.empty((n_faces, 3))
+    for f in range(n_faces):
+        for k in range(3):
+            p = vertices[faces[f, k]]
+            a = vertices[faces[f, (k + 1) % 3]] - p
+            b = vertices[faces[f, (k + 2) % 3]] - p
+            cross = np.cross(a, b)
+            weight[f, k] = math.atan2(math.sqrt(np.dot(cross, cross)), np.dot(a, b))
+    out = np.zeros((n_faces, 3, 3))
+    for f in range(n_faces):
+        for k in range(3):
+            vertex = faces[f, k]
+            total = np.zeros(3)
+            apex = False
+            for j in range(start[vertex], start[vertex + 1]):
+                g, corner = corner_of[j] // 3, corner_of[j] % 3
+                if np.dot(normals[f], normals[g]) >= cos_limit:
+                    total += weight[g, corner] * normals[g]
+                else:
+                    apex = apex or patch[g] == patch[f]
+            if not apex:
+                out[f, k] = total / math.sqrt(np.dot(total, total))
+        if not out[f].any():
+            out[f] = normals[f]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def project_edges(vertices, planes, creases, folds, closed, lens, matrix, offset, scale, centre, front, segments, limb):  # type: ignore[no-untyped-def]
+    """Project the creases and silhouettes of one view.
+
+    Parameters
+    ----------
+    vertices, planes, creases, folds, closed
+        As in :class:`MeshTopology`.
+    lens : (3,)
+        The lens in the landmark frame.
+    matrix, offset : (3, 3), (3,)
+        p_image = matrix · p' + offset: landmark frame to the tilted camera's frame (x along the axis).
+    scale, centre : (2,)
+        u = centre[0] − scale[0] · y/x, v = centre[1] − scale[1] · z/x.
+    front : (f,) uint8, overwritten
+        Whether the lens is on the front side of each face.
+    segments : (e, 4) float64, overwritten
+        u, v of both ends.
+    limb : (e,) int8, overwritten
+        1 for a silhouette of a smooth surface; then the surface lies on the side where
+        du·(v − v_a) − dv·(u − u_a) < 0.
+
+    Returns
+    -------
+    int
+        How many segments were written.
+    """
+    for f in range(len(planes)):
+        side = planes[f, 0] * lens[0] + planes[f, 1] * lens[1] + planes[f, 2] * lens[2] - planes[f, 3]
+        front[f] = side > 0.0
+    n = 0
+    for e in range(len(creases)):
+        other = creases[e, 3]
+        # what turns its back is hidden behind the front of a closed mesh
+        if closed and not front[creases[e, 2]] and not front[other]:
+            continue
+        if _project(vertices, creases[e, 0], creases[e, 1], matrix, offset, scale, centre, segments[n]):
+            limb[n] = 0
+            n += 1
+    for e in range(len(folds)):
+        f0 = front[folds[e, 2]]
+        if f0 == front[folds[e, 3]]:
+            continue
+        a, b = (folds[e, 0], folds[e, 1]) if f0 else (folds[e, 1], folds[e, 0])
+        if _project(vertices, a, b, matrix, offset, scale, centre, segments[n]):
+            limb[n] = 1
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _project(vertices, a, b, matrix, offset, scale, centre, out):  # type: ignore[no-untyped-def]
+    ax = matrix[0, 0] * vertices[a, 0] + matrix[0, 1] * vertices[a, 1] + matrix[0, 2] * vertices[a, 2] + offset[0]
+    bx = matrix[0, 0] * vertices[b, 0] + matrix[0, 1] * vertices[b, 1] + matrix[0, 2] * vertices[b, 2] + offset[0]
+    if ax < _NEAR_M and bx < _NEAR_M:
+        return 0
+    ay = matrix[1, 0] * vertices[a, 0] + matrix[1, 1] * vertices[a, 1] + matrix[1, 2] * vertices[a, 2] + offset[1]
+    by = matrix[1, 0] * vertices[b, 0] + matrix[1, 1] * vertices[b, 1] + matrix[1, 2] * vertices[b, 2] + offset[1]
+    az = matrix[2, 0] * vertices[a, 0] + matrix[2, 1] * vertices[a, 1] + matrix[2, 2] * vertices[a, 2] + offset[2]
+    bz = matrix[2, 0] * vertices[b, 0] + matrix[2, 1] * vertices[b, 1] + matrix[2, 2] * vertices[b, 2] + offset[2]
+    if ax < _NEAR_M:
+        w = (_NEAR_M - ax) / (bx - ax)
+        ax, ay, az = _NEAR_M, ay + w * (by - ay), az + w * (bz - az)
+    elif bx < _NEAR_M:
+        w = (_NEAR_M - bx) / (ax - bx)
+        bx, by, bz = _NEAR_M, by + w * (ay - by), bz + w * (az - bz)
+    out[0] = centre[0] - scale[0] * ay / ax
+    out[1] = centre[1] - scale[1] * az / ax
+    out[2] = centre[0] - scale[0] * by / bx
+    out[3] = centre[1] - scale[1] * bz / bx
+    return 1

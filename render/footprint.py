@@ -1,0 +1,468 @@
+"""Which rays a pixel needs: its active area split along the projected edges, with Gauss points in every smooth piece.
+
+Edges cut a pixel into pieces inside which the integrand is smooth. Along one image axis (the *sweep*) the pixel is cut
+into slabs wherever an edge begins, ends, crosses another, enters or leaves; within a slab the edges do not cross, so
+every line across it meets them in the same order, and the pieces between them are trapezoids. A few Gauss lines in the
+slab, and a few Gauss points between neighbouring edges on each line, integrate them.
+
+Beside the limb of a curved surface cos θ falls like the square root of the distance x to the silhouette, where plain
+Gauss points converge badly. There the points are placed in s with x = s², or, between two limbs, in τ with
+x = c + w sin τ; both make the integrand smooth again. The limb may lie in the neighbouring pixel, so those are asked.
+The sweep runs along the limb, so that lines cross it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+MAX_SEGMENTS = 128
+"""Edges in a box above which it is quartered rather than swept: crossings are searched pair by pair."""
+_MAX_DEPTH = 5
+_MAX_EVENTS = 4 * MAX_SEGMENTS + 64
+_EMPTY = 1e-10
+"""Pieces narrower than this (pixels) are not sampled."""
+_THIN = 0.2
+"""Slabs and intervals narrower than this (pixels) get one Gauss point."""
+
+_REACH = 0.5
+"""How far along the sweep (pixels) the end of a limb is felt."""
+_PINCH = 1e-6
+"""Edges closer than this (pixels) at the end of a slab meet there."""
+
+
+def gauss_legendre(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return nodes and weights of the n-point Gauss-Legendre rule on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(n)
+    return 0.5 + 0.5 * nodes, 0.5 * weights
+
+
+_G2X, _G2W = gauss_legendre(2)
+_G3X, _G3W = gauss_legendre(3)
+_G4X, _G4W = gauss_legendre(4)
+_G5X, _G5W = gauss_legendre(5)
+
+
+@njit(cache=True, nogil=True)
+def bin_segments(segments, n_segments, rows, cols, head, link, owner):  # type: ignore[no-untyped-def]
+    """List the segments of every pixel, with a border of one pixel around the image.
+
+    Parameters
+    ----------
+    segments : (e, 4) float64
+        u, v of both ends.
+    head : (rows + 2, cols + 2) int32, overwritten
+        First entry of each pixel's list, −1: none.
+    link, owner : (m,) int32, overwritten
+        Next entry, and the entry's segment.
+
+    Returns
+    -------
+    int
+        Entries used, or −1 if m was too small.
+    """
+    head[:] = -1
+    n = 0
+    for i in range(n_segments):
+        ua, va, ub, vb = segments[i]
+        if va > vb:
+            ua, va, ub, vb = ub, vb, ua, va
+        if vb < -1.0 or va > rows + 1.0 or max(ua, ub) < -1.0 or min(ua, ub) > cols + 1.0:
+            continue
+        first = math.floor(max(va, -1.0))
+        last = min(math.floor(min(vb, rows + 0.5)), rows)
+        slope = (ub - ua) / (vb - va) if vb > va else 0.0
+        for r in range(first, last + 1):
+            if vb > va and last > first:
+                u0 = ua + slope * (max(va, r) - va)
+                u1 = ua + slope * (min(vb, r + 1) - va)
+            else:
+                u0, u1 = ua, ub
+            if u0 > u1:
+                u0, u1 = u1, u0
+            c0 = math.floor(max(u0 - 1e-9, -1.0))
+            c1 = min(math.floor(min(u1 + 1e-9, cols + 0.5)), cols)
+            for c in range(c0, c1 + 1):
+                if n == len(link):
+                    return -1
+                link[n] = head[r + 1, c + 1]
+                owner[n] = i
+                head[r + 1, c + 1] = n
+                n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _has_limb(entry, link, owner, limb):  # type: ignore[no-untyped-def]
+    while entry >= 0:
+        if limb[owner[entry]]:
+            return True
+        entry = link[entry]
+    return False
+
+
+@njit(cache=True, nogil=True)
+def sample_pixel(  # type: ignore[no-untyped-def]
+    r, c, width, height, segments, limb, head, link, owner, work, points, weights, regions, n, region
+):
+    """Place the samples of one pixel.
+
+    Parameters
+    ----------
+    r, c : int
+        Row and column.
+    width, height : float
+        Fill factor.
+    segments, limb, head, link, owner
+        As :func:`project_edges` and :func:`bin_segments` left them.
+    work : (MAX_SEGMENTS, 5) float64
+        Scratch.
+    points : (m, 2) float64
+        u, v of the samples, written from `n` on.
+    weights : (m,) float64
+        Shares of the active area; they add up to one.
+    regions : (m,) int32
+        Number of the interval a sample lies in, counted from `region`.
+
+    Returns
+    -------
+    n, region, trusted : int, int, bool
+        Where the next pixel starts (n = −1: the arrays are full), and whether every box could be split exactly.
+    """
+    u0 = c + 0.5 - 0.5 * width
+    v0 = r + 0.5 - 0.5 * height
+    inverse_area = 1.0 / (width * height)
+    i, j = r + 1, c + 1
+    sideways = _has_limb(head[i, j - 1], link, owner, limb) or _has_limb(head[i, j + 1], link, owner, limb)
+    upright = _has_limb(head[i - 1, j], link, owner, limb) or _has_limb(head[i + 1, j], link, owner, limb)
+    if head[i, j] < 0 and not sideways and not upright:
+        if n + 4 > len(weights):
+            return -1, region, True
+        for a in range(2):
+            for b in range(2):
+                points[n, 0] = u0 + width * _G2X[b]
+                points[n, 1] = v0 + height * _G2X[a]
+                weights[n] = 0.25
+                regions[n] = region
+                n += 1
+        return n, region + 1, True
+    along_v, along_u = 0.0, 0.0
+    entry = head[i, j]
+    while entry >= 0:
+        if limb[owner[entry]]:
+            s = segments[owner[entry]]
+            along_u += abs(min(max(s[2], c), c + 1) - min(max(s[0], c), c + 1))
+            along_v += abs(min(max(s[3], r), r + 1) - min(max(s[1], r), r + 1))
+        entry = link[entry]
+    if along_u == 0.0 and along_v == 0.0:
+        sweep_v = sideways or not upright
+    else:
+        sweep_v = along_v >= along_u
+    curved = sideways or upright or along_u > 0.0 or along_v > 0.0
+    # the neighbours across the sweep may hold the limb this pixel's surface ends at
+    before, after = (head[i, j - 1], head[i, j + 1]) if sweep_v else (head[i - 1, j], head[i + 1, j])
+    stack = np.empty((4 * _MAX_DEPTH + 4, 5))
+    stack[0] = (u0, v0, u0 + width, v0 + height, 0.0)
+    depth = 1
+    trusted = True
+    while depth > 0:
+        depth -= 1
+        bu0, bv0, bu1, bv1, level = stack[depth]
+        m = _clip_to_box(head[i, j], link, owner, segments, limb, bu0, bv0, bu1, bv1, sweep_v, work)
+        if m < 0 and level < _MAX_DEPTH:
+            um, vm = 0.5 * (bu0 + bu1), 0.5 * (bv0 + bv1)
+            stack[depth] = (bu0, bv0, um, vm, level + 1)
+            stack[depth + 1] = (um, bv0, bu1, vm, level + 1)
+            stack[depth + 2] = (bu0, vm, um, bv1, level + 1)
+            stack[depth + 3] = (um, vm, bu1, bv1, level + 1)
+            depth += 4
+            continue
+        if m < 0:
+            m, trusted = 0, False
+        s0, s1, x0, x1 = (bv0, bv1, bu0, bu1) if sweep_v else (bu0, bu1, bv0, bv1)
+        n, region = _sweep_box(
+            s0, s1, x0, x1, sweep_v, work, m, segments, limb, link, owner, head[i, j], before, after,
+            curved, inverse_area, points, weights, regions, n, region,
+        )  # fmt: skip
+        if n < 0:
+            return -1, region, trusted
+    return n, region, trusted
+
+
+@njit(cache=True, nogil=True)
+def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, work):  # type: ignore[no-untyped-def]
+    """Clip a pixel's segments to a box.
+
+    Rows of `work` are s, x of both ends (s rising) and the limb's side, sorted by where they begin. The side is +1
+    where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number, or −1 if there
+    are too many.
+    """
+    m = 0
+    while entry >= 0:
+        k = owner[entry]
+        entry = link[entry]
+        ua, va, ub, vb = segments[k]
+        du, dv = ub - ua, vb - va
+        lo, hi = 0.0, 1.0
+        inside = True
+        for p, q in ((-du, ua - u0), (du, u1 - ua), (-dv, va - v0), (dv, v1 - va)):
+            if p == 0.0:
+                inside = inside and q >= 0.0
+            elif p < 0.0:
+                lo = max(lo, q / p)
+            else:
+                hi = min(hi, q / p)
+        if not inside or lo >= hi:
+            continue
+        if m == MAX_SEGMENTS:
+            return -1
+        if sweep_v:
+            sa, xa, sb, xb = va + lo * dv, ua + lo * du, va + hi * dv, ua + hi * du
+            side = 1.0 if dv > 0 else -1.0
+        else:
+            sa, xa, sb, xb = ua + lo * du, va + lo * dv, ua + hi * du, va + hi * dv
+            side = -1.0 if du > 0 else 1.0
+        if sa <= sb:
+            work[m, 0], work[m, 1], work[m, 2], work[m, 3] = sa, xa, sb, xb
+        else:
+            work[m, 0], work[m, 1], work[m, 2], work[m, 3] = sb, xb, sa, xa
+        work[m, 4] = side if limb[k] else 0.0
+        m += 1
+    for i in range(1, m):  # sort by where they begin
+        j = i
+        while j > 0 and work[j - 1, 0] > work[j, 0]:
+            for k in range(5):
+                work[j - 1, k], work[j, k] = work[j, k], work[j - 1, k]
+            j -= 1
+    return m
+
+
+@njit(cache=True, nogil=True)
+def _events(s0, s1, work, m, events):  # type: ignore[no-untyped-def]
+    """Collect, sorted, where the order of the edges across the sweep may change."""
+    n = 2
+    events[0], events[1] = s0, s1
+    for i in range(m):
+        events[n] = work[i, 0]
+        events[n + 1] = work[i, 2]
+        n += 2
+    for i in range(m):
+        for j in range(i + 1, m):
+            if work[j, 0] >= work[i, 2] or n == len(events):
+                break
+            lo, hi = work[j, 0], min(work[i, 2], work[j, 2])
+            if hi - lo <= _EMPTY:
+                continue
+            if max(work[i, 1], work[i, 3]) < min(work[j, 1], work[j, 3]):
+                continue
+            if max(work[j, 1], work[j, 3]) < min(work[i, 1], work[i, 3]):
+                continue
+            ki = (work[i, 3] - work[i, 1]) / (work[i, 2] - work[i, 0])
+            kj = (work[j, 3] - work[j, 1]) / (work[j, 2] - work[j, 0])
+            gap_lo = work[i, 1] + ki * (lo - work[i, 0]) - work[j, 1] - kj * (lo - work[j, 0])
+            gap_hi = work[i, 1] + ki * (hi - work[i, 0]) - work[j, 1] - kj * (hi - work[j, 0])
+            if gap_lo * gap_hi < 0.0:
+                events[n] = lo + (hi - lo) * gap_lo / (gap_lo - gap_hi)
+                n += 1
+    events[:n].sort()
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _nearest_limb(entry, link, owner, segments, limb, sweep_v, s, side, bound):  # type: ignore[no-untyped-def]
+    """Find the limb nearest to `bound`, beyond it and with its surface on our side, on or near the line at `s`.
+
+    A limb that ends before it reaches the line (at a rim, say) still shapes the surface beside its end.
+    """
+    best = -np.inf if side > 0 else np.inf
+    closest = _REACH
+    while entry >= 0:
+        k = owner[entry]
+        entry = link[entry]
+        if not limb[k]:
+            continue
+        if sweep_v:
+            xa, sa, xb, sb = segments[k]
+            facing = 1.0 if sb > sa else -1.0
+        else:
+            sa, xa, sb, xb = segments[k]
+            facing = -1.0 if sb > sa else 1.0
+        if facing != side or sa == sb:
+            continue
+        gap = max(min(sa, sb) - s, s - max(sa, sb), 0.0)
+        if gap > closest:
+            continue
+        t = min(max((s - sa) / (sb - sa), 0.0), 1.0)
+        x = xa + t * (xb - xa)
+        if (side > 0 and x > bound) or (side < 0 and x < bound):
+            continue
+        if gap < closest or (side > 0 and x > best) or (side < 0 and x < best):
+            best, closest = x, gap
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _plan_lines(lo, hi, x0, x1, work, m, curved):  # type: ignore[no-untyped-def]
+    """Decide how many lines a slab needs, and at which of its ends a piece beside a limb shrinks to a point.
+
+    The light of such a corner grows like the 3/2 power of the distance from it; lines placed at its square make that
+    smooth. One line misses how the integrand changes along slanted edges, two are exact to third order.
+    """
+    slab, middle = hi - lo, 0.5 * (lo + hi)
+    slant = 0.0
+    beside_limb, pinched_low, pinched_high = False, False, False
+    for i in range(m):
+        if not work[i, 0] <= middle <= work[i, 2] or work[i, 2] <= work[i, 0]:
+            continue
+        slope = (work[i, 3] - work[i, 1]) / (work[i, 2] - work[i, 0])
+        slant = max(slant, abs(slope) * slab)
+        if work[i, 4] == 0.0:
+            continue
+        beside_limb = True
+        low, high = work[i, 1] + slope * (lo - work[i, 0]), work[i, 1] + slope * (hi - work[i, 0])
+        border = x1 if work[i, 4] > 0 else x0
+        pinched_low = pinched_low or abs(low - border) < _PINCH
+        pinched_high = pinched_high or abs(high - border) < _PINCH
+        for j in range(m):
+            if j == i or not work[j, 0] <= middle <= work[j, 2] or work[j, 2] <= work[j, 0]:
+                continue
+            k = (work[j, 3] - work[j, 1]) / (work[j, 2] - work[j, 0])
+            pinched_low = pinched_low or abs(work[j, 1] + k * (lo - work[j, 0]) - low) < _PINCH
+            pinched_high = pinched_high or abs(work[j, 1] + k * (hi - work[j, 0]) - high) < _PINCH
+    if pinched_low and pinched_high:
+        return 4, True, True
+    if pinched_low or pinched_high:
+        return 3, pinched_low, pinched_high
+    if slab < _THIN and slab * slant * slant < 1e-3 and not (beside_limb and slab > 0.05):
+        return 1, False, False
+    if slab < 0.3:
+        return 2, False, False
+    return (5 if curved else 3), False, False
+
+
+@njit(cache=True, nogil=True)
+def _sweep_box(  # type: ignore[no-untyped-def]
+    s0, s1, x0, x1, sweep_v, work, m, segments, limb, link, owner, own, before, after,
+    curved, scale, points, weights, regions, n, region,
+):  # fmt: skip
+    """Sample a box slab by slab; `scale` turns areas into weights."""
+    events = np.empty(_MAX_EVENTS)
+    n_events = _events(s0, s1, work, m, events)
+    cross = np.empty(m + 2)
+    side = np.empty(m + 2)
+    for e in range(n_events - 1):
+        lo, hi = max(events[e], s0), min(events[e + 1], s1)
+        slab = hi - lo
+        if slab <= _EMPTY:
+            continue
+        lines, pinched_low, pinched_high = _plan_lines(lo, hi, x0, x1, work, m, curved)
+        for g in range(lines):
+            if lines == 1:
+                t, line_weight = 0.5, slab
+            elif lines == 2:
+                t, line_weight = _G2X[g], _G2W[g] * slab
+            elif lines == 3:
+                t, line_weight = _G3X[g], _G3W[g] * slab
+            elif lines == 4:
+                t, line_weight = _G4X[g], _G4W[g] * slab
+            else:
+                t, line_weight = _G5X[g], _G5W[g] * slab
+            if pinched_low and pinched_high:
+                line_weight *= 6.0 * t * (1.0 - t)
+                t = t * t * (3.0 - 2.0 * t)
+            elif pinched_low:
+                line_weight *= 2.0 * t
+                t = t * t
+            elif pinched_high:
+                line_weight *= 2.0 * (1.0 - t)
+                t = t * (2.0 - t)
+            s = lo + t * slab
+            k = 1
+            cross[0], side[0] = x0, 0.0
+            for i in range(m):
+                if work[i, 0] <= s <= work[i, 2] and work[i, 2] > work[i, 0]:
+                    x = work[i, 1] + (s - work[i, 0]) * (work[i, 3] - work[i, 1]) / (work[i, 2] - work[i, 0])
+                    j = k
+                    while j > 1 and cross[j - 1] > x:
+                        cross[j], side[j] = cross[j - 1], side[j - 1]
+                        j -= 1
+                    cross[j], side[j] = min(max(x, x0), x1), work[i, 4]
+                    k += 1
+            cross[k], side[k] = x1, 0.0
+            left, behind_limb = -np.inf, False
+            for i in range(k):
+                if side[i] > 0:
+                    left, behind_limb = cross[i], False
+                elif side[i] < 0:
+                    left, behind_limb = -np.inf, True
+                a, b = cross[i], cross[i + 1]
+                if b - a <= _EMPTY:
+                    continue
+                if curved and left == -np.inf and not behind_limb:
+                    left = max(
+                        _nearest_limb(own, link, owner, segments, limb, sweep_v, s, 1.0, a),
+                        _nearest_limb(before, link, owner, segments, limb, sweep_v, s, 1.0, a),
+                    )
+                right = np.inf
+                j = i + 1
+                while j < k and side[j] == 0:
+                    j += 1
+                if j < k and side[j] < 0:
+                    right = cross[j]
+                elif curved and j == k:
+                    right = min(
+                        _nearest_limb(own, link, owner, segments, limb, sweep_v, s, -1.0, b),
+                        _nearest_limb(after, link, owner, segments, limb, sweep_v, s, -1.0, b),
+                    )
+                if n + 5 > len(weights):
+                    return -1, region
+                n = _place(
+                    a, b, left, right, s, sweep_v, slab, line_weight * scale, points, weights, regions, n, region
+                )
+                region += 1
+    return n, region
+
+
+@njit(cache=True, nogil=True)
+def _place(a, b, left, right, s, sweep_v, slab, scale, points, weights, regions, n, region):  # type: ignore[no-untyped-def]
+    """Place Gauss points on one interval [a, b] of a line, with limbs at `left` and `right` (±inf: none)."""
+    near_left, near_right = a - left < 1.5, right - b < 1.5
+    if near_left and near_right:
+        middle, half = 0.5 * (left + right), 0.5 * (right - left)
+        t0 = math.asin(max((a - middle) / half, -1.0))
+        t1 = math.asin(min((b - middle) / half, 1.0))
+        count = 4
+    elif near_left:
+        t0, t1, count = math.sqrt(max(a - left, 0.0)), math.sqrt(b - left), 4
+    elif near_right:
+        t0, t1, count = math.sqrt(right - a), math.sqrt(max(right - b, 0.0)), 4
+    else:
+        count = 1 if b - a < _THIN and slab < _THIN else 2
+        t0, t1 = a, b
+    total = 0.0
+    for g in range(count):
+        if count == 1:
+            t, w = 0.5 * (t0 + t1), 1.0
+        elif count == 2:
+            t, w = t0 + _G2X[g] * (t1 - t0), _G2W[g]
+        else:
+            t, w = t0 + _G4X[g] * (t1 - t0), _G4W[g]
+        if near_left and near_right:
+            x, w = middle + half * math.sin(t), w * math.cos(t)
+        elif near_left:
+            x, w = left + t * t, w * t
+        elif near_right:
+            x, w = right - t * t, w * t
+        else:
+            x = t
+        points[n + g, 0] = x if sweep_v else s
+        points[n + g, 1] = s if sweep_v else x
+        weights[n + g] = w
+        regions[n + g] = region
+        total += w
+    for g in range(count):  # the constant is integrated exactly, whatever the substitution
+        weights[n + g] *= scale * (b - a) / total
+    return n + count

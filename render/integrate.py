@@ -1,0 +1,259 @@
+"""The area integral: which rays a batch of views needs, and the sum of the phasors they bring back.
+
+Two compiled steps with one call of the intersector between them. :func:`plan_rays` fills a buffer with samples of as
+many views as fit; the intersector names the face each meets; :func:`sum_samples` computes the hit in float64, its
+amplitude and phase, and adds it to its pixel.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from phasemark.render.background import background_edge, background_hit
+from phasemark.render.edges import project_edges
+from phasemark.render.footprint import bin_segments, gauss_legendre, sample_pixel
+
+_NODES, _WEIGHTS = gauss_legendre(4)
+
+SKIPPED = 0
+"""Pixel state: no sample can meet the landmark; only the background is seen."""
+SPLIT = 1
+"""Pixel state: sampled, split exactly."""
+UNTRUSTED = 2
+"""Pixel state: sampled, but too many edges for an exact split."""
+
+
+@njit(cache=True, nogil=True)
+def plan_rays(  # type: ignore[no-untyped-def]
+    first, vertices, planes, creases, folds, closed, lens, matrix, offset, bearing, camera, level, row_range,
+    background, front, segments, limb, head, link, owner, work,
+    points, weights, regions, pixel, origins, directions, state,
+):  # fmt: skip
+    """Place the samples of as many views as fit into the buffers, from view `first` on.
+
+    Parameters
+    ----------
+    vertices, planes, creases, folds, closed
+        The mesh, see :class:`phasemark.render.edges.MeshTopology`.
+    lens, matrix, offset : (n, 3), (n, 3, 3), (n, 3) float64
+        The lens in the landmark frame, and the landmark frame to the tilted camera's.
+    bearing : (n,) float64
+    camera : (8,) float64
+        Scale (2), principal point (2), rows, cols, fill factor (2).
+    level : (3, 3) float64
+        Tilted to level camera frame.
+    row_range : (2,) int64
+        First and last-but-one image row to render.
+    background : (4,) float64
+    front, segments, limb, head, link, owner, work
+        Scratch, see :func:`project_edges`, :func:`bin_segments` and :func:`sample_pixel`.
+    points, weights, regions, pixel, origins, directions
+        The samples: u, v; share of the pixel; interval; view · pixels + pixel; float32 ray in the landmark frame.
+    state : (n, rows, cols) uint8, overwritten
+        Per pixel :data:`SKIPPED`, :data:`SPLIT` or :data:`UNTRUSTED`.
+
+    Returns
+    -------
+    next_view, n_samples : int, int
+        `next_view` equals `first` when not even one view fits; −1 in place of it: `link` is too small.
+    """
+    scale, centre = camera[:2], camera[2:4]
+    rows, cols = int(camera[4]), int(camera[5])
+    out_rows = row_range[1] - row_range[0]
+    n, region = 0, 0
+    for view in range(first, len(lens)):
+        n_edges = project_edges(
+            vertices, planes, creases, folds, closed, lens[view], matrix[view], offset[view], scale, centre,
+            front, segments, limb,
+        )  # fmt: skip
+        u_low, u_high, v_low, v_high = np.inf, -np.inf, np.inf, -np.inf
+        for i in range(n_edges):
+            u_low = min(u_low, segments[i, 0], segments[i, 2])
+            u_high = max(u_high, segments[i, 0], segments[i, 2])
+            v_low = min(v_low, segments[i, 1], segments[i, 3])
+            v_high = max(v_high, segments[i, 1], segments[i, 3])
+        cos_b, sin_b = math.cos(bearing[view]), math.sin(bearing[view])
+        if background_edge(background, cos_b, sin_b, level, scale, centre, rows, cols, segments[n_edges]):
+            limb[n_edges] = 0
+            n_edges += 1
+        if bin_segments(segments, n_edges, rows, cols, head, link, owner) < 0:
+            return -1, n
+        start = n
+        for r in range(row_range[0], row_range[1]):
+            for c in range(cols):
+                outside = c >= u_high or c + 1 <= u_low or r >= v_high or r + 1 <= v_low
+                if outside and head[r + 1, c + 1] < 0:
+                    state[view, r - row_range[0], c] = SKIPPED
+                    continue
+                before = n
+                n, region, trusted = sample_pixel(
+                    r, c, camera[6], camera[7], segments, limb, head, link, owner, work,
+                    points, weights, regions, n, region,
+                )  # fmt: skip
+                if n < 0:
+                    return view, start
+                state[view, r - row_range[0], c] = SPLIT if trusted else UNTRUSTED
+                index = (view * out_rows + r - row_range[0]) * cols + c
+                for k in range(before, n):
+                    pixel[k] = index
+        m = matrix[view]
+        for k in range(start, n):
+            y = (centre[0] - points[k, 0]) / scale[0]
+            z = (centre[1] - points[k, 1]) / scale[1]
+            for a in range(3):
+                origins[k, a] = lens[view, a]
+                directions[k, a] = m[0, a] + m[1, a] * y + m[2, a] * z
+    return len(lens), n
+
+
+@njit(cache=True, nogil=True)
+def sum_samples(  # type: ignore[no-untyped-def]
+    n, points, weights, pixel, face, vertices, faces, planes, corner_normals, flat, part,
+    lens, matrix, bearing, camera, level, background, albedo, radians_per_metre, orders, vignetting,
+    pixels_per_view, phasor, intensity, coverage, upper,
+):  # fmt: skip
+    """Add the light of each sample to its pixel.
+
+    Parameters
+    ----------
+    n : int
+        Number of samples.
+    points, weights, pixel, lens, matrix, bearing, camera, level, background
+        As in :func:`plan_rays`.
+    face : (n,) int32
+        Face met, −1: none.
+    vertices, faces, planes, corner_normals, flat, part
+        The mesh, see :class:`phasemark.render.edges.MeshTopology`.
+    albedo : float
+    radians_per_metre : float
+        4πf / c.
+    orders : (k,) int64
+        Harmonic orders; the first is 1.
+    vignetting : bool
+    pixels_per_view : int
+    phasor : (pixels, k) complex128, added to
+    intensity, coverage, upper : (pixels,) float64, added to
+        `upper` is the coverage by the landmark's upper part.
+    """
+    normal = np.empty(3)
+    for k in range(n):
+        index = pixel[k]
+        view = index // pixels_per_view
+        m = matrix[view]
+        y = (camera[2] - points[k, 0]) / camera[0]
+        z = (camera[3] - points[k, 1]) / camera[1]
+        length = math.sqrt(1.0 + y * y + z * z)
+        f = face[k]
+        if f >= 0:
+            dx = m[0, 0] + m[1, 0] * y + m[2, 0] * z
+            dy = m[0, 1] + m[1, 1] * y + m[2, 1] * z
+            dz = m[0, 2] + m[1, 2] * y + m[2, 2] * z
+            ox, oy, oz = lens[view]
+            nx, ny, nz, d = planes[f]
+            facing = nx * dx + ny * dy + nz * dz
+            t, cos_theta = _hit(ox, oy, oz, dx, dy, dz, nx, ny, nz, d, facing, flat[f], f, vertices, faces,
+                                corner_normals, normal)  # fmt: skip
+            cos_theta /= length
+            distance = t * length
+            a = albedo * cos_theta / (distance * distance)
+            coverage[index] += weights[k]
+            if part[f]:
+                upper[index] += weights[k]
+        else:
+            dx = level[0, 0] + level[0, 1] * y + level[0, 2] * z
+            dy = level[1, 0] + level[1, 1] * y + level[1, 2] * z
+            dz = level[2, 0] + level[2, 1] * y + level[2, 2] * z
+            t, rho, cos_theta = background_hit(background, math.cos(bearing[view]), math.sin(bearing[view]), dx, dy, dz)
+            if t == 0.0:
+                continue
+            distance = t * length
+            a = rho * cos_theta / length / (distance * distance)
+        if vignetting:
+            a /= length * length * length * length
+        a *= weights[k]
+        intensity[index] += a
+        for j in range(len(orders)):
+            phase = radians_per_metre * distance * orders[j]
+            phasor[index, j] += complex(a * math.cos(phase), a * math.sin(phase))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _hit(  # type: ignore[no-untyped-def]
+    ox, oy, oz, dx, dy, dz, nx, ny, nz, d, facing, is_flat, f, vertices, faces, corner_normals, normal
+):
+    """Return the multiple of the ray at its hit, and |cos θ| of the shading normal times the ray's length."""
+    t = (d - nx * ox - ny * oy - nz * oz) / facing if facing != 0.0 else 0.0
+    if is_flat and facing != 0.0 and t > 0.0:
+        return t, abs(facing)
+    a, b, c = faces[f]
+    px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
+    # barycentric coordinates in the plane of the face
+    e1x, e1y, e1z = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+    e2x, e2y, e2z = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+    qx, qy, qz = px - vertices[a, 0], py - vertices[a, 1], pz - vertices[a, 2]
+    d11 = e1x * e1x + e1y * e1y + e1z * e1z
+    d12 = e1x * e2x + e1y * e2y + e1z * e2z
+    d22 = e2x * e2x + e2y * e2y + e2z * e2z
+    q1 = qx * e1x + qy * e1y + qz * e1z
+    q2 = qx * e2x + qy * e2y + qz * e2z
+    determinant = d11 * d22 - d12 * d12
+    v = min(max((d22 * q1 - d12 * q2) / determinant, 0.0), 1.0)
+    w = min(max((d11 * q2 - d12 * q1) / determinant, 0.0), 1.0 - v)
+    u = 1.0 - v - w
+    # a face seen edge-on leaves the plane's intersection ill-conditioned: take the nearest point of the face instead
+    if abs(facing) < 1e-6 * math.sqrt(dx * dx + dy * dy + dz * dz):
+        px = u * vertices[a, 0] + v * vertices[b, 0] + w * vertices[c, 0]
+        py = u * vertices[a, 1] + v * vertices[b, 1] + w * vertices[c, 1]
+        pz = u * vertices[a, 2] + v * vertices[b, 2] + w * vertices[c, 2]
+        along = (px - ox) * dx + (py - oy) * dy + (pz - oz) * dz
+        t = along / (dx * dx + dy * dy + dz * dz)
+    for k in range(3):
+        normal[k] = u * corner_normals[f, 0, k] + v * corner_normals[f, 1, k] + w * corner_normals[f, 2, k]
+    towards = normal[0] * dx + normal[1] * dy + normal[2] * dz
+    size = math.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
+    if size == 0.0:  # at the very apex
+        return t, abs(facing)
+    # the interpolated normal may lean past the ray at the very limb, where nothing comes back
+    cos_theta = towards / size if facing > 0.0 else -towards / size
+    return t, max(cos_theta, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def add_background(  # type: ignore[no-untyped-def]
+    start, stop, state, bearing, camera, level, row_range, background, radians_per_metre, orders, vignetting,
+    phasor, intensity,
+):  # fmt: skip
+    """Integrate the background over the skipped pixels of views `start` to `stop`, 4 × 4 Gauss points each."""
+    cols = state.shape[2]
+    for view in range(start, stop):
+        cos_b, sin_b = math.cos(bearing[view]), math.sin(bearing[view])
+        for r in range(state.shape[1]):
+            for c in range(cols):
+                if state[view, r, c] != SKIPPED:
+                    continue
+                index = (view * state.shape[1] + r) * cols + c
+                for i in range(4):
+                    v = r + row_range[0] + 0.5 + camera[7] * (_NODES[i] - 0.5)
+                    z = (camera[3] - v) / camera[1]
+                    for j in range(4):
+                        u = c + 0.5 + camera[6] * (_NODES[j] - 0.5)
+                        y = (camera[2] - u) / camera[0]
+                        length = math.sqrt(1.0 + y * y + z * z)
+                        dx = level[0, 0] + level[0, 1] * y + level[0, 2] * z
+                        dy = level[1, 0] + level[1, 1] * y + level[1, 2] * z
+                        dz = level[2, 0] + level[2, 1] * y + level[2, 2] * z
+                        t, rho, cos_theta = background_hit(background, cos_b, sin_b, dx, dy, dz)
+                        if t == 0.0:
+                            continue
+                        distance = t * length
+                        a = _WEIGHTS[i] * _WEIGHTS[j]
+                        a *= rho * cos_theta / length / (distance * distance)
+                        if vignetting:
+                            a /= length * length * length * length
+                        intensity[index] += a
+                        for k in range(len(orders)):
+                            phase = radians_per_metre * distance * orders[k]
+                            phasor[index, k] += complex(a * math.cos(phase), a * math.sin(phase))

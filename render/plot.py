@@ -1,0 +1,272 @@
+"""Pictures of images and frames: in matplotlib figures, and in the terminal.
+
+Figures are built without pyplot, so that nothing here needs a display or touches global state.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+from rich.color import Color
+from rich.style import Style
+from rich.text import Text
+
+from phasemark import UsageError
+from phasemark.render.frames import Flag
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
+
+    from phasemark.render.frames import Frames
+    from phasemark.render.phasor import PhasorImages
+
+PAPER_CMAP = LinearSegmentedColormap.from_list("paper", ["#ffffff", "#2f6fe4", "#000000"])
+"""The colours of the paper's figure 4: near is white, far is black, between them lies blue."""
+
+_NOTHING = "#efe3d0"
+_NOTHING_HATCH = "#b58a55"
+
+_FLAG_COLOURS = {
+    "valid": "#e8eef7",
+    "no return": _NOTHING_HATCH,
+    "missing": "#7b3f98",
+    "saturated": "#d62728",
+    "dead": "#202020",
+}
+
+
+def range_picture(
+    range_m: NDArray[np.float64],
+    *,
+    near_m: float | None = None,
+    far_m: float | None = None,
+    title: str | None = None,
+) -> Figure:
+    """Draw a range image in the style of the paper's figure 4.
+
+    Parameters
+    ----------
+    range_m : (rows, cols) ndarray
+        Metres; NaN where nothing returned, drawn hatched.
+    near_m, far_m : float, optional
+        Ranges drawn white and black; by default the image's own nearest and farthest.
+    title : str, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure = Figure(figsize=(4.6, 3.8), layout="constrained")
+    axes = figure.add_subplot()
+    draw_range(axes, range_m, near_m=near_m, far_m=far_m)
+    if title is not None:
+        axes.set_title(title)
+    return figure
+
+
+def draw_range(
+    axes: Axes,
+    range_m: NDArray[np.float64],
+    *,
+    near_m: float | None = None,
+    far_m: float | None = None,
+    colour_bar: bool = True,
+) -> AxesImage:
+    """Draw a range image into axes of a larger figure; the arguments are those of :func:`range_picture`.
+
+    Raises
+    ------
+    UsageError
+        `range_m` is not an image.
+    """
+    near, far = _limits(range_m, near_m, far_m)
+    # What is NaN stays unpainted and shows the hatched paper behind.
+    axes.patch.set(facecolor=_NOTHING, edgecolor=_NOTHING_HATCH, hatch="////", linewidth=0)
+    image = _draw_pixels(axes, range_m, cmap=PAPER_CMAP, vmin=near, vmax=far)
+    if colour_bar:
+        _colour_bar(axes, image, "range (m)")
+    if np.isnan(range_m).any():
+        hatched = Patch(facecolor=_NOTHING, edgecolor=_NOTHING_HATCH, hatch="////", linewidth=0, label="no range")
+        _legend_below(axes, [hatched])
+    return image
+
+
+def plot_phasor_image(images: PhasorImages, index: int = 0) -> Figure:
+    """Draw range, amplitude and coverage of one view side by side.
+
+    Parameters
+    ----------
+    images : PhasorImages
+    index : int
+        Which view.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    index = _checked("view", index, len(images))
+    figure = Figure(figsize=(12.4, 4.0), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    left.set_title("range")
+    draw_range(left, images.range_m[index])
+    _panel(middle, images.amplitude[index], "amplitude", "amplitude |S| (1: albedo 1 at 1 m)", cmap="gray", vmin=0.0)
+    _panel(right, images.coverage[index], "coverage", "share of the pixel on the landmark", cmap="gray", vmin=0, vmax=1)
+    views = images.views
+    figure.suptitle(
+        f"view {index}: D = {views.distance_m[index]:.3f} m, δ = {math.degrees(views.delta_rad[index]):.2f}°, "
+        f"b = {math.degrees(views.bearing_rad[index]):.2f}°, h = {views.height_m[index]:.3f} m"
+    )
+    return figure
+
+
+def plot_frame(frames: Frames, index: int = 0, frame: int = 0) -> Figure:
+    """Draw range, amplitude (if there is one) and flags of one frame side by side.
+
+    Parameters
+    ----------
+    frames : Frames
+    index : int
+        Which position.
+    frame : int
+        Which frame of that position.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    index = _checked("position", index, len(frames))
+    frame = _checked("frame", frame, frames.n_frames)
+    n_panels = 2 if frames.amplitude_e is None else 3
+    figure = Figure(figsize=(0.4 + 4.0 * n_panels, 4.0), layout="constrained")
+    panels = figure.subplots(1, n_panels)
+    panels[0].set_title("range")
+    draw_range(panels[0], frames.range_m[index, frame])
+    if frames.amplitude_e is not None:
+        _panel(panels[1], frames.amplitude_e[index, frame], "amplitude", "amplitude (e-)", cmap="gray", vmin=0.0)
+    _draw_flags(panels[-1], frames.flags[index, frame])
+    figure.suptitle(f"position {index}, frame {frame}")
+    return figure
+
+
+def terminal_picture(
+    range_m: NDArray[np.float64],
+    *,
+    width: int = 32,
+    near_m: float | None = None,
+    far_m: float | None = None,
+) -> Text:
+    """Draw a range image for a terminal with 24-bit colour, two pixels to a character, and a legend below.
+
+    Parameters
+    ----------
+    range_m : (rows, cols) ndarray
+        Metres; NaN where nothing returned.
+    width : int
+        Characters a line may have; pixels are magnified by the whole number that fits, at least 1.
+    near_m, far_m : float, optional
+        Ranges drawn white and black; by default the image's own nearest and farthest.
+
+    Returns
+    -------
+    rich.text.Text
+        Print it with a ``rich.console.Console``. Without colour it says nothing.
+
+    Raises
+    ------
+    UsageError
+        `range_m` is not an image.
+    """
+    near, far = _limits(range_m, near_m, far_m)
+    rgba = PAPER_CMAP((range_m - near) / (far - near), bytes=True)
+    rgba[np.isnan(range_m)] = [*bytes.fromhex(_NOTHING_HATCH[1:]), 255]
+    scale = max(1, width // range_m.shape[1])
+    rgb = rgba[..., :3].repeat(scale, axis=0).repeat(scale, axis=1)
+    text = Text(no_wrap=True)
+    for top in range(0, len(rgb), 2):
+        for col in range(rgb.shape[1]):
+            # The upper half block shows the character's own colour above and the background's below.
+            below = Color.from_rgb(*rgb[top + 1, col]) if top + 1 < len(rgb) else None
+            text.append("▀", Style(color=Color.from_rgb(*rgb[top, col]), bgcolor=below))
+        text.append("\n")
+    for step in np.linspace(0.0, 1.0, 8):
+        text.append("█", Style(color=Color.from_rgb(*PAPER_CMAP(step, bytes=True)[:3])))
+    text.append(f" {near:.2f} … {far:.2f} m")
+    if np.isnan(range_m).any():
+        text.append("  ").append("█", Style(color=Color.parse(_NOTHING_HATCH))).append(" no range")
+    return text
+
+
+def _limits(range_m: NDArray[np.float64], near_m: float | None, far_m: float | None) -> tuple[float, float]:
+    if range_m.ndim != 2:
+        raise UsageError(f"'range_m' must be one image, (rows, cols), got shape {range_m.shape}")
+    seen = range_m[np.isfinite(range_m)]
+    nearest, farthest = (float(seen.min()), float(seen.max())) if seen.size else (0.0, 1.0)
+    near = nearest if near_m is None else near_m
+    far = farthest if far_m is None else far_m
+    return near, max(far, near + 1e-3)  # a flat image still needs two ends to its colour bar
+
+
+def _checked(what: str, index: int, count: int) -> int:
+    if not 0 <= index < count:
+        raise UsageError(f"there is no {what} {index}: they count from 0 to {count - 1}")
+    return index
+
+
+def _draw_pixels(axes: Axes, values: NDArray[np.generic], **how: object) -> AxesImage:
+    """Draw an image in the coordinates of PHYSICS section 2, where pixel (r, c) covers u ∈ [c, c+1], v ∈ [r, r+1]."""
+    rows, cols = values.shape
+    image = axes.imshow(values, extent=(0, cols, rows, 0), interpolation="nearest", **how)  # type: ignore[arg-type]
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 4, 5, 10]))
+    axes.set_xlabel("u (pixel columns)")
+    axes.set_ylabel("v (pixel rows)")
+    return image
+
+
+def _panel(axes: Axes, values: NDArray[np.float64], title: str, label: str, **how: object) -> None:
+    axes.set_title(title)
+    _colour_bar(axes, _draw_pixels(axes, values, **how), label)
+
+
+def _colour_bar(axes: Axes, image: AxesImage, label: str) -> None:
+    figure = axes.get_figure(root=True)
+    if figure is not None:
+        figure.colorbar(image, ax=axes, label=label, shrink=0.9)
+
+
+def _draw_flags(axes: Axes, flags: NDArray[np.uint8]) -> None:
+    names = list(_FLAG_COLOURS)
+    kind = np.zeros(flags.shape, dtype=np.int64)
+    # Later entries say more about the cause, so they win.
+    for flag, name in (
+        (Flag.NO_RETURN, "no return"),
+        (Flag.MISSING, "missing"),
+        (Flag.SATURATED, "saturated"),
+        (Flag.DEAD, "dead"),
+    ):
+        kind[(flags & int(flag)) != 0] = names.index(name)
+    norm = BoundaryNorm(np.arange(len(names) + 1) - 0.5, len(names))
+    _draw_pixels(axes, kind, cmap=ListedColormap(list(_FLAG_COLOURS.values())), norm=norm)
+    axes.set_title("flags")
+    present = [names[value] for value in np.unique(kind)]
+    _legend_below(axes, [Patch(facecolor=_FLAG_COLOURS[name], edgecolor="0.5", label=name) for name in present])
+
+
+def _legend_below(axes: Axes, handles: list[Patch]) -> None:
+    axes.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.16),
+        ncols=len(handles),
+        frameon=False,
+        fontsize="small",
+        borderaxespad=0.0,
+    )

@@ -1,0 +1,270 @@
+"""From a mesh and a sensor to noise-free images, many views at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from phasemark import UsageError
+from phasemark.render.background import Background
+from phasemark.render.edges import MeshTopology
+from phasemark.render.footprint import MAX_SEGMENTS
+from phasemark.render.integrate import UNTRUSTED, add_background, plan_rays, sum_samples
+from phasemark.render.intersect import make_intersector
+from phasemark.render.phasor import PhasorImages
+from phasemark.render.sensor import Sensor
+from phasemark.render.view import Views
+
+_SAMPLES = 1 << 17
+_VIEWS_PER_TASK = 64
+
+
+@dataclass
+class _Buffers:
+    """Scratch of one thread; grows when a view needs more."""
+
+    n_edges: int
+    n_faces: int
+    shape: tuple[int, int]
+    n_samples: int = _SAMPLES
+    n_links: int = 1 << 14
+    front: NDArray[np.uint8] = field(init=False)
+
+    def __post_init__(self) -> None:
+        rows, cols = self.shape
+        self.front = np.empty(self.n_faces, np.uint8)
+        self.segments = np.empty((self.n_edges + 1, 4))
+        self.limb = np.empty(self.n_edges + 1, np.int8)
+        self.head = np.empty((rows + 2, cols + 2), np.int32)
+        self.work = np.empty((MAX_SEGMENTS, 5))
+        self.grow_links(self.n_links)
+        self.grow_samples(self.n_samples)
+
+    def grow_links(self, n: int) -> None:
+        self.n_links = n
+        self.link = np.empty(n, np.int32)
+        self.owner = np.empty(n, np.int32)
+
+    def grow_samples(self, n: int) -> None:
+        self.n_samples = n
+        self.points = np.empty((n, 2))
+        self.weights = np.empty(n)
+        self.regions = np.empty(n, np.int32)
+        self.pixel = np.empty(n, np.int64)
+        self.origins = np.empty((n, 3), np.float32)
+        self.directions = np.empty((n, 3), np.float32)
+
+
+class Renderer:
+    """Renders one landmark with one camera, from any view.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        The landmark, metres, landmark frame (PHYSICS section 1). Open or inverted meshes are rendered two-sided.
+    sensor : Sensor
+    albedo : float
+        Of the Lambertian landmark, in (0, 1].
+    harmonics : sequence of int
+        Harmonic orders k > 1 wanted beside the signal.
+    intersector : {"auto", "embree", "float64"}
+        What finds the face a ray meets; "auto" is Embree where the package embreex is installed.
+
+    Raises
+    ------
+    UsageError
+        The mesh cannot be rendered, or a parameter is out of range.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> from phasemark.render import Renderer, preset
+    >>> plate = trimesh.creation.box((0.002, 2.0, 2.0))  # its front is 1 m from the lens at D = 1.001
+    >>> image = Renderer(plate, preset("pmd-16x16"), albedo=1.0).render(distance_m=1.001)
+    >>> image.phasor.shape, float(image.coverage.min())
+    ((1, 16, 16), 1.0)
+    """
+
+    def __init__(
+        self,
+        mesh: trimesh.Trimesh,
+        sensor: Sensor,
+        *,
+        albedo: float = 0.8,
+        harmonics: Sequence[int] = (),
+        intersector: str = "auto",
+    ) -> None:
+        if not 0 < albedo <= 1:
+            raise UsageError(f"'albedo' must be in (0, 1], got {albedo!r}")
+        if any(order < 2 or order != int(order) for order in harmonics):
+            raise UsageError(f"'harmonics' must be whole orders of 2 or more, got {tuple(harmonics)!r}")
+        self.sensor = sensor
+        self.albedo = float(albedo)
+        self.topology = MeshTopology.from_mesh(mesh)
+        self._orders = np.array([1, *harmonics], dtype=np.int64)
+        self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
+        tan_h, tan_v = sensor.tan_half_angles
+        scale = (sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v))
+        self._camera = np.array([*scale, *sensor.centre_px, sensor.rows, sensor.cols, *sensor.fill_factor], float)
+        self.untrusted_pixels = 0
+        """How many pixels, of all rendered so far, had too many edges to be split exactly."""
+
+    def render(
+        self,
+        distance_m: ArrayLike,
+        delta_rad: ArrayLike = 0.0,
+        bearing_rad: ArrayLike = 0.0,
+        height_m: ArrayLike = 0.0,
+        *,
+        background: Background | None = None,
+        rows: tuple[int, int] | None = None,
+        workers: int = 1,
+    ) -> PhasorImages:
+        """Render views; the arguments broadcast against each other and are flattened in C order.
+
+        Parameters
+        ----------
+        distance_m, delta_rad, bearing_rad, height_m : array_like
+            The views, PHYSICS section 1.
+        background : Background, optional
+            What stands behind the landmark; None: nothing.
+        rows : (first, stop), optional
+            Render only these image rows.
+        workers : int
+            Threads; the result does not depend on their number.
+
+        Returns
+        -------
+        PhasorImages
+            n views; with `rows`, only those rows.
+
+        Raises
+        ------
+        UsageError
+            A view that is not finite, a lens inside the landmark, a wall before it or a floor above its foot.
+        """
+        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m)
+        return self.render_views(views, background=background, rows=rows, workers=workers)
+
+    def render_views(
+        self,
+        views: Views,
+        *,
+        background: Background | None = None,
+        rows: tuple[int, int] | None = None,
+        workers: int = 1,
+    ) -> PhasorImages:
+        """Render a batch of views; see :meth:`render`."""
+        first, stop = rows if rows is not None else (0, self.sensor.rows)
+        if not 0 <= first < stop <= self.sensor.rows:
+            raise UsageError(f"'rows' must lie in 0 … {self.sensor.rows}, got {(first, stop)!r}")
+        if workers < 1:
+            raise UsageError(f"'workers' must be at least 1, got {workers!r}")
+        self._check_lens_outside(views)
+        if background is not None:
+            background.check_behind(self.topology.vertices, views)
+        shape = (len(views), stop - first, self.sensor.cols)
+        sums = _Sums(shape, len(self._orders))
+        behind = (background or Background()).parameters()
+        tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
+        if workers == 1 or len(tasks) <= 1:
+            self._render_tasks(tasks, views, behind, (first, stop), sums)
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                lanes = [tasks[i::workers] for i in range(workers)]
+                list(pool.map(lambda lane: self._render_tasks(lane, views, behind, (first, stop), sums), lanes))
+        self.untrusted_pixels += int((sums.state == UNTRUSTED).sum())
+        phasor = sums.phasor.reshape(*shape, -1)
+        return PhasorImages(
+            phasor=np.ascontiguousarray(phasor[..., 0]),
+            intensity=sums.intensity.reshape(shape),
+            coverage=np.minimum(sums.coverage.reshape(shape), 1.0),
+            sensor=self.sensor,
+            views=views,
+            harmonics={
+                int(order): np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._orders) if order > 1
+            },
+        )
+
+    def _render_tasks(
+        self,
+        tasks: Iterable[slice],
+        views: Views,
+        behind: NDArray[np.float64],
+        rows: tuple[int, int],
+        sums: _Sums,
+    ) -> None:
+        """Render slices of the views into `sums`, in one thread."""
+        mesh, sensor = self.topology, self.sensor
+        buffers = _Buffers(len(mesh.creases) + len(mesh.folds), len(mesh.faces), (sensor.rows, sensor.cols))
+        level = np.ascontiguousarray(sensor.cam2level)
+        row_range = np.array(rows, np.int64)
+        radians_per_metre = 1 / sensor.metres_per_radian
+        per_view = (rows[1] - rows[0]) * sensor.cols
+        for task in tasks:
+            part = views[task]
+            rotation, translation = part.landmark2cam()
+            matrix = np.ascontiguousarray(level.T @ rotation)
+            offset = np.ascontiguousarray(translation @ level)
+            lens = part.lens_in_landmark()
+            state = sums.state[task]
+            pixels = slice(task.start * per_view, task.stop * per_view)
+            phasor, intensity = sums.phasor[pixels], sums.intensity[pixels]
+            coverage, upper = sums.coverage[pixels], sums.upper[pixels]
+            view = 0
+            while view < len(part):
+                b = buffers
+                reached, n = plan_rays(
+                    view, mesh.vertices, mesh.planes, mesh.creases, mesh.folds, mesh.closed, lens, matrix, offset,
+                    part.bearing_rad, self._camera, level, row_range, behind, b.front, b.segments, b.limb, b.head,
+                    b.link, b.owner, b.work, b.points, b.weights, b.regions, b.pixel, b.origins, b.directions, state,
+                )  # fmt: skip
+                if reached == -1:
+                    buffers.grow_links(2 * buffers.n_links)
+                    continue
+                if reached == view:
+                    buffers.grow_samples(2 * buffers.n_samples)
+                    continue
+                face = self._intersector.first_face(b.origins[:n], b.directions[:n])
+                sum_samples(
+                    n, b.points, b.weights, b.pixel, face, mesh.vertices, mesh.faces, mesh.planes,
+                    mesh.corner_normals, mesh.flat, mesh.part, lens, matrix, part.bearing_rad, self._camera, level,
+                    behind, self.albedo, radians_per_metre, self._orders, sensor.vignetting, per_view,
+                    phasor, intensity, coverage, upper,
+                )  # fmt: skip
+                if behind[0] or behind[1]:
+                    add_background(
+                        view, reached, state, part.bearing_rad, self._camera, level, row_range, behind,
+                        radians_per_metre, self._orders, sensor.vignetting, phasor, intensity,
+                    )  # fmt: skip
+                view = reached
+
+    def _check_lens_outside(self, views: Views) -> None:
+        """Refuse views whose lens lies inside the landmark, or within a millimetre of its axis-aligned box."""
+        low, high = self.topology.vertices.min(axis=0), self.topology.vertices.max(axis=0)
+        lens = views.lens_in_landmark()
+        near = np.flatnonzero(((lens > low - 1e-3) & (lens < high + 1e-3)).all(axis=1))
+        if near.size:
+            radius = math.hypot(*np.abs([low[:2], high[:2]]).max(axis=0))
+            raise UsageError(
+                f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
+                f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
+            )
+
+
+class _Sums:
+    """What the pixels of a batch add up to."""
+
+    def __init__(self, shape: tuple[int, int, int], n_orders: int) -> None:
+        n = math.prod(shape)
+        self.phasor = np.zeros((n, n_orders), np.complex128)
+        self.intensity = np.zeros(n)
+        self.coverage = np.zeros(n)
+        self.upper = np.zeros(n)
+        self.state = np.zeros(shape, np.uint8)
