@@ -1,0 +1,316 @@
+"""Banks of model images, as they are built: rendered in batches, each written to its place in the file."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import h5py
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data.bank import (
+    FORMAT,
+    IMAGE_DIMS,
+    LAYOUT_GROUPS,
+    PHASOR_DIMS,
+    SCHEMA_VERSION,
+    VIEW_DIMS,
+    Bank,
+    GroupName,
+    group_rows,
+    open_bank,
+)
+from phasemark.data.layout import Layout, place
+from phasemark.data.plan import BankPlan, factored_refusal
+from phasemark.data.provenance import mesh_sha256, versions
+from phasemark.data.store import replacing
+from phasemark.landmarks import LandmarkSpec, build_mesh, read_mesh
+from phasemark.render import PhasorImages, Sensor, Views
+from phasemark.render.renderer import Renderer
+
+BATCH_PIXELS = 1 << 19
+"""Pixels rendered at a time: 2048 images of 16 × 16, some 20 MB."""
+
+Progress = Callable[[int, int], None]
+ImagesOf = Callable[[Views], PhasorImages]
+
+
+@dataclass(frozen=True)
+class Landmark:
+    """A class of the bank: its mesh, and its description unless it came from a file."""
+
+    name: str
+    mesh: trimesh.Trimesh
+    symmetry: int
+    albedo: float
+    spec: LandmarkSpec | None = None
+
+
+def build_bank(
+    plan: BankPlan,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    force: bool = False,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Bank:
+    """Render a bank of noise-free model images and write it with its checksum.
+
+    The same plan gives the same bytes, whatever the number of workers. Memory does not grow with the bank.
+
+    Parameters
+    ----------
+    plan : BankPlan
+    path : path-like, optional
+        The file to write; ``FILE.sha256`` goes beside it. None: a temporary file, gone once the bank is closed.
+    force : bool
+        Whether an existing file may be replaced.
+    workers : int, optional
+        Threads that render. None: one for each processor this process may use.
+    progress : callable (done, total), optional
+        Called from this thread after each batch with the number of images rendered so far and in all.
+
+    Returns
+    -------
+    Bank
+        The bank, open for reading.
+
+    Raises
+    ------
+    UsageError
+        The plan cannot be built, with the reason.
+    InputFileError
+        A mesh or sensor file cannot be read.
+    OutputExistsError, StorageError
+        As in :func:`phasemark.data.write_atomically`.
+    """
+    if workers is not None and workers < 1:
+        raise UsageError(f"'workers' must be at least 1, got {workers}")
+    if path is None:
+        with TemporaryDirectory(prefix="phasemark-") as folder:
+            # The open file outlives its name.
+            return build_bank(plan, Path(folder) / "bank.h5", workers=workers, progress=progress)
+    plan = plan.resolve()
+    _refuse_impossible(plan)
+    with replacing(path, force=force, checksum=True) as temporary:
+        sensor = plan.build_sensor()
+        landmarks = _landmarks(plan)
+        slabs = list(_slabs(plan, sensor, landmarks, workers or _processors()))
+        places = _write_header(temporary, plan, sensor, landmarks)
+        descriptor = os.open(temporary, os.O_WRONLY)
+        try:
+            _render_all(slabs, places, descriptor, max(1, BATCH_PIXELS // (sensor.rows * sensor.cols)), progress)
+        finally:
+            os.close(descriptor)
+    return open_bank(path)
+
+
+@dataclass(frozen=True)
+class _Slab:
+    """Images that lie one behind the other in a group: those of one class, or of all."""
+
+    group: GroupName
+    start: int
+    views: Views
+    images_of: ImagesOf
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a dataset's images begin in the file, and how many bytes each takes."""
+
+    offset: int
+    stride: int
+
+
+def _refuse_impossible(plan: BankPlan) -> None:
+    reason = factored_refusal(plan) if plan.layout == "factored" else None
+    if reason is not None:
+        raise UsageError(f"no factored bank: {reason}; build a full one (--full, layout = 'full')")
+    if plan.model == "planar" and plan.meshes:
+        raise UsageError(
+            f"'model' must be 'ray' for '{plan.meshes[0].name}', which comes from a mesh file, got 'planar'"
+        )
+
+
+def _landmarks(plan: BankPlan) -> list[Landmark]:
+    return [
+        *(Landmark(spec.name, build_mesh(spec), spec.symmetry, spec.albedo, spec) for spec in plan.landmarks),
+        *(
+            Landmark(
+                part.name,
+                read_mesh(part.path, unit=part.unit, up=part.up, origin=part.origin),
+                part.symmetry,
+                part.albedo,
+            )
+            for part in plan.meshes
+        ),
+    ]
+
+
+def _images_of(
+    plan: BankPlan,
+    sensor: Sensor,
+    landmark: Landmark,
+    part: Literal["both", "lower", "upper"],
+    rows: tuple[int, int],
+    workers: int,
+) -> ImagesOf:
+    """Return the function that makes the model images of a landmark, or of one of its parts, on some rows."""
+    mesh = landmark.mesh if landmark.spec is None else build_mesh(landmark.spec, part=part)
+    renderer = Renderer(mesh, sensor, albedo=landmark.albedo, harmonics=plan.harmonics)
+    return lambda views: renderer.render_views(views, rows=rows, workers=workers)
+
+
+def _slabs(plan: BankPlan, sensor: Sensor, landmarks: list[Landmark], workers: int) -> Iterator[_Slab]:
+    distance_m, delta_rad = np.array(plan.distance_m), plan.delta_rad
+    by_angle = Views.broadcast(distance_m[:, None], delta_rad)
+    facing = Views.broadcast(distance_m)  # a solid of revolution looks the same from every side
+    jobs: list[tuple[GroupName, Literal["both", "lower", "upper"], Views, list[Landmark]]] = [
+        ("full", "both", by_angle, landmarks),
+        ("lower", "lower", by_angle, landmarks[:1]),
+        ("upper", "upper", facing, landmarks),
+    ]
+    for group, part, views, shown in jobs:
+        if group in LAYOUT_GROUPS[plan.layout]:
+            for k, landmark in enumerate(shown):
+                images_of = _images_of(plan, sensor, landmark, part, group_rows(group, sensor), workers)
+                yield _Slab(group, k * len(views), views, images_of)
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _render_all(
+    slabs: list[_Slab],
+    places: dict[tuple[GroupName, str], _Place],
+    descriptor: int,
+    batch: int,
+    progress: Progress | None,
+) -> None:
+    """Render batch after batch of views, and write each before the next."""
+    done, total = 0, sum(len(slab.views) for slab in slabs)
+    for slab in slabs:
+        for at in range(0, len(slab.views), batch):
+            views = slab.views[at : at + batch]
+            for name, values in _stored(slab.images_of(views)).items():
+                where = places[slab.group, name]
+                place(descriptor, where.offset + (slab.start + at) * where.stride, values)
+            done += len(views)
+            if progress is not None:
+                progress(done, total)
+
+
+def _stored(images: PhasorImages) -> dict[str, NDArray[np.float32]]:
+    """Return images as the bank's datasets hold them, views first."""
+    orders = [images.phasor, *(images.harmonics[k] for k in sorted(images.harmonics))]
+    phasor = np.stack(orders, axis=1).astype("<c8")
+    stored = {
+        "phasor": phasor.view("<f4").reshape(*phasor.shape, 2),
+        "intensity": images.intensity.astype("<f4"),
+        "coverage": images.coverage.astype("<f4"),
+    }
+    for name, values in stored.items():
+        if not np.isfinite(values).all():
+            raise FloatingPointError(f"the renderer returned a {name} that is not finite")
+    return stored
+
+
+def _write_header(
+    temporary: Path, plan: BankPlan, sensor: Sensor, landmarks: list[Landmark]
+) -> dict[tuple[GroupName, str], _Place]:
+    """Write everything but the images, with room for them, and return where they go."""
+    places: dict[tuple[GroupName, str], _Place] = {}
+    with Layout() as layout:
+        file = layout.file
+        file.attrs["format"] = FORMAT
+        file.attrs["schema_version"] = SCHEMA_VERSION
+        file.attrs["layout"] = plan.layout
+        file.attrs["model"] = plan.model
+        file.attrs["plan"] = plan.model_dump_json()
+        file.attrs["sensor"] = sensor.model_dump_json()
+        file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
+        for name in LAYOUT_GROUPS[plan.layout]:
+            places |= _lay_out_group(layout, name, plan, sensor, [landmark.name for landmark in landmarks])
+        for landmark in landmarks:
+            _write_mesh(file.create_group(f"meshes/{landmark.name}"), landmark)
+    descriptor = os.open(temporary, os.O_WRONLY)
+    try:
+        layout.write_to(descriptor)
+    finally:
+        os.close(descriptor)
+    return places
+
+
+def _lay_out_group(
+    layout: Layout, name: GroupName, plan: BankPlan, sensor: Sensor, classes: list[str]
+) -> dict[tuple[GroupName, str], _Place]:
+    group = layout.file.create_group(name)
+    coordinates = _coordinates(name, plan, sensor, classes)
+    scales = {}
+    for dim in (*VIEW_DIMS[name], *PHASOR_DIMS):
+        values, units, long_name = coordinates[dim]
+        kind = h5py.string_dtype() if isinstance(values[0], str) else np.asarray(values).dtype.newbyteorder("<")
+        scales[dim] = group.create_dataset(dim, data=values, dtype=kind)
+        scales[dim].make_scale(dim)
+        scales[dim].attrs["long_name"] = long_name
+        if units:
+            scales[dim].attrs["units"] = units
+    places: dict[tuple[GroupName, str], _Place] = {}
+    for field, dims, long_name in (
+        ("phasor", PHASOR_DIMS, "phasor S_k of the landmark alone"),
+        ("intensity", IMAGE_DIMS, "mean amplitude of the landmark alone"),
+        ("coverage", IMAGE_DIMS, "share of the pixel that sees the landmark"),
+    ):
+        shape = [len(scales[dim]) for dim in (*VIEW_DIMS[name], *dims)]
+        dataset, offset = layout.reserve(group, field, shape, "<f4")
+        for axis, dim in enumerate((*VIEW_DIMS[name], *dims)):
+            dataset.dims[axis].attach_scale(scales[dim])
+        dataset.attrs["long_name"] = long_name
+        dataset.attrs["units"] = "1"
+        stride = int(np.prod(shape[len(VIEW_DIMS[name]) :])) * 4
+        places[name, field] = _Place(offset, stride)
+    return places
+
+
+def _coordinates(
+    name: GroupName, plan: BankPlan, sensor: Sensor, classes: list[str]
+) -> dict[str, tuple[Any, str | None, str]]:
+    """Return values, units and long name of every dimension a group can have."""
+    rows = group_rows(name, sensor)
+    return {
+        "landmark_class": (classes, None, "landmark class"),
+        "distance": (np.array(plan.distance_m), "m", "horizontal distance from the lens to the landmark's axis"),
+        "delta": (np.array(plan.delta_deg), "degree", "angle from which the landmark is seen"),
+        "frequency": (
+            np.array([1, *plan.harmonics]) * sensor.modulation_hz,
+            "Hz",
+            "harmonic order times modulation frequency",
+        ),
+        "row": (np.arange(*rows, dtype=np.int32), "1", "pixel row, 0 at the top"),
+        "col": (np.arange(sensor.cols, dtype=np.int32), "1", "pixel column, 0 on the left"),
+        "iq": (["i", "q"], None, "real and imaginary part"),
+    }
+
+
+def _write_mesh(group: h5py.Group, landmark: Landmark) -> None:
+    vertices = group.create_dataset("vertices", data=np.asarray(landmark.mesh.vertices, dtype="<f8"))
+    vertices.attrs["units"] = "m"
+    vertices.attrs["long_name"] = "vertices x', y', z' in the landmark frame"
+    faces = group.create_dataset("faces", data=np.asarray(landmark.mesh.faces, dtype="<i4"))
+    faces.attrs["long_name"] = "three vertex indices of each face"
+    if "part" in landmark.mesh.face_attributes:
+        part = group.create_dataset("part", data=np.asarray(landmark.mesh.face_attributes["part"], dtype=np.uint8))
+        part.attrs["long_name"] = "0 on faces of the lower part, 1 on those of the upper one"
+    group.attrs["delta_period_deg"] = 360 / landmark.symmetry
+    group.attrs["albedo"] = landmark.albedo
+    group.attrs["sha256"] = mesh_sha256(landmark.mesh)

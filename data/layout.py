@@ -1,0 +1,150 @@
+"""HDF5 files laid out in memory and written by plain writes, large arrays one block at a time.
+
+HDF5 crashes the process when the disk fills under an open file. Here it never touches the disk: it lays the file out in
+sparse memory, with room for the large arrays but not their content, and every byte on disk is written by
+:func:`os.pwrite`, whose errors are ordinary exceptions. Memory does not grow with the file.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+_PAGE_BYTES = 1 << 16
+
+
+class SparseMemory(io.RawIOBase):
+    """A file in memory that only holds the pages that were written; what was never written reads as zero."""
+
+    def __init__(self) -> None:
+        self._pages: dict[int, bytearray] = {}
+        self._position = 0
+        self._size = 0
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def writable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Move to a position, beyond the end if need be."""
+        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
+        self._position = start + offset
+        return self._position
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the size."""
+        self._size = self._position if size is None else size
+        return self._size
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        """Read from the position on and return how many bytes there were."""
+        view = memoryview(buffer).cast("B")
+        length = max(0, min(len(view), self._size - self._position))
+        done = 0
+        while done < length:
+            page, start = divmod(self._position + done, _PAGE_BYTES)
+            count = min(length - done, _PAGE_BYTES - start)
+            held = self._pages.get(page)
+            view[done : done + count] = bytes(count) if held is None else held[start : start + count]
+            done += count
+        self._position += length
+        return length
+
+    def write(self, data: memoryview) -> int:  # type: ignore[override]
+        """Write at the position and return the number of bytes."""
+        view = memoryview(data).cast("B")
+        done = 0
+        while done < len(view):
+            page, start = divmod(self._position + done, _PAGE_BYTES)
+            count = min(len(view) - done, _PAGE_BYTES - start)
+            held = self._pages.setdefault(page, bytearray(_PAGE_BYTES))
+            held[start : start + count] = view[done : done + count]
+            done += count
+        self._position += done
+        self._size = max(self._size, self._position)
+        return done
+
+    def __len__(self) -> int:
+        return self._size
+
+    def pages(self) -> list[tuple[int, memoryview]]:
+        """Return offset and content of every page that was written."""
+        starts = sorted(page * _PAGE_BYTES for page in self._pages)
+        return [(at, memoryview(self._pages[at // _PAGE_BYTES])[: self._size - at]) for at in starts if at < self._size]
+
+
+class Layout:
+    """An HDF5 file under construction; a context manager that closes it.
+
+    Attributes
+    ----------
+    file : h5py.File
+        Takes groups, attributes and small datasets in the usual way.
+    """
+
+    def __init__(self) -> None:
+        self._memory = SparseMemory()
+        self.file = h5py.File(self._memory, "w")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.file.close()
+
+    def reserve(self, group: h5py.Group, name: str, shape: Sequence[int], dtype: DTypeLike) -> tuple[h5py.Dataset, int]:
+        """Make a contiguous dataset whose content is placed later; return it and the offset of its first byte."""
+        creation = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        creation.set_layout(h5py.h5d.CONTIGUOUS)
+        creation.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+        creation.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+        creation.set_obj_track_times(False)
+        space = h5py.h5s.create_simple(tuple(shape))
+        kind = h5py.h5t.py_create(np.dtype(dtype))
+        dataset = h5py.h5d.create(group.id, name.encode(), kind, space, creation)
+        return h5py.Dataset(dataset), int(dataset.get_offset())
+
+    def write_to(self, descriptor: int) -> None:
+        """Claim the whole file's space on disk and write all but the reserved arrays, once the file is closed.
+
+        Raises
+        ------
+        OSError
+            The disk has no room for the whole file, or fails.
+        """
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(descriptor, 0, len(self._memory))
+        os.ftruncate(descriptor, len(self._memory))
+        for offset, page in self._memory.pages():
+            place(descriptor, offset, page)
+
+
+def place(descriptor: int, offset: int, data: NDArray[Any] | memoryview) -> None:
+    """Write an array, or raw bytes, at an offset of an open file; any thread may do so at any time.
+
+    Raises
+    ------
+    OSError
+        The disk is full or fails.
+    """
+    view = np.ascontiguousarray(data).reshape(-1).view(np.uint8).data
+    while view:
+        written = os.pwrite(descriptor, view, offset)
+        view, offset = view[written:], offset + written

@@ -1,0 +1,317 @@
+"""Frames that somebody else's camera measured, from CSV, NPY, NPZ and HDF5 files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+import warnings
+import zipfile
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark.render import Frames, Sensor
+
+Unit = Literal["m", "cm", "mm"]
+Quantity = Literal["range", "z"]
+InvalidMeans = Literal["missing", "no-return"]
+
+METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+QUANTITIES = ("range", "z")
+
+_FIELDS = ("range", "amplitude", "intensity", "status", "valid")
+_ELECTRONS = ("e", "e-", "electron", "electrons")
+_NOT_A_NUMBER = ("", "nan")
+
+
+@dataclass(frozen=True)
+class _Raw:
+    """Arrays as the file has them, and what it says about them."""
+
+    arrays: Mapping[str, NDArray[Any]]
+    stated: Mapping[str, str] = field(default_factory=dict)  # "unit" and "quantity", where the file says so
+    flat: bool = False  # frames are rows of rows · cols values
+
+
+def read_frames(
+    path: str | os.PathLike[str],
+    *,
+    sensor: Sensor,
+    unit: Unit | None = None,
+    quantity: Quantity | None = None,
+    invalid_means: InvalidMeans = "missing",
+    valid_status: Collection[int] | None = None,
+    flip_h: bool = False,
+    flip_v: bool = False,
+    rotate: int = 0,
+) -> Frames:
+    """Read measured frames; what kind of file it is follows from its content.
+
+    *CSV*: one frame a line, row by row from the top left pixel. Values are separated by semicolons (then decimal
+    commas are understood too), tabs, commas or blanks, the first of these that occurs. A first line without a number
+    is a header; empty lines and those that start with ``#`` are skipped; an empty cell and ``nan`` are invalid pixels.
+    *NPY*: the ranges. *NPZ*: ``range`` and optionally ``amplitude``, ``intensity`` (electrons per phase image),
+    ``status``, ``valid`` (0: invalid), ``unit`` and ``quantity``. *HDF5*: the same arrays as datasets, with the
+    attributes ``units`` and ``quantity`` on ``range``. Arrays are (frames, rows, cols), (n, frames, rows, cols), or
+    (rows, cols) for a single frame.
+
+    A range that is not finite is invalid. So is one that no such camera can measure, zero or negative or beyond c / 2f,
+    and a warning tells how many there are; if it is most of them, unit or sensor are wrong, which is an error.
+
+    Parameters
+    ----------
+    path : path-like
+    sensor : Sensor
+        The camera that took the frames.
+    unit : {"m", "cm", "mm"}
+        Unit of the ranges; may be left out if the file states it.
+    quantity : {"range", "z"}
+        Whether the file has ranges along the ray or distances z along the optical axis; may be left out if the file
+        states it. z is converted to range with the ray of the pixel's centre.
+    invalid_means : {"missing", "no-return"}
+        What an invalid pixel stands for (PHYSICS section 7).
+    valid_status : collection of int, optional
+        Which values of ``status`` mark a valid pixel; needed if the file has it, since cameras differ.
+    flip_h, flip_v : bool
+        Whether to mirror left and right, or top and bottom.
+    rotate : {0, 90, 180, 270}
+        Degrees to turn the image clockwise, after mirroring.
+
+    Returns
+    -------
+    Frames
+        (n, frames, rows, cols), ranges along the ray, metres.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, is empty or damaged, or its frames do not have the sensor's pixels; names file, line
+        and column where there are any.
+    UsageError
+        `unit` or `quantity` is missing, contradicts the file, or is not one of the above.
+
+    Warns
+    -----
+    UserWarning
+        Some ranges cannot be right.
+    """
+    path = Path(path)
+    if rotate not in (0, 90, 180, 270):
+        raise UsageError(f"'rotate' must be 0, 90, 180 or 270, got {rotate!r}")
+    if invalid_means not in ("missing", "no-return"):
+        raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
+    shape = (sensor.cols, sensor.rows) if rotate in (90, 270) else (sensor.rows, sensor.cols)
+    raw = _read(path, shape)
+    unit_scale = METRES_PER_UNIT[_settled("unit", unit, raw, tuple(METRES_PER_UNIT), path)]
+    settled_quantity = _settled("quantity", quantity, raw, QUANTITIES, path)
+
+    arrays = {name: _as_frames(values, name, shape, raw.flat, path) for name, values in raw.arrays.items()}
+    for name, values in arrays.items():
+        if values.shape != arrays["range"].shape:
+            raise InputFileError(
+                f"{path}: '{name}' must have the shape of 'range', {arrays['range'].shape}, got {values.shape}"
+            )
+    valid = np.ones(arrays["range"].shape, dtype=bool)
+    if "valid" in arrays:
+        valid &= arrays["valid"] != 0
+    if "status" in arrays:
+        if valid_status is None:
+            raise UsageError(f"{path}: has 'status': say with --valid-status which of its values mark a valid pixel")
+        valid &= np.isin(arrays["status"], list(valid_status))
+    arrays = {name: _upright(values, flip_h, flip_v, rotate) for name, values in arrays.items()}
+    range_m = arrays["range"].astype(np.float64) * unit_scale
+    if settled_quantity == "z":
+        range_m = range_m / _axis_cosine(sensor)
+    valid = _upright(valid, flip_h, flip_v, rotate) & np.isfinite(range_m)
+    valid &= ~_impossible(range_m, valid, sensor, path)
+    return Frames(
+        range_m,
+        arrays.get("amplitude"),
+        arrays.get("intensity"),
+        valid,
+        sensor=sensor,
+        invalid_means=invalid_means,
+    )
+
+
+def _axis_cosine(sensor: Sensor) -> NDArray[np.float64]:
+    """Return the cosine between each pixel's ray and the camera's own optical axis, (rows, cols): z = range · cosine.
+
+    Tilting the camera turns both, so mounting does not enter.
+    """
+    optical_axis = sensor.cam2level[:, 0]
+    return np.asarray(sensor.pixel_directions() @ optical_axis)
+
+
+def _upright(values: NDArray[Any], flip_h: bool, flip_v: bool, rotate: int) -> NDArray[Any]:
+    values = values[..., ::-1] if flip_h else values
+    values = values[..., ::-1, :] if flip_v else values
+    return np.rot90(values, -rotate // 90, axes=(-2, -1))
+
+
+def _impossible(
+    range_m: NDArray[np.float64], valid: NDArray[np.bool_], sensor: Sensor, path: Path
+) -> NDArray[np.bool_]:
+    wrong = valid & ~((range_m > 0) & (range_m < sensor.unambiguous_range_m))
+    count, of = int(wrong.sum()), int(valid.sum())
+    if count:
+        place = np.argwhere(wrong)[0]
+        message = (
+            f"{path}: {count} of {of} ranges are not in 0 … {sensor.unambiguous_range_m:.4g} m (c / 2f), the first in"
+            f" frame {place[1]}, row {place[2]}, column {place[3]}: {range_m[tuple(place)]:.6g} m"
+        )
+        if 2 * count > of:
+            raise InputFileError(f"{message}; is --unit right?")
+        warnings.warn(f"{message}; taken as invalid", UserWarning, stacklevel=3)
+    return wrong
+
+
+def _settled(name: str, given: str | None, raw: _Raw, known: tuple[str, ...], path: Path) -> str:
+    """Return unit or quantity, from the caller or the file, which must agree."""
+    if given is not None and given not in known:
+        raise UsageError(f"--{name} must be one of {', '.join(known)}, got {given!r}")
+    stated = raw.stated.get(name)
+    if stated is not None and stated not in known:
+        raise InputFileError(f"{path}: its {name} must be one of {', '.join(known)}, got {stated!r}")
+    if given is not None and stated is not None and given != stated:
+        raise UsageError(f"--{name} is {given}, but {path} says {stated}")
+    value = given or stated
+    if value is None:
+        raise UsageError(f"{path}: does not say its {name}: give --{name} {'|'.join(known)}")
+    return value
+
+
+def _as_frames(values: NDArray[Any], name: str, shape: tuple[int, int], flat: bool, path: Path) -> NDArray[Any]:
+    """Return an array as (n, frames, rows, cols) of the file's own orientation."""
+    if values.dtype.kind not in "fiub":
+        raise InputFileError(f"{path}: '{name}' must hold real numbers, got {values.dtype}")
+    if not values.size:
+        raise InputFileError(f"{path}: '{name}' holds no frames")
+    if flat:
+        return values.reshape(1, -1, *shape)
+    if values.ndim not in (2, 3, 4):
+        raise InputFileError(
+            f"{path}: '{name}' must have shape (frames, rows, cols) or (n, frames, rows, cols), got {values.shape}"
+        )
+    if values.shape[-2:] != shape:
+        raise InputFileError(
+            f"{path}: the frames in '{name}' have {values.shape[-2]} × {values.shape[-1]} pixels, but the sensor's"
+            f" have {shape[0]} × {shape[1]}"
+        )
+    return values.reshape((1,) * (4 - values.ndim) + values.shape)
+
+
+def _read(path: Path, shape: tuple[int, int]) -> _Raw:
+    try:
+        with path.open("rb") as file:
+            start = file.read(8)
+        if not start:
+            raise InputFileError(f"{path}: is empty")
+        if start.startswith(b"\x93NUMPY"):
+            return _Raw({"range": np.asarray(np.load(path, allow_pickle=False))})
+        if start.startswith(b"PK"):
+            return _read_npz(path)
+        if start.startswith(b"\x89HDF"):
+            return _read_hdf5(path)
+        return _Raw({"range": _parse_csv(path.read_bytes(), shape, path)}, flat=True)
+    except PhasemarkError:
+        raise
+    except (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        raise InputFileError(f"{path}: cannot be read ({reason})") from None
+
+
+def _read_npz(path: Path) -> _Raw:
+    with np.load(path, allow_pickle=False) as archive:
+        if "range" not in archive:
+            raise InputFileError(f"{path}: must have an array 'range', got {', '.join(archive) or 'nothing'}")
+        arrays = {name: np.asarray(archive[name]) for name in _FIELDS if name in archive}
+        stated = {name: str(archive[name]) for name in ("unit", "quantity") if name in archive}
+    return _Raw(arrays, stated)
+
+
+def _read_hdf5(path: Path) -> _Raw:
+    with h5py.File(path, "r") as file:
+        if not isinstance(file.get("range"), h5py.Dataset):
+            kind = file.attrs.get("format")
+            raise InputFileError(
+                f"{path}: must have a dataset 'range', "
+                + (f"but is a {kind}" if kind else f"got {', '.join(file) or 'nothing'}")
+            )
+        datasets = {name: file[name] for name in _FIELDS if isinstance(file.get(name), h5py.Dataset)}
+        for name in ("amplitude", "intensity"):
+            units = datasets[name].attrs.get("units") if name in datasets else None
+            if units is not None and units not in _ELECTRONS:
+                raise InputFileError(f"{path}: '{name}' must be in electrons (units 'e-'), got {units!r}")
+        attributes = {"unit": "units", "quantity": "quantity"}
+        stated = {
+            name: str(datasets["range"].attrs[key])
+            for name, key in attributes.items()
+            if key in datasets["range"].attrs
+        }
+        return _Raw({name: np.asarray(dataset[...]) for name, dataset in datasets.items()}, stated)
+
+
+def _parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> NDArray[np.float64]:
+    """Return (frames, rows · cols) values of a text file."""
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise InputFileError(f"{path}: is not CSV, NPY, NPZ or HDF5")
+    expected = math.prod(shape)
+    lines = [
+        (number, line)
+        for number, line in enumerate(io.StringIO(text, newline=None), start=1)
+        if line.strip() and not line.startswith("#")
+    ]
+    separator = next((mark for mark in ";\t," if lines and mark in lines[0][1]), None)
+    frames: list[list[float]] = []
+    for index, (number, line) in enumerate(lines):
+        cells = _cells(line, separator)
+        if index == 0 and _is_header(cells, separator):
+            continue
+        if len(cells) != expected:
+            raise InputFileError(
+                f"{path}: line {number} has {len(cells)} values, must have {expected} ({shape[0]} × {shape[1]} pixels)"
+            )
+        frame = []
+        for column, cell in enumerate(cells, start=1):
+            value = _to_float(cell, separator)
+            if value is None:
+                raise InputFileError(f"{path}: line {number}, column {column} must be a number, got {cell[:40]!r}")
+            frame.append(value)
+        frames.append(frame)
+    if not frames:
+        raise InputFileError(f"{path}: holds no frames")
+    return np.array(frames)
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    cells = line.split() if separator is None else next(csv.reader([line], delimiter=separator))
+    return [cell.strip() for cell in cells]
+
+
+def _is_header(cells: list[str], separator: str | None) -> bool:
+    filled = [cell for cell in cells if cell.lower() not in _NOT_A_NUMBER]
+    return bool(filled) and all(_to_float(cell, separator) is None for cell in filled)
+
+
+def _to_float(cell: str, separator: str | None) -> float | None:
+    """Return a cell's number, NaN if it is empty, or None if it is neither."""
+    if cell.lower() in _NOT_A_NUMBER:
+        return math.nan
+    try:
+        number = float(cell.replace(",", ".", 1) if separator == ";" else cell)
+    except ValueError:
+        return None
+    return None if "_" in cell else number  # Python reads 1_000 as a number; nobody else does

@@ -1,0 +1,268 @@
+"""What a bank is made of, as a TOML file or in code: frozen, validated, and resolved to the last default."""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
+
+from phasemark import InputFileError, UsageError
+from phasemark.data.grid import drop_repeated_stop, format_grid, parse_grid
+from phasemark.landmarks import LandmarkSpec, catalog
+from phasemark.render import Sensor, preset
+
+DEFAULT_DISTANCE_M = "0.7:2.1:0.01"
+DEFAULT_DELTA_STEP_DEG = 1.0
+
+_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
+_Albedo = Annotated[float, Field(gt=0, le=1)]
+
+
+def _to_grid(value: Any, info: ValidationInfo) -> tuple[float, ...]:
+    return tuple(parse_grid(value, str(info.field_name)).tolist())
+
+
+def _positive(values: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
+    if values[0] <= 0:
+        raise UsageError(f"'{info.field_name}' must be positive throughout, got {values[0]!r}")
+    return values
+
+
+_Grid = Annotated[tuple[float, ...], BeforeValidator(_to_grid), PlainSerializer(format_grid, return_type=str)]
+
+
+class _PlanModel(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def __init__(self, **data: Any) -> None:
+        try:
+            super().__init__(**data)
+        except ValidationError as error:
+            raise _as_usage_error(error) from None
+
+
+class MeshPlan(_PlanModel):
+    """A landmark from a mesh file.
+
+    Parameters
+    ----------
+    name : str
+        Name of its class: letters, digits, ``_``, ``-`` and ``.``.
+    path : str
+        STL, PLY, OBJ or OFF file; in a plan file relative to the plan's folder.
+    unit : {"m", "cm", "mm", "inch"}
+        Unit of the file's coordinates.
+    up, origin : str
+        Which axis of the file points up, and which of its points becomes the origin, as
+        :func:`phasemark.landmarks.read_mesh` takes them.
+    symmetry : int
+        How many turns about the vertical axis leave the landmark as it is.
+    albedo : float
+        Share of light that the surface returns, in (0, 1].
+    """
+
+    name: _Name
+    path: str
+    unit: Literal["m", "cm", "mm", "inch"]
+    up: str = "z"
+    origin: str = "file"
+    symmetry: Annotated[int, Field(ge=1, le=360)] = 1
+    albedo: _Albedo = 0.8
+
+
+class BankPlan(_PlanModel):
+    """A bank of model images (PHYSICS sections 5 and 7).
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Names from the catalogue. Without classes, landmarks and meshes: the whole catalogue.
+    landmarks : sequence of LandmarkSpec
+        Further boxes with a solid of revolution, spelled out.
+    meshes : sequence of MeshPlan
+        Landmarks from mesh files.
+    sensor : str
+        A preset's name, or a sensor file (with a ``/`` or ending in ``.toml``).
+    sensor_overrides : mapping
+        Fields of the sensor that replace those of `sensor`.
+    distance_m, delta_deg : str, number or sequence of numbers
+        Grids as :func:`phasemark.data.parse_grid` reads them. A last δ that repeats the first by the landmarks'
+        common symmetry is dropped. Default: 0.7 m to 2.1 m in steps of 1 cm, and one period in steps of 1°.
+    model : {"ray", "planar"}
+        The ray caster, or the paper's own generator in two dimensions.
+    layout : {"factored", "full"}
+        Lower and upper images apart (the paper's saving), or every class at every distance and angle.
+    albedo : float, optional
+        Replaces the landmarks' own.
+    harmonics : sequence of int
+        Orders k > 1 to keep beside the fundamental.
+
+    Raises
+    ------
+    UsageError
+        With one line that names the key, its value and what would be right.
+
+    Examples
+    --------
+    >>> BankPlan(classes=["cone"], distance_m="0.8:1.2:0.2").distance_m
+    (0.8, 1.0, 1.2)
+    """
+
+    classes: tuple[str, ...] = ()
+    landmarks: tuple[LandmarkSpec, ...] = ()
+    meshes: tuple[MeshPlan, ...] = ()
+    sensor: str = "pmd-16x16"
+    sensor_overrides: dict[str, Any] = Field(default_factory=dict)
+    distance_m: Annotated[_Grid, AfterValidator(_positive)] = Field(DEFAULT_DISTANCE_M, validate_default=True)
+    delta_deg: _Grid | None = None
+    model: Literal["ray", "planar"] = "ray"
+    layout: Literal["factored", "full"] = "factored"
+    albedo: _Albedo | None = None
+    harmonics: tuple[Annotated[int, Field(ge=2, le=99)], ...] = ()
+
+    @model_validator(mode="after")
+    def _orders_increase(self) -> Self:
+        if list(self.harmonics) != sorted(set(self.harmonics)):
+            raise UsageError(f"'harmonics' must increase from order to order, got {list(self.harmonics)}")
+        return self
+
+    def resolve(self) -> BankPlan:
+        """Return the plan with every default made explicit: landmarks, the sensor's fields, both grids, albedo.
+
+        Resolving again changes nothing, and the result no longer depends on the catalogue or the presets.
+
+        Raises
+        ------
+        UsageError
+            A class or sensor is unknown, or two landmarks have one name.
+        InputFileError
+            The sensor file cannot be read.
+        """
+        named = self.classes or (() if self.landmarks or self.meshes else tuple(catalog()))
+        specs: list[LandmarkSpec] = [*(_from_catalog(name) for name in named), *self.landmarks]
+        meshes: list[MeshPlan] = list(self.meshes)
+        if self.albedo is not None:
+            specs = [LandmarkSpec(**{**spec.model_dump(), "albedo": self.albedo}) for spec in specs]
+            meshes = [MeshPlan(**{**mesh.model_dump(), "albedo": self.albedo}) for mesh in meshes]
+        parts: list[LandmarkSpec | MeshPlan] = [*specs, *meshes]
+        names = [part.name for part in parts]
+        for name in names:
+            if names.count(name) > 1 or name == "none":
+                problem = "stands for no landmark" if name == "none" else "names two landmarks"
+                raise UsageError(f"the class name {name!r} {problem}: give each landmark a name of its own")
+        period_deg = 360 / math.gcd(*(part.symmetry for part in parts))
+        delta_deg = parse_grid(self.delta_deg or f"0:{period_deg!r}:{DEFAULT_DELTA_STEP_DEG}", "delta_deg")
+        return BankPlan(
+            landmarks=tuple(specs),
+            meshes=tuple(meshes),
+            sensor=self.sensor,
+            sensor_overrides=self.build_sensor().model_dump(),
+            distance_m=self.distance_m,
+            delta_deg=drop_repeated_stop(delta_deg, period_deg).tolist(),
+            model=self.model,
+            layout=self.layout,
+            harmonics=self.harmonics,
+        )
+
+    def build_sensor(self) -> Sensor:
+        """Return the sensor, overrides applied.
+
+        Raises
+        ------
+        UsageError
+            The preset is unknown, or a field or its value is wrong.
+        InputFileError
+            The sensor file cannot be read.
+        """
+        if set(self.sensor_overrides) >= set(Sensor.model_fields):  # a resolved plan needs no preset and no file
+            return Sensor(**self.sensor_overrides)
+        is_file = self.sensor.endswith(".toml") or "/" in self.sensor
+        base = Sensor.from_toml(self.sensor) if is_file else preset(self.sensor)
+        return base.with_(**self.sensor_overrides)
+
+    @property
+    def delta_rad(self) -> NDArray[np.float64]:
+        """The grid of angles of a resolved plan, radians."""
+        if self.delta_deg is None:
+            raise UsageError("'delta_deg' follows from the landmarks' symmetry: resolve the plan first")
+        return np.deg2rad(self.delta_deg)
+
+
+def load_plan(path: str | os.PathLike[str]) -> BankPlan:
+    """Read a bank's plan from a TOML file; files it names are relative to its folder.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read or is not TOML.
+    UsageError
+        With one line that names the file, the key, the value and what would be right.
+    """
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputFileError(f"{path}: not a TOML file ({error})") from None
+    try:
+        plan = BankPlan(**table)
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
+    meshes = [MeshPlan(**{**mesh.model_dump(), "path": str(path.parent / mesh.path)}) for mesh in plan.meshes]
+    is_file = plan.sensor.endswith(".toml") or "/" in plan.sensor
+    return plan.model_copy(
+        update={"meshes": tuple(meshes), "sensor": str(path.parent / plan.sensor) if is_file else plan.sensor}
+    )
+
+
+def factored_refusal(plan: BankPlan) -> str | None:
+    """Return why a resolved plan cannot have a factored bank, or None.
+
+    Lower and upper images come apart if every landmark is a solid of revolution on one and the same box, and the plane
+    between them falls on the image's middle line at every distance: a level camera at the interface's height.
+    """
+    sensor = plan.build_sensor()
+    if plan.meshes:
+        return f"'{plan.meshes[0].name}' comes from a mesh file"
+    boxes = {(spec.box, spec.albedo): spec.name for spec in plan.landmarks}
+    if len(boxes) > 1:
+        return f"'{plan.landmarks[0].name}' and '{list(boxes.values())[1]}' stand on different boxes"
+    if sensor.pitch_deg or sensor.roll_deg:
+        return f"the sensor is tilted (pitch {sensor.pitch_deg:g}°, roll {sensor.roll_deg:g}°)"
+    if sensor.rows % 2:
+        return f"the sensor has an odd number of rows ({sensor.rows})"
+    if sensor.centre_px[1] != sensor.rows / 2:
+        return f"the optical axis meets the image at row {sensor.centre_px[1]:g}, not in the middle"
+    return None
+
+
+def _from_catalog(name: str) -> LandmarkSpec:
+    known = catalog()
+    if name not in known:
+        raise UsageError(f"unknown class {name!r}: the catalogue has {', '.join(known)}")
+    return known[name]
+
+
+def _as_usage_error(error: ValidationError) -> UsageError:
+    first = error.errors()[0]
+    own = first.get("ctx", {}).get("error")
+    if isinstance(own, UsageError) and len(first["loc"]) <= 1 and first["loc"] not in (("landmarks",), ("meshes",)):
+        return own  # a grid's message names its key and value already
+    return UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"])

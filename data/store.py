@@ -1,0 +1,223 @@
+"""Files that are whole or not there: atomic replacement and SHA-256 checksums beside them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import secrets
+import stat
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
+
+_BLOCK_BYTES = 1 << 20
+_CHECKSUM_LINE = re.compile(r"\\?(?P<digest>[0-9a-fA-F]{64}) [ *](?P<name>[^\n]+)\n?")
+
+Buffer = bytes | bytearray | memoryview
+
+
+def write_atomically(
+    path: str | os.PathLike[str], data: Buffer | Iterable[Buffer], *, force: bool = False, checksum: bool = False
+) -> Path:
+    """Write a file so that under its name there is the old content or all of the new, never a part.
+
+    Parameters
+    ----------
+    path : path-like
+        The file to write.
+    data : bytes-like or iterable of bytes-like
+        Its content, whole or in pieces.
+    force : bool
+        Whether an existing file may be replaced.
+    checksum : bool
+        Whether to write ``FILE.sha256`` too.
+
+    Returns
+    -------
+    Path
+        `path`.
+
+    Raises
+    ------
+    OutputExistsError
+        The file exists and `force` is not set.
+    UsageError
+        The folder does not exist, or the name is that of a folder or device.
+    StorageError
+        The disk is full or fails; what was there before is untouched.
+    """
+    pieces = (data,) if isinstance(data, bytes | bytearray | memoryview) else data
+    with replacing(path, force=force, checksum=checksum) as temporary, temporary.open("wb") as file:
+        for piece in pieces:
+            file.write(piece)
+    return Path(path)
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bool = False) -> Iterator[Path]:
+    """Hand out an empty temporary file beside `path` and put it in the place of `path` when the block ends well.
+
+    Whatever ends the block early, an interrupt included, removes the temporary file and leaves `path` as it was. With
+    `checksum` the old ``FILE.sha256`` goes before the file is replaced and the new one comes after, so a crash in
+    between leaves a file without a checksum, never one with another file's checksum.
+
+    Parameters and errors are those of :func:`write_atomically`; an OSError raised in the block is a StorageError.
+
+    Yields
+    ------
+    Path
+        The temporary file.
+    """
+    path = Path(path)
+    targets = [path, checksum_path(path)] if checksum else [path]
+    for target in targets:
+        _refuse_unwritable(target, force=force)
+    parts = [target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial") for target in targets]
+    aside = parts[-1].with_suffix(".old")
+    try:
+        with _storage_errors(path):
+            _create(parts[0])
+            yield parts[0]
+            _sync(parts[0])
+            if checksum:
+                parts[1].write_bytes(_checksum_line(sha256_of(parts[0]), path.name))
+                _sync(parts[1])
+        for target in targets:  # somebody else may have been faster
+            _refuse_unwritable(target, force=force)
+        with _storage_errors(path):
+            if checksum and targets[1].exists():
+                os.replace(targets[1], aside)
+            for part, target in zip(parts, targets, strict=True):
+                os.replace(part, target)
+            _sync(path.parent)
+    except BaseException:
+        if aside.exists() and parts[0].exists():  # `path` is still the old file: give it its checksum back
+            with suppress(OSError):
+                os.replace(aside, targets[1])
+        raise
+    finally:
+        for leftover in (*parts, aside):
+            with suppress(OSError):
+                leftover.unlink(missing_ok=True)
+
+
+def checksum_path(path: str | os.PathLike[str]) -> Path:
+    """Return where the checksum of a file lies: ``FILE.sha256`` beside it."""
+    path = Path(path)
+    return path.with_name(path.name + ".sha256")
+
+
+def sha256_of(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 of a file's content in hexadecimal."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(_BLOCK_BYTES):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def write_checksum(path: str | os.PathLike[str], *, force: bool = False) -> Path:
+    """Write ``FILE.sha256`` for an existing file, in the format of ``sha256sum``, and return its path.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read.
+    OutputExistsError, StorageError
+        As in :func:`write_atomically`.
+    """
+    path = Path(path)
+    return write_atomically(checksum_path(path), _checksum_line(_readable_sha256(path), path.name), force=force)
+
+
+def read_checksum(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 that ``FILE.sha256`` states for a file, in lower-case hexadecimal.
+
+    Raises
+    ------
+    InputFileError
+        There is no checksum file, it is not in the format of ``sha256sum``, or it is about another file.
+    """
+    path, beside = Path(path), checksum_path(path)
+    try:
+        text = os.fsdecode(beside.read_bytes())
+    except OSError as error:
+        raise InputFileError(f"{beside}: cannot be read ({error.strerror})") from None
+    match = _CHECKSUM_LINE.fullmatch(text)
+    if match is None:
+        raise InputFileError(f"{beside}: must be one line '<SHA-256>  {path.name}', as sha256sum writes it")
+    if match["name"] != _escaped(path.name):
+        raise InputFileError(f"{beside}: must name '{path.name}', but names '{match['name']}'")
+    return match["digest"].lower()
+
+
+def verify_checksum(path: str | os.PathLike[str]) -> str:
+    """Compare a file with its ``FILE.sha256`` and return the SHA-256 both agree on.
+
+    Raises
+    ------
+    InputFileError
+        The file or its checksum cannot be read, or they do not agree.
+    """
+    stated, actual = read_checksum(path), _readable_sha256(Path(path))
+    if stated != actual:
+        raise InputFileError(f"{path}: damaged: its SHA-256 is {actual}, but {checksum_path(path).name} says {stated}")
+    return actual
+
+
+def _refuse_unwritable(path: Path, *, force: bool) -> None:
+    if not path.name:
+        raise UsageError(f"'{path}' is not a file name")
+    if not path.parent.is_dir():
+        raise UsageError(f"{path}: the folder '{path.parent}' does not exist: make it first")
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written ({error.strerror})") from None
+    if not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+        raise UsageError(f"{path}: is a {'folder' if stat.S_ISDIR(mode) else 'device'}, give the name of a file")
+    if not force:
+        raise OutputExistsError(f"{path}: exists; use --force to replace it")
+
+
+@contextmanager
+def _storage_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def _create(path: Path) -> None:
+    # os.open lets the user's umask set the permissions; the tempfile module would make the file private.
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _readable_sha256(path: Path) -> str:
+    try:
+        return sha256_of(path)
+    except OSError as error:
+        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _escaped(name: str) -> str:
+    return name.replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
+
+
+def _checksum_line(digest: str, name: str) -> bytes:
+    # sha256sum starts the line with a backslash when the name needed escaping.
+    escaped = _escaped(name)
+    return os.fsencode(f"{'' if escaped == name else chr(92)}{digest}  {escaped}\n")

@@ -1,0 +1,160 @@
+"""Files are whole or not there."""
+
+import errno
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
+from phasemark.data import read_checksum, verify_checksum, write_atomically, write_checksum
+from phasemark.data.store import replacing
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def test_writes_bytes_and_pieces(tmp_path):
+    assert write_atomically(tmp_path / "a", b"whole").read_bytes() == b"whole"
+    assert write_atomically(tmp_path / "b", (bytes([i]) for i in range(3))).read_bytes() == b"\0\1\2"
+    assert names(tmp_path) == ["a", "b"]
+
+
+def test_new_file_has_the_permissions_the_umask_leaves(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_atomically(tmp_path / "a", b"x")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
+
+
+def test_an_existing_output_needs_force(tmp_path):
+    path = tmp_path / "a"
+    write_atomically(path, b"old")
+    with pytest.raises(OutputExistsError, match=r"a: exists; use --force"):
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"old"
+    write_atomically(path, b"new", force=True)
+    assert path.read_bytes() == b"new"
+
+
+def test_an_output_made_by_somebody_else_meanwhile_is_not_replaced(tmp_path):
+    path = tmp_path / "a"
+    with pytest.raises(OutputExistsError), replacing(path) as temporary:
+        temporary.write_bytes(b"mine")
+        path.write_bytes(b"theirs")
+    assert path.read_bytes() == b"theirs"
+    assert names(tmp_path) == ["a"]
+
+
+def test_a_stray_checksum_of_an_absent_file_needs_force_too(tmp_path):
+    (tmp_path / "a.sha256").write_text("somebody's")
+    with pytest.raises(OutputExistsError, match=r"a\.sha256: exists"):
+        write_atomically(tmp_path / "a", b"x", checksum=True)
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_folders_devices_and_absent_folders_are_refused(tmp_path, force):
+    for path, reason in (
+        (tmp_path / "none" / "a", "folder .*none' does not exist"),
+        (tmp_path, "is a folder"),
+        (Path("/dev/null"), "is a device"),
+    ):
+        with pytest.raises(UsageError, match=reason):
+            write_atomically(path, b"x", force=force)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
+@pytest.mark.parametrize("call", ["write", "fsync", "replace"])
+def test_a_failing_disk_leaves_the_old_file_and_its_checksum(tmp_path, monkeypatch, call, code):
+    path = tmp_path / "a"
+    write_atomically(path, b"old", checksum=True)
+
+    def fail(*arguments, **options):
+        raise OSError(code, os.strerror(code))
+
+    def pieces():
+        yield b"new"
+        if call == "write":
+            fail()
+
+    real = os.replace
+    if call == "fsync":
+        monkeypatch.setattr(os, "fsync", fail)
+    if call == "replace":  # only that of the file itself: the checksum has been set aside by then
+        monkeypatch.setattr(os, "replace", lambda a, b: fail() if b == path else real(a, b))
+    with pytest.raises(StorageError, match=os.strerror(code)) as caught:
+        write_atomically(path, pieces(), force=True, checksum=True)
+    assert "\n" not in str(caught.value)
+    monkeypatch.undo()
+    assert path.read_bytes() == b"old"
+    verify_checksum(path)
+    assert names(tmp_path) == ["a", "a.sha256"]
+
+
+def test_a_crash_between_the_two_renames_leaves_no_wrong_checksum(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    write_atomically(path, b"old", checksum=True)
+    seen = []
+
+    def spy(source, target, real=os.replace):
+        real(source, target)
+        sums = tmp_path / "a.sha256"
+        seen.append((path.read_bytes(), verify_checksum(path) if sums.exists() else None))
+
+    monkeypatch.setattr(os, "replace", spy)
+    write_atomically(path, b"new", force=True, checksum=True)
+    assert [content for content, _ in seen] == [b"old", b"new", b"new"]
+    assert [digest is None for _, digest in seen] == [True, True, False]
+
+
+def test_an_interrupt_leaves_nothing_behind(tmp_path):
+    def pieces():
+        yield b"half"
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(tmp_path / "a", pieces(), checksum=True)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["bank.h5", "two words.h5", "back\\slash", "new\nline", "ünï"])
+def test_sha256sum_accepts_the_checksum(tmp_path, name):
+    if shutil.which("sha256sum") is None:
+        pytest.skip("needs sha256sum")
+    write_atomically(tmp_path / name, b"content", checksum=True)
+    subprocess.run(["sha256sum", "--check", "--strict", f"{name}.sha256"], cwd=tmp_path, check=True, capture_output=True)
+    theirs = subprocess.run(["sha256sum", name], cwd=tmp_path, check=True, capture_output=True).stdout
+    assert (tmp_path / f"{name}.sha256").read_bytes() == theirs
+    verify_checksum(tmp_path / name)
+
+
+def test_checksum_of_abc_is_the_published_one(tmp_path):
+    path = write_atomically(tmp_path / "abc", b"abc")
+    write_checksum(path)
+    # FIPS 180-2, appendix B.1
+    assert read_checksum(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_damage_is_found(tmp_path):
+    path = write_atomically(tmp_path / "a", b"content", checksum=True)
+    path.write_bytes(b"Content")
+    with pytest.raises(InputFileError, match="damaged"):
+        verify_checksum(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [(None, "cannot be read"), ("", "must be one line"), ("xyz  a\n", "must be one line"), (f"{'0' * 64}  b\n", "must name 'a'")],
+)
+def test_a_useless_checksum_file_is_an_input_error(tmp_path, text, reason):
+    path = write_atomically(tmp_path / "a", b"content")
+    if text is not None:
+        (tmp_path / "a.sha256").write_text(text)
+    with pytest.raises(InputFileError, match=reason):
+        verify_checksum(path)
