@@ -95,11 +95,10 @@ class Templates:
         Model ranges less `mean_m`; 0 where the model may not return.
     may_return, must_return : (t, pixels) bool
     mean_m : (pixels,) float64
-        Mean of the model ranges of each pixel.
+        Circular mean of the model ranges of each pixel.
     matrix : (t, 4 · pixels) float32
         [M, −2 M f, M f², C], what the matrix product needs.
-    half_wrap_m : float
-        c / 4f, half the unambiguous range.
+    sensor : Sensor
     """
 
     range_m: NDArray[np.float32]

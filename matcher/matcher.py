@@ -326,6 +326,6 @@ def _p_value(chi2: float, dof: int, frames: FilteredFrames, k: int) -> float:
         return float(stats.chi2.sf(chi2, dof))
     returned = frames.n_effective[k][frames.n_effective[k] > 0]
     nu = max(float(np.median(returned)) - 1, 5.0)  # the variance of F(1, ν) exists above 4
-    mean = dof * nu / (nu - 2)
-    variance = dof * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
+    mean: float = dof * nu / (nu - 2)
+    variance: float = dof * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
     return float(stats.chi2.sf(chi2 * 2 * mean / variance, 2 * mean**2 / variance))

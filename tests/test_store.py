@@ -128,7 +128,9 @@ def test_sha256sum_accepts_the_checksum(tmp_path, name):
     if shutil.which("sha256sum") is None:
         pytest.skip("needs sha256sum")
     write_atomically(tmp_path / name, b"content", checksum=True)
-    subprocess.run(["sha256sum", "--check", "--strict", f"{name}.sha256"], cwd=tmp_path, check=True, capture_output=True)
+    subprocess.run(
+        ["sha256sum", "--check", "--strict", f"{name}.sha256"], cwd=tmp_path, check=True, capture_output=True
+    )
     theirs = subprocess.run(["sha256sum", name], cwd=tmp_path, check=True, capture_output=True).stdout
     assert (tmp_path / f"{name}.sha256").read_bytes() == theirs
     verify_checksum(tmp_path / name)
@@ -150,7 +152,12 @@ def test_damage_is_found(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "reason"),
-    [(None, "cannot be read"), ("", "must be one line"), ("xyz  a\n", "must be one line"), (f"{'0' * 64}  b\n", "must name 'a'")],
+    [
+        (None, "cannot be read"),
+        ("", "must be one line"),
+        ("xyz  a\n", "must be one line"),
+        (f"{'0' * 64}  b\n", "must name 'a'"),
+    ],
 )
 def test_a_useless_checksum_file_is_an_input_error(tmp_path, text, reason):
     path = write_atomically(tmp_path / "a", b"content")
