@@ -129,7 +129,7 @@ class BankPlan(_PlanModel):
     meshes: tuple[MeshPlan, ...] = ()
     sensor: str = "pmd-16x16"
     sensor_overrides: dict[str, Any] = Field(default_factory=dict)
-    distance_m: Annotated[_Grid, AfterValidator(_positive)] = Field(DEFAULT_DISTANCE_M, validate_default=True)
+    distance_m: Annotated[_Grid, AfterValidator(_positive)] = Field(default=DEFAULT_DISTANCE_M, validate_default=True)
     delta_deg: _Grid | None = None
     model: Literal["ray", "planar"] = "ray"
     layout: Literal["factored", "full"] = "factored"
