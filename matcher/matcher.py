@@ -284,7 +284,7 @@ class _Cell:
         """Fit the position in the cell and return χ² with the number of pixels in it."""
         weight = 1 / (1 / self.weight + self.bend**2)
         root = np.sqrt(weight)
-        offset = np.zeros(2)
+        offset: NDArray[np.floating] = np.zeros(2)
         if len(weight) >= MIN_RETURNS:
             offset = np.linalg.lstsq(self.slope * root[:, None], self.residual * root, rcond=1e-9)[0]
             offset = np.clip(offset, -0.6, 0.6)
