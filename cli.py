@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main"]
 
-_ORIGIN_HELP = "Where the mesh file's origin is moved: keep, base (centre of its foot) or center (of its bounding box)."
+_ORIGIN_HELP = "What becomes the origin: file (its own), base (centre of its foot) or center (of its bounding box)."
 
 _FIRST_STEPS = """\
 phasemark renders, banks and matches what a low-resolution time-of-flight camera sees of a 3D landmark.
@@ -159,7 +159,7 @@ def _landmark_show(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for NAME.png and NAME.html.")] = None,
     unit: _Unit = None,
     up: _Up = "z",
-    origin: _Origin = "keep",
+    origin: _Origin = "file",
     force: _Force = False,
 ) -> None:
     """Draw a landmark: a shaded picture, and a page to turn it in 3D."""
@@ -186,7 +186,7 @@ def _landmark_export(
     from phasemark.data import write_atomically
     from phasemark.landmarks import export_mesh
 
-    _, mesh = _load_landmark(name, None, "z", "keep", from_catalog=True)
+    _, mesh = _load_landmark(name, None, "z", "file", from_catalog=True)
     typer.echo(write_atomically(out, export_mesh(mesh, out.suffix.removeprefix(".")), force=force))
 
 
@@ -195,7 +195,7 @@ def _landmark_check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An STL, PLY, OBJ or OFF file.")],
     unit: _Unit = None,
     up: _Up = "z",
-    origin: _Origin = "keep",
+    origin: _Origin = "file",
     as_json: _Json = False,
 ) -> None:
     """Check a mesh file and say what it holds."""
@@ -225,7 +225,7 @@ def _render(
     mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
     unit: _Unit = None,
     up: _Up = "z",
-    origin: _Origin = "keep",
+    origin: _Origin = "file",
     sensor: _SensorOption = "pmd-16x16",
     wall: _Wall = None,
     floor: _Floor = None,
@@ -247,7 +247,7 @@ def _render(
     data = out.with_suffix(".npz")
     _refuse_existing([out, data], force)
     if class_name is not None:
-        _, mesh = _load_landmark(class_name, None, "z", "keep", from_catalog=True)
+        _, mesh = _load_landmark(class_name, None, "z", "file", from_catalog=True)
     else:
         assert mesh_file is not None
         _, path = _name_and_file(mesh_file)
@@ -286,7 +286,7 @@ def _bank_build(
     meshes: Annotated[list[str] | None, typer.Option("--mesh", metavar="NAME=FILE", help="Repeatable.")] = None,
     unit: _Unit = None,
     up: _Up = "z",
-    origin: _Origin = "keep",
+    origin: _Origin = "file",
     symmetry: Annotated[int, typer.Option("--symmetry", help="Turns that leave the mesh as it is.")] = 1,
     sensor: Annotated[
         str | None, typer.Option("--sensor", metavar="NAME|FILE", help="A preset or sensor file.")
