@@ -40,7 +40,7 @@ class Ring:
     @property
     def azimuths_rad(self) -> NDArray[np.float64]:
         """Azimuths of the corners, ascending, (count,)."""
-        return (np.arange(self.count) + self.phase) * (2 * math.pi / self.count)
+        return np.asarray((np.arange(self.count) + self.phase) * (2 * math.pi / self.count), dtype=np.float64)
 
     @property
     def vertices(self) -> NDArray[np.float64]:
@@ -53,7 +53,7 @@ class Ring:
         quarter = self.azimuths_rad[: self.count // 4]
         x, y = self.radius_m * np.cos(quarter), self.radius_m * np.sin(quarter)
         xy = np.vstack([np.c_[x, y], np.c_[-y, x], np.c_[-x, -y], np.c_[y, -x]])
-        return np.c_[xy, np.full(self.count, self.z_m)]
+        return np.asarray(np.c_[xy, np.full(self.count, self.z_m)])
 
 
 def revolve(upper: Cylinder | Cone | Sphere | Revolution, tolerance_m: float, max_faces: int) -> Triangles:
