@@ -25,10 +25,6 @@ METHODS = ("nearest",)
 MIN_RETURNS = 3
 """Fewer returns among the pixels that give distance and angle decide nothing: two numbers are sought."""
 _FRAMES_AT_ONCE = 128
-_GEOMETRY = (
-    "rows", "cols", "half_angle_h_deg", "half_angle_v_deg", "principal_point_px", "pitch_deg", "roll_deg",
-    "fill_factor", "modulation_hz",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -115,7 +111,9 @@ class Matcher:
         UsageError
             The frames come from another camera than the bank.
         """
-        check_same_camera(frames.sensor, self.bank.sensor)
+        difference = frames.sensor.optics_difference(self.bank.sensor)
+        if difference is not None:
+            raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
         matches: list[Match] = []
         for start in range(0, len(frames), _FRAMES_AT_ONCE):
             matches.extend(self._match_some(frames[start : start + _FRAMES_AT_ONCE]))
@@ -296,22 +294,6 @@ class _Cell:
 def background_image(background: Background, sensor: Sensor) -> PhasorImages:
     """Return what a background alone returns, straight ahead: one image."""
     return Renderer(None, sensor).render(distance_m=1.0, background=background)
-
-
-def check_same_camera(frames: Sensor, bank: Sensor) -> None:
-    """Refuse frames of a camera whose geometry or modulation differs from the bank's.
-
-    Raises
-    ------
-    UsageError
-        Naming the first field that differs.
-    """
-    for name in _GEOMETRY:
-        ours, theirs = getattr(frames, name), getattr(bank, name)
-        if ours != theirs:
-            raise UsageError(
-                f"the frames were taken with another sensor than the bank's: {name} is {ours}, in the bank {theirs}"
-            )
 
 
 def _p_value(chi2: float, dof: int, frames: FilteredFrames, k: int) -> float:

@@ -91,7 +91,7 @@ def draw_residual(axes: Axes, residual_m: NDArray[np.float64]) -> None:
     image = axes.imshow(
         residual_mm, cmap="RdBu", vmin=-span, vmax=span, extent=(0, residual_m.shape[1], residual_m.shape[0], 0)
     )
-    axes.set(title="measured − model", xlabel="column", ylabel="row")
+    axes.set(title="measured − model", xlabel="u (pixel columns)", ylabel="v (pixel rows)")
     axes.figure.colorbar(image, ax=axes, label="residual (mm)", extend="both")
 
 
