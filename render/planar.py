@@ -137,7 +137,7 @@ def planar_images(
     >>> post = PlanarLandmark(0.24, 0.16, profile_m=[(0.035, 0.0), (0.035, 0.15)])
     >>> image = planar_images(post, preset("pmd-16x16"), Views.broadcast(1.0))
     >>> image.range_m[0, [7, 8], 7].round(3).tolist()
-    [0.966, 0.88]
+    [0.967, 0.88]
     """
     if not 0 < albedo <= 1:
         raise UsageError(f"'albedo' must be in (0, 1], got {albedo!r}")

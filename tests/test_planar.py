@@ -171,7 +171,9 @@ def test_a_column_that_misses_returns_nothing():
 
 
 def test_what_is_behind_the_camera_is_not_seen():
-    assert not planar_images(CYLINDER, SENSOR, Views.broadcast(1.0, 0.3, [math.pi, 2.5])).coverage.any()
+    endless = PlanarLandmark(LENGTH, WIDTH, lambda z: np.full(z.shape, 0.06))
+    assert planar_images(endless, SENSOR, Views.broadcast(1.0, 0.3, 0.0)).coverage[0, :, 7].all()
+    assert not planar_images(endless, SENSOR, Views.broadcast(1.0, 0.3, [math.pi, 2.9])).coverage.any()
 
 
 def test_every_lower_row_and_every_cylinder_row_below_its_top_has_the_same_values():
