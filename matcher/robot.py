@@ -154,7 +154,7 @@ def robot_poses(
     --------
     >>> from phasemark.matcher import Match, robot_poses
     >>> match = Match("cone", True, distance_m=1.0, delta_rad=0.5, symmetry=2)
-    >>> [(round(pose.x_m, 3), round(pose.y_m, 3)) for pose in robot_poses(match, (2.0, 1.0), prior=(3.0, 1.0, 0.0))]
+    >>> [(round(pose.x_m, 3), round(pose.y_m, 3)) for pose in robot_poses(match, (2.0, 1.0), prior=(3.0, 1.0, 3.0))]
     [(2.878, 1.479), (1.122, 0.521)]
     """
     landmark = _finite("landmark_xy_m", landmark_xy_m, 2)
@@ -311,7 +311,7 @@ def _finite(name: str, value: ArrayLike, *shape: int) -> NDArray[np.float64]:
         array = np.array(math.nan)
     if array.shape != shape or not np.isfinite(array).all():
         wanted = f"{'×'.join(map(str, shape))} finite numbers" if shape else "a finite number"
-        raise UsageError(f"'{name}' must be {wanted}, got {value!r}")
+        raise UsageError(f"'{name}' must be {wanted}, got {' '.join(repr(value).split())}")
     return array
 
 

@@ -330,12 +330,14 @@ def test_arguments_out_of_range_are_refused(arguments, message):
         ({"profile_m": [(0.1, 0.0), (-0.1, 0.1)]}, "'profile_m' must be two points"),
         ({"profile_m": [(0.1, 0.0), (math.inf, 0.1)]}, "'profile_m' must be two points"),
         ({"profile_m": [(0.1, 0.0), (0.1,)]}, "'profile_m' must be two points"),
+        ({"profile_m": np.full((2, 3), 0.1)}, "'profile_m' must be two points"),
         ({"profile_m": ["ab", "cd"]}, "'profile_m' must be two points"),
     ],
 )
 def test_a_landmark_that_is_none_is_refused(fields, message):
-    with pytest.raises(UsageError, match=message):
+    with pytest.raises(UsageError, match=message) as caught:
         PlanarLandmark(**{"box_length_m": LENGTH, "box_width_m": WIDTH, **fields})
+    assert "\n" not in str(caught.value)
 
 
 def test_without_an_upper_part_the_upper_rows_are_empty():
