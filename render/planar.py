@@ -77,12 +77,15 @@ class PlanarLandmark:
 
 
 def _outline(profile: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    if not len(profile):
+        return ()
     try:
-        points = np.array(profile, dtype=np.float64).reshape(-1, 2) if len(profile) else np.empty((0, 2))
-    except (TypeError, ValueError):  # ragged, not numbers, or not in pairs
-        points = np.full((1, 2), np.nan)
-    if len(points) == 1 or not np.isfinite(points).all() or (points[:, 0] < 0).any():
-        raise UsageError(f"'profile_m' must be two points (r, z) or more, finite and with r ≥ 0, got {profile!r}")
+        points = np.asarray(profile, dtype=np.float64)
+    except (TypeError, ValueError):  # ragged, or not numbers
+        points = np.array(math.nan)
+    if points.shape != (max(2, len(profile)), 2) or not np.isfinite(points).all() or (points[:, 0] < 0).any():
+        shown = " ".join(repr(profile).split())
+        raise UsageError(f"'profile_m' must be two points (r, z) or more, finite and with r ≥ 0, got {shown}")
     return tuple((float(r), float(z)) for r, z in points)
 
 
@@ -105,7 +108,7 @@ def planar_images(
 
     A pixel is one point at distance r: S_1 = ρ cos θ / r² · exp(iφ(r)) with coverage 1, or nothing with coverage 0.
     Everything is horizontal: r ignores the row's elevation, and is shorter than the range along the ray by the factor
-    √(1 + t_v² / (1 + a_c²)), with t_v the tangent above; 1.7 % at the image's upper edge for 11°.
+    √(1 + t_v² / (1 + a_c²)), with t_v the tangent above; 1.7 % in the top row of 16 for 11°.
 
     Parameters
     ----------
@@ -137,7 +140,7 @@ def planar_images(
     >>> post = PlanarLandmark(0.24, 0.16, profile_m=[(0.035, 0.0), (0.035, 0.15)])
     >>> image = planar_images(post, preset("pmd-16x16"), Views.broadcast(1.0))
     >>> image.range_m[0, [7, 8], 7].round(3).tolist()
-    [0.966, 0.88]
+    [0.967, 0.88]
     """
     if not 0 < albedo <= 1:
         raise UsageError(f"'albedo' must be in (0, 1], got {albedo!r}")

@@ -171,7 +171,9 @@ def test_a_column_that_misses_returns_nothing():
 
 
 def test_what_is_behind_the_camera_is_not_seen():
-    assert not planar_images(CYLINDER, SENSOR, Views.broadcast(1.0, 0.3, [math.pi, 2.5])).coverage.any()
+    endless = PlanarLandmark(LENGTH, WIDTH, lambda z: np.full(z.shape, 0.06))
+    assert planar_images(endless, SENSOR, Views.broadcast(1.0, 0.3, 0.0)).coverage[0, :, 7].all()
+    assert not planar_images(endless, SENSOR, Views.broadcast(1.0, 0.3, [math.pi, 2.9])).coverage.any()
 
 
 def test_every_lower_row_and_every_cylinder_row_below_its_top_has_the_same_values():
@@ -328,12 +330,14 @@ def test_arguments_out_of_range_are_refused(arguments, message):
         ({"profile_m": [(0.1, 0.0), (-0.1, 0.1)]}, "'profile_m' must be two points"),
         ({"profile_m": [(0.1, 0.0), (math.inf, 0.1)]}, "'profile_m' must be two points"),
         ({"profile_m": [(0.1, 0.0), (0.1,)]}, "'profile_m' must be two points"),
+        ({"profile_m": np.full((2, 3), 0.1)}, "'profile_m' must be two points"),
         ({"profile_m": ["ab", "cd"]}, "'profile_m' must be two points"),
     ],
 )
 def test_a_landmark_that_is_none_is_refused(fields, message):
-    with pytest.raises(UsageError, match=message):
+    with pytest.raises(UsageError, match=message) as caught:
         PlanarLandmark(**{"box_length_m": LENGTH, "box_width_m": WIDTH, **fields})
+    assert "\n" not in str(caught.value)
 
 
 def test_without_an_upper_part_the_upper_rows_are_empty():
