@@ -1,4 +1,4 @@
-"""The paper's experiment: four landmarks at three distances and three angles before a wall, and the same off the grid."""
+"""The paper's experiment: four landmarks, three distances, three angles, before a wall; on the grid and off it."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from phasemark.matcher.filters import FilteredFrames, kalman_filter
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.robot import robot_poses
-from phasemark.render import Background, PhasorImages, Renderer, Views, capture, preset
+from phasemark.render import Background, PhasorImages, Renderer, Views, capture
 
 SENSOR = "pmd-16x16"
 WALL_M = 3.0
@@ -163,10 +164,10 @@ def run_demo(
         if value < 1:
             raise UsageError(f"'{name}' must be at least 1, got {value}")
     started = time.perf_counter()
-    grids = {"distance_m": bank_distance_m, "delta_deg": bank_delta_deg}
-    plan = BankPlan(
-        classes=tuple(classes), sensor=SENSOR, **{key: value for key, value in grids.items() if value is not None}
-    )
+    fields: dict[str, Any] = {"classes": tuple(classes), "sensor": SENSOR, "delta_deg": bank_delta_deg}
+    if bank_distance_m is not None:
+        fields["distance_m"] = bank_distance_m
+    plan = BankPlan(**fields)
     bank = build_bank(plan, bank_path, force=force, workers=workers)
     background = Background(wall_m=WALL_M)
     matcher = Matcher(bank, background=background)
@@ -284,7 +285,7 @@ def cell_rows(results: Sequence[CellResult]) -> list[dict[str, str | int | float
             )
             for statistic in (_median, _worst)
         ]
-        values = (
+        values: tuple[str | int | float, ...] = (
             result.cell.class_name,
             int(result.cell.shifted),
             round(result.cell.distance_m, 6),
