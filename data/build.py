@@ -33,8 +33,7 @@ from phasemark.data.plan import BankPlan, factored_refusal
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.store import replacing
 from phasemark.landmarks import LandmarkSpec, build_mesh, read_mesh
-from phasemark.render import PhasorImages, Sensor, Views
-from phasemark.render.renderer import Renderer
+from phasemark.render import PhasorImages, Renderer, Sensor, Views
 
 BATCH_PIXELS = 1 << 19
 """Pixels rendered at a time: 2048 images of 16 × 16, some 20 MB."""

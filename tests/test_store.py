@@ -10,7 +10,6 @@ import pytest
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data import read_checksum, verify_checksum, write_atomically, write_checksum
-from phasemark.data.store import replacing
 
 
 def names(folder: Path) -> list[str]:
@@ -44,9 +43,13 @@ def test_an_existing_output_needs_force(tmp_path):
 
 def test_an_output_made_by_somebody_else_meanwhile_is_not_replaced(tmp_path):
     path = tmp_path / "a"
-    with pytest.raises(OutputExistsError), replacing(path) as temporary:
-        temporary.write_bytes(b"mine")
+
+    def pieces():
+        yield b"mine"
         path.write_bytes(b"theirs")
+
+    with pytest.raises(OutputExistsError):
+        write_atomically(path, pieces())
     assert path.read_bytes() == b"theirs"
     assert names(tmp_path) == ["a"]
 
@@ -128,7 +131,9 @@ def test_sha256sum_accepts_the_checksum(tmp_path, name):
     if shutil.which("sha256sum") is None:
         pytest.skip("needs sha256sum")
     write_atomically(tmp_path / name, b"content", checksum=True)
-    subprocess.run(["sha256sum", "--check", "--strict", f"{name}.sha256"], cwd=tmp_path, check=True, capture_output=True)
+    subprocess.run(
+        ["sha256sum", "--check", "--strict", f"{name}.sha256"], cwd=tmp_path, check=True, capture_output=True
+    )
     theirs = subprocess.run(["sha256sum", name], cwd=tmp_path, check=True, capture_output=True).stdout
     assert (tmp_path / f"{name}.sha256").read_bytes() == theirs
     verify_checksum(tmp_path / name)
@@ -150,7 +155,12 @@ def test_damage_is_found(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "reason"),
-    [(None, "cannot be read"), ("", "must be one line"), ("xyz  a\n", "must be one line"), (f"{'0' * 64}  b\n", "must name 'a'")],
+    [
+        (None, "cannot be read"),
+        ("", "must be one line"),
+        ("xyz  a\n", "must be one line"),
+        (f"{'0' * 64}  b\n", "must name 'a'"),
+    ],
 )
 def test_a_useless_checksum_file_is_an_input_error(tmp_path, text, reason):
     path = write_atomically(tmp_path / "a", b"content")
