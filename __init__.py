@@ -42,9 +42,10 @@ class UsageError(PhasemarkError, ValueError):
             return cls(f"unknown key '{key}'")
         if kind == "missing":
             return cls(f"'{key}' is missing")
-        message = message.removeprefix("Value error, ").removeprefix("Input should be ")
-        if message.startswith("'"):  # a nested model has put its own finding into words already
-            return cls(f"{key}: {message}")
+        own = message.removeprefix("Value error, ")
+        if own != message and own.startswith("'"):  # a nested model has put its own finding into words already
+            return cls(f"{key}: {own}")
+        message = own.removeprefix("Input should be ")
         message = message if message.startswith("must") else f"must be {message}"
         shown = repr(value)
         return cls(f"'{key}' {message}, got {shown if len(shown) <= 80 else shown[:77] + '...'}")

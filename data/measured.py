@@ -132,14 +132,17 @@ def read_frames(
         range_m = range_m / _axis_cosine(sensor)
     valid = _upright(valid, flip_h, flip_v, rotate) & np.isfinite(range_m)
     valid &= ~_impossible(range_m, valid, sensor, path)
-    return Frames(
-        range_m,
-        arrays.get("amplitude"),
-        arrays.get("intensity"),
-        valid,
-        sensor=sensor,
-        invalid_means=invalid_means,
-    )
+    try:
+        return Frames(
+            range_m,
+            arrays.get("amplitude"),
+            arrays.get("intensity"),
+            valid,
+            sensor=sensor,
+            invalid_means=invalid_means,
+        )
+    except UsageError as error:  # an amplitude or intensity that cannot be
+        raise InputFileError(f"{path}: {error}") from None
 
 
 def _axis_cosine(sensor: Sensor) -> NDArray[np.float64]:
@@ -230,7 +233,8 @@ def _read(path: Path, shape: tuple[int, int]) -> _Raw:
 
 
 def _read_npz(path: Path) -> _Raw:
-    with np.load(path, allow_pickle=False) as archive:
+    # A handle of our own: np.load leaves its file open when the archive is cut off.
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         if "range" not in archive:
             raise InputFileError(f"{path}: must have an array 'range', got {', '.join(archive) or 'nothing'}")
         arrays = {name: np.asarray(archive[name]) for name in _FIELDS if name in archive}
@@ -274,7 +278,8 @@ def _parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> NDArray[np
         for number, line in enumerate(io.StringIO(text, newline=None), start=1)
         if line.strip() and not line.startswith("#")
     ]
-    separator = next((mark for mark in ";\t," if lines and mark in lines[0][1]), None)
+    first_frame = lines[:2][-1][1] if lines else ""  # a header's names may have separators of their own, or none
+    separator = next((mark for mark in ";\t," if mark in first_frame), None)
     frames: list[list[float]] = []
     for index, (number, line) in enumerate(lines):
         cells = _cells(line, separator)

@@ -172,7 +172,7 @@ class BankPlan(_PlanModel):
             landmarks=tuple(specs),
             meshes=tuple(meshes),
             sensor=self.sensor,
-            sensor_overrides=self.build_sensor().model_dump(),
+            sensor_overrides=self.build_sensor().model_dump(mode="json"),
             distance_m=self.distance_m,
             delta_deg=drop_repeated_stop(delta_deg, period_deg).tolist(),
             model=self.model,
@@ -263,6 +263,6 @@ def _from_catalog(name: str) -> LandmarkSpec:
 def _as_usage_error(error: ValidationError) -> UsageError:
     first = error.errors()[0]
     own = first.get("ctx", {}).get("error")
-    if isinstance(own, UsageError) and len(first["loc"]) <= 1 and first["loc"] not in (("landmarks",), ("meshes",)):
-        return own  # a grid's message names its key and value already
+    if isinstance(own, UsageError) and len(first["loc"]) <= 1:
+        return own  # it names key and value already
     return UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"])

@@ -10,7 +10,6 @@ import pytest
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data import read_checksum, verify_checksum, write_atomically, write_checksum
-from phasemark.data.store import replacing
 
 
 def names(folder: Path) -> list[str]:
@@ -44,9 +43,13 @@ def test_an_existing_output_needs_force(tmp_path):
 
 def test_an_output_made_by_somebody_else_meanwhile_is_not_replaced(tmp_path):
     path = tmp_path / "a"
-    with pytest.raises(OutputExistsError), replacing(path) as temporary:
-        temporary.write_bytes(b"mine")
+
+    def pieces():
+        yield b"mine"
         path.write_bytes(b"theirs")
+
+    with pytest.raises(OutputExistsError):
+        write_atomically(path, pieces())
     assert path.read_bytes() == b"theirs"
     assert names(tmp_path) == ["a"]
 

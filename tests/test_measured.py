@@ -1,0 +1,290 @@
+"""Measured frames from files that somebody else wrote."""
+
+import math
+
+import h5py
+import numpy as np
+import pytest
+
+from phasemark import InputFileError, UsageError
+from phasemark.data import read_frames
+from phasemark.render import Flag, Sensor, preset
+
+PMD = preset("pmd-16x16")
+SMALL = Sensor(rows=2, cols=3, half_angle_h_deg=30, half_angle_v_deg=20)
+IMAGE = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+STATED = {"unit": "m", "quantity": "range"}
+
+
+def csv_file(tmp_path, text):
+    path = tmp_path / "frames.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def hdf5_file(tmp_path, datasets, attributes=None):
+    path = tmp_path / "frames.h5"
+    with h5py.File(path, "w") as file:
+        for name, values in datasets.items():
+            file[name] = values
+        for name, values in (attributes or {}).items():
+            file[name].attrs.update(values)
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1,2,3,4,5,6\n",
+        "1;2;3;4;5;6",
+        "1,0;2,0;3,0;4,0;5,0;6,0\n",  # decimal commas
+        "1\t2\t3\t4\t5\t6\r\n",
+        "1 2  3 4 5 6\n",
+        " 1, 2, 3, 4, 5, 6 \n",
+        '"1","2","3","4","5","6"\n',
+        "a,b,c,d,e,f\n1,2,3,4,5,6\n",
+        "t,x\n1,2,3,4,5,6\n",
+        "# comment, 1\n\n1,2,3,4,5,6\n\n",
+        "\ufeff1,2,3,4,5,6\n",
+        "1e0,2e0,3e0,4e0,5e0,6e0\n",
+    ],
+)
+def test_spellings_of_one_csv_frame(tmp_path, text):
+    frames = read_frames(csv_file(tmp_path, text), sensor=SMALL, **STATED)
+    assert frames.range_m.tolist() == [[IMAGE.tolist()]]
+    assert frames.valid.all()
+
+
+def test_each_csv_line_is_a_frame_of_one_position(tmp_path):
+    frames = read_frames(csv_file(tmp_path, "1,2,3,4,5,6\n" * 4), sensor=SMALL, **STATED)
+    assert frames.range_m.shape == (1, 4, 2, 3)
+
+
+@pytest.mark.parametrize(("means", "flag"), [("missing", Flag.MISSING), ("no-return", Flag.NO_RETURN)])
+def test_blank_and_nan_cells_are_invalid_and_mean_what_the_caller_says(tmp_path, means, flag):
+    path = csv_file(tmp_path, "1,,nan,NaN,inf,6\n")
+    frames = read_frames(path, sensor=SMALL, invalid_means=means, **STATED)
+    assert frames.valid.tolist() == [[[[True, False, False], [False, False, True]]]]
+    assert frames.flags.tolist() == [[[[0, flag, flag], [flag, flag, 0]]]]
+
+
+@pytest.mark.parametrize("count", [255, 257])
+def test_a_csv_line_with_a_value_too_few_or_too_many_is_named(tmp_path, count):
+    lines = [",".join(["1.5"] * n) for n in (256, 256, count)]
+    with pytest.raises(InputFileError) as caught:
+        read_frames(csv_file(tmp_path, "header\n" + "\n".join(lines)), sensor=PMD, **STATED)
+    assert str(caught.value).endswith(f"line 4 has {count} values, must have 256 (16 × 16 pixels)")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("1,2,3,4,5,6\n1,2,x,4,5,6\n", "line 2, column 3 must be a number, got 'x'"),
+        ("1,2,3,4,5,six\n", "line 1, column 6 must be a number, got 'six'"),  # no header: it has numbers
+        ("1,2,3,4,5,1_0\n", "line 1, column 6 must be a number, got '1_0'"),
+        ("1,2,3,4,5,6\n1,2,3,4\n", "line 2 has 4 values, must have 6"),
+        ("1,2,3,4,5,6,\n", "line 1 has 7 values, must have 6"),
+        ("a,b,c\n", "holds no frames"),
+        ("\n \n", "holds no frames"),
+        ("", "is empty"),
+    ],
+)
+def test_a_bad_csv_is_one_line_naming_the_place(tmp_path, text, reason):
+    path = csv_file(tmp_path, text)
+    with pytest.raises(InputFileError) as caught:
+        read_frames(path, sensor=SMALL, **STATED)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert reason in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001)])
+def test_units_become_metres(tmp_path, unit, metres):
+    np.save(tmp_path / "a.npy", np.round(IMAGE / metres).astype(np.uint16))
+    frames = read_frames(tmp_path / "a.npy", sensor=SMALL, unit=unit, quantity="range")
+    np.testing.assert_allclose(frames.range_m[0, 0], IMAGE, rtol=1e-15)  # one rounding of a product
+
+
+@pytest.mark.parametrize(("shape", "result"), [((2, 3), (1, 1)), ((5, 2, 3), (1, 5)), ((4, 5, 2, 3), (4, 5))])
+def test_npy_shapes(tmp_path, shape, result):
+    values = 1 + np.arange(math.prod(shape)).reshape(shape) / 100
+    np.save(tmp_path / "a.npy", values)
+    frames = read_frames(tmp_path / "a.npy", sensor=SMALL, **STATED)
+    assert frames.range_m.shape == (*result, 2, 3)
+    assert np.array_equal(frames.range_m.ravel(), values.ravel())
+
+
+@pytest.mark.parametrize("tilt", [{}, {"pitch_deg": 20.0, "roll_deg": -10.0}, {"principal_point_px": (1.0, 0.5)}])
+def test_z_of_a_plane_across_the_optical_axis_becomes_range_along_each_ray(tmp_path, tilt):
+    sensor = SMALL.with_(**tilt)
+    z_m = 2.0
+    np.save(tmp_path / "a.npy", np.full((2, 3), z_m))
+    frames = read_frames(tmp_path / "a.npy", sensor=sensor, unit="m", quantity="z")
+    u0, v0 = sensor.principal_point_px or (1.5, 1.0)
+    tan_h, tan_v = math.tan(math.radians(30)), math.tan(math.radians(20))
+    for row in range(2):
+        for col in range(3):
+            x, y = 2 * (u0 - col - 0.5) / 3 * tan_h, 2 * (v0 - row - 0.5) / 2 * tan_v  # PHYSICS section 2
+            expected = z_m * math.sqrt(1 + x * x + y * y)
+            assert frames.range_m[0, 0, row, col] == pytest.approx(expected, rel=1e-12)  # rounding
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"flip_h": True}, [[3, 2, 1], [6, 5, 4]]),
+        ({"flip_v": True}, [[4, 5, 6], [1, 2, 3]]),
+        ({"rotate": 180}, [[6, 5, 4], [3, 2, 1]]),
+    ],
+)
+def test_images_are_mirrored_and_turned(tmp_path, options, expected):
+    path = csv_file(tmp_path, "1,2,3,4,5,6\n")
+    assert read_frames(path, sensor=SMALL, **STATED, **options).range_m[0, 0].tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"rotate": 90}, [[4, 1], [5, 2], [6, 3]]),  # clockwise: the top left pixel goes to the top right
+        ({"rotate": 270}, [[3, 6], [2, 5], [1, 4]]),
+        ({"rotate": 90, "flip_h": True}, [[6, 3], [5, 2], [4, 1]]),  # mirrored first
+    ],
+)
+@pytest.mark.parametrize("kind", ["csv", "npy"])
+def test_a_quarter_turn_is_clockwise_and_swaps_rows_and_columns(tmp_path, kind, options, expected):
+    upright = Sensor(rows=3, cols=2, half_angle_h_deg=20, half_angle_v_deg=30)
+    path = csv_file(tmp_path, "1,2,3,4,5,6\n") if kind == "csv" else tmp_path / "a.npy"
+    if kind == "npy":
+        np.save(path, IMAGE)
+    assert read_frames(path, sensor=upright, **STATED, **options).range_m[0, 0].tolist() == expected
+
+
+def test_amplitude_and_validity_turn_with_the_range(tmp_path):
+    valid = np.ones((2, 3), bool)
+    valid[0, 0] = False
+    np.savez(tmp_path / "a.npz", range=IMAGE, amplitude=10 * IMAGE, intensity=20 * IMAGE, valid=valid)
+    frames = read_frames(tmp_path / "a.npz", sensor=SMALL, flip_h=True, **STATED)
+    assert frames.amplitude_e[0, 0].tolist() == (10 * IMAGE[:, ::-1]).tolist()
+    assert frames.intensity_e[0, 0].tolist() == (20 * IMAGE[:, ::-1]).tolist()
+    assert np.argwhere(~frames.valid[0, 0]).tolist() == [[0, 2]]
+
+
+def test_status_needs_the_values_that_are_valid(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, range=IMAGE, status=np.array([[5, 9, 0], [255, 5, 5]]))
+    with pytest.raises(UsageError, match="--valid-status"):
+        read_frames(path, sensor=SMALL, **STATED)
+    frames = read_frames(path, sensor=SMALL, valid_status={5, 9}, **STATED)
+    assert frames.valid[0, 0].tolist() == [[True, True, False], [False, True, True]]
+
+
+@pytest.mark.parametrize("kind", ["npz", "h5"])
+def test_a_file_that_states_unit_and_quantity_needs_no_options(tmp_path, kind):
+    if kind == "npz":
+        path = tmp_path / "a.npz"
+        np.savez(path, range=1000 * IMAGE, unit="mm", quantity="range")
+    else:
+        path = hdf5_file(tmp_path, {"range": 1000 * IMAGE}, {"range": {"units": "mm", "quantity": "range"}})
+    frames = read_frames(path, sensor=SMALL)
+    np.testing.assert_allclose(frames.range_m[0, 0], IMAGE, rtol=1e-15)  # one rounding of a product
+    read_frames(path, sensor=SMALL, unit="mm", quantity="range")
+    with pytest.raises(UsageError, match=r"--unit is m, but .* says mm"):
+        read_frames(path, sensor=SMALL, unit="m")
+    with pytest.raises(UsageError, match=r"--quantity is z, but .* says range"):
+        read_frames(path, sensor=SMALL, quantity="z")
+
+
+def test_hdf5_frames_with_amplitudes(tmp_path):
+    path = hdf5_file(tmp_path, {"range": IMAGE[None], "amplitude": 7 * IMAGE[None]}, {"amplitude": {"units": "e-"}})
+    frames = read_frames(path, sensor=SMALL, **STATED)
+    assert frames.amplitude_e[0, 0].tolist() == (7 * IMAGE).tolist()
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"quantity": "range"}, r"does not say its unit: give --unit m\|cm\|mm"),
+        ({"unit": "m"}, r"does not say its quantity: give --quantity range\|z"),
+        ({"unit": "inch", "quantity": "range"}, "--unit must be one of m, cm, mm, got 'inch'"),
+        ({"unit": "m", "quantity": "depth"}, "--quantity must be one of range, z, got 'depth'"),
+        ({**STATED, "rotate": 45}, "'rotate' must be 0, 90, 180 or 270, got 45"),
+        ({**STATED, "invalid_means": "far"}, "'invalid_means' must be"),
+    ],
+)
+def test_a_missing_or_wrong_option_is_a_usage_error_that_names_it(tmp_path, options, reason):
+    path = csv_file(tmp_path, "1,2,3,4,5,6\n")
+    with pytest.raises(UsageError, match=reason):
+        read_frames(path, sensor=SMALL, **options)
+
+
+def test_ranges_no_such_camera_can_measure_are_invalid_with_a_warning(tmp_path):
+    path = csv_file(tmp_path, "1,2,3,4,5,6\n1,0,-3,4,15,6\n")  # c / 2f is 14.99 m
+    with pytest.warns(
+        UserWarning, match=r"3 of 12 ranges .* frame 1, row 0, column 1: 0 m; taken as invalid"
+    ) as caught:
+        frames = read_frames(path, sensor=SMALL, **STATED)
+    assert len(caught) == 1
+    assert frames.valid[0, 1].tolist() == [[True, False, False], [True, False, True]]
+
+
+def test_millimetres_read_as_metres_are_an_error_that_asks_for_the_unit(tmp_path):
+    path = csv_file(tmp_path, "1000,2000,3000,4000,5000,6000\n")
+    with pytest.raises(InputFileError, match=r"6 of 6 ranges .* is --unit right\?"):
+        read_frames(path, sensor=SMALL, **STATED)
+
+
+def saved(tmp_path, **arrays):
+    np.savez(tmp_path / "a.npz", **arrays)
+    return tmp_path / "a.npz"
+
+
+def npy(tmp_path, values):
+    np.save(tmp_path / "a.npy", values, allow_pickle=True)
+    return tmp_path / "a.npy"
+
+
+def cut(path, size):
+    path.write_bytes(path.read_bytes()[:size])
+    return path
+
+
+def plain(tmp_path, content):
+    (tmp_path / "a").write_bytes(content)
+    return tmp_path / "a"
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda t: t / "absent.csv", "No such file"),
+        (lambda t: t, "Is a directory"),
+        (lambda t: plain(t, b"\x00\x01\x02"), "is not CSV, NPY, NPZ or HDF5"),
+        (lambda t: plain(t, b"\xff\xfe\xfd"), "is not CSV, NPY, NPZ or HDF5"),
+        (lambda t: npy(t, np.ones((3, 8, 8))), "8 × 8 pixels, but the sensor's have 2 × 3"),
+        (lambda t: npy(t, np.ones((3, 6))), "3 × 6 pixels"),
+        (lambda t: npy(t, np.ones(6)), r"must have shape .*got \(6,\)"),
+        (lambda t: npy(t, np.ones((0, 2, 3))), "holds no frames"),
+        (lambda t: npy(t, np.ones((2, 3), complex)), "real numbers, got complex128"),
+        (lambda t: npy(t, np.array([[1, None, "x"]] * 2)), "cannot be read"),  # a pickle is never loaded
+        (lambda t: cut(npy(t, np.ones((2, 3))), 100), "cannot be read"),
+        (lambda t: cut(npy(t, np.ones((2, 3))), 140), "cannot be read"),
+        (lambda t: saved(t, z=IMAGE), "must have an array 'range', got z"),
+        (lambda t: saved(t, range=IMAGE, amplitude=np.ones((4, 2, 3))), "'amplitude' must have the shape of 'range'"),
+        (lambda t: saved(t, range=IMAGE, amplitude=-IMAGE), "'amplitude_e' must be finite and not negative"),
+        (lambda t: saved(t, range=IMAGE, unit="furlong"), "its unit must be one of m, cm, mm, got 'furlong'"),
+        (lambda t: cut(saved(t, range=IMAGE), 200), "cannot be read"),
+        (lambda t: hdf5_file(t, {"depth": IMAGE}), "must have a dataset 'range', got depth"),
+        (lambda t: hdf5_file(t, {"range/x": IMAGE}), "must have a dataset 'range'"),
+        (
+            lambda t: hdf5_file(t, {"range": IMAGE, "amplitude": IMAGE}, {"amplitude": {"units": "mV"}}),
+            "'amplitude' must be in electrons",
+        ),
+        (lambda t: cut(hdf5_file(t, {"range": IMAGE}), 600), "cannot be read"),
+    ],
+)
+def test_a_bad_file_is_an_input_error_of_one_line(tmp_path, make, reason):
+    path = make(tmp_path)
+    with pytest.raises(InputFileError, match=reason) as caught:
+        read_frames(path, sensor=SMALL, **STATED)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
