@@ -47,6 +47,14 @@ class BankGroup:
     ``views`` below stands for (distance, delta) in `lower`, (class, distance) in `upper` and (class, distance, delta)
     in `full`.
 
+    Parameters
+    ----------
+    name : {"lower", "upper", "full"}
+    group : h5py.Group
+    path : Path
+        Name of the file, for messages.
+    sensor : Sensor
+
     Attributes
     ----------
     distance_m, delta_rad : (n,) float64
@@ -147,6 +155,13 @@ class BankGroup:
 
 class Bank:
     """Model images over distance, angle and class; made by :func:`open_bank`, and a context manager.
+
+    Parameters
+    ----------
+    file : h5py.File
+        Open for reading; the bank closes it.
+    path : Path
+        Its name, for messages.
 
     Attributes
     ----------

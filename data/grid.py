@@ -62,6 +62,14 @@ def parse_grid(grid: str | float | Sequence[float], name: str = "grid") -> NDArr
 def format_grid(values: NDArray[np.float64] | Sequence[float]) -> str:
     """Return the shortest text from which :func:`parse_grid` makes these values again.
 
+    Parameters
+    ----------
+    values : sequence of float
+
+    Returns
+    -------
+    str
+
     Examples
     --------
     >>> format_grid([0.7, 0.71, 0.72])

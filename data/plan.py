@@ -207,6 +207,14 @@ class BankPlan(_PlanModel):
 def load_plan(path: str | os.PathLike[str]) -> BankPlan:
     """Read a bank's plan from a TOML file; files it names are relative to its folder.
 
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    BankPlan
+
     Raises
     ------
     InputFileError

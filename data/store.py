@@ -120,7 +120,19 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
 
 
 def write_checksum(path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write ``FILE.sha256`` for an existing file, in the format of ``sha256sum``, and return its path.
+    """Write ``FILE.sha256`` for an existing file, in the format of ``sha256sum``.
+
+    Parameters
+    ----------
+    path : path-like
+        The file to sum up.
+    force : bool
+        Whether an existing checksum file may be replaced.
+
+    Returns
+    -------
+    Path
+        The checksum file.
 
     Raises
     ------
@@ -134,7 +146,17 @@ def write_checksum(path: str | os.PathLike[str], *, force: bool = False) -> Path
 
 
 def read_checksum(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 that ``FILE.sha256`` states for a file, in lower-case hexadecimal.
+    """Return the SHA-256 that ``FILE.sha256`` states for a file.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, not its checksum.
+
+    Returns
+    -------
+    str
+        Lower-case hexadecimal.
 
     Raises
     ------
@@ -155,7 +177,17 @@ def read_checksum(path: str | os.PathLike[str]) -> str:
 
 
 def verify_checksum(path: str | os.PathLike[str]) -> str:
-    """Compare a file with its ``FILE.sha256`` and return the SHA-256 both agree on.
+    """Compare a file with its ``FILE.sha256``.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, not its checksum.
+
+    Returns
+    -------
+    str
+        The SHA-256 both agree on.
 
     Raises
     ------

@@ -160,6 +160,10 @@ def check_mesh(mesh: trimesh.Trimesh) -> MeshReport:
     ----------
     mesh : trimesh.Trimesh
         Metres.
+
+    Returns
+    -------
+    MeshReport
     """
     watertight = bool(mesh.is_watertight)
     volume = float(mesh.volume) if watertight else None

@@ -104,6 +104,10 @@ class Match:
 class Matches(Sequence[Match]):
     """The matches of a batch; the fields of :class:`Match` are there as arrays too.
 
+    Parameters
+    ----------
+    matches : iterable of Match
+
     Attributes
     ----------
     class_name : (n,) object

@@ -292,7 +292,18 @@ class _Cell:
 
 
 def background_image(background: Background, sensor: Sensor) -> PhasorImages:
-    """Return what a background alone returns, straight ahead: one image."""
+    """Return what a background alone returns, straight ahead.
+
+    Parameters
+    ----------
+    background : Background
+    sensor : Sensor
+
+    Returns
+    -------
+    PhasorImages
+        One image.
+    """
     return Renderer(None, sensor).render(distance_m=1.0, background=background)
 
 

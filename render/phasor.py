@@ -37,14 +37,38 @@ def phasor_to_range_m(phasor: NDArray[np.complexfloating], sensor: Sensor) -> ND
 
 
 def wrap_range_m(range_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
-    """Bring ranges into [0, c/2f), metres."""
+    """Bring ranges into [0, c/2f).
+
+    Parameters
+    ----------
+    range_m : array_like
+        Metres.
+    sensor : Sensor
+
+    Returns
+    -------
+    ndarray
+        Metres, in the shape of `range_m`.
+    """
     wrapped = np.asarray(range_m, dtype=np.float64) % sensor.unambiguous_range_m
     # the modulo of a tiny negative range rounds up to the period itself
     return np.where(wrapped >= sensor.unambiguous_range_m, 0.0, wrapped)
 
 
 def wrap_difference_m(difference_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
-    """Bring differences of ranges into [−c/4f, c/4f), metres; a difference that is there already stays as it is."""
+    """Bring differences of ranges into [−c/4f, c/4f).
+
+    Parameters
+    ----------
+    difference_m : array_like
+        Metres.
+    sensor : Sensor
+
+    Returns
+    -------
+    ndarray
+        Metres, in the shape of `difference_m`; a difference that is there already stays as it is.
+    """
     difference = np.asarray(difference_m, dtype=np.float64)
     period = sensor.unambiguous_range_m
     return difference - period * np.floor(difference / period + 0.5)
