@@ -11,27 +11,38 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from phasemark import PhasemarkError, StorageError, UsageError, __version__
+from phasemark import OutputExistsError, PhasemarkError, StorageError, UsageError, __version__
 
 if TYPE_CHECKING:
     from types import FrameType
 
-    from phasemark.render import Sensor
+    from rich.progress import Progress
+    from trimesh import Trimesh
+
+    from phasemark.data import Bank
+    from phasemark.landmarks import LandmarkSpec
+    from phasemark.matcher import FilteredFrames, Match, Matches
+    from phasemark.render import Background, Sensor
 
 __all__ = ["app", "main"]
+
+_ORIGIN_HELP = "What becomes the origin: file (its own), base (centre of its foot) or center (of its bounding box)."
 
 _FIRST_STEPS = """\
 phasemark renders, banks and matches what a low-resolution time-of-flight camera sees of a 3D landmark.
 
 Start with
-  phasemark sensor list             the cameras that are shipped
-  phasemark sensor show pmd-16x16   one of them, as a sensor file to edit
+  phasemark demo                    the paper's experiment, with a report, in about a minute
+  phasemark landmark list           the landmarks of the catalogue
+  phasemark render --class cylinder --distance 1.0 --delta 30 --wall 4 -o frame.png
+  phasemark bank build -o bank.h5   a bank of model images to match your frames against
+  phasemark match bank.h5 measured.csv --unit m --quantity range
   phasemark --help                  all commands; COMMAND --help explains one
 """
 
@@ -41,10 +52,24 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+_landmark_app = typer.Typer(help="The landmarks: the catalogue and mesh files.")
 _sensor_app = typer.Typer(help="The cameras: shipped presets and sensor files.")
+_bank_app = typer.Typer(help="Banks of model images.")
+app.add_typer(_landmark_app, name="landmark")
 app.add_typer(_sensor_app, name="sensor")
+app.add_typer(_bank_app, name="bank")
 
 _Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+_Force = Annotated[bool, typer.Option("--force", help="Replace an output that exists.")]
+_Unit = Annotated[str | None, typer.Option("--unit", help="Unit of the mesh file: m, cm, mm or inch.")]
+_Up = Annotated[str, typer.Option("--up", help="Axis of the mesh file that points up: x, y, z, -x, -y or -z.")]
+_Origin = Annotated[str, typer.Option("--origin", help=_ORIGIN_HELP)]
+_SensorOption = Annotated[
+    str, typer.Option("--sensor", metavar="NAME|FILE", help="A preset, or a sensor file (.toml).")
+]
+_Wall = Annotated[float | None, typer.Option("--wall", metavar="M", help="Distance of a wall behind the landmark.")]
+_Floor = Annotated[float | None, typer.Option("--floor", metavar="M", help="How far a floor lies below the lens.")]
+_Workers = Annotated[int | None, typer.Option("--workers", help="Threads; the result does not depend on it.")]
 
 
 def _print_version(wanted: bool) -> None:
@@ -102,6 +127,508 @@ def _sensor_show(
     typer.echo(f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {sensor.metres_per_radian:.6f} m per radian")
     for key, value in sensor.model_dump(mode="json").items():
         typer.echo(f"# {key} is not set" if value is None else f"{key} = {json.dumps(value)}")
+
+
+@_landmark_app.command("list")
+def _landmark_list(as_json: _Json = False) -> None:
+    """List the landmarks of the catalogue."""
+    from phasemark.landmarks import catalog
+
+    specs = catalog()
+    if as_json:
+        _echo_json([spec.model_dump(mode="json") for spec in specs.values()])
+        return
+    _echo_table(
+        ("class", "box (m)", "upper part", "albedo", "repeats every"),
+        (
+            (
+                name,
+                f"{spec.box.length_m:g} × {spec.box.width_m:g} × {spec.box.height_m:g}",
+                _describe_upper(spec),
+                f"{spec.albedo:g}",
+                f"{360 / spec.symmetry:g}°",
+            )
+            for name, spec in specs.items()
+        ),
+    )
+
+
+@_landmark_app.command("show")
+def _landmark_show(
+    name_or_file: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A class, or an STL, PLY, OBJ or OFF file.")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for NAME.png and NAME.html.")] = None,
+    unit: _Unit = None,
+    up: _Up = "z",
+    origin: _Origin = "file",
+    force: _Force = False,
+) -> None:
+    """Draw a landmark: a shaded picture, and a page to turn it in 3D."""
+    from phasemark.data import write_atomically
+    from phasemark.landmarks import mesh_html, mesh_picture
+
+    name, mesh = _load_landmark(name_or_file, unit, up, origin)
+    folder = out or Path()
+    picture, page = folder / f"{name}.png", folder / f"{name}.html"
+    _refuse_existing([picture, page], force)
+    write_atomically(picture, mesh_picture(mesh), force=force)
+    write_atomically(page, mesh_html(mesh, name).encode(), force=force)
+    typer.echo(picture)
+    typer.echo(page)
+
+
+@_landmark_app.command("export")
+def _landmark_export(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A class of the catalogue.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The file; .stl, .ply, .obj or .off.")],
+    force: _Force = False,
+) -> None:
+    """Write a landmark of the catalogue as a mesh, in metres."""
+    from phasemark.data import write_atomically
+    from phasemark.landmarks import export_mesh
+
+    _, mesh = _load_landmark(name, None, "z", "file", from_catalog=True)
+    typer.echo(write_atomically(out, export_mesh(mesh, out.suffix.removeprefix(".")), force=force))
+
+
+@_landmark_app.command("check")
+def _landmark_check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="An STL, PLY, OBJ or OFF file.")],
+    unit: _Unit = None,
+    up: _Up = "z",
+    origin: _Origin = "file",
+    as_json: _Json = False,
+) -> None:
+    """Check a mesh file and say what it holds."""
+    import dataclasses
+
+    from phasemark.landmarks import check_mesh
+
+    _, mesh = _load_landmark(str(file), unit, up, origin)
+    report = dataclasses.asdict(check_mesh(mesh))
+    if as_json:
+        _echo_json({"file": str(file), **report})
+        return
+    warnings = report.pop("warnings")
+    _echo_facts({"file": file, **report})
+    for warning in warnings:
+        _report(warning)
+
+
+@app.command("render")
+def _render(
+    distance: Annotated[float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png; the data go beside it as .npz.")],
+    delta: Annotated[float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen.")] = 0.0,
+    bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
+    height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the optical axis.")] = 0.0,
+    class_name: Annotated[str | None, typer.Option("--class", help="A class of the catalogue.")] = None,
+    mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
+    unit: _Unit = None,
+    up: _Up = "z",
+    origin: _Origin = "file",
+    sensor: _SensorOption = "pmd-16x16",
+    wall: _Wall = None,
+    floor: _Floor = None,
+    force: _Force = False,
+) -> None:
+    """Render one noise-free frame: a picture, the phasors, and a sketch in the terminal."""
+    import io as bytes_io
+    import math
+
+    import numpy as np
+
+    from phasemark.data import write_atomically
+    from phasemark.render import Renderer, terminal_picture
+
+    if (class_name is None) == (mesh_file is None):
+        raise UsageError("say what to render: either --class NAME or --mesh NAME=FILE")
+    if out.suffix.lower() != ".png":
+        raise UsageError(f"the picture must be a .png file, got '{out}'")
+    data = out.with_suffix(".npz")
+    _refuse_existing([out, data], force)
+    if class_name is not None:
+        _, mesh = _load_landmark(class_name, None, "z", "file", from_catalog=True)
+    else:
+        assert mesh_file is not None
+        _, path = _name_and_file(mesh_file)
+        _, mesh = _load_landmark(path, unit, up, origin)
+    image = Renderer(mesh, _load_sensor(sensor), albedo=mesh.metadata.get("albedo", 0.8)).render(
+        distance, math.radians(delta), math.radians(bearing), height, background=_background(wall, floor)
+    )
+    arrays = {
+        "phasor": image.phasor[0],
+        "intensity": image.intensity[0],
+        "coverage": image.coverage[0],
+        "range": image.range_m[0],
+        "unit": "m",
+        "quantity": "range",
+    }
+    buffer, picture = bytes_io.BytesIO(), bytes_io.BytesIO()
+    np.savez(buffer, **arrays)
+    image.plot().savefig(picture, format="png", dpi=120)
+    write_atomically(data, buffer.getvalue(), force=force)
+    write_atomically(out, picture.getvalue(), force=force)
+    if sys.stdout.isatty():
+        from rich.console import Console
+
+        Console().print(terminal_picture(image.range_m[0], width=48))
+    typer.echo(out)
+    typer.echo(data)
+
+
+@_bank_app.command("build")
+def _bank_build(
+    out: Annotated[Path, typer.Option("-o", "--out", help="The bank to write; its checksum goes beside it.")],
+    plan_file: Annotated[
+        Path | None, typer.Argument(metavar="[PLAN]", help="A plan (.toml); options override it.")
+    ] = None,
+    classes: Annotated[list[str] | None, typer.Option("--class", help="A class of the catalogue; repeatable.")] = None,
+    meshes: Annotated[list[str] | None, typer.Option("--mesh", metavar="NAME=FILE", help="Repeatable.")] = None,
+    unit: _Unit = None,
+    up: _Up = "z",
+    origin: _Origin = "file",
+    symmetry: Annotated[int, typer.Option("--symmetry", help="Turns that leave the mesh as it is.")] = 1,
+    sensor: Annotated[
+        str | None, typer.Option("--sensor", metavar="NAME|FILE", help="A preset or sensor file.")
+    ] = None,
+    distance: Annotated[str | None, typer.Option("--distance", metavar="START:STOP:STEP", help="Metres.")] = None,
+    delta: Annotated[str | None, typer.Option("--delta", metavar="START:STOP:STEP", help="Degrees.")] = None,
+    model: Annotated[str | None, typer.Option("--model", help="ray, or planar: the paper's own generator.")] = None,
+    full: Annotated[bool, typer.Option("--full", help="Every class at every D and δ; a must for meshes.")] = False,
+    workers: _Workers = None,
+    force: _Force = False,
+) -> None:
+    """Build a bank of noise-free model images."""
+    from phasemark.data import BankPlan, MeshPlan, build_bank, load_plan
+
+    plan = BankPlan() if plan_file is None else load_plan(plan_file)
+    changes: dict[str, Any] = {}
+    if classes or meshes:
+        changes["classes"] = tuple(classes or ())
+        changes["landmarks"] = ()
+        changes["meshes"] = tuple(
+            MeshPlan(
+                name=name,
+                path=path,
+                unit=_stated_unit(path, unit),
+                up=up,  # type: ignore[arg-type]  # MeshPlan says what is right
+                origin=origin,  # type: ignore[arg-type]
+                symmetry=symmetry,
+            )
+            for name, path in map(_name_and_file, meshes or ())
+        )
+    for key, value in (("sensor", sensor), ("distance_m", distance), ("delta_deg", delta), ("model", model)):
+        if value is not None:
+            changes[key] = value
+    if full or meshes:
+        changes["layout"] = "full"
+    plan = BankPlan(**{**plan.model_dump(), **changes})
+    with _Progress("rendering") as progress, build_bank(plan, out, force=force, workers=workers, progress=progress):
+        pass
+    typer.echo(out)
+
+
+@_bank_app.command("info")
+def _bank_info(
+    bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank.")],
+    as_json: _Json = False,
+) -> None:
+    """Say what a bank holds."""
+    from phasemark.data import open_bank
+
+    with open_bank(bank) as opened:
+        info = opened.info()
+    if as_json:
+        _echo_json(info)
+    else:
+        _echo_facts(info)
+
+
+@app.command("match")
+def _match(
+    bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank.")],
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Measured frames: CSV, NPY, NPZ or HDF5.")],
+    unit: Annotated[str | None, typer.Option("--unit", help="Unit of the frames: m, cm or mm.")] = None,
+    quantity: Annotated[
+        str | None, typer.Option("--quantity", help="range (along the ray) or z (along the optical axis).")
+    ] = None,
+    invalid_means: Annotated[
+        str, typer.Option("--invalid-means", help="What an invalid pixel stands for: missing or no-return.")
+    ] = "missing",
+    valid_status: Annotated[
+        list[int] | None, typer.Option("--valid-status", help="Value of 'status' that marks a valid pixel; repeatable.")
+    ] = None,
+    flip_h: Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")] = False,
+    flip_v: Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")] = False,
+    rotate: Annotated[int, typer.Option("--rotate", help="Turn the image clockwise by 0, 90, 180 or 270 degrees.")] = 0,
+    filter_name: Annotated[str, typer.Option("--filter", help="kalman or phasor-mean.")] = "kalman",
+    method: Annotated[
+        str, typer.Option("--method", help="nearest: the paper's minimum-distance classifier.")
+    ] = "nearest",
+    wall: _Wall = None,
+    floor: _Floor = None,
+    landmark_xy: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--landmark-xy", metavar="X Y", help="Where the landmark stands, metres."),
+    ] = None,
+    landmark_yaw: Annotated[float, typer.Option("--landmark-yaw", metavar="DEG", help="Heading of its x' axis.")] = 0.0,
+    pan: Annotated[float, typer.Option("--pan", metavar="DEG", help="Pan angle of the camera on the robot.")] = 0.0,
+    prior: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--prior", metavar="X Y DEG", help="Where the robot is thought to be; orders the solutions."),
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Draw measured, model and residual into this .png.")
+    ] = None,
+    as_json: _Json = False,
+    force: _Force = False,
+) -> None:
+    """Match measured frames against a bank, and place the robot.
+
+    All frames of a file are averaged: the camera stands still. A file of shape (n, frames, rows, cols) has n positions.
+    """
+    import math
+
+    from phasemark.data import open_bank, read_frames
+    from phasemark.matcher import Matcher, kalman_filter, phasor_mean
+
+    filters = {"kalman": kalman_filter, "phasor-mean": phasor_mean}
+    if filter_name not in filters:
+        raise UsageError(f"unknown filter '{filter_name}': give {' or '.join(filters)}")
+    if prior is not None and landmark_xy is None:
+        raise UsageError("--prior needs --landmark-xy: without it there is no robot position")
+    if plot is not None:
+        _refuse_existing([plot], force)
+    background = _background(wall, floor)
+    with open_bank(bank) as opened:
+        measured = read_frames(
+            frames,
+            sensor=opened.sensor,
+            unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
+            quantity=quantity,  # type: ignore[arg-type]
+            invalid_means=invalid_means,  # type: ignore[arg-type]
+            valid_status=valid_status,
+            flip_h=flip_h,
+            flip_v=flip_v,
+            rotate=rotate,
+        )
+        filtered = filters[filter_name](measured)
+        matches = Matcher(opened, method, background=background).match(filtered)
+        if plot is not None:
+            _save_match_pictures(plot, filtered, matches, opened, background, force)
+    answers = []
+    for match in matches:
+        answer = match.as_dict()
+        if landmark_xy is not None:
+            answer["poses"] = _poses(match, landmark_xy, math.radians(landmark_yaw), math.radians(pan), prior)
+        answers.append(answer)
+    if as_json:
+        _echo_json({"bank": str(bank), "frames": str(frames), "matches": answers})
+        return
+    _echo_matches(answers)
+    if plot is not None:
+        typer.echo(plot)
+
+
+@app.command("demo")
+def _demo(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, the tables and the bank.")] = Path(
+        "out/demo"
+    ),
+    seed: Annotated[int, typer.Option("--seed", help="Root of all random numbers.")] = 2005,
+    workers: _Workers = None,
+    as_json: _Json = False,
+    force: _Force = False,
+) -> None:
+    """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°."""
+    from phasemark.matcher.demo import cell_rows, run_demo, write_demo
+    from phasemark.matcher.report import summary_rows
+
+    outputs = [out / name for name in ("bank.h5", "report.html", "cells.csv", "trials.csv")]
+    _refuse_existing(outputs, force)
+    out.mkdir(parents=True, exist_ok=True)
+    with _Progress("matching") as progress:
+        result = run_demo(outputs[0], seed=seed, workers=workers, force=force, progress=progress)
+    report = write_demo(result, out, force=force)
+    if as_json:
+        _echo_json({"report": str(report), "seconds": result.seconds, "cells": cell_rows(result.cells)})
+        return
+    header = ("D (cm)", "δ (°)", "class right", "|ΔD| mm", "worst", "|Δδ| °", "worst", "position mm", "worst")
+    for title, shifted in (("on the bank's grid", False), ("between grid points", True)):
+        typer.echo(f"{title}: medians and worst over the classes")
+        _echo_table(header, summary_rows(result.select(shifted=shifted)))
+        typer.echo("")
+    typer.echo(report)
+
+
+def _save_match_pictures(
+    path: Path,
+    filtered: FilteredFrames,
+    matches: Matches,
+    bank: Bank,
+    background: Background | None,
+    force: bool,
+) -> None:
+    """Draw each match; more than one get a number before the suffix."""
+    import io as bytes_io
+
+    from phasemark.data import write_atomically
+    from phasemark.matcher.picture import match_picture
+
+    for k, match in enumerate(matches):
+        buffer = bytes_io.BytesIO()
+        match_picture(filtered, match, bank, background, k).savefig(buffer, format="png", dpi=120)
+        target = path if len(matches) == 1 else path.with_stem(f"{path.stem}-{k}")
+        write_atomically(target, buffer.getvalue(), force=force)
+
+
+def _poses(
+    match: Match,
+    landmark_xy: tuple[float, float],
+    landmark_yaw_rad: float,
+    pan_rad: float,
+    prior: tuple[float, float, float] | None,
+) -> list[dict[str, Any]]:
+    """Return the robot poses of a match as plain numbers, best first; none if there is no landmark."""
+    import math
+
+    from phasemark.matcher import robot_poses
+
+    if match.class_name is None:
+        return []
+    believed = None if prior is None else (prior[0], prior[1], math.radians(prior[2]))
+    poses = robot_poses(match, landmark_xy, landmark_yaw_rad, pan_rad, prior=believed)
+    return [
+        {
+            "x_m": pose.x_m,
+            "y_m": pose.y_m,
+            "heading_deg": math.degrees(pose.heading_rad),
+            "covariance": None if pose.covariance is None else pose.covariance.tolist(),
+        }
+        for pose in poses
+    ]
+
+
+def _echo_matches(answers: Sequence[dict[str, Any]]) -> None:
+    """Print one line a match, and one a pose."""
+    rows = []
+    for k, answer in enumerate(answers):
+        found = answer["class"] is not None
+        rows.append(
+            (
+                str(k),
+                answer["class"] or "no landmark",
+                f"{answer['distance_m']:.3f}" if found else "",
+                f"{answer['delta_deg']:.2f}" if found else "",
+                "yes" if answer["accepted"] else "no",
+                "" if answer["p_value"] is None else f"{answer['p_value']:.3g}",
+                "  or  ".join(
+                    f"({pose['x_m']:.3f}, {pose['y_m']:.3f}) m heading {pose['heading_deg']:.2f}°"
+                    for pose in answer.get("poses", ())
+                ),
+            )
+        )
+    _echo_table(("position", "class", "D (m)", "δ (°)", "accepted", "p", "robot"), rows)
+
+
+def _load_landmark(
+    name_or_file: str, unit: str | None, up: str, origin: str, *, from_catalog: bool = False
+) -> tuple[str, Trimesh]:
+    """Return the name and mesh of a class of the catalogue, or of a mesh file; warnings go to stderr."""
+    import warnings
+
+    from phasemark.landmarks import build_mesh, catalog, read_mesh
+
+    specs = catalog()
+    if name_or_file in specs:
+        return name_or_file, build_mesh(specs[name_or_file])
+    path = Path(name_or_file)
+    if from_catalog or not (path.suffix or path.exists()):
+        raise UsageError(f"unknown class '{name_or_file}': the catalogue has {', '.join(specs)}")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        mesh = read_mesh(path, unit=unit, up=up, origin=origin)
+    for warning in caught:
+        _report(str(warning.message))
+    return path.stem, mesh
+
+
+def _name_and_file(text: str) -> tuple[str, str]:
+    """Split NAME=FILE."""
+    name, separator, path = text.partition("=")
+    if not (name and separator and path):
+        raise UsageError(f"--mesh must be NAME=FILE, got '{text}'")
+    return name, path
+
+
+def _stated_unit(path: str, unit: str | None) -> Any:
+    """Return the unit, or let the mesh reader say what the extents would be in each."""
+    if unit is None:
+        from phasemark.landmarks import read_mesh
+
+        read_mesh(path, unit=None)
+    return unit
+
+
+def _background(wall: float | None, floor: float | None) -> Background | None:
+    from phasemark.render import Background
+
+    return None if wall is None and floor is None else Background(wall_m=wall, floor_m=floor)
+
+
+def _refuse_existing(paths: Iterable[Path], force: bool) -> None:
+    """Refuse outputs that exist before any work is done."""
+    for path in paths:
+        if path.exists() and not force:
+            raise OutputExistsError(f"{path}: exists already; --force replaces it")
+
+
+class _Progress:
+    """A progress bar on stderr, called with (done, total); nothing if stderr is not a terminal."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+
+    def __enter__(self) -> Callable[[int, int], None] | None:
+        self._bar: Progress | None = None
+        if not sys.stderr.isatty():
+            return None
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+        self._bar.start()
+        task = self._bar.add_task(self._what, total=None)
+        bar = self._bar
+        return lambda done, total: bar.update(task, completed=done, total=total)
+
+    def __exit__(self, *error: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+
+def _describe_upper(spec: LandmarkSpec) -> str:
+    if spec.upper is None:
+        return "none"
+    fields = spec.upper.model_dump(exclude={"kind", "profile_m"})
+    return " ".join([spec.upper.kind, *(f"{key.removesuffix('_m')} {value:g}" for key, value in fields.items())])
+
+
+def _echo_facts(facts: Mapping[str, Any]) -> None:
+    """Print one fact a line, names aligned."""
+    width = max(map(len, facts))
+    for key, value in facts.items():
+        if isinstance(value, Mapping):
+            value = ", ".join(f"{k} {v}" for k, v in value.items())
+        elif isinstance(value, list | tuple):
+            value = ", ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value)
+        typer.echo(f"{key.replace('_', ' ').ljust(width)}  {value}")
+
+
+def _report(message: str) -> None:
+    """Write one line to stderr."""
+    typer.echo(f"note: {message}", err=True)
 
 
 def _load_sensor(name_or_file: str) -> Sensor:

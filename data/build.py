@@ -32,8 +32,8 @@ from phasemark.data.layout import Layout, place
 from phasemark.data.plan import BankPlan, factored_refusal
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.store import replacing
-from phasemark.landmarks import LandmarkSpec, build_mesh, read_mesh
-from phasemark.render import PhasorImages, Renderer, Sensor, Views
+from phasemark.landmarks import LandmarkSpec, Revolution, build_mesh, read_mesh
+from phasemark.render import PhasorImages, PlanarLandmark, Renderer, Sensor, Views, planar_images
 
 BATCH_PIXELS = 1 << 19
 """Pixels rendered at a time: 2048 images of 16 × 16, some 20 MB."""
@@ -164,9 +164,24 @@ def _images_of(
     workers: int,
 ) -> ImagesOf:
     """Return the function that makes the model images of a landmark, or of one of its parts, on some rows."""
+    if plan.model == "planar":
+        assert landmark.spec is not None  # _refuse_impossible has seen to it
+        outline = _top_view(landmark.spec)
+        return lambda views: planar_images(
+            outline, sensor, views, albedo=landmark.albedo, harmonics=plan.harmonics, rows=rows
+        )
     mesh = landmark.mesh if landmark.spec is None else build_mesh(landmark.spec, part=part)
     renderer = Renderer(mesh, sensor, albedo=landmark.albedo, harmonics=plan.harmonics)
     return lambda views: renderer.render_views(views, rows=rows, workers=workers)
+
+
+def _top_view(spec: LandmarkSpec) -> PlanarLandmark:
+    """Return what the paper's generator knows of a landmark."""
+    upper = spec.upper
+    if upper is None:
+        return PlanarLandmark(spec.box.length_m, spec.box.width_m)
+    profile = upper.profile_m if isinstance(upper, Revolution) else upper.radius_at_m
+    return PlanarLandmark(spec.box.length_m, spec.box.width_m, profile)
 
 
 def _slabs(plan: BankPlan, sensor: Sensor, landmarks: list[Landmark], workers: int) -> Iterator[_Slab]:

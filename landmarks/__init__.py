@@ -1,8 +1,14 @@
 """What stands in the world: the parts, the catalogue, and meshes from files."""
 
+from typing import TYPE_CHECKING
+
 from phasemark.landmarks.catalog import catalog
 from phasemark.landmarks.mesh import DEFAULT_TOLERANCE_M, LOWER, MAX_FACES, UPPER, build_mesh
+from phasemark.landmarks.reading import MeshReport, MeshWarning, check_mesh, export_mesh, read_mesh
 from phasemark.landmarks.spec import Box, Cone, Cylinder, LandmarkSpec, Revolution, Sphere
+
+if TYPE_CHECKING:
+    from phasemark.landmarks.picture import mesh_html, mesh_picture
 
 __all__ = [
     "DEFAULT_TOLERANCE_M",
@@ -13,8 +19,24 @@ __all__ = [
     "Cone",
     "Cylinder",
     "LandmarkSpec",
+    "MeshReport",
+    "MeshWarning",
     "Revolution",
     "Sphere",
     "build_mesh",
     "catalog",
+    "check_mesh",
+    "export_mesh",
+    "mesh_html",
+    "mesh_picture",
+    "read_mesh",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Import pictures when they are asked for: matplotlib takes half a second to load."""
+    if name in ("mesh_html", "mesh_picture"):
+        from phasemark.landmarks import picture
+
+        return getattr(picture, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

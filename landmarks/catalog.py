@@ -21,7 +21,7 @@ def catalog() -> dict[str, LandmarkSpec]:
     >>> list(catalog())
     ['cylinder', 'cone', 'sphere', 'post']
     """
-    uppers = {
+    uppers: dict[str, Cylinder | Cone | Sphere] = {
         "cylinder": Cylinder(radius_m=0.06, height_m=_HEIGHT_M),
         "cone": Cone(radius_m=0.075, height_m=_HEIGHT_M),
         "sphere": Sphere(radius_m=_HEIGHT_M / 2),

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.landmarks.spec import Cone, Cylinder, Revolution, Sphere
 
-CREASE_RAD = math.radians(30)  # PHYSICS section 3: faces that meet at more than this keep flat normals
 _MIN_SECTIONS = 24  # neighbouring faces meet at 15°, well below a crease
 
 # Side of the smallest pixel footprint in units of the permitted displacement: 1e-4 of coverage is displacement / side.
@@ -40,7 +39,7 @@ class Ring:
     @property
     def azimuths_rad(self) -> NDArray[np.float64]:
         """Azimuths of the corners, ascending, (count,)."""
-        return (np.arange(self.count) + self.phase) * (2 * math.pi / self.count)
+        return np.asarray((np.arange(self.count) + self.phase) * (2 * math.pi / self.count), dtype=np.float64)
 
     @property
     def vertices(self) -> NDArray[np.float64]:
@@ -53,7 +52,7 @@ class Ring:
         quarter = self.azimuths_rad[: self.count // 4]
         x, y = self.radius_m * np.cos(quarter), self.radius_m * np.sin(quarter)
         xy = np.vstack([np.c_[x, y], np.c_[-y, x], np.c_[-x, -y], np.c_[y, -x]])
-        return np.c_[xy, np.full(self.count, self.z_m)]
+        return np.asarray(np.c_[xy, np.full(self.count, self.z_m)])
 
 
 def revolve(upper: Cylinder | Cone | Sphere | Revolution, tolerance_m: float, max_faces: int) -> Triangles:
@@ -99,7 +98,7 @@ def outline(upper: Cylinder | Cone | Revolution) -> tuple[tuple[float, float], .
 
 
 def profile_rings(profile: tuple[tuple[float, float], ...], tolerance_m: float, max_faces: int) -> list[Ring]:
-    """Return one ring per point of a profile; discs close its ends, and pointed tips get a ring of their own.
+    """Return one ring per point of a profile; discs close its ends, a tip is a plain fan of triangles.
 
     All rings have the same corners in azimuth, so that every band is made of plane quadrilaterals.
     """
@@ -111,32 +110,12 @@ def profile_rings(profile: tuple[tuple[float, float], ...], tolerance_m: float, 
     _refuse_more_than(max_faces, 2.0 * count * len(profile))
     stretch = (math.pi / count) / math.sin(math.pi / count)
 
-    points = [*profile]
-    if points[0][0] == 0:
-        points[1:1] = _tip(points[0], points[1], tolerance_m)
-    if points[-1][0] == 0:
-        points[-1:-1] = _tip(points[-1], points[-2], tolerance_m)
-    rings = [Ring(r * stretch, z, count) if r > 0 else Ring(0.0, z) for r, z in points]
+    rings = [Ring(r * stretch, z, count) if r > 0 else Ring(0.0, z) for r, z in profile]
     if rings[0].count > 1:
         rings.insert(0, Ring(0.0, rings[0].z_m))
     if rings[-1].count > 1:
         rings.append(Ring(0.0, rings[-1].z_m))
     return rings
-
-
-def _tip(apex: tuple[float, float], other: tuple[float, float], tolerance_m: float) -> list[tuple[float, float]]:
-    """Return the point where a pointed end is cut off for shading, if it is pointed.
-
-    Smooth normals averaged at an apex point along the axis, and interpolation would carry them over the whole cone.
-    A ring close to the apex confines that to a tip whose picture is a tenth of the permitted error in area.
-    """
-    radius_m, rise_m = other[0], abs(other[1] - apex[1])
-    slant_m = math.hypot(radius_m, rise_m)
-    if 2 * math.asin(rise_m / slant_m) < CREASE_RAD:  # opposite sides meet like parts of one smooth surface
-        return []
-    tip_area_m2 = 0.1 * tolerance_m * _PIXEL_PER_TOLERANCE * tolerance_m
-    share = min(math.sqrt(tip_area_m2 / (radius_m * slant_m)), 0.1)
-    return [(share * radius_m, apex[1] + share * (other[1] - apex[1]))]
 
 
 def sphere_rings(radius_m: float, tolerance_m: float, max_faces: int) -> list[Ring]:

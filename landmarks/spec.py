@@ -58,6 +58,10 @@ class Cylinder(_Spec):
     radius_m: _Length
     height_m: _Length
 
+    def radius_at_m(self, z_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the radius at heights above the box, metres; 0 where there is none."""
+        return np.where((z_m >= 0) & (z_m <= self.height_m), self.radius_m, 0.0)
+
 
 class Cone(_Spec):
     """An upright circular cone, its tip up.
@@ -74,6 +78,10 @@ class Cone(_Spec):
     radius_m: _Length
     height_m: _Length
 
+    def radius_at_m(self, z_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the radius at heights above the box, metres; 0 where there is none."""
+        return np.where(z_m >= 0, self.radius_m * np.maximum(1 - z_m / self.height_m, 0.0), 0.0)
+
 
 class Sphere(_Spec):
     """A sphere that touches the box's top in one point.
@@ -86,6 +94,10 @@ class Sphere(_Spec):
 
     kind: Literal["sphere"] = "sphere"
     radius_m: _Length
+
+    def radius_at_m(self, z_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the radius at heights above the box, metres; 0 where there is none."""
+        return np.sqrt(np.maximum(self.radius_m**2 - (z_m - self.radius_m) ** 2, 0.0))
 
 
 class Revolution(_Spec):

@@ -9,13 +9,25 @@ from phasemark.matcher.filters import (
     kalman_step,
     phasor_mean,
 )
+from phasemark.matcher.match import Candidate, Match, Matches
+from phasemark.matcher.matcher import Matcher, background_image
+from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
 
 __all__ = [
+    "PRIOR_STD",
+    "Candidate",
     "FilteredFrames",
+    "Match",
+    "Matcher",
+    "Matches",
     "PixelKalman",
     "PixelState",
+    "RobotPose",
+    "ViewEstimate",
+    "background_image",
     "kalman",
     "kalman_filter",
     "kalman_step",
     "phasor_mean",
+    "robot_poses",
 ]

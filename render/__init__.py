@@ -7,6 +7,7 @@ from phasemark.render.capture import capture
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.noise import measured_range_std, predicted_range_std
 from phasemark.render.phasor import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
+from phasemark.render.planar import PlanarLandmark, planar_images
 from phasemark.render.renderer import Renderer
 from phasemark.render.sensor import Sensor, preset, preset_names
 from phasemark.render.view import Views
@@ -20,12 +21,14 @@ __all__ = [
     "Flag",
     "Frames",
     "PhasorImages",
+    "PlanarLandmark",
     "Renderer",
     "Sensor",
     "Views",
     "capture",
     "measured_range_std",
     "phasor_to_range_m",
+    "planar_images",
     "predicted_range_std",
     "preset",
     "preset_names",

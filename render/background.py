@@ -66,6 +66,8 @@ class Background:
         UsageError
             Naming the view and what would be right.
         """
+        if not len(vertices):
+            return
         if self.floor_m is not None:
             lowest = vertices[:, 2].min() + views.height_m
             bad = np.flatnonzero(lowest < -self.floor_m - 1e-9)

@@ -107,6 +107,22 @@ class MeshTopology:
             closed=bool(regular.all() and signed_volume > 0),
         )
 
+    @classmethod
+    def empty(cls) -> MeshTopology:
+        """Return a mesh of nothing."""
+        return cls(
+            vertices=np.zeros((0, 3)),
+            faces=np.zeros((0, 3), np.int32),
+            planes=np.zeros((0, 4)),
+            corner_normals=np.zeros((0, 3, 3)),
+            flat=np.zeros(0, np.bool_),
+            patch=np.zeros(0, np.int32),
+            part=np.zeros(0, np.int8),
+            creases=np.zeros((0, 4), np.int32),
+            folds=np.zeros((0, 4), np.int32),
+            closed=True,
+        )
+
 
 def _part_by_height(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int8]:
     """Tell the parts of an unlabelled mesh apart by the side of the interface plane their centre lies on."""

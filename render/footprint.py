@@ -21,13 +21,15 @@ from numpy.typing import NDArray
 
 MAX_SEGMENTS = 128
 """Edges in a box above which it is quartered rather than swept: crossings are searched pair by pair."""
+_MAX_LIMBS = 256
 _MAX_DEPTH = 5
 _MAX_EVENTS = 4 * MAX_SEGMENTS + 64
 _EMPTY = 1e-10
 """Pieces narrower than this (pixels) are not sampled."""
-_THIN = 0.2
+_THIN = 0.15
 """Slabs and intervals narrower than this (pixels) get one Gauss point."""
 
+_THIN_AT_LIMB = 0.06
 _REACH = 0.5
 """How far along the sweep (pixels) the end of a limb is felt."""
 _PINCH = 1e-6
@@ -149,21 +151,30 @@ def sample_pixel(  # type: ignore[no-untyped-def]
                 regions[n] = region
                 n += 1
         return n, region + 1, True
-    along_v, along_u = 0.0, 0.0
+    # sweep along the limb if there is one, else along where one is near, else along most of the edges
+    along = np.zeros(4)
     entry = head[i, j]
     while entry >= 0:
-        if limb[owner[entry]]:
-            s = segments[owner[entry]]
-            along_u += abs(min(max(s[2], c), c + 1) - min(max(s[0], c), c + 1))
-            along_v += abs(min(max(s[3], r), r + 1) - min(max(s[1], r), r + 1))
+        s = segments[owner[entry]]
+        kind = 2 * limb[owner[entry]]
+        along[kind] += abs(min(max(s[2], c), c + 1) - min(max(s[0], c), c + 1))
+        along[kind + 1] += abs(min(max(s[3], r), r + 1) - min(max(s[1], r), r + 1))
         entry = link[entry]
-    if along_u == 0.0 and along_v == 0.0:
-        sweep_v = sideways or not upright
+    has_limb = along[2] > 0.0 or along[3] > 0.0
+    if has_limb:
+        sweep_v = along[3] >= along[2]
+    elif sideways != upright:
+        sweep_v = sideways
     else:
-        sweep_v = along_v >= along_u
-    curved = sideways or upright or along_u > 0.0 or along_v > 0.0
-    # the neighbours across the sweep may hold the limb this pixel's surface ends at
-    before, after = (head[i, j - 1], head[i, j + 1]) if sweep_v else (head[i - 1, j], head[i + 1, j])
+        sweep_v = along[1] >= along[0]
+    curved = sideways or upright or has_limb
+    # the pixel itself and its neighbours across the sweep may hold the limb this pixel's surface ends at
+    limbs = np.empty((_MAX_LIMBS if curved else 0, 5))
+    n_limbs = 0
+    if curved:
+        before, after = (head[i, j - 1], head[i, j + 1]) if sweep_v else (head[i - 1, j], head[i + 1, j])
+        for near in (head[i, j], before, after):
+            n_limbs = _collect_limbs(near, link, owner, segments, limb, sweep_v, limbs, n_limbs)
     stack = np.empty((4 * _MAX_DEPTH + 4, 5))
     stack[0] = (u0, v0, u0 + width, v0 + height, 0.0)
     depth = 1
@@ -184,9 +195,8 @@ def sample_pixel(  # type: ignore[no-untyped-def]
             m, trusted = 0, False
         s0, s1, x0, x1 = (bv0, bv1, bu0, bu1) if sweep_v else (bu0, bu1, bv0, bv1)
         n, region = _sweep_box(
-            s0, s1, x0, x1, sweep_v, work, m, segments, limb, link, owner, head[i, j], before, after,
-            curved, inverse_area, points, weights, regions, n, region,
-        )  # fmt: skip
+            s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, inverse_area, points, weights, regions, n, region
+        )
         if n < 0:
             return -1, region, trusted
     return n, region, trusted
@@ -231,12 +241,8 @@ def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, wo
             work[m, 0], work[m, 1], work[m, 2], work[m, 3] = sb, xb, sa, xa
         work[m, 4] = side if limb[k] else 0.0
         m += 1
-    for i in range(1, m):  # sort by where they begin
-        j = i
-        while j > 0 and work[j - 1, 0] > work[j, 0]:
-            for k in range(5):
-                work[j - 1, k], work[j, k] = work[j, k], work[j - 1, k]
-            j -= 1
+    if m > 1:
+        work[:m] = work[np.argsort(work[:m, 0])]
     return m
 
 
@@ -272,31 +278,45 @@ def _events(s0, s1, work, m, events):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _nearest_limb(entry, link, owner, segments, limb, sweep_v, s, side, bound):  # type: ignore[no-untyped-def]
-    """Find the limb nearest to `bound`, beyond it and with its surface on our side, on or near the line at `s`.
+def _collect_limbs(entry, link, owner, segments, limb, sweep_v, limbs, n):  # type: ignore[no-untyped-def]
+    """Append a pixel's limbs: rows of s, x at the low end, s, x at the high end, and the side of the surface.
 
-    A limb that ends before it reaches the line (at a rim, say) still shapes the surface beside its end.
+    Returns their number; what no longer fits into `limbs` is left out.
     """
-    best = -np.inf if side > 0 else np.inf
-    closest = _REACH
-    while entry >= 0:
+    while entry >= 0 and n < len(limbs):
         k = owner[entry]
         entry = link[entry]
         if not limb[k]:
             continue
         if sweep_v:
             xa, sa, xb, sb = segments[k]
-            facing = 1.0 if sb > sa else -1.0
+            side = 1.0 if sb > sa else -1.0
         else:
             sa, xa, sb, xb = segments[k]
-            facing = -1.0 if sb > sa else 1.0
-        if facing != side or sa == sb:
+            side = -1.0 if sb > sa else 1.0
+        if sa == sb:
             continue
-        gap = max(min(sa, sb) - s, s - max(sa, sb), 0.0)
-        if gap > closest:
+        if sa > sb:
+            sa, xa, sb, xb = sb, xb, sa, xa
+        limbs[n, 0], limbs[n, 1], limbs[n, 2], limbs[n, 3], limbs[n, 4] = sa, xa, sb, xb, side
+        n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _nearest_limb(limbs, n_limbs, s, side, bound):  # type: ignore[no-untyped-def]
+    """Find the limb nearest to `bound`, beyond it and with its surface on our side, on or near the line at `s`.
+
+    A limb that ends before it reaches the line (at a rim, say) still shapes the surface beside its end.
+    """
+    best = -np.inf if side > 0 else np.inf
+    closest = _REACH
+    for i in range(n_limbs):
+        gap = max(limbs[i, 0] - s, s - limbs[i, 2], 0.0)
+        if limbs[i, 4] != side or gap > closest:
             continue
-        t = min(max((s - sa) / (sb - sa), 0.0), 1.0)
-        x = xa + t * (xb - xa)
+        t = min(max((s - limbs[i, 0]) / (limbs[i, 2] - limbs[i, 0]), 0.0), 1.0)
+        x = limbs[i, 1] + t * (limbs[i, 3] - limbs[i, 1])
         if (side > 0 and x > bound) or (side < 0 and x < bound):
             continue
         if gap < closest or (side > 0 and x > best) or (side < 0 and x < best):
@@ -305,131 +325,257 @@ def _nearest_limb(entry, link, owner, segments, limb, sweep_v, s, side, bound): 
 
 
 @njit(cache=True, nogil=True)
-def _plan_lines(lo, hi, x0, x1, work, m, curved):  # type: ignore[no-untyped-def]
+def _activate(lo, hi, work, m, started, active, n_active):  # type: ignore[no-untyped-def]
+    """Update the list of edges that span the slab [lo, hi], ordered along its middle line.
+
+    Returns how many edges have started, and how many are active.
+    """
+    middle = 0.5 * (lo + hi)
+    kept = 0
+    for i in range(n_active):
+        if work[active[i], 2] >= middle:
+            active[kept] = active[i]
+            kept += 1
+    n_active = kept
+    while started < m and work[started, 0] <= middle:
+        if work[started, 2] >= middle and work[started, 2] > work[started, 0]:
+            active[n_active] = started
+            n_active += 1
+        started += 1
+    for i in range(1, n_active):
+        edge = active[i]
+        x = _edge_at(work, edge, middle)
+        j = i
+        while j > 0 and _edge_at(work, active[j - 1], middle) > x:
+            active[j] = active[j - 1]
+            j -= 1
+        active[j] = edge
+    return started, n_active
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _edge_at(work, i, s):  # type: ignore[no-untyped-def]
+    """Return where an edge meets the line at `s`."""
+    return work[i, 1] + (s - work[i, 0]) * (work[i, 3] - work[i, 1]) / (work[i, 2] - work[i, 0])
+
+
+@njit(cache=True, nogil=True)
+def _plan_lines(lo, hi, x0, x1, work, active, n_active, curved):  # type: ignore[no-untyped-def]
     """Decide how many lines a slab needs, and at which of its ends a piece beside a limb shrinks to a point.
 
     The light of such a corner grows like the 3/2 power of the distance from it; lines placed at its square make that
     smooth. One line misses how the integrand changes along slanted edges, two are exact to third order.
+
+    Returns the number of lines, whether the slab is pinched at its low and at its high end, and whether it has a limb.
     """
-    slab, middle = hi - lo, 0.5 * (lo + hi)
+    slab = hi - lo
     slant = 0.0
     beside_limb, pinched_low, pinched_high = False, False, False
-    for i in range(m):
-        if not work[i, 0] <= middle <= work[i, 2] or work[i, 2] <= work[i, 0]:
-            continue
-        slope = (work[i, 3] - work[i, 1]) / (work[i, 2] - work[i, 0])
-        slant = max(slant, abs(slope) * slab)
-        if work[i, 4] == 0.0:
+    for i in range(n_active):
+        edge = active[i]
+        low, high = _edge_at(work, edge, lo), _edge_at(work, edge, hi)
+        slant = max(slant, abs(high - low))
+        if work[edge, 4] == 0.0:
             continue
         beside_limb = True
-        low, high = work[i, 1] + slope * (lo - work[i, 0]), work[i, 1] + slope * (hi - work[i, 0])
-        border = x1 if work[i, 4] > 0 else x0
-        pinched_low = pinched_low or abs(low - border) < _PINCH
-        pinched_high = pinched_high or abs(high - border) < _PINCH
-        for j in range(m):
-            if j == i or not work[j, 0] <= middle <= work[j, 2] or work[j, 2] <= work[j, 0]:
-                continue
-            k = (work[j, 3] - work[j, 1]) / (work[j, 2] - work[j, 0])
-            pinched_low = pinched_low or abs(work[j, 1] + k * (lo - work[j, 0]) - low) < _PINCH
-            pinched_high = pinched_high or abs(work[j, 1] + k * (hi - work[j, 0]) - high) < _PINCH
+        # what bounds the limb's own surface on its other side
+        other = i + 1 if work[edge, 4] > 0 else i - 1
+        other_low = other_high = x1 if work[edge, 4] > 0 else x0
+        if 0 <= other < n_active:
+            other_low, other_high = _edge_at(work, active[other], lo), _edge_at(work, active[other], hi)
+        pinched_low = pinched_low or abs(low - other_low) < _PINCH
+        pinched_high = pinched_high or abs(high - other_high) < _PINCH
     if pinched_low and pinched_high:
-        return 4, True, True
+        return 4, True, True, True
     if pinched_low or pinched_high:
-        return 3, pinched_low, pinched_high
-    if slab < _THIN and slab * slant * slant < 1e-3 and not (beside_limb and slab > 0.05):
-        return 1, False, False
+        return 3, pinched_low, pinched_high, True
+    if slab <= (_THIN_AT_LIMB if beside_limb else _THIN) and slab * slant * slant < 1e-3:
+        return 1, False, False, beside_limb
     if slab < 0.3:
-        return 2, False, False
-    return (5 if curved else 3), False, False
+        return 2, False, False, beside_limb
+    return (5 if curved else 3), False, False, beside_limb
+
+
+@njit(cache=True, nogil=True)
+def _continues(work, m, before, after, n, stop, lo):  # type: ignore[no-untyped-def]
+    """Tell whether the edges of two neighbouring slabs are the same, or links of the same chains.
+
+    Not so where edges cross, begin or end alone, or where one lies along the border between the slabs.
+    """
+    for i in range(n):
+        old, new = before[i], after[i]
+        if old == new:
+            continue
+        if work[old, 4] != work[new, 4] or abs(work[old, 2] - stop) > _EMPTY or abs(work[new, 0] - lo) > _EMPTY:
+            return False
+        if abs(work[old, 3] - work[new, 1]) > _PINCH:
+            return False
+    for i in range(m):
+        if work[i, 0] > lo + _EMPTY:
+            break
+        if work[i, 2] <= lo + _EMPTY and work[i, 0] >= stop - _EMPTY and abs(work[i, 3] - work[i, 1]) > _EMPTY:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _line_position(lines, g, pinched_low, pinched_high):  # type: ignore[no-untyped-def]
+    """Return the place of a line in its slab (0 … 1) and its share of it."""
+    if lines == 1:
+        return 0.5, 1.0
+    if lines == 2:
+        t, weight = _G2X[g], _G2W[g]
+    elif lines == 3:
+        t, weight = _G3X[g], _G3W[g]
+    elif lines == 4:
+        t, weight = _G4X[g], _G4W[g]
+    else:
+        t, weight = _G5X[g], _G5W[g]
+    if pinched_low and pinched_high:
+        return t * t * (3.0 - 2.0 * t), weight * 6.0 * t * (1.0 - t)
+    if pinched_low:
+        return t * t, weight * 2.0 * t
+    if pinched_high:
+        return t * (2.0 - t), weight * 2.0 * (1.0 - t)
+    return t, weight
+
+
+@njit(cache=True, nogil=True)
+def _write(nodes, count, sweep_v, scale, points, weights, regions, n, region):  # type: ignore[no-untyped-def]
+    """Write the nodes of a line, or of lines merged into one, as samples."""
+    if n + count > len(weights):
+        return -1, region
+    last = -1.0
+    for g in range(count):
+        weight, s, x = nodes[g, 0], nodes[g, 1] / nodes[g, 0], nodes[g, 2] / nodes[g, 0]
+        points[n, 0] = x if sweep_v else s
+        points[n, 1] = s if sweep_v else x
+        weights[n] = weight * scale
+        if nodes[g, 3] != last:
+            region += 1
+            last = nodes[g, 3]
+        regions[n] = region
+        n += 1
+    return n, region
 
 
 @njit(cache=True, nogil=True)
 def _sweep_box(  # type: ignore[no-untyped-def]
-    s0, s1, x0, x1, sweep_v, work, m, segments, limb, link, owner, own, before, after,
-    curved, scale, points, weights, regions, n, region,
-):  # fmt: skip
-    """Sample a box slab by slab; `scale` turns areas into weights."""
+    s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, scale, points, weights, regions, n, region
+):
+    """Sample a box slab by slab; `scale` turns areas into weights.
+
+    A rim or silhouette is a chain of many short edges, each of which makes a slab. Thin slabs that follow one another
+    without a change of structure are merged: their lines have corresponding nodes, and one sample at the centroid of
+    corresponding nodes, with their total weight, integrates a linear function over the union exactly.
+    """
     events = np.empty(_MAX_EVENTS)
     n_events = _events(s0, s1, work, m, events)
-    cross = np.empty(m + 2)
-    side = np.empty(m + 2)
+    cross, side = np.empty(m + 2), np.empty(m + 2)
+    nodes, merged = np.empty((4 * m + 4, 4)), np.empty((4 * m + 4, 4))
+    active, previous = np.empty(m, np.int64), np.empty(m, np.int64)
+    start_cross, start_slope = np.empty(m + 2), np.empty(m + 2)
+    started, n_active, n_previous = 0, 0, 0
+    n_merged, start, stop, start_line, n_slabs = 0, 0.0, -np.inf, 0.0, 0
     for e in range(n_events - 1):
         lo, hi = max(events[e], s0), min(events[e + 1], s1)
         slab = hi - lo
         if slab <= _EMPTY:
             continue
-        lines, pinched_low, pinched_high = _plan_lines(lo, hi, x0, x1, work, m, curved)
+        started, n_active = _activate(lo, hi, work, m, started, active, n_active)
+        lines, pinched_low, pinched_high, beside_limb = _plan_lines(lo, hi, x0, x1, work, active, n_active, curved)
+        k = n_active + 1
+        cross[0], side[0], cross[k], side[k] = x0, 0.0, x1, 0.0
         for g in range(lines):
-            if lines == 1:
-                t, line_weight = 0.5, slab
-            elif lines == 2:
-                t, line_weight = _G2X[g], _G2W[g] * slab
-            elif lines == 3:
-                t, line_weight = _G3X[g], _G3W[g] * slab
-            elif lines == 4:
-                t, line_weight = _G4X[g], _G4W[g] * slab
-            else:
-                t, line_weight = _G5X[g], _G5W[g] * slab
-            if pinched_low and pinched_high:
-                line_weight *= 6.0 * t * (1.0 - t)
-                t = t * t * (3.0 - 2.0 * t)
-            elif pinched_low:
-                line_weight *= 2.0 * t
-                t = t * t
-            elif pinched_high:
-                line_weight *= 2.0 * (1.0 - t)
-                t = t * (2.0 - t)
+            t, share = _line_position(lines, g, pinched_low, pinched_high)
             s = lo + t * slab
-            k = 1
-            cross[0], side[0] = x0, 0.0
-            for i in range(m):
-                if work[i, 0] <= s <= work[i, 2] and work[i, 2] > work[i, 0]:
-                    x = work[i, 1] + (s - work[i, 0]) * (work[i, 3] - work[i, 1]) / (work[i, 2] - work[i, 0])
-                    j = k
-                    while j > 1 and cross[j - 1] > x:
-                        cross[j], side[j] = cross[j - 1], side[j - 1]
-                        j -= 1
-                    cross[j], side[j] = min(max(x, x0), x1), work[i, 4]
-                    k += 1
-            cross[k], side[k] = x1, 0.0
-            left, behind_limb = -np.inf, False
-            for i in range(k):
-                if side[i] > 0:
-                    left, behind_limb = cross[i], False
-                elif side[i] < 0:
-                    left, behind_limb = -np.inf, True
-                a, b = cross[i], cross[i + 1]
-                if b - a <= _EMPTY:
-                    continue
-                if curved and left == -np.inf and not behind_limb:
-                    left = max(
-                        _nearest_limb(own, link, owner, segments, limb, sweep_v, s, 1.0, a),
-                        _nearest_limb(before, link, owner, segments, limb, sweep_v, s, 1.0, a),
-                    )
-                right = np.inf
-                j = i + 1
-                while j < k and side[j] == 0:
-                    j += 1
-                if j < k and side[j] < 0:
-                    right = cross[j]
-                elif curved and j == k:
-                    right = min(
-                        _nearest_limb(own, link, owner, segments, limb, sweep_v, s, -1.0, b),
-                        _nearest_limb(after, link, owner, segments, limb, sweep_v, s, -1.0, b),
-                    )
-                if n + 5 > len(weights):
+            for i in range(n_active):
+                cross[i + 1] = min(max(_edge_at(work, active[i], s), cross[i]), x1)
+                side[i + 1] = work[active[i], 4]
+            count = _line_nodes(s, slab, share * slab, cross, side, k, limbs, n_limbs, curved, nodes)
+            if lines > 1:
+                n, region = _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
+                if n >= 0:
+                    n, region = _write(nodes, count, sweep_v, scale, points, weights, regions, n, region)
+                if n < 0:
                     return -1, region
-                n = _place(
-                    a, b, left, right, s, sweep_v, slab, line_weight * scale, points, weights, regions, n, region
-                )
-                region += 1
-    return n, region
+                n_merged = 0
+                continue
+            wide = hi - start
+            follows = (
+                n_merged == count
+                and n_previous == n_active
+                and lo - stop <= _EMPTY
+                and wide <= (_THIN_AT_LIMB if beside_limb else _THIN)
+                and _continues(work, m, previous, active, n_active, stop, lo)
+            )
+            if follows:
+                slant = 0.0
+                for i in range(1, k):
+                    if n_slabs == 1:
+                        start_slope[i] = (cross[i] - start_cross[i]) / (s - start_line)
+                    bent = abs(cross[i] - start_cross[i] - start_slope[i] * (s - start_line))
+                    follows = follows and bent <= 0.02 * min(cross[i] - cross[i - 1], cross[i + 1] - cross[i])
+                    slant = max(slant, abs(start_slope[i]) * wide)
+                follows = follows and wide * slant * slant < 1e-3
+                for j in range(count):
+                    follows = follows and nodes[j, 3] == merged[j, 3]
+            if follows:
+                for j in range(count):
+                    for i in range(3):
+                        merged[j, i] += nodes[j, i]
+                n_slabs += 1
+            else:
+                n, region = _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
+                if n < 0:
+                    return -1, region
+                n_merged, start, start_line, n_slabs = count, lo, s, 1
+                start_cross[: k + 1] = cross[: k + 1]
+                merged[:count] = nodes[:count]
+            stop, n_previous = hi, n_active
+            previous[:n_active] = active[:n_active]
+    return _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
 
 
 @njit(cache=True, nogil=True)
-def _place(a, b, left, right, s, sweep_v, slab, scale, points, weights, regions, n, region):  # type: ignore[no-untyped-def]
-    """Place Gauss points on one interval [a, b] of a line, with limbs at `left` and `right` (±inf: none)."""
+def _line_nodes(s, slab, line_weight, cross, side, k, limbs, n_limbs, curved, nodes):  # type: ignore[no-untyped-def]
+    """Place the nodes of one line: rows (weight, weight · s, weight · x, interval); returns their number."""
+    count = 0
+    left, behind_limb = -np.inf, False
+    for i in range(k):
+        if side[i] > 0:
+            left, behind_limb = cross[i], False
+        elif side[i] < 0:
+            left, behind_limb = -np.inf, True
+        a, b = cross[i], cross[i + 1]
+        if b - a <= _EMPTY:
+            continue
+        if curved and left == -np.inf and not behind_limb:
+            left = _nearest_limb(limbs, n_limbs, s, 1.0, a)
+        right = np.inf
+        j = i + 1
+        while j < k and side[j] == 0:
+            j += 1
+        if j < k and side[j] < 0:
+            right = cross[j]
+        elif curved and j == k:
+            right = _nearest_limb(limbs, n_limbs, s, -1.0, b)
+        placed = _place(a, b, left, right, slab, nodes[count:])
+        for g in range(count, count + placed):
+            weight = nodes[g, 0] * line_weight
+            nodes[g, 0], nodes[g, 1], nodes[g, 2], nodes[g, 3] = weight, weight * s, weight * nodes[g, 2], float(i)
+        count += placed
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _place(a, b, left, right, slab, nodes):  # type: ignore[no-untyped-def]
+    """Place Gauss points on one interval [a, b], with limbs at `left` and `right` (±inf: none).
+
+    Column 0 of `nodes` gets the weight, which adds up to b − a, column 2 the place; returns their number.
+    """
     near_left, near_right = a - left < 1.5, right - b < 1.5
+    middle, half = 0.0, 0.0
     if near_left and near_right:
         middle, half = 0.5 * (left + right), 0.5 * (right - left)
         t0 = math.asin(max((a - middle) / half, -1.0))
@@ -458,11 +604,9 @@ def _place(a, b, left, right, s, sweep_v, slab, scale, points, weights, regions,
             x, w = right - t * t, w * t
         else:
             x = t
-        points[n + g, 0] = x if sweep_v else s
-        points[n + g, 1] = s if sweep_v else x
-        weights[n + g] = w
-        regions[n + g] = region
+        nodes[g, 0] = w
+        nodes[g, 2] = x
         total += w
     for g in range(count):  # the constant is integrated exactly, whatever the substitution
-        weights[n + g] *= scale * (b - a) / total
-    return n + count
+        nodes[g, 0] *= (b - a) / total
+    return count

@@ -48,6 +48,14 @@ class EmbreeIntersector:
         return faces
 
 
+class NoIntersector:
+    """For a scene without a mesh."""
+
+    def first_face(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
+        """Return −1 for every ray."""
+        return np.full(len(origins), -1, np.int32)
+
+
 class BvhIntersector:
     """A bounding-volume hierarchy walked in float64; for machines without Embree, and as its oracle.
 
@@ -95,6 +103,8 @@ def make_intersector(vertices: NDArray[np.float64], faces: NDArray[np.int32], ki
     """
     if kind not in ("auto", "embree", "float64"):
         raise UsageError(f"'intersector' must be auto, embree or float64, got {kind!r}")
+    if not len(faces):
+        return NoIntersector()
     has_embree = importlib.util.find_spec("embreex") is not None
     if kind == "embree" and not has_embree:
         raise UsageError("the package embreex is not installed here: use intersector='float64'")

@@ -18,7 +18,20 @@ if TYPE_CHECKING:
 
 
 def phasor_to_range_m(phasor: NDArray[np.complexfloating], sensor: Sensor) -> NDArray[np.float64]:
-    """Return the range a phasor stands for, (c / 4πf) · arg S in [0, c/2f); NaN where S is zero."""
+    """Return the range a phasor stands for, (c / 4πf) · arg S in [0, c/2f) (PHYSICS section 3).
+
+    Parameters
+    ----------
+    phasor : (...) complex
+        S_1.
+    sensor : Sensor
+        The camera; its modulation frequency f is what counts.
+
+    Returns
+    -------
+    (...) float64
+        Metres along the ray; NaN where the phasor is zero.
+    """
     range_m = wrap_range_m(sensor.metres_per_radian * np.angle(phasor), sensor)
     return np.where(phasor == 0, np.nan, range_m)
 

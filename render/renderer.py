@@ -66,8 +66,9 @@ class Renderer:
 
     Parameters
     ----------
-    mesh : trimesh.Trimesh
-        The landmark, metres, landmark frame (PHYSICS section 1). Open or inverted meshes are rendered two-sided.
+    mesh : trimesh.Trimesh or None
+        The landmark, metres, landmark frame (PHYSICS section 1). Open or inverted meshes are rendered two-sided. None:
+        no landmark, only what stands behind it.
     sensor : Sensor
     albedo : float
         Of the Lambertian landmark, in (0, 1].
@@ -93,7 +94,7 @@ class Renderer:
 
     def __init__(
         self,
-        mesh: trimesh.Trimesh,
+        mesh: trimesh.Trimesh | None,
         sensor: Sensor,
         *,
         albedo: float = 0.8,
@@ -106,7 +107,7 @@ class Renderer:
             raise UsageError(f"'harmonics' must be whole orders of 2 or more, got {tuple(harmonics)!r}")
         self.sensor = sensor
         self.albedo = float(albedo)
-        self.topology = MeshTopology.from_mesh(mesh)
+        self.topology = MeshTopology.empty() if mesh is None else MeshTopology.from_mesh(mesh)
         self._orders = np.array([1, *harmonics], dtype=np.int64)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
         tan_h, tan_v = sensor.tan_half_angles
@@ -247,6 +248,8 @@ class Renderer:
 
     def _check_lens_outside(self, views: Views) -> None:
         """Refuse views whose lens lies inside the landmark, or within a millimetre of its axis-aligned box."""
+        if not len(self.topology.faces):
+            return
         low, high = self.topology.vertices.min(axis=0), self.topology.vertices.max(axis=0)
         lens = views.lens_in_landmark()
         near = np.flatnonzero(((lens > low - 1e-3) & (lens < high + 1e-3)).all(axis=1))

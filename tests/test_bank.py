@@ -211,6 +211,29 @@ def test_a_bank_of_a_mesh_file_keeps_its_symmetry_and_albedo(painted, tmp_path):
         assert bank.mesh("part").metadata == {"name": "part", "symmetry": 2, "albedo": 0.4}
 
 
+def test_a_mesh_file_without_a_unit_is_refused_with_its_extents(painted, tmp_path):
+    trimesh.creation.box((100, 60, 200)).export(tmp_path / "part.stl")
+    part = {"name": "part", "path": str(tmp_path / "part.stl")}
+    with pytest.raises(UsageError, match="unit"):
+        build_bank(BankPlan(meshes=[part], layout="full", **GRID), tmp_path / "bank.h5")
+    assert names(tmp_path) == ["part.stl"]
+
+
+@pytest.mark.parametrize("layout", ["factored", "full"])
+def test_the_planar_model_fills_the_same_schema(layout):
+    plan = BankPlan(classes=["cone"], model="planar", layout=layout, **GRID)
+    with build_bank(plan) as bank:
+        assert bank.plan.model == bank.info()["model"] == "planar"
+        # At D = 0.8 m and δ = 0 the box shows its front, 0.12 m before the axis, in the middle columns.
+        assert bank.image("cone", 0, 0).range_m[0, 8, 8] == pytest.approx(0.68, abs=1e-3)  # the column is 0.7° aside
+
+
+def test_the_planar_model_refuses_mesh_files(painted):
+    part = {"name": "part", "path": "part.stl", "unit": "mm"}
+    with pytest.raises(UsageError, match="'model' must be 'ray' for 'part'"):
+        build_bank(BankPlan(meshes=[part], model="planar", layout="full", **GRID))
+
+
 @pytest.mark.parametrize(
     ("group", "dims"),
     [

@@ -382,3 +382,8 @@ def test_images_that_no_light_can_make_are_refused_by_pixel():
     image.phasor[1, 2, 3] = np.nan
     with pytest.raises(UsageError, match="view 1, row 2, column 3: phasor and intensity must be finite"):
         capture(image, sensor, rng=np.random.default_rng(0))
+
+
+def test_each_noise_term_has_a_stream_of_its_own():
+    streams = NoiseStreams.from_rng(np.random.default_rng(1))
+    assert not np.isin(streams.shot.random(100), streams.read.random(100)).any()

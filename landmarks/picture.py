@@ -1,0 +1,146 @@
+"""Pictures of a landmark: a shaded drawing, and a page to turn it in 3D that needs nothing but a browser."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import string
+from importlib import resources
+
+import numpy as np
+import trimesh
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from numpy.typing import NDArray
+
+_CREASE_RAD = np.radians(30)
+_COLOUR = np.array([0.47, 0.65, 0.85])
+
+
+def mesh_picture(mesh: trimesh.Trimesh, *, azimuth_deg: float = -50.0, elevation_deg: float = 22.0) -> bytes:
+    """Draw a mesh, shaded, its edges marked.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        Metres, landmark frame.
+    azimuth_deg, elevation_deg : float
+        Where it is seen from.
+
+    Returns
+    -------
+    bytes
+        A PNG.
+    """
+    figure = Figure(figsize=(5.2, 5.2))
+    axes = Axes3D(figure, (0.0, 0.03, 0.92, 0.94), computed_zorder=False)
+    figure.add_axes(axes)
+    axes.view_init(elev=elevation_deg, azim=azimuth_deg)
+    towards = _direction(azimuth_deg, elevation_deg)
+    light = _direction(azimuth_deg - 35, elevation_deg + 25)
+    normals = np.asarray(mesh.face_normals)
+    closed = bool(mesh.is_watertight and mesh.volume > 0)
+    seen = normals @ towards > 0 if closed else np.ones(len(normals), bool)
+    triangles = np.asarray(mesh.triangles)[seen] * 100
+    shade = 0.35 + 0.65 * np.abs(normals[seen] @ light)
+    order = np.argsort(triangles.mean(axis=1) @ towards)
+    colours = np.clip(shade[order, None] * _COLOUR, 0, 1)
+    axes.add_collection3d(Poly3DCollection(triangles[order], facecolors=colours, edgecolors=colours, linewidths=0.4))
+    axes.add_collection3d(
+        Line3DCollection(_visible_edges(mesh, towards, closed) * 100, colors="#1d2733", linewidths=0.7)
+    )
+    low, high = mesh.bounds * 100
+    for name, a, b in zip("xyz", low, high, strict=True):
+        middle, half = (a + b) / 2, 0.55 * (high - low).max()
+        getattr(axes, f"set_{name}lim")(middle - half, middle + half)
+    axes.set_box_aspect((1, 1, 1))
+    axes.set_xlabel("x' (cm)")
+    axes.set_ylabel("y' (cm)")
+    axes.set_zlabel("z' (cm)")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=130)
+    return buffer.getvalue()
+
+
+def mesh_html(mesh: trimesh.Trimesh, title: str) -> str:
+    """Return a self-contained page that shows a mesh in 3D, to be turned and zoomed.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        Metres.
+    title : str
+        Heading of the page.
+
+    Returns
+    -------
+    str
+        HTML with the mesh inside; it loads nothing.
+    """
+    vertices = np.asarray(mesh.vertices)
+    centre = mesh.bounds.mean(axis=0)
+    radius = np.linalg.norm(vertices - centre, axis=1).max()
+    corners = trimesh.graph.smooth_shade(mesh, angle=_CREASE_RAD)
+    extents = " × ".join(f"{100 * value:.4g}" for value in mesh.extents)
+    page = resources.files("phasemark.landmarks").joinpath("viewer.html").read_text(encoding="utf-8")
+    shown = np.asarray(corners.vertices)
+    return string.Template(page).substitute(
+        title=html.escape(title),
+        facts=f"{extents} cm, {len(mesh.faces)} faces",
+        vertices=_base64((shown - centre) / radius, np.float32),
+        faces=_base64(np.asarray(corners.faces), np.uint32),
+        normals=_base64(np.asarray(corners.vertex_normals)[corners.faces], np.float32),
+    )
+
+
+def _base64(values: NDArray[np.generic], kind: type[np.generic]) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<")).tobytes()).decode()
+
+
+def _direction(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
+    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
+    return np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)],
+        dtype=np.float64,
+    )
+
+
+def _visible_edges(mesh: trimesh.Trimesh, towards: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
+    """Return the pieces of creases and silhouettes that the viewer sees, (n, 2, 3)."""
+    pairs, edges = np.asarray(mesh.face_adjacency), np.asarray(mesh.face_adjacency_edges)
+    front = np.asarray(mesh.face_normals) @ towards > 0
+    sharp = np.asarray(mesh.face_adjacency_angles) > _CREASE_RAD
+    shown = (sharp & (front[pairs].any(axis=1) | (not closed))) | (front[pairs[:, 0]] != front[pairs[:, 1]])
+    ends = np.asarray(mesh.vertices)[edges[shown]]
+    size = float(np.linalg.norm(mesh.extents))
+    pieces = np.maximum(1, np.ceil(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / (0.02 * size))).astype(int)
+    whole = np.repeat(np.arange(len(ends)), pieces)
+    step = np.arange(len(whole)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    start, stop = step / pieces[whole], (step + 1) / pieces[whole]
+    way = ends[whole, 1] - ends[whole, 0]
+    parts = np.stack([ends[whole, 0] + start[:, None] * way, ends[whole, 0] + stop[:, None] * way], axis=1)
+    blocking = np.asarray(mesh.triangles)[front] if closed else np.asarray(mesh.triangles)
+    hidden = _hidden(parts.mean(axis=1) + 1e-3 * size * towards, blocking, towards)
+    return np.asarray(parts[~hidden])
+
+
+def _hidden(
+    points: NDArray[np.float64], triangles: NDArray[np.float64], towards: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Tell which points have a triangle between them and a viewer far away, (n,)."""
+    across = np.cross(towards, [0.0, 0.0, 1.0] if abs(towards[2]) < 0.9 else [1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across)
+    frame = np.stack([across, np.cross(towards, across), towards])
+    a, b, c = (triangles[:, k] @ frame.T for k in range(3))
+    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
+    a, b, c, area = (array[area != 0] for array in (a, b, c, area))
+    hidden = np.zeros(len(points), np.bool_)
+    for k, (x, y, z) in enumerate(points @ frame.T):
+        u = ((b[:, 0] - x) * (c[:, 1] - y) - (c[:, 0] - x) * (b[:, 1] - y)) / area
+        v = ((c[:, 0] - x) * (a[:, 1] - y) - (a[:, 0] - x) * (c[:, 1] - y)) / area
+        w = 1 - u - v
+        over = (u >= 0) & (v >= 0) & (w >= 0)
+        hidden[k] = bool((u * a[:, 2] + v * b[:, 2] + w * c[:, 2] > z)[over].any())
+    return hidden

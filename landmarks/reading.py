@@ -1,0 +1,315 @@
+"""Meshes from files: read from bytes, checked, brought to metres and into the landmark frame; and back to bytes."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import struct
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark.landmarks.mesh import MAX_FACES
+
+FORMATS = ("stl", "ply", "obj", "off")
+METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+ORIGINS = ("file", "base", "center")
+_UP: dict[str, list[list[float]]] = {
+    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+    "-x": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+}
+"""Rotations that turn each axis of a file upwards."""
+
+
+class MeshWarning(UserWarning):
+    """A mesh that can be rendered, but may not be what its maker meant."""
+
+
+@dataclass(frozen=True)
+class MeshReport:
+    """What a mesh holds.
+
+    Parameters
+    ----------
+    faces, vertices, bodies : int
+        Triangles, distinct points, and pieces that hang together.
+    watertight : bool
+        Whether every edge joins exactly two faces.
+    outward : bool
+        Whether the surface is wound outward throughout (only asked of a watertight mesh).
+    extents_m : tuple of float
+        Size of the bounding box.
+    area_m2, volume_m3 : float
+        Volume is that of a watertight mesh, negative if it is inside out; NaN of an open one.
+    warnings : tuple of str
+        What may be wrong, one line each.
+    """
+
+    faces: int
+    vertices: int
+    bodies: int
+    watertight: bool
+    outward: bool
+    extents_m: tuple[float, float, float]
+    area_m2: float
+    volume_m3: float | None
+    warnings: tuple[str, ...]
+
+
+def read_mesh(
+    source: str | os.PathLike[str] | bytes,
+    *,
+    unit: str | None,
+    file_type: str | None = None,
+    up: str = "z",
+    origin: str = "file",
+) -> trimesh.Trimesh:
+    """Read a mesh file and bring it into the landmark frame, in metres.
+
+    Files that a mesh file names, such as materials, are never opened.
+
+    Parameters
+    ----------
+    source : path-like or bytes
+        An STL, PLY, OBJ or OFF file, or its content.
+    unit : {"m", "cm", "mm", "inch"}
+        Unit of the coordinates; mesh files do not say.
+    file_type : str, optional
+        The format; taken from the name's ending if not given.
+    up : {"z", "-z", "y", "-y", "x", "-x"}
+        Axis of the file that points up.
+    origin : {"file", "base", "center"}
+        What becomes the origin: the file's own, the centre of the foot, or the centre of the bounding box.
+
+    Returns
+    -------
+    trimesh.Trimesh
+        Vertices at one point are merged, faces without area dropped. ``metadata`` has ``name``, ``symmetry`` (1) and
+        ``albedo`` (0.8).
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, or has no faces, vertices that are not finite, indices out of range, no extent, over
+        two million faces, or an unknown format.
+    UsageError
+        An option is wrong or the unit is missing; then the message gives the extents in each unit.
+
+    Warns
+    -----
+    MeshWarning
+        The mesh is open or inside out; it is rendered two-sided.
+    """
+    if up not in _UP:
+        raise UsageError(f"'up' must be one of {', '.join(_UP)}, got {up!r}")
+    if origin not in ORIGINS:
+        raise UsageError(f"'origin' must be one of {', '.join(ORIGINS)}, got {origin!r}")
+    if unit is not None and unit not in METRES_PER_UNIT:
+        raise UsageError(f"'unit' must be one of {', '.join(METRES_PER_UNIT)}, got {unit!r}")
+    if isinstance(source, bytes):
+        name, content = "mesh", source
+    else:
+        path = Path(source)
+        name, file_type = str(path), file_type or path.suffix.removeprefix(".")
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    kind = (file_type or "").lower()
+    if kind not in FORMATS:
+        raise InputFileError(f"{name}: unknown mesh format '{kind}': the formats are {', '.join(FORMATS)}")
+    vertices, faces = _parse(content, kind, name)
+    extents = np.ptp(vertices, axis=0)
+    if unit is None:
+        sizes = "; ".join(
+            f"{key}: {' × '.join(f'{value * scale:.4g}' for value in extents)} m"
+            for key, scale in METRES_PER_UNIT.items()
+        )
+        raise UsageError(f"{name}: say in which unit it is (--unit); its extents would be {sizes}")
+    vertices = vertices * METRES_PER_UNIT[unit] @ np.array(_UP[up]).T
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    if origin != "file":
+        centre = (low + high) / 2
+        vertices = vertices - np.array([centre[0], centre[1], low[2] if origin == "base" else centre[2]])
+    mesh = trimesh.Trimesh(
+        vertices=vertices,
+        faces=faces,
+        process=False,
+        metadata={"name": Path(name).stem, "symmetry": 1, "albedo": 0.8},
+    )
+    for warning in check_mesh(mesh).warnings:
+        warnings.warn(f"{name}: {warning}", MeshWarning, stacklevel=2)
+    return mesh
+
+
+def check_mesh(mesh: trimesh.Trimesh) -> MeshReport:
+    """Say what a mesh holds and what may be wrong with it.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        Metres.
+    """
+    watertight = bool(mesh.is_watertight)
+    volume = float(mesh.volume) if watertight else None
+    outward = watertight and bool(mesh.is_winding_consistent) and float(mesh.volume) > 0
+    found = []
+    if not watertight:
+        found.append("the surface is open; it is rendered two-sided")
+    elif not outward:
+        found.append("the surface is inside out or wound inconsistently; it is rendered two-sided")
+    largest = float(max(mesh.extents))
+    if largest > 5 or largest < 0.01:
+        found.append(f"it is {largest:.3g} m large: is the unit right?")
+    return MeshReport(
+        faces=len(mesh.faces),
+        vertices=len(mesh.vertices),
+        bodies=int(mesh.body_count),
+        watertight=watertight,
+        outward=outward,
+        extents_m=(float(mesh.extents[0]), float(mesh.extents[1]), float(mesh.extents[2])),
+        area_m2=float(mesh.area),
+        volume_m3=volume,
+        warnings=tuple(found),
+    )
+
+
+def export_mesh(mesh: trimesh.Trimesh, file_type: str) -> bytes:
+    """Return a mesh as the content of a file, in metres; the same mesh gives the same bytes.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+    file_type : {"stl", "ply", "obj", "off"}
+
+    Raises
+    ------
+    UsageError
+        The format is unknown.
+    """
+    kind = file_type.lower()
+    if kind not in FORMATS:
+        raise UsageError(f"unknown mesh format '{file_type}': the formats are {', '.join(FORMATS)}")
+    plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    content = plain.export(file_type=kind)
+    return content.encode() if isinstance(content, str) else bytes(content)
+
+
+def _parse(content: bytes, kind: str, name: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return distinct vertices and the faces that have an area, in the file's unit.
+
+    The loader drops or repairs in silence what is damaged, so the file is checked before and what comes out after.
+    """
+    {"stl": _check_stl, "ply": _check_ply, "obj": _check_obj, "off": _check_off}[kind](content, name)
+    try:
+        loaded: Any = trimesh.load(
+            io.BytesIO(content), file_type=kind, process=False, force="mesh", skip_materials=True, maintain_order=True
+        )
+        vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
+    except PhasemarkError:
+        raise
+    except Exception as error:  # whatever a damaged file makes the loader say
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputFileError(f"{name}: damaged, or not {kind.upper()} ({reason})") from None
+    if not len(faces):
+        raise InputFileError(f"{name}: has no faces")
+    _refuse_too_many(len(faces), name)
+    if not np.isfinite(vertices).all():
+        index = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        raise InputFileError(f"{name}: vertex {index} is not finite")
+    wrong = faces[(faces < 0) | (faces >= len(vertices))]
+    if wrong.size:
+        raise InputFileError(f"{name}: a face names vertex {wrong[0]}, but there are {len(vertices)}")
+    vertices, merged = np.unique(vertices + 0.0, axis=0, return_inverse=True)
+    faces = merged.reshape(-1)[faces]
+    if np.abs(vertices).max() > 1e9:
+        raise InputFileError(f"{name}: a coordinate is {np.abs(vertices).max():.3g}, which no landmark reaches")
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    faces = faces[area > 1e-14 * float(np.ptp(vertices, axis=0).max()) ** 2]
+    if not len(faces):
+        raise InputFileError(f"{name}: has no extent: no face has an area")
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3)
+
+
+def _refuse_too_many(count: int, name: str) -> None:
+    if count > MAX_FACES:
+        raise InputFileError(f"{name}: has {count} faces, at most {MAX_FACES} can be used")
+
+
+def _check_stl(content: bytes, name: str) -> None:
+    declared = struct.unpack_from("<I", content, 80)[0] if len(content) >= 84 else 0
+    if len(content) >= 84 and len(content) == 84 + 50 * declared:
+        _refuse_too_many(declared, name)
+        return
+    if content.lstrip()[:5].lower() == b"solid":
+        text = content.lower()
+        facets, loops, corners = (
+            text.count(b"facet normal"),
+            text.count(b"endfacet"),
+            len(re.findall(rb"\bvertex\s", text)),
+        )
+        if not facets:
+            raise InputFileError(f"{name}: has no faces")
+        if loops != facets or corners != 3 * facets or b"endsolid" not in text:
+            raise InputFileError(
+                f"{name}: cut off, or not STL ({facets} facets begin, {loops} end, {corners} vertices)"
+            )
+        _refuse_too_many(facets, name)
+        return
+    if len(content) < 84:
+        raise InputFileError(f"{name}: cut off, or not STL ({len(content)} bytes, a header alone has 84)")
+    _refuse_too_many(declared, name)
+    raise InputFileError(
+        f"{name}: cut off, or not STL ({declared} faces need {84 + 50 * declared} bytes, it has {len(content)})"
+    )
+
+
+def _check_ply(content: bytes, name: str) -> None:
+    end = content.find(b"end_header")
+    if not content.startswith(b"ply") or end < 0:
+        raise InputFileError(f"{name}: cut off, or not PLY (no header from 'ply' to 'end_header')")
+    header = content[:end].decode("ascii", "replace")
+    counts = {kind: int(n) for kind, n in re.findall(r"^element\s+(\w+)\s+(\d{1,12})\s*$", header, re.MULTILINE)}
+    if not counts.get("face") or not counts.get("vertex"):
+        raise InputFileError(f"{name}: has no faces")
+    _refuse_too_many(max(counts["face"], counts["vertex"] // 3), name)
+    if re.search(r"^format\s+ascii", header, re.MULTILINE):
+        lines = sum(1 for line in content[end:].splitlines()[1:] if line.strip())
+        if lines < sum(counts.values()):
+            raise InputFileError(f"{name}: cut off ({sum(counts.values())} lines of data announced, {lines} there)")
+
+
+def _check_off(content: bytes, name: str) -> None:
+    text = re.sub(rb"#[^\n]*", b"", content).split()
+    if not text or not text[0].upper().endswith(b"OFF"):
+        raise InputFileError(f"{name}: not OFF (the first word must be OFF)")
+    try:
+        n_vertices, n_faces = int(text[1]), int(text[2])
+    except (IndexError, ValueError):
+        raise InputFileError(f"{name}: cut off, or not OFF (no counts of vertices and faces)") from None
+    if n_faces <= 0 or n_vertices <= 0:
+        raise InputFileError(f"{name}: has no faces")
+    _refuse_too_many(n_faces, name)
+    if len(text) < 4 + 3 * n_vertices + 4 * n_faces:
+        raise InputFileError(f"{name}: cut off ({n_vertices} vertices and {n_faces} faces announced, fewer there)")
+
+
+def _check_obj(content: bytes, name: str) -> None:
+    faces = len(re.findall(rb"^\s*f\s", content, re.MULTILINE))
+    if not faces:
+        raise InputFileError(f"{name}: has no faces")
+    _refuse_too_many(faces, name)

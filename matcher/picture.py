@@ -1,0 +1,106 @@
+"""A picture of a match: measured, best model, residual, side by side (the paper's figure 11)."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from phasemark.data import Bank
+from phasemark.matcher.filters import FilteredFrames
+from phasemark.matcher.match import Match
+from phasemark.matcher.matcher import background_image
+from phasemark.render import Background, phasor_to_range_m, predicted_range_std, wrap_difference_m
+from phasemark.render.plot import draw_range
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def model_range_m(bank: Bank, match: Match, background: Background | None) -> NDArray[np.float64]:
+    """Return the ranges of the model image a match names, (rows, cols); NaN where it returns too little to measure.
+
+    Parameters
+    ----------
+    bank : Bank
+    match : Match
+        Its view is rounded to the bank's grid.
+    background : Background, optional
+        What the model is composed with, as in the matcher.
+    """
+    name = match.class_name or match.alternatives[0].class_name
+    i = int(np.abs(bank.distance_m - match.distance_m).argmin())
+    period = 2 * math.pi / match.symmetry
+    turned = np.abs(bank.delta_rad - match.delta_rad)
+    j = int(np.minimum(turned, period - turned).argmin())
+    image = bank.image(name, i, j)
+    phasor, intensity = image.phasor[0], image.intensity[0]
+    if background is not None:
+        behind = background_image(background, bank.sensor)
+        free = 1 - image.coverage[0]
+        phasor, intensity = phasor + free * behind.phasor[0], intensity + free * behind.intensity[0]
+    noise = predicted_range_std(np.abs(phasor), intensity, bank.sensor) / bank.sensor.metres_per_radian
+    limit = bank.sensor.max_phase_std_rad or np.inf
+    return np.where(noise <= limit, phasor_to_range_m(phasor, bank.sensor), np.nan)
+
+
+def match_picture(
+    frames: FilteredFrames, match: Match, bank: Bank, background: Background | None = None, index: int = 0
+) -> Figure:
+    """Draw a filtered frame beside the best model image and their difference.
+
+    Parameters
+    ----------
+    frames : FilteredFrames
+    match : Match
+        The match of ``frames[index]``.
+    bank : Bank
+    background : Background, optional
+    index : int
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    measured = frames.range_m[index]
+    model = np.full_like(measured, np.nan)
+    if math.isfinite(match.distance_m):
+        model = model_range_m(bank, match, background)
+    both = np.concatenate([measured[np.isfinite(measured)], model[np.isfinite(model)]])
+    near, far = (float(both.min()), float(both.max())) if both.size else (0.0, 1.0)
+    figure = Figure(figsize=(12.6, 4.2), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    left.set_title("measured, filtered")
+    draw_range(left, measured, near_m=near, far_m=far)
+    middle.set_title("best model image")
+    draw_range(middle, model, near_m=near, far_m=far)
+    draw_residual(right, wrap_difference_m(measured - model, frames.sensor))
+    figure.suptitle(describe(match))
+    return figure
+
+
+def draw_residual(axes: Axes, residual_m: NDArray[np.float64]) -> None:
+    """Draw measured minus model in millimetres, (rows, cols); what one of them lacks stays grey."""
+    residual_mm = 1e3 * residual_m
+    known = np.abs(residual_mm[np.isfinite(residual_mm)])
+    span = max(float(np.percentile(known, 90)) if known.size else 1.0, 1.0)
+    axes.set_facecolor("#d0d0d0")
+    image = axes.imshow(
+        residual_mm, cmap="RdBu", vmin=-span, vmax=span, extent=(0, residual_m.shape[1], residual_m.shape[0], 0)
+    )
+    axes.set(title="measured − model", xlabel="u (pixel columns)", ylabel="v (pixel rows)")
+    axes.figure.colorbar(image, ax=axes, label="residual (mm)", extend="both")
+
+
+def describe(match: Match) -> str:
+    """Say in one line what a match found."""
+    if match.class_name is None:
+        return "no landmark"
+    verdict = "accepted" if match.accepted else "doubtful"
+    return (
+        f"{match.class_name} at D = {match.distance_m:.3f} m, δ = {math.degrees(match.delta_rad):.2f}°"
+        f" ({verdict}: χ² = {match.chi2:.0f}, {match.dof} degrees of freedom, p = {match.p_value:.2g})"
+    )

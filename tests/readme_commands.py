@@ -1,0 +1,149 @@
+"""Read the fenced blocks of a Markdown page and run them as printed, in order, in one folder.
+
+HTML comments directly above a block change how it is run:
+
+``<!-- test: given FILE -->``
+    make an input file that the reader would bring; :data:`GIVEN` knows how.
+``<!-- test: phasemark CMD += OPTIONS -->``
+    append options to that command: a later option overrides an earlier one, so a grid becomes small.
+``<!-- test: skip REASON -->``
+    do not run the block.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+RUN = ("phasemark", "sha256sum")
+SET_UP = (".", "cd", "git", "make", "pip", "python", "python3")
+_SHELL_LANGUAGES = ("bash", "console", "sh")
+
+_DIRECTIVE = re.compile(r"<!-- test: (.*) -->")
+_FENCE = re.compile(r"```(\w*)")
+
+
+@dataclass(frozen=True)
+class Block:
+    """One fenced block and what the comments above it ask for."""
+
+    line: int
+    language: str
+    text: str
+    directives: tuple[str, ...]
+
+    @property
+    def skipped(self) -> bool:
+        return any(directive.startswith("skip ") for directive in self.directives)
+
+    @property
+    def given(self) -> list[str]:
+        return [directive.removeprefix("given ") for directive in self.directives if directive.startswith("given ")]
+
+    @property
+    def appended(self) -> list[tuple[list[str], str]]:
+        pairs = [directive.split(" += ", 1) for directive in self.directives if " += " in directive]
+        return [(command.split(), options) for command, options in pairs]
+
+
+def read_blocks(markdown: str) -> list[Block]:
+    """Return the fenced blocks of a page; the line is that of the opening fence."""
+    blocks: list[Block] = []
+    directives: list[str] = []
+    body: list[str] | None = None
+    opened, language = 0, ""
+    for number, line in enumerate(markdown.splitlines(), start=1):
+        fence, directive = _FENCE.fullmatch(line), _DIRECTIVE.fullmatch(line)
+        if body is not None:
+            if line == "```":
+                blocks.append(Block(opened, language, "\n".join(body), tuple(directives)))
+                body, directives = None, []
+            else:
+                body.append(line)
+        elif fence:
+            body, opened, language = [], number, fence[1]
+        elif directive:
+            known = directive[1].startswith(("given ", "skip ")) or " += " in directive[1]
+            if not known:
+                raise ValueError(f"line {number}: unknown directive '{directive[1]}'")
+            directives.append(directive[1])
+        elif line and directives:
+            raise ValueError(f"line {number}: a directive stands directly above its block")
+    return blocks
+
+
+def shell_commands(block: Block) -> list[str]:
+    """Return the commands of a shell block; in a console block those are the lines after ``$``."""
+    text = block.text.replace("\\\n", " ")
+    lines = [line.strip() for line in text.splitlines()]
+    if block.language == "console":
+        lines = [line.removeprefix("$ ") for line in lines if line.startswith("$ ")]
+    commands = [line for line in lines if line and not line.startswith("#")]
+    return [_append(command, block.appended) for command in commands]
+
+
+def _append(command: str, appended: list[tuple[list[str], str]]) -> str:
+    words = shlex.split(command, comments=True)
+    for prefix, options in appended:
+        if words[: len(prefix)] == prefix:
+            command = f"{command} {options}"
+    return command
+
+
+def run_page(page: Path, folder: Path) -> Iterator[str]:
+    """Run every block of a page in `folder`; yield what was run, and raise AssertionError where something fails."""
+    for block in read_blocks(page.read_text(encoding="utf-8")):
+        if block.skipped:
+            continue
+        for name in block.given:
+            if not (folder / name).exists():
+                GIVEN[name](folder / name)
+        if block.language == "python":
+            _run([sys.executable, "-W", "error", "-c", block.text], folder, f"{page.name}:{block.line}")
+            yield block.text
+        elif block.language in _SHELL_LANGUAGES:
+            for command in shell_commands(block):
+                program = shlex.split(command, comments=True)[0]
+                if program in RUN:
+                    _run(["bash", "-euo", "pipefail", "-c", command], folder, f"{page.name}:{block.line}: {command}")
+                    yield command
+                elif program not in SET_UP:
+                    raise AssertionError(f"{page.name}:{block.line}: no rule for '{command}'")
+
+
+def _run(command: list[str], folder: Path, what: str) -> None:
+    bin_folder = str(Path(sys.executable).parent)
+    environment = {**os.environ, "PATH": os.pathsep.join([bin_folder, os.environ["PATH"]]), "MPLBACKEND": "agg"}
+    done = subprocess.run(
+        command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
+    assert done.returncode == 0, f"{what}\nexit code {done.returncode}\n{done.stdout}{done.stderr}"
+
+
+def _write_part(path: Path) -> None:
+    """Write a CAD part: a block of 120 × 80 × 60 mm."""
+    import trimesh
+
+    trimesh.creation.box(extents=(120, 80, 60)).export(path)
+
+
+def _write_measured(path: Path) -> None:
+    """Write 50 frames of the cylinder at 1 m from 30°, before nothing."""
+    import numpy as np
+
+    from phasemark.landmarks import build_mesh, catalog
+    from phasemark.render import Renderer, capture, preset
+
+    sensor = preset("pmd-16x16")
+    image = Renderer(build_mesh(catalog()["cylinder"]), sensor, albedo=0.8).render(distance_m=1.0, delta_rad=np.pi / 6)
+    frames = capture(image, sensor, rng=np.random.default_rng(1), n_frames=50)
+    np.savetxt(path, frames.range_m.reshape(50, -1), delimiter=",", fmt="%.6f")
+
+
+GIVEN: dict[str, Callable[[Path], None]] = {"measured.csv": _write_measured, "my_part.stl": _write_part}

@@ -1,0 +1,184 @@
+"""The frame of the command line: exit codes, one line for every mistake, output that other programs can read."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from phasemark import PhasemarkError, __version__, cli
+from phasemark.render import Sensor, preset, preset_names
+
+PHASEMARK = str(Path(sys.executable).with_name("phasemark"))
+
+
+class Outcome(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., Outcome]]:
+    """Run the command line in this process."""
+    before = signal.getsignal(signal.SIGTERM)
+
+    def call(*arguments: str) -> Outcome:
+        code = cli.main(arguments)
+        return Outcome(code, *capsys.readouterr())
+
+    yield call
+    signal.signal(signal.SIGTERM, before)
+
+
+def test_version_is_printed(run: Callable[..., Outcome]) -> None:
+    assert run("--version") == (0, f"phasemark {__version__}\n", "")
+
+
+def test_without_arguments_the_first_steps_are_printed_and_run(run: Callable[..., Outcome]) -> None:
+    code, out, err = run()
+    steps = [line.split("   ")[0].split()[1:] for line in out.splitlines() if line.startswith("  phasemark ")]
+    assert (code, err) == (0, "")
+    assert steps
+    for step in steps:
+        assert run(*step, "--help").code == 0
+
+
+def test_listed_sensors_are_the_shipped_ones(run: Callable[..., Outcome]) -> None:
+    assert [line.split()[0] for line in run("sensor", "list").out.splitlines()[1:]] == preset_names()
+    assert [entry["name"] for entry in json.loads(run("sensor", "list", "--json").out)] == preset_names()
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_a_shown_sensor_is_a_sensor_file_again(run: Callable[..., Outcome], name: str, tmp_path: Path) -> None:
+    path = tmp_path / "camera.toml"
+    path.write_text(run("sensor", "show", name).out, encoding="utf-8")
+    assert Sensor.from_toml(path) == preset(name)
+    assert run("sensor", "show", str(path)).out == run("sensor", "show", name).out
+
+
+def test_a_sensor_as_json_has_every_field(run: Callable[..., Outcome]) -> None:
+    shown = json.loads(run("sensor", "show", "pmd-16x16", "--json").out)
+    assert set(Sensor.model_fields) < set(shown)
+    assert shown["unambiguous_range_m"] == pytest.approx(14.9896, abs=5e-5)  # c / 2f as PHYSICS section 3 prints it
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("sensor", "show", "pmd-17x17"), 2, ["pmd-17x17", "pmd-16x16", ".toml"]),
+        (("sensor", "show", "missing.toml"), 3, ["missing.toml"]),
+        (("sensor", "show"), 2, ["NAME|FILE", "phasemark sensor show --help"]),
+        (("sensor", "show", "ideal", "--jsn"), 2, ["--jsn"]),
+        (("sensor",), 2, ["phasemark sensor --help"]),
+        (("snesor",), 2, ["snesor", "phasemark --help"]),
+    ],
+)
+def test_a_mistake_is_one_line_and_its_code(
+    run: Callable[..., Outcome], arguments: tuple[str, ...], code: int, words: list[str]
+) -> None:
+    outcome = run(*arguments)
+    assert (outcome.code, outcome.out) == (code, "")
+    assert outcome.err.startswith("error: ")
+    assert outcome.err.count("\n") == 1
+    assert "\x1b" not in outcome.err  # no colours where nobody sees them
+    assert all(word in outcome.err for word in words)
+
+
+@pytest.mark.parametrize("error", [PhasemarkError, *PhasemarkError.__subclasses__()])
+def test_each_error_has_its_exit_code(
+    run: Callable[..., Outcome], monkeypatch: pytest.MonkeyPatch, error: type[PhasemarkError]
+) -> None:
+    _fail_with(monkeypatch, error("first\nsecond \x1b[2J [bold]third"))
+    assert run("sensor", "show", "ideal") == (error.exit_code, "", "error: first second  [2J [bold]third\n")
+
+
+def test_the_exit_codes_are_the_documented_ones() -> None:
+    codes = {error.__name__: error.exit_code for error in PhasemarkError.__subclasses__()}
+    assert codes == {"UsageError": 2, "InputFileError": 3, "OutputExistsError": 4, "StorageError": 5}
+
+
+def test_an_operating_system_error_is_a_storage_error(
+    run: Callable[..., Outcome], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _fail_with(monkeypatch, OSError(28, "No space left on device", "bank.h5"))
+    assert run("sensor", "show", "ideal") == (5, "", "error: bank.h5: No space left on device\n")
+
+
+def test_an_interrupt_exits_with_130(run: Callable[..., Outcome], monkeypatch: pytest.MonkeyPatch) -> None:
+    _fail_with(monkeypatch, KeyboardInterrupt())
+    assert run("sensor", "show", "ideal") == (130, "", "error: interrupted\n")
+
+
+def test_a_bug_of_ours_keeps_its_traceback(run: Callable[..., Outcome], monkeypatch: pytest.MonkeyPatch) -> None:
+    _fail_with(monkeypatch, ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        run("sensor", "show", "ideal")
+
+
+def _fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    def fail(name_or_file: str) -> Sensor:
+        raise error
+
+    monkeypatch.setattr(cli, "_load_sensor", fail)
+
+
+def test_termination_unwinds_and_exits_with_143() -> None:
+    program = """
+        import sys, time
+        from phasemark import cli
+
+        def wait(name_or_file):
+            try:
+                print("waiting", flush=True)
+                time.sleep(60)
+            finally:
+                print("cleaned up")
+
+        cli._load_sensor = wait
+        sys.exit(cli.main(["sensor", "show", "ideal"]))
+    """
+    command = [sys.executable, "-c", textwrap.dedent(program)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "waiting\n"
+        process.terminate()
+        out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (143, "cleaned up\n", "")
+
+
+def test_a_reader_that_went_away_is_no_error() -> None:
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    done = subprocess.run([PHASEMARK, "sensor", "list"], stdout=write_end, stderr=subprocess.PIPE, text=True)
+    os.close(write_end)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
+def test_results_that_find_no_space_exit_with_5() -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([PHASEMARK, "sensor", "list"], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (5, "error: No space left on device\n")
+
+
+def test_a_terminal_without_the_signs_still_gets_the_table() -> None:
+    environment = {**os.environ, "PYTHONIOENCODING": "cp1251"}  # has a degree sign, but no multiplication sign
+    done = subprocess.run([PHASEMARK, "sensor", "list"], env=environment, capture_output=True)
+    assert done.returncode == 0
+    assert r"16 \xd7 16  22° \xd7 22°" in done.stdout.decode("cp1251")
+
+
+def test_help_imports_nothing_heavy() -> None:
+    # What makes a start slow, checked by name: a measured time would depend on the machine.
+    heavy = {"embreex", "h5py", "jinja2", "manifold3d", "matplotlib", "numba", "numpy", "pydantic", "scipy", "trimesh"}
+    program = "import sys; from phasemark import cli; code = cli.main(['--help']); print(*sys.modules); sys.exit(code)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0
+    assert heavy.isdisjoint(done.stdout.splitlines()[-1].split())

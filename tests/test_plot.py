@@ -1,0 +1,141 @@
+import io
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from phasemark import UsageError
+from phasemark.render import PAPER_CMAP, Flag, Frames, PhasorImages, Views, preset, range_picture, terminal_picture
+
+SENSOR = preset("ideal")
+
+
+def range_image():
+    image = np.linspace(1.0, 3.0, 256).reshape(16, 16)
+    image[3:5, 4:9] = np.nan
+    return image
+
+
+def png_size(figure):
+    """Width and height of the figure drawn as PNG, from the file's own header."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer)
+    data = buffer.getvalue()
+    assert data.startswith(b"\x89PNG")
+    return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
+
+
+def texts(figure):
+    return {text.get_text() for text in figure.findobj(lambda artist: hasattr(artist, "get_text"))}
+
+
+def pixel_colour(figure, row, col):
+    """Colour at the centre of a pixel of the first axes, as drawn, 0 … 255."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    x, y = figure.axes[0].transData.transform((col + 0.5, row + 0.5))
+    drawn = np.asarray(canvas.buffer_rgba())
+    return drawn[drawn.shape[0] - 1 - int(y), int(x), :3]
+
+
+def test_near_is_white_far_is_black_and_between_is_blue():
+    np.testing.assert_allclose(PAPER_CMAP(0.0)[:3], 1)
+    np.testing.assert_allclose(PAPER_CMAP(1.0)[:3], 0)
+    red, green, blue, _ = PAPER_CMAP(0.5)
+    assert blue > 1.5 * green > 1.5 * red
+
+
+def test_row_zero_is_drawn_at_the_top_and_column_zero_at_the_left():
+    image = np.full((16, 16), 3.0)
+    image[0, 0] = 1.0
+    figure = range_picture(image)
+    np.testing.assert_array_equal(pixel_colour(figure, 0, 0), 255)
+    for row, col in ((0, 15), (15, 0), (15, 15)):
+        np.testing.assert_array_equal(pixel_colour(figure, row, col), 0)
+    left, right, bottom, top = figure.axes[0].images[0].get_extent()
+    assert (left, right, bottom, top) == (0, 16, 16, 0)
+
+
+def test_nothing_returned_is_hatched_and_named():
+    figure = range_picture(range_image(), near_m=0.5, far_m=4.0, title="cone")
+    assert {"cone", "no range", "range (m)", "u (pixel columns)", "v (pixel rows)"} <= texts(figure)
+    assert figure.axes[0].patch.get_hatch()
+    red, _, blue = (int(c) for c in pixel_colour(figure, 3, 5))
+    assert red > blue  # the paper behind is warm, no colour of the map is
+    assert "no range" not in texts(range_picture(np.ones((16, 16))))
+
+
+@pytest.mark.parametrize("image", [np.full((16, 16), np.nan), np.full((16, 16), 2.0)])
+def test_empty_and_flat_images_can_be_drawn(image):
+    assert png_size(range_picture(image))[0] > 300
+    assert "m" in terminal_picture(image).plain
+
+
+def test_images_and_frames_can_be_drawn_for_a_first_look():
+    ranges = range_image()
+    amplitude = np.where(np.isnan(ranges), 0.0, 0.8)
+    phasor = amplitude * np.exp(1j * np.nan_to_num(ranges) / SENSOR.metres_per_radian)
+    images = PhasorImages(phasor[None], amplitude[None], amplitude[None], SENSOR, Views.broadcast(1.0, np.radians(30)))
+    figure = images.plot()
+    assert png_size(figure)[0] > 900
+    assert {"range", "amplitude", "coverage"} <= texts(figure)
+    assert "view 0: D = 1.000 m, δ = 30.00°, b = 0.00°, h = 0.000 m" in texts(figure)
+    with pytest.raises(UsageError, match="there is no view 1: they count from 0 to 0"):
+        images.plot(1)
+
+    flags = np.where(np.isnan(ranges), int(Flag.NO_RETURN), 0)
+    flags[0, 0] = int(Flag.MISSING | Flag.SATURATED)
+    figure = Frames(ranges, amplitude * 1e4, sensor=SENSOR, flags=flags).plot()
+    assert {"range", "amplitude (e-)", "flags", "valid", "no return", "saturated"} <= texts(figure)
+    assert "missing" not in texts(figure)
+    without = Frames(ranges, sensor=SENSOR)
+    assert "amplitude (e-)" not in texts(without.plot())
+    with pytest.raises(UsageError, match="there is no frame 1"):
+        without.plot(0, 1)
+
+
+def test_terminal_picture_draws_two_pixels_in_a_character():
+    image = np.array([[1.0, 2.0], [3.0, np.nan], [1.0, 3.0]])
+    text = terminal_picture(image, width=2)
+    lines = text.plain.split("\n")
+    assert lines[:2] == ["▀▀", "▀▀"]
+    assert lines[2].endswith("1.00 … 3.00 m  █ no range")
+    corner, beside = text.spans[0].style, text.spans[1].style
+    assert tuple(corner.color.triplet) == (255, 255, 255)
+    assert tuple(corner.bgcolor.triplet) == (0, 0, 0)
+    assert beside.color.triplet.blue > beside.color.triplet.red
+    assert beside.bgcolor.triplet.red > beside.bgcolor.triplet.blue  # no range: warm
+    assert text.spans[2].style.bgcolor is None  # an odd row count leaves the last half line as it is
+
+
+def test_terminal_picture_fills_the_width_by_whole_pixels():
+    lines = terminal_picture(range_image(), width=40).plain.split("\n")
+    assert {len(line) for line in lines[:-1]} == {32}
+    assert len(lines) == 17
+    stream = io.StringIO()
+    Console(file=stream, force_terminal=True, color_system="truecolor", width=80).print(terminal_picture(range_image()))
+    assert "\x1b[38;2;255;255;255" in stream.getvalue()
+
+
+def test_pictures_are_of_one_image():
+    with pytest.raises(UsageError, match=r"must be one image, \(rows, cols\), got shape \(1, 16, 16\)"):
+        range_picture(range_image()[None])
+
+
+def test_matplotlib_loads_only_when_a_picture_is_drawn_and_pyplot_never():
+    code = (
+        "import sys, phasemark.render as r; assert 'matplotlib' not in sys.modules;"
+        "r.range_picture; assert 'matplotlib' in sys.modules; assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_unknown_names_are_attribute_errors():
+    import phasemark.render
+
+    with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
+        phasemark.render.nonsense  # noqa: B018

@@ -1,0 +1,74 @@
+"""What the documentation prints can be typed: commands run, make targets and linked files exist."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+from readme_commands import RUN, Block, read_blocks, run_page, shell_commands
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("**/*.md")])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_printed_command_runs(page: Path, tmp_path: Path) -> None:
+    run = list(run_page(page, tmp_path))
+    assert run or page.name != "README.md"  # a reader that finds no block would pass otherwise
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_printed_make_target_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    printed = [block.text for block in read_blocks(text)] + re.findall(r"`([^`\n]+)`", text)
+    for target in {target for code in printed for target in re.findall(r"^make ([\w-]+)", code, flags=re.MULTILINE)}:
+        done = subprocess.run(["make", "-n", "-C", ROOT, target], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_local_link_leads_to_a_file(page: Path) -> None:
+    links = re.findall(r"\]\((?!\w+:)([^)#]+)", page.read_text(encoding="utf-8"))
+    assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+def test_a_console_block_yields_its_prompted_lines() -> None:
+    (block,) = read_blocks("```console\n$ phasemark a \\\n    --b\noutput\n$ phasemark c\n```\n")
+    assert [command.split() for command in shell_commands(block)] == [["phasemark", "a", "--b"], ["phasemark", "c"]]
+
+
+def test_options_are_appended_to_the_named_command_alone() -> None:
+    directive = "<!-- test: phasemark bank build += --delta 0:90:45 -->"
+    (block,) = read_blocks(f"{directive}\n```bash\nphasemark bank build\nphasemark bank info\n```")
+    assert shell_commands(block) == ["phasemark bank build --delta 0:90:45", "phasemark bank info"]
+
+
+def test_a_directive_belongs_to_the_next_block_alone() -> None:
+    first, second = read_blocks("<!-- test: skip slow -->\n```bash\na\n```\n\n```bash\nb\n```")
+    assert (first.skipped, second.skipped) == (True, False)
+
+
+@pytest.mark.parametrize(
+    "text", ["<!-- test: skipp it -->\n```bash\na\n```", "<!-- test: skip x -->\ntext\n```bash\na\n```"]
+)
+def test_a_misspelt_or_misplaced_directive_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="directive"):
+        read_blocks(text)
+
+
+@pytest.mark.parametrize("language", ["bash", "python"])
+def test_a_failing_block_fails_with_its_line(language: str, tmp_path: Path) -> None:
+    text = {"bash": f"{RUN[0]} no-such-command", "python": "raise SystemExit(1)"}[language]
+    (tmp_path / "page.md").write_text(f"text\n\n```{language}\n{text}\n```\n", encoding="utf-8")
+    with pytest.raises(AssertionError, match=r"page\.md:3"):
+        list(run_page(tmp_path / "page.md", tmp_path))
+
+
+def test_an_unknown_program_is_not_passed_over(tmp_path: Path) -> None:
+    (tmp_path / "page.md").write_text("```bash\nphasemrk sensor list\n```\n", encoding="utf-8")
+    with pytest.raises(AssertionError, match="no rule"):
+        list(run_page(tmp_path / "page.md", tmp_path))
+
+
+def test_the_block_keeps_its_given_files() -> None:
+    assert Block(1, "bash", "", ("given a.csv", "given b.stl")).given == ["a.csv", "b.stl"]
