@@ -1,6 +1,7 @@
 """Banks of model images: what is written, what is read, what is refused."""
 
 import errno
+import hashlib
 import json
 import os
 import resource
@@ -190,6 +191,12 @@ def test_the_file_says_where_it_comes_from(bank_file):
         assert info["size_bytes"] == bank_file.stat().st_size
         assert (info["distance_m"], info["delta_deg"]) == ("0.8:1.2:0.2", "0:135:45")
         json.dumps(info)
+
+
+def test_a_mesh_hash_is_that_of_its_vertices_and_faces():
+    mesh = trimesh.creation.box()
+    content = mesh.vertices.astype("<f8").tobytes() + mesh.faces.astype("<i8").tobytes()
+    assert mesh_sha256(mesh) == hashlib.sha256(content).hexdigest()
 
 
 def test_the_mesh_comes_back_with_symmetry_albedo_and_parts(bank_file):
