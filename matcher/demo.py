@@ -68,7 +68,7 @@ class CellResult:
     position_error_m : float64
         How far the robot is from where it was placed, of the symmetric solutions the one nearest to the truth.
     filtered : FilteredFrames
-        The first repetition's filtered frame.
+        The filtered frame of each repetition.
     """
 
     cell: Cell
@@ -191,7 +191,7 @@ def run_demo(
         clock.lap("filter")
         matches = matcher.match(filtered)
         clock.lap("match")
-        return _judge(cell, matches, filtered[:1])
+        return _judge(cell, matches, filtered)
 
     results: list[CellResult] = []
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,10 +13,7 @@ from phasemark.matcher.filters import FilteredFrames
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import background_image
 from phasemark.render import Background, phasor_to_range_m, predicted_range_std, wrap_difference_m
-from phasemark.render.plot import draw_range
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from phasemark.render.plot import draw_difference, draw_range
 
 
 def model_range_m(bank: Bank, match: Match, background: Background | None) -> NDArray[np.float64]:
@@ -48,7 +44,13 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
 
 
 def match_picture(
-    frames: FilteredFrames, match: Match, bank: Bank, background: Background | None = None, index: int = 0
+    frames: FilteredFrames,
+    match: Match,
+    bank: Bank,
+    background: Background | None = None,
+    index: int = 0,
+    *,
+    title: bool = True,
 ) -> Figure:
     """Draw a filtered frame beside the best model image and their difference.
 
@@ -60,6 +62,8 @@ def match_picture(
     bank : Bank
     background : Background, optional
     index : int
+    title : bool
+        Whether to write above what was found.
 
     Returns
     -------
@@ -71,28 +75,17 @@ def match_picture(
         model = model_range_m(bank, match, background)
     both = np.concatenate([measured[np.isfinite(measured)], model[np.isfinite(model)]])
     near, far = (float(both.min()), float(both.max())) if both.size else (0.0, 1.0)
-    figure = Figure(figsize=(12.6, 4.2), layout="constrained")
+    figure = Figure(figsize=(13.2, 4.2), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     left.set_title("measured, filtered")
     draw_range(left, measured, near_m=near, far_m=far)
     middle.set_title("best model image")
     draw_range(middle, model, near_m=near, far_m=far)
-    draw_residual(right, wrap_difference_m(measured - model, frames.sensor))
-    figure.suptitle(describe(match))
+    right.set_title("measured − model")
+    draw_difference(right, wrap_difference_m(measured - model, frames.sensor))
+    if title:
+        figure.suptitle(describe(match))
     return figure
-
-
-def draw_residual(axes: Axes, residual_m: NDArray[np.float64]) -> None:
-    """Draw measured minus model in millimetres, (rows, cols); what one of them lacks stays grey."""
-    residual_mm = 1e3 * residual_m
-    known = np.abs(residual_mm[np.isfinite(residual_mm)])
-    span = max(float(np.percentile(known, 90)) if known.size else 1.0, 1.0)
-    axes.set_facecolor("#d0d0d0")
-    image = axes.imshow(
-        residual_mm, cmap="RdBu", vmin=-span, vmax=span, extent=(0, residual_m.shape[1], residual_m.shape[0], 0)
-    )
-    axes.set(title="measured − model", xlabel="u (pixel columns)", ylabel="v (pixel rows)")
-    axes.figure.colorbar(image, ax=axes, label="residual (mm)", extend="both")
 
 
 def describe(match: Match) -> str:

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 from phasemark.data import versions
 from phasemark.landmarks import mesh_picture
 from phasemark.matcher.demo import LANDMARK_XY_M, SHIFT_STEPS, WALL_M, CellResult, DemoResult, cell_rows
-from phasemark.matcher.match import Match
-from phasemark.matcher.picture import describe, draw_residual, model_range_m
-from phasemark.render import wrap_difference_m
+from phasemark.matcher.picture import describe, match_picture
 from phasemark.render.plot import draw_range
 
 _ANGLE_STYLES = (("#0072B2", "o", "-"), ("#D55E00", "s", "--"), ("#009E73", "^", ":"), ("#CC79A7", "D", "-."))
@@ -130,31 +128,24 @@ def _gallery(result: DemoResult) -> list[dict[str, Any]]:
 
 
 def _matches(result: DemoResult) -> list[dict[str, Any]]:
-    """Show filtered image, best model image and residual of three cells on the grid and of the worst cell."""
+    """Show filtered image, best model image and residual of three cells on the grid and of the worst trial."""
     on_grid = result.select(shifted=False)
     picked = [on_grid[k * (len(on_grid) - 1) // 2] for k in range(3)]
     worst = _worst_cell(result)
     return [
         {
             "title": title,
-            "found": describe(r.matches[0]),
-            "picture": _image(_match_figure(r, r.matches[0], result), f"Measured, model and residual: {title}"),
+            "found": f"Repetition {k}: {describe(r.matches[k])}",
+            "picture": _image(
+                match_picture(r.filtered, r.matches[k], result.bank, result.background, k, title=False),
+                f"Measured, model and residual: {title}",
+            ),
         }
-        for title, r in [*((_cell_name(r), r) for r in picked), (f"The worst cell: {_cell_name(worst)}", worst)]
+        for title, r, k in [
+            *((_cell_name(r), r, 0) for r in picked),
+            (f"The worst trial: {_cell_name(worst)}", worst, int(worst.position_error_m.argmax())),
+        ]
     ]
-
-
-def _match_figure(cell: CellResult, match: Match, result: DemoResult) -> Figure:
-    measured = cell.filtered.range_m[0]
-    model = model_range_m(result.bank, match, result.background)
-    known = np.concatenate([measured[np.isfinite(measured)], model[np.isfinite(model)]])
-    figure = Figure(figsize=(10.8, 3.4), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
-    for axes, ranges, title in ((left, measured, "filtered image"), (middle, model, "best model image")):
-        draw_range(axes, ranges, near_m=float(known.min()), far_m=float(known.max()))
-        axes.set_title(title)
-    draw_residual(right, wrap_difference_m(measured - model, result.bank.sensor))
-    return figure
 
 
 def _confusion_figure(result: DemoResult) -> Figure:

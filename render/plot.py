@@ -99,6 +99,27 @@ def draw_range(
     return image
 
 
+def draw_difference(axes: Axes, difference_m: NDArray[np.float64]) -> AxesImage:
+    """Draw a difference of ranges into axes of a larger figure, in millimetres.
+
+    Parameters
+    ----------
+    axes : matplotlib.axes.Axes
+    difference_m : (rows, cols) ndarray
+        Metres; what is NaN stays grey. Nine tenths of the pixels lie within the colour bar.
+
+    Returns
+    -------
+    matplotlib.image.AxesImage
+    """
+    known = 1e3 * np.abs(difference_m[np.isfinite(difference_m)])
+    span = max(float(np.percentile(known, 90)) if known.size else 1.0, 1.0)
+    axes.set_facecolor("#d0d0d0")
+    image = _draw_pixels(axes, 1e3 * difference_m, cmap="RdBu", vmin=-span, vmax=span)
+    _colour_bar(axes, image, "difference (mm)")
+    return image
+
+
 def plot_phasor_image(images: PhasorImages, index: int = 0) -> Figure:
     """Draw range, amplitude and coverage of one view side by side.
 
@@ -239,7 +260,7 @@ def _panel(axes: Axes, values: NDArray[np.float64], title: str, label: str, **ho
 def _colour_bar(axes: Axes, image: AxesImage, label: str) -> None:
     figure = axes.get_figure(root=True)
     if figure is not None:
-        figure.colorbar(image, ax=axes, label=label, shrink=0.9)
+        figure.colorbar(image, ax=axes, label=label, shrink=0.9, pad=0.04, aspect=18)
 
 
 def _draw_flags(axes: Axes, flags: NDArray[np.uint8]) -> None:
