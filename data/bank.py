@@ -47,6 +47,16 @@ class BankGroup:
     ``views`` below stands for (distance, delta) in `lower`, (class, distance) in `upper` and (class, distance, delta)
     in `full`.
 
+    Parameters
+    ----------
+    name : {"lower", "upper", "full"}
+    group : h5py.Group
+        The open group.
+    path : Path
+        Its file, for messages.
+    sensor : Sensor
+        The camera that the images belong to.
+
     Attributes
     ----------
     distance_m, delta_rad : (n,) float64
@@ -148,9 +158,15 @@ class BankGroup:
 class Bank:
     """Model images over distance, angle and class; made by :func:`open_bank`, and a context manager.
 
+    Parameters
+    ----------
+    file : h5py.File
+        The open file; the bank closes it.
+    path : Path
+        Its name.
+
     Attributes
     ----------
-    path : Path
     sensor : Sensor
     plan : BankPlan
         The resolved plan the bank was made from.

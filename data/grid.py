@@ -62,6 +62,11 @@ def parse_grid(grid: str | float | Sequence[float], name: str = "grid") -> NDArr
 def format_grid(values: NDArray[np.float64] | Sequence[float]) -> str:
     """Return the shortest text from which :func:`parse_grid` makes these values again.
 
+    Parameters
+    ----------
+    values : (n,) sequence of float
+        Increasing, rounded to 12 decimals.
+
     Examples
     --------
     >>> format_grid([0.7, 0.71, 0.72])

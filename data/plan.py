@@ -208,6 +208,15 @@ class BankPlan(_PlanModel):
 def load_plan(path: str | os.PathLike[str]) -> BankPlan:
     """Read a bank's plan from a TOML file; files it names are relative to its folder.
 
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    BankPlan
+        As it stands in the file; :meth:`BankPlan.resolve` fills in the rest.
+
     Raises
     ------
     InputFileError

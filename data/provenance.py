@@ -26,7 +26,12 @@ def versions() -> dict[str, str]:
 
 
 def mesh_sha256(mesh: trimesh.Trimesh) -> str:
-    """Return the SHA-256 of a mesh: its vertices as little-endian float64, then its faces as little-endian int64."""
+    """Return the SHA-256 of a mesh: its vertices as little-endian float64, then its faces as little-endian int64.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+    """
     digest = hashlib.sha256()
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())

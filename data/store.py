@@ -120,7 +120,19 @@ def sha256_of(path: str | os.PathLike[str]) -> str:
 
 
 def write_checksum(path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write ``FILE.sha256`` for an existing file, in the format of ``sha256sum``, and return its path.
+    """Write ``FILE.sha256`` for an existing file, in the format of ``sha256sum``.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, not its checksum.
+    force : bool
+        Whether an existing checksum may be replaced.
+
+    Returns
+    -------
+    Path
+        The checksum file.
 
     Raises
     ------
@@ -135,6 +147,11 @@ def write_checksum(path: str | os.PathLike[str], *, force: bool = False) -> Path
 
 def read_checksum(path: str | os.PathLike[str]) -> str:
     """Return the SHA-256 that ``FILE.sha256`` states for a file, in lower-case hexadecimal.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, not its checksum.
 
     Raises
     ------
@@ -155,7 +172,17 @@ def read_checksum(path: str | os.PathLike[str]) -> str:
 
 
 def verify_checksum(path: str | os.PathLike[str]) -> str:
-    """Compare a file with its ``FILE.sha256`` and return the SHA-256 both agree on.
+    """Compare a file with its ``FILE.sha256``.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, not its checksum.
+
+    Returns
+    -------
+    str
+        The SHA-256 both agree on, in lower-case hexadecimal.
 
     Raises
     ------
