@@ -27,9 +27,11 @@ _MAX_EVENTS = 4 * MAX_SEGMENTS + 64
 _EMPTY = 1e-10
 """Pieces narrower than this (pixels) are not sampled."""
 _THIN = 0.15
-"""Slabs and intervals narrower than this (pixels) get one Gauss point."""
-
-_THIN_AT_LIMB = 0.06
+"""Intervals narrower than this (pixels) get one Gauss point."""
+_NARROW = 0.04
+"""Slabs narrower than this (pixels) get one line."""
+_MERGED = 0.3
+"""Thin slabs are merged up to this width (pixels)."""
 _REACH = 0.5
 """How far along the sweep (pixels) the end of a limb is felt."""
 _PINCH = 1e-6
@@ -366,18 +368,17 @@ def _plan_lines(lo, hi, x0, x1, work, active, n_active, curved):  # type: ignore
     The light of such a corner grows like the 3/2 power of the distance from it; lines placed at its square make that
     smooth. One line misses how the integrand changes along slanted edges, two are exact to third order.
 
-    Returns the number of lines, whether the slab is pinched at its low and at its high end, and whether it has a limb.
+    Returns the number of lines, and whether the slab is pinched at its low and at its high end.
     """
     slab = hi - lo
     slant = 0.0
-    beside_limb, pinched_low, pinched_high = False, False, False
+    pinched_low, pinched_high = False, False
     for i in range(n_active):
         edge = active[i]
         low, high = _edge_at(work, edge, lo), _edge_at(work, edge, hi)
         slant = max(slant, abs(high - low))
         if work[edge, 4] == 0.0:
             continue
-        beside_limb = True
         # what bounds the limb's own surface on its other side
         other = i + 1 if work[edge, 4] > 0 else i - 1
         other_low = other_high = x1 if work[edge, 4] > 0 else x0
@@ -386,14 +387,14 @@ def _plan_lines(lo, hi, x0, x1, work, active, n_active, curved):  # type: ignore
         pinched_low = pinched_low or abs(low - other_low) < _PINCH
         pinched_high = pinched_high or abs(high - other_high) < _PINCH
     if pinched_low and pinched_high:
-        return 4, True, True, True
+        return 4, True, True
     if pinched_low or pinched_high:
-        return 3, pinched_low, pinched_high, True
-    if slab <= (_THIN_AT_LIMB if beside_limb else _THIN) and slab * slant * slant < 1e-3:
-        return 1, False, False, beside_limb
-    if slab < 0.3:
-        return 2, False, False, beside_limb
-    return (5 if curved else 3), False, False, beside_limb
+        return 3, pinched_low, pinched_high
+    if slab < _NARROW and slant < _THIN:
+        return 1, False, False
+    if slab < _MERGED:
+        return 2, False, False
+    return (5 if curved else 3), False, False
 
 
 @njit(cache=True, nogil=True)
@@ -441,21 +442,35 @@ def _line_position(lines, g, pinched_low, pinched_high):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True)
-def _write(nodes, count, sweep_v, scale, points, weights, regions, n, region):  # type: ignore[no-untyped-def]
-    """Write the nodes of a line, or of lines merged into one, as samples."""
-    if n + count > len(weights):
+def _write(nodes, count, wide, sweep_v, scale, points, weights, regions, n, region):  # type: ignore[no-untyped-def]
+    """Write the nodes of a line, or of lines merged over a width, as samples.
+
+    Merged nodes have a total weight, a mean (s, x), and a variance of s. Two samples of half the weight at one standard
+    deviation before and behind the mean, along the regression line of x on s, have the same moments up to the second
+    (the third too, if the lines lie evenly): the two-point Gauss rule of the merged lines.
+    """
+    if n + 2 * count > len(weights):
         return -1, region
     last = -1.0
     for g in range(count):
-        weight, s, x = nodes[g, 0], nodes[g, 1] / nodes[g, 0], nodes[g, 2] / nodes[g, 0]
-        points[n, 0] = x if sweep_v else s
-        points[n, 1] = s if sweep_v else x
-        weights[n] = weight * scale
+        total = nodes[g, 0]
+        s, x = nodes[g, 1] / total, nodes[g, 2] / total
         if nodes[g, 3] != last:
             region += 1
             last = nodes[g, 3]
-        regions[n] = region
-        n += 1
+        copies, ds, dx = 1, 0.0, 0.0
+        if wide > _NARROW:
+            variance = nodes[g, 4] / total - s * s
+            if variance > 1e-6:
+                copies, ds = 2, math.sqrt(variance)
+                dx = (nodes[g, 5] / total - s * x) / ds
+        for sign in range(copies):
+            direction = 1.0 - 2.0 * sign
+            points[n, 0] = x + direction * dx if sweep_v else s + direction * ds
+            points[n, 1] = s + direction * ds if sweep_v else x + direction * dx
+            weights[n] = total * scale / copies
+            regions[n] = region
+            n += 1
     return n, region
 
 
@@ -466,24 +481,25 @@ def _sweep_box(  # type: ignore[no-untyped-def]
     """Sample a box slab by slab; `scale` turns areas into weights.
 
     A rim or silhouette is a chain of many short edges, each of which makes a slab. Thin slabs that follow one another
-    without a change of structure are merged: their lines have corresponding nodes, and one sample at the centroid of
-    corresponding nodes, with their total weight, integrates a linear function over the union exactly.
+    without a change of structure are merged: their lines have corresponding nodes, and two samples with the mean and
+    the variance of corresponding nodes take the place of all of them.
     """
     events = np.empty(_MAX_EVENTS)
     n_events = _events(s0, s1, work, m, events)
     cross, side = np.empty(m + 2), np.empty(m + 2)
-    nodes, merged = np.empty((4 * m + 4, 4)), np.empty((4 * m + 4, 4))
+    nodes, merged = np.empty((4 * m + 4, 6)), np.empty((4 * m + 4, 6))
     active, previous = np.empty(m, np.int64), np.empty(m, np.int64)
     start_cross, start_slope = np.empty(m + 2), np.empty(m + 2)
     started, n_active, n_previous = 0, 0, 0
-    n_merged, start, stop, start_line, n_slabs = 0, 0.0, -np.inf, 0.0, 0
+    n_merged, start, stop, start_line, n_lines = 0, 0.0, -np.inf, 0.0, 0
     for e in range(n_events - 1):
         lo, hi = max(events[e], s0), min(events[e + 1], s1)
         slab = hi - lo
         if slab <= _EMPTY:
             continue
         started, n_active = _activate(lo, hi, work, m, started, active, n_active)
-        lines, pinched_low, pinched_high, beside_limb = _plan_lines(lo, hi, x0, x1, work, active, n_active, curved)
+        lines, pinched_low, pinched_high = _plan_lines(lo, hi, x0, x1, work, active, n_active, curved)
+        mergeable = slab < _MERGED and not pinched_low and not pinched_high
         k = n_active + 1
         cross[0], side[0], cross[k], side[k] = x0, 0.0, x1, 0.0
         for g in range(lines):
@@ -492,54 +508,46 @@ def _sweep_box(  # type: ignore[no-untyped-def]
             for i in range(n_active):
                 cross[i + 1] = min(max(_edge_at(work, active[i], s), cross[i]), x1)
                 side[i + 1] = work[active[i], 4]
-            count = _line_nodes(s, slab, share * slab, cross, side, k, limbs, n_limbs, curved, nodes)
-            if lines > 1:
-                n, region = _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
-                if n >= 0:
-                    n, region = _write(nodes, count, sweep_v, scale, points, weights, regions, n, region)
-                if n < 0:
-                    return -1, region
-                n_merged = 0
-                continue
-            wide = hi - start
-            follows = (
-                n_merged == count
-                and n_previous == n_active
-                and lo - stop <= _EMPTY
-                and wide <= (_THIN_AT_LIMB if beside_limb else _THIN)
-                and _continues(work, m, previous, active, n_active, stop, lo)
-            )
+            count = _line_nodes(s, share * slab, cross, side, k, limbs, n_limbs, curved, nodes)
+            follows = mergeable and n_merged == count and n_previous == n_active and hi - start <= _MERGED
+            if follows and g == 0:
+                follows = lo - stop <= _EMPTY and _continues(work, m, previous, active, n_active, stop, lo)
             if follows:
-                slant = 0.0
                 for i in range(1, k):
-                    if n_slabs == 1:
+                    if n_lines == 1:
                         start_slope[i] = (cross[i] - start_cross[i]) / (s - start_line)
                     bent = abs(cross[i] - start_cross[i] - start_slope[i] * (s - start_line))
                     follows = follows and bent <= 0.02 * min(cross[i] - cross[i - 1], cross[i + 1] - cross[i])
-                    slant = max(slant, abs(start_slope[i]) * wide)
-                follows = follows and wide * slant * slant < 1e-3
                 for j in range(count):
                     follows = follows and nodes[j, 3] == merged[j, 3]
             if follows:
                 for j in range(count):
-                    for i in range(3):
+                    for i in (0, 1, 2, 4, 5):
                         merged[j, i] += nodes[j, i]
-                n_slabs += 1
+                n_lines += 1
             else:
-                n, region = _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
+                n, region = _write(merged, n_merged, stop - start, sweep_v, scale, points, weights, regions, n, region)
                 if n < 0:
                     return -1, region
-                n_merged, start, start_line, n_slabs = count, lo, s, 1
+                n_merged, start, start_line, n_lines = count, lo, s, 1
                 start_cross[: k + 1] = cross[: k + 1]
                 merged[:count] = nodes[:count]
             stop, n_previous = hi, n_active
             previous[:n_active] = active[:n_active]
-    return _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
+            if not mergeable:
+                n, region = _write(merged, n_merged, 0.0, sweep_v, scale, points, weights, regions, n, region)
+                if n < 0:
+                    return -1, region
+                n_merged, stop = 0, -np.inf
+    return _write(merged, n_merged, stop - start, sweep_v, scale, points, weights, regions, n, region)
 
 
 @njit(cache=True, nogil=True)
-def _line_nodes(s, slab, line_weight, cross, side, k, limbs, n_limbs, curved, nodes):  # type: ignore[no-untyped-def]
-    """Place the nodes of one line: rows (weight, weight · s, weight · x, interval); returns their number."""
+def _line_nodes(s, line_weight, cross, side, k, limbs, n_limbs, curved, nodes):  # type: ignore[no-untyped-def]
+    """Place the nodes of one line.
+
+    Rows are w, w·s, w·x, the interval, w·s², w·s·x with the weight w; returns their number.
+    """
     count = 0
     left, behind_limb = -np.inf, False
     for i in range(k):
@@ -560,16 +568,17 @@ def _line_nodes(s, slab, line_weight, cross, side, k, limbs, n_limbs, curved, no
             right = cross[j]
         elif curved and j == k:
             right = _nearest_limb(limbs, n_limbs, s, -1.0, b)
-        placed = _place(a, b, left, right, slab, nodes[count:])
+        placed = _place(a, b, left, right, nodes[count:])
         for g in range(count, count + placed):
-            weight = nodes[g, 0] * line_weight
-            nodes[g, 0], nodes[g, 1], nodes[g, 2], nodes[g, 3] = weight, weight * s, weight * nodes[g, 2], float(i)
+            weight, x = nodes[g, 0] * line_weight, nodes[g, 2]
+            nodes[g, 0], nodes[g, 1], nodes[g, 2], nodes[g, 3] = weight, weight * s, weight * x, float(i)
+            nodes[g, 4], nodes[g, 5] = weight * s * s, weight * s * x
         count += placed
     return count
 
 
 @njit(cache=True, nogil=True)
-def _place(a, b, left, right, slab, nodes):  # type: ignore[no-untyped-def]
+def _place(a, b, left, right, nodes):  # type: ignore[no-untyped-def]
     """Place Gauss points on one interval [a, b], with limbs at `left` and `right` (±inf: none).
 
     Column 0 of `nodes` gets the weight, which adds up to b − a, column 2 the place; returns their number.
@@ -586,7 +595,7 @@ def _place(a, b, left, right, slab, nodes):  # type: ignore[no-untyped-def]
     elif near_right:
         t0, t1, count = math.sqrt(right - a), math.sqrt(max(right - b, 0.0)), 4
     else:
-        count = 1 if b - a < _THIN and slab < _THIN else 2
+        count = 1 if b - a < _THIN else 2
         t0, t1 = a, b
     total = 0.0
     for g in range(count):
