@@ -307,7 +307,14 @@ def _bank_build(
         changes["classes"] = tuple(classes or ())
         changes["landmarks"] = ()
         changes["meshes"] = tuple(
-            MeshPlan(name=name, path=path, unit=_stated_unit(path, unit), up=up, origin=origin, symmetry=symmetry)
+            MeshPlan(
+                name=name,
+                path=path,
+                unit=_stated_unit(path, unit),
+                up=up,  # type: ignore[arg-type]  # MeshPlan says what is right
+                origin=origin,  # type: ignore[arg-type]
+                symmetry=symmetry,
+            )
             for name, path in map(_name_and_file, meshes or ())
         )
     for key, value in (("sensor", sensor), ("distance_m", distance), ("delta_deg", delta), ("model", model)):

@@ -165,7 +165,6 @@ class Bank:
 
     Attributes
     ----------
-    path : Path
     sensor : Sensor
     plan : BankPlan
         The resolved plan the bank was made from.

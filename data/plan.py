@@ -67,10 +67,11 @@ class MeshPlan(_PlanModel):
     path : str
         STL, PLY, OBJ or OFF file; in a plan file relative to the plan's folder.
     unit : {"m", "cm", "mm", "inch"}
-        Unit of the file's coordinates.
-    up, origin : str
-        Which axis of the file points up, and which of its points becomes the origin, as
-        :func:`phasemark.landmarks.read_mesh` takes them.
+        Unit of the file's coordinates. Without it the mesh is refused when it is read, with its extents in each unit.
+    up : {"z", "-z", "y", "-y", "x", "-x"}
+        Axis of the file that points up.
+    origin : {"file", "base", "center"}
+        What becomes the origin: the file's own, the centre of the foot, or the centre of the bounding box.
     symmetry : int
         How many turns about the vertical axis leave the landmark as it is.
     albedo : float
@@ -79,9 +80,9 @@ class MeshPlan(_PlanModel):
 
     name: _Name
     path: str
-    unit: Literal["m", "cm", "mm", "inch"]
-    up: str = "z"
-    origin: str = "file"
+    unit: Literal["m", "cm", "mm", "inch"] | None = None
+    up: Literal["z", "-z", "y", "-y", "x", "-x"] = "z"
+    origin: Literal["file", "base", "center"] = "file"
     symmetry: Annotated[int, Field(ge=1, le=360)] = 1
     albedo: _Albedo = 0.8
 
@@ -249,6 +250,9 @@ def factored_refusal(plan: BankPlan) -> str | None:
     sensor = plan.build_sensor()
     if plan.meshes:
         return f"'{plan.meshes[0].name}' comes from a mesh file"
+    bare = next((spec.name for spec in plan.landmarks if spec.upper is None), None)
+    if bare is not None:
+        return f"'{bare}' has no upper part"
     boxes = {(spec.box, spec.albedo): spec.name for spec in plan.landmarks}
     if len(boxes) > 1:
         return f"'{plan.landmarks[0].name}' and '{list(boxes.values())[1]}' stand on different boxes"

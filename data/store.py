@@ -158,6 +158,11 @@ def read_checksum(path: str | os.PathLike[str]) -> str:
     str
         Lower-case hexadecimal.
 
+    Parameters
+    ----------
+    path : path-like
+        The file, not its checksum.
+
     Raises
     ------
     InputFileError

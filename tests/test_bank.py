@@ -1,6 +1,7 @@
 """Banks of model images: what is written, what is read, what is refused."""
 
 import errno
+import hashlib
 import json
 import os
 import resource
@@ -192,6 +193,12 @@ def test_the_file_says_where_it_comes_from(bank_file):
         json.dumps(info)
 
 
+def test_a_mesh_hash_is_that_of_its_vertices_and_faces():
+    mesh = trimesh.creation.box()
+    content = mesh.vertices.astype("<f8").tobytes() + mesh.faces.astype("<i8").tobytes()
+    assert mesh_sha256(mesh) == hashlib.sha256(content).hexdigest()
+
+
 def test_the_mesh_comes_back_with_symmetry_albedo_and_parts(bank_file):
     built = build_mesh(catalog()["cone"])
     with open_bank(bank_file) as bank:
@@ -209,6 +216,29 @@ def test_a_bank_of_a_mesh_file_keeps_its_symmetry_and_albedo(painted, tmp_path):
         assert bank.classes == ("part",)
         assert sorted(bank.mesh("part").extents.round(6)) == [0.06, 0.1, 0.2]
         assert bank.mesh("part").metadata == {"name": "part", "symmetry": 2, "albedo": 0.4}
+
+
+def test_a_mesh_file_without_a_unit_is_refused_with_its_extents(painted, tmp_path):
+    trimesh.creation.box((100, 60, 200)).export(tmp_path / "part.stl")
+    part = {"name": "part", "path": str(tmp_path / "part.stl")}
+    with pytest.raises(UsageError, match="unit"):
+        build_bank(BankPlan(meshes=[part], layout="full", **GRID), tmp_path / "bank.h5")
+    assert names(tmp_path) == ["part.stl"]
+
+
+@pytest.mark.parametrize("layout", ["factored", "full"])
+def test_the_planar_model_fills_the_same_schema(layout):
+    plan = BankPlan(classes=["cone"], model="planar", layout=layout, **GRID)
+    with build_bank(plan) as bank:
+        assert bank.plan.model == bank.info()["model"] == "planar"
+        # At D = 0.8 m and δ = 0 the box shows its front, 0.12 m before the axis, in the middle columns.
+        assert bank.image("cone", 0, 0).range_m[0, 8, 8] == pytest.approx(0.68, abs=1e-3)  # the column is 0.7° aside
+
+
+def test_the_planar_model_refuses_mesh_files(painted):
+    part = {"name": "part", "path": "part.stl", "unit": "mm"}
+    with pytest.raises(UsageError, match="'model' must be 'ray' for 'part'"):
+        build_bank(BankPlan(meshes=[part], model="planar", layout="full", **GRID))
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,7 @@ def test_a_plan_file_sets_every_key(tmp_path):
         ("albedo = 2.0", "'albedo' must be less than or equal to 1, got 2.0"),
         ("harmonics = [5, 3]", "'harmonics' must increase"),
         ("harmonics = [1]", "'harmonics.0' must be greater than or equal to 2, got 1"),
-        ("[[meshes]]\nname = 'a'\npath = 'a.stl'", "meshes.0: 'unit' is missing"),
+        ("[[meshes]]\nname = 'a'\nunit = 'mm'", "meshes.0: 'path' is missing"),
         ("[[meshes]]\nname = 'a/b'\npath = 'a.stl'\nunit = 'm'", "'name'"),
         (
             "[[meshes]]\nname = 'a'\npath = 'a.stl'\nunit = 'ft'",
@@ -154,6 +154,7 @@ def test_an_unreadable_plan_is_an_input_error(tmp_path):
         ({}, None),
         ({"landmarks": [OTHER_BOX]}, None),
         ({"meshes": [PART]}, "'part' comes from a mesh file"),
+        ({"landmarks": [{**OTHER_BOX, "upper": None}]}, "'mast' has no upper part"),
         ({"classes": ["cone"], "landmarks": [OTHER_BOX]}, "'cone' and 'mast' stand on different boxes"),
         ({"sensor_overrides": {"pitch_deg": 1}}, "tilted (pitch 1°, roll 0°)"),
         ({"sensor_overrides": {"roll_deg": -2}}, "tilted (pitch 0°, roll -2°)"),

@@ -116,6 +116,26 @@ def test_a_crash_between_the_two_renames_leaves_no_wrong_checksum(tmp_path, monk
     assert [digest is None for _, digest in seen] == [True, True, False]
 
 
+def test_content_is_on_disk_before_it_gets_its_name_and_the_name_after(tmp_path, monkeypatch):
+    events = []
+    real_fsync, real_replace = os.fsync, os.replace
+
+    def fsync(descriptor):
+        status = os.fstat(descriptor)
+        events.append(("sync", status.st_ino))
+        real_fsync(descriptor)
+
+    def replace(source, target):
+        events.append(("rename", os.stat(source).st_ino))
+        real_replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", replace)
+    path = write_atomically(tmp_path / "a", b"content", checksum=True)
+    file, sums, folder = path.stat().st_ino, (tmp_path / "a.sha256").stat().st_ino, tmp_path.stat().st_ino
+    assert events == [("sync", file), ("sync", sums), ("rename", file), ("rename", sums), ("sync", folder)]
+
+
 def test_an_interrupt_leaves_nothing_behind(tmp_path):
     def pieces():
         yield b"half"
