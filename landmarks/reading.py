@@ -217,9 +217,11 @@ def _parse(content: bytes, kind: str, name: str) -> tuple[NDArray[np.float64], N
     """
     {"stl": _check_stl, "ply": _check_ply, "obj": _check_obj, "off": _check_off}[kind](content, name)
     try:
-        loaded: Any = trimesh.load(
-            io.BytesIO(content), file_type=kind, process=False, force="mesh", skip_materials=True, maintain_order=True
-        )
+        with np.errstate(all="ignore"):
+            loaded: Any = trimesh.load(
+                io.BytesIO(content), file_type=kind, process=False, force="mesh", skip_materials=True,
+                maintain_order=True,
+            )  # fmt: skip
         vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
         faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
     except PhasemarkError:

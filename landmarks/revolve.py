@@ -144,7 +144,7 @@ def sphere_rings(radius_m: float, tolerance_m: float, max_faces: int) -> list[Ri
     return rings(radius_m * math.sqrt(4 * math.pi * radius_m**2 / _area(_skin(rings(radius_m)))))
 
 
-_SPHERE_STEP = 6.0
+_SPHERE_STEP = 5.3
 
 
 def _multiple_of_four(count: float, least: int = _MIN_SECTIONS) -> int:

@@ -1,0 +1,283 @@
+"""The commands as a user types them: what they write, and one line for every mistake, with its exit code."""
+
+import json
+import math
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+
+from phasemark.cli import main
+from phasemark.data import verify_checksum
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.render import Background, Renderer, capture, preset
+
+SENSOR = preset("pmd-16x16")
+SMALL = ["--distance", "0.96:1.04:0.02", "--delta", "0:180:10"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder with a bank and frames of a cone 1 m away, turned by 40°, a wall at 3 m behind."""
+    folder = tmp_path_factory.mktemp("commands")
+    assert main(["bank", "build", *SMALL, "-o", str(folder / "bank.h5")]) == 0
+    image = Renderer(build_mesh(catalog()["cone"]), SENSOR).render(
+        1.0, math.radians(40), background=Background(wall_m=3.0)
+    )
+    frames = capture(image, SENSOR, rng=np.random.default_rng(4), n_frames=20)
+    np.savetxt(folder / "frames.csv", frames.range_m[0].reshape(20, -1), delimiter=",", fmt="%.5f")
+    np.savez(folder / "frames.npz", range=np.repeat(frames.range_m, 2, axis=0))
+    return folder
+
+
+@pytest.fixture
+def run(capsys):
+    """Run a command; return its exit code, standard output and standard error."""
+
+    def run(*arguments):
+        capsys.readouterr()
+        code = main([str(argument) for argument in arguments])
+        done = capsys.readouterr()
+        return code, done.out, done.err
+
+    return run
+
+
+MATCH = ["--unit", "m", "--quantity", "range", "--wall", "3"]
+
+
+def test_a_frame_is_matched_and_the_robot_placed(run, folder):
+    code, out, _ = run(
+        "match", folder / "bank.h5", folder / "frames.csv", *MATCH, "--landmark-xy", 2.0, 1.0, "--pan", 0, "--json"
+    )
+    assert code == 0
+    (match,) = json.loads(out)["matches"]
+    assert (match["class"], match["accepted"]) == ("cone", True)
+    assert match["distance_m"] == pytest.approx(1.0)
+    assert match["delta_deg"] == pytest.approx(40.0)
+    # equation (11), and the mirrored solution
+    here = [2 - math.cos(math.radians(40)), 1 - math.sin(math.radians(40))]
+    there = [4 - here[0], 2 - here[1]]
+    np.testing.assert_allclose(sorted([pose["x_m"], pose["y_m"]] for pose in match["poses"]), sorted([here, there]))
+
+
+def test_a_prior_puts_the_pose_it_fits_first(run, folder):
+    for x, y, heading in ((1.2, 0.4, 40), (2.8, 1.6, -140)):
+        _, out, _ = run(
+            "match", folder / "bank.h5", folder / "frames.csv", *MATCH, "--landmark-xy", 2, 1, "--prior", x, y, heading,
+            "--json",
+        )  # fmt: skip
+        first = json.loads(out)["matches"][0]["poses"][0]
+        assert math.hypot(first["x_m"] - x, first["y_m"] - y) < 0.1
+
+
+def test_the_table_has_a_line_a_position(run, folder, tmp_path):
+    code, out, _ = run("match", folder / "bank.h5", folder / "frames.npz", *MATCH, "--plot", tmp_path / "m.png")
+    assert code == 0
+    assert sum("cone" in line for line in out.splitlines()) == 2
+    assert {path.name for path in tmp_path.iterdir()} == {"m-0.png", "m-1.png"}
+
+
+def test_no_landmark_is_an_answer(run, folder, tmp_path):
+    np.savetxt(tmp_path / "wall.csv", np.full((5, 256), 3.0) + np.linspace(0, 1e-3, 5)[:, None], delimiter=",")
+    code, out, _ = run("match", folder / "bank.h5", tmp_path / "wall.csv", "--unit", "m", "--quantity", "range")
+    assert code == 0
+    assert "no landmark" in out
+
+
+def test_the_mean_phasor_is_the_other_filter(run, folder):
+    code, out, _ = run("match", folder / "bank.h5", folder / "frames.csv", *MATCH, "--filter", "phasor-mean", "--json")
+    assert code == 0
+    assert json.loads(out)["matches"][0]["class"] == "cone"
+
+
+def test_render_writes_picture_and_phasors(run, tmp_path):
+    code, out, _ = run(
+        "render", "--class", "cylinder", "--distance", 1.0, "--delta", 30, "--wall", 4, "-o", tmp_path / "f.png"
+    )
+    assert code == 0
+    assert out.split() == [str(tmp_path / "f.png"), str(tmp_path / "f.npz")]
+    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+    expected = Renderer(build_mesh(catalog()["cylinder"]), SENSOR).render(
+        1.0, math.radians(30), background=Background(wall_m=4.0)
+    )
+    with np.load(tmp_path / "f.npz", allow_pickle=False) as data:
+        np.testing.assert_array_equal(data["phasor"], expected.phasor[0])
+        np.testing.assert_array_equal(data["coverage"], expected.coverage[0])
+
+
+def test_what_render_writes_match_reads(run, folder, tmp_path):
+    run("render", "--class", "cone", "--distance", 1.0, "--delta", 40, "--wall", 3, "-o", tmp_path / "f.png")
+    code, out, _ = run("match", folder / "bank.h5", tmp_path / "f.npz", "--wall", 3, "--json")
+    assert code == 0
+    assert json.loads(out)["matches"][0]["class"] == "cone"
+
+
+def test_a_bank_is_written_with_its_checksum_and_described(run, folder):
+    verify_checksum(folder / "bank.h5")
+    code, out, _ = run("bank", "info", folder / "bank.h5", "--json")
+    info = json.loads(out)
+    assert code == 0
+    assert info["classes"] == ["cylinder", "cone", "sphere", "post"]
+    assert (info["n_distance"], info["n_delta"], info["layout"]) == (5, 18, "factored")
+    code, out, _ = run("bank", "info", folder / "bank.h5")
+    assert code == 0
+    assert "0.96:1.04:0.02" in out
+
+
+def test_the_same_command_writes_the_same_bytes(run, folder, tmp_path):
+    assert run("bank", "build", *SMALL, "--workers", 2, "-o", tmp_path / "bank.h5")[0] == 0
+    assert (tmp_path / "bank.h5").read_bytes() == (folder / "bank.h5").read_bytes()
+
+
+def test_a_mesh_file_becomes_a_class(run, tmp_path):
+    assert run("landmark", "export", "post", "-o", tmp_path / "post.stl")[0] == 0
+    code, _, _ = run(
+        "bank", "build", "--mesh", f"mine={tmp_path / 'post.stl'}", "--unit", "m", "--symmetry", 2,
+        "--distance", "0.9:1.1:0.1", "--delta", "0:180:30", "-o", tmp_path / "b.h5",
+    )  # fmt: skip
+    assert code == 0
+    with h5py.File(tmp_path / "b.h5") as file:
+        assert file["full/landmark_class"].asstr()[...].tolist() == ["mine"]
+        assert file["full/delta"][...].tolist() == [0, 30, 60, 90, 120, 150]
+
+
+def test_a_planar_bank_sees_no_mixed_pixels(run, tmp_path):
+    code, _, _ = run("bank", "build", "--model", "planar", "--class", "cone", *SMALL, "-o", tmp_path / "b.h5")
+    assert code == 0
+    with h5py.File(tmp_path / "b.h5") as file:
+        assert set(np.unique(file["lower/coverage"])) == {0.0, 1.0}
+
+
+def test_a_plan_is_overridden_by_options(run, tmp_path):
+    (tmp_path / "plan.toml").write_text('classes = ["cone"]\ndistance_m = "0.9:1.1:0.1"\ndelta_deg = "0:180:90"\n')
+    code, _, _ = run("bank", "build", tmp_path / "plan.toml", "--delta", "0:180:45", "-o", tmp_path / "b.h5")
+    assert code == 0
+    info = json.loads(run("bank", "info", tmp_path / "b.h5", "--json")[1])
+    assert (info["classes"], info["n_distance"], info["n_delta"]) == (["cone"], 3, 4)
+
+
+def test_landmarks_are_listed_shown_exported_and_checked(run, tmp_path):
+    code, out, _ = run("landmark", "list", "--json")
+    assert (code, [spec["name"] for spec in json.loads(out)]) == (0, ["cylinder", "cone", "sphere", "post"])
+    assert "180°" in run("landmark", "list")[1]
+    assert run("landmark", "show", "cone", "-o", tmp_path)[0] == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"cone.png", "cone.html"}
+    for kind in ("stl", "ply", "obj", "off"):
+        assert run("landmark", "export", "cone", "-o", tmp_path / f"cone.{kind}")[0] == 0
+        code, out, err = run("landmark", "check", tmp_path / f"cone.{kind}", "--unit", "m", "--json")
+        report = json.loads(out)
+        assert (code, err) == (0, "")
+        assert (report["watertight"], report["outward"], report["warnings"]) == (True, True, [])
+        assert report["extents_m"] == pytest.approx([0.24, 0.16, 0.30], abs=1e-6)  # float32 in STL and PLY
+
+
+def _case(code, *arguments, contains):
+    return pytest.param(code, arguments, contains, id=" ".join(map(str, arguments))[:60])
+
+
+MISTAKES = [
+    _case(3, "match", "none.h5", "frames.csv", *MATCH, contains="none.h5"),
+    _case(3, "match", "frames.csv", "frames.csv", *MATCH, contains="not a bank"),
+    _case(3, "match", "cut.h5", "frames.csv", *MATCH, contains="cut.h5"),
+    _case(3, "match", "bank.h5", "none.csv", *MATCH, contains="none.csv"),
+    _case(3, "match", "bank.h5", "narrow.csv", *MATCH, contains="255"),
+    _case(3, "match", "bank.h5", "wide.csv", *MATCH, contains="257"),
+    _case(3, "match", "bank.h5", "text.csv", *MATCH, contains="text.csv"),
+    _case(3, "match", "bank.h5", "mixed.csv", *MATCH, contains="mixed.csv"),
+    _case(3, "match", "bank.h5", "empty.csv", *MATCH, contains="empty.csv"),
+    _case(3, "match", "bank.h5", "small.npy", *MATCH, contains="small.npy"),
+    _case(2, "match", "bank.h5", "frames.csv", "--quantity", "range", contains="--unit"),
+    _case(2, "match", "bank.h5", "frames.csv", "--unit", "m", contains="--quantity"),
+    _case(2, "match", "bank.h5", "frames.csv", "--unit", "yard", "--quantity", "range", contains="yard"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--method", "guess", contains="nearest"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--filter", "median", contains="kalman"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--prior", 1, 2, 3, contains="--landmark-xy"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH[:4], "--wall", -1, contains="wall_m"),
+    _case(4, "match", "bank.h5", "frames.csv", *MATCH, "--plot", "bank.h5", contains="--force"),
+    _case(2, "bank", "build", "--class", "pyramid", "-o", "x.h5", contains="pyramid"),
+    _case(2, "bank", "build", "--distance", "1:2:0", "-o", "x.h5", contains="1:2:0"),
+    _case(2, "bank", "build", "--distance", "1:2:-0.1", "-o", "x.h5", contains="1:2:-0.1"),
+    _case(2, "bank", "build", "--distance", "2:1:0.1", "-o", "x.h5", contains="2:1:0.1"),
+    _case(2, "bank", "build", "--distance", "near", "-o", "x.h5", contains="near"),
+    _case(2, "bank", "build", "--distance", "0.05:0.1:0.05", "-o", "x.h5", contains="distance_m"),
+    _case(2, "bank", "build", "--sensor", "kinect", "-o", "x.h5", contains="pmd-16x16"),
+    _case(2, "bank", "build", "--model", "magic", "-o", "x.h5", contains="planar"),
+    _case(2, "bank", "build", "--mesh", "part", "--unit", "mm", "-o", "x.h5", contains="NAME=FILE"),
+    _case(2, "bank", "build", "--mesh", "part=box.stl", "-o", "x.h5", contains="--unit"),
+    _case(3, "bank", "build", "--mesh", "part=cut.stl", "--unit", "m", "-o", "x.h5", contains="cut.stl"),
+    _case(3, "bank", "build", "plan-that-is-not-there.toml", "-o", "x.h5", contains="plan-that-is-not-there.toml"),
+    _case(2, "bank", "build", "bad.toml", "-o", "x.h5", contains="distanz"),
+    _case(4, "bank", "build", *SMALL, "-o", "bank.h5", contains="bank.h5"),
+    _case(2, "bank", "build", *SMALL, "-o", "no/such/folder/x.h5", contains="folder"),
+    _case(3, "bank", "info", "none.h5", contains="none.h5"),
+    _case(3, "bank", "info", "cut.h5", contains="cut.h5"),
+    _case(2, "render", "--distance", 1, "-o", "x.png", contains="--class"),
+    _case(2, "render", "--class", "cone", "--mesh", "a=box.stl", "--distance", 1, "-o", "x.png", contains="--class"),
+    _case(2, "render", "--class", "pyramid", "--distance", 1, "-o", "x.png", contains="pyramid"),
+    _case(2, "render", "--class", "cone", "--distance", -1, "-o", "x.png", contains="distance_m"),
+    _case(2, "render", "--class", "cone", "--distance", 0.1, "-o", "x.png", contains="distance_m"),
+    _case(2, "render", "--class", "cone", "--distance", "nan", "-o", "x.png", contains="distance_m"),
+    _case(2, "render", "--class", "cone", "--distance", 1, "--wall", 0.9, "-o", "x.png", contains="wall_m"),
+    _case(2, "render", "--class", "cone", "--distance", 1, "--floor", 0.1, "-o", "x.png", contains="floor_m"),
+    _case(2, "render", "--class", "cone", "--distance", 1, "-o", "x.jpg", contains=".png"),
+    _case(4, "render", "--class", "cone", "--distance", 1, "-o", "taken.png", contains="taken.png"),
+    _case(2, "render", "--class", "cone", "-o", "x.png", contains="--distance"),
+    _case(2, "landmark", "show", "pyramid", contains="pyramid"),
+    _case(2, "landmark", "export", "cone", "-o", "x.step", contains="stl"),
+    _case(2, "landmark", "check", "box.stl", contains="inch"),
+    _case(2, "landmark", "check", "box.stl", "--unit", "mile", contains="mile"),
+    _case(2, "landmark", "check", "box.stl", "--unit", "m", "--up", "w", contains="'up'"),
+    _case(3, "landmark", "check", "cut.stl", "--unit", "m", contains="cut off"),
+    _case(3, "landmark", "check", "none.stl", "--unit", "m", contains="none.stl"),
+    _case(3, "landmark", "check", "frames.csv", "--unit", "m", contains="csv"),
+    _case(4, "demo", "-o", ".", contains="bank.h5"),
+]
+
+
+@pytest.fixture(scope="module")
+def bad_files(folder):
+    rows = np.full((3, 256), "1.0")
+    np.savetxt(folder / "narrow.csv", rows[:, :255], fmt="%s", delimiter=",")
+    np.savetxt(folder / "wide.csv", np.hstack([rows, rows[:, :1]]), fmt="%s", delimiter=",")
+    rows[1, 7] = "far"
+    np.savetxt(folder / "text.csv", rows, fmt="%s", delimiter=",")
+    (folder / "mixed.csv").write_text(",".join(["1"] * 256) + "\n" + ",".join(["1"] * 64) + "\n")
+    (folder / "empty.csv").write_text("")
+    np.save(folder / "small.npy", np.ones((4, 8, 8)))
+    (folder / "cut.h5").write_bytes((folder / "bank.h5").read_bytes()[:5000])
+    main(["landmark", "export", "post", "-o", str(folder / "box.stl")])
+    (folder / "cut.stl").write_bytes((folder / "box.stl").read_bytes()[:-100])
+    (folder / "bad.toml").write_text('distanz = "1:2:0.1"\n')
+    (folder / "taken.png").write_bytes(b"mine")
+    return folder
+
+
+@pytest.mark.parametrize(("code", "arguments", "contains"), MISTAKES)
+def test_a_mistake_is_one_line_and_leaves_nothing_behind(run, bad_files, monkeypatch, code, arguments, contains):
+    monkeypatch.chdir(bad_files)
+    before = {path.name: path.stat().st_mtime_ns for path in bad_files.iterdir()}
+    found, out, err = run(*arguments)
+    assert (found, out) == (code, "")
+    assert len(err.splitlines()) == 1
+    assert err.startswith("error: ")
+    assert contains in err
+    assert {path.name: path.stat().st_mtime_ns for path in bad_files.iterdir()} == before
+
+
+def test_a_bank_of_another_sensor_than_the_frames_is_refused(run, folder, tmp_path):
+    (tmp_path / "cam.toml").write_text("rows = 8\ncols = 8\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\n")
+    grid = ["--class", "cone", "--distance", "0.9:1.1:0.1", "--delta", "0:180:90"]
+    assert run("bank", "build", *grid, "--sensor", tmp_path / "cam.toml", "-o", tmp_path / "b.h5")[0] == 0
+    code, out, err = run("match", tmp_path / "b.h5", folder / "frames.csv", *MATCH)
+    assert (code, out) == (3, "")
+    assert "64" in err
+
+
+def test_force_replaces_an_output(run, folder, tmp_path):
+    target = tmp_path / "bank.h5"
+    shutil.copy(folder / "frames.csv", target)
+    assert run("bank", "build", "--class", "cone", *SMALL, "-o", target)[0] == 4
+    assert run("bank", "build", "--class", "cone", *SMALL, "-o", target, "--force")[0] == 0
+    assert run("bank", "info", target)[0] == 0

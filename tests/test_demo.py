@@ -1,0 +1,146 @@
+"""The paper's experiment at a small size: the same whatever the workers, and a report that stands alone."""
+
+import csv
+import io
+import math
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from phasemark import OutputExistsError, UsageError
+from phasemark.data.seeds import stream
+from phasemark.matcher.demo import LANDMARK_XY_M, cells_csv, run_demo, trials_csv, write_demo
+from phasemark.matcher.report import summary_rows
+
+SMALL = {
+    "classes": ("cone", "post"),
+    "distances_m": (1.0,),
+    "deltas_deg": (0.0, 45.0),
+    "repetitions": 3,
+    "n_frames": 20,
+    "bank_distance_m": "0.96:1.04:0.01",
+    "bank_delta_deg": "0:180:1",
+}
+
+
+@pytest.fixture(scope="module")
+def result():
+    return run_demo(workers=1, **SMALL)
+
+
+@pytest.fixture(scope="module")
+def written(result, tmp_path_factory):
+    return write_demo(result, tmp_path_factory.mktemp("demo"))
+
+
+def test_cells_on_the_grid_are_found_exactly(result):
+    for cell in result.select(shifted=False):
+        assert cell.class_right.all()
+        assert np.abs(cell.distance_error_m).max() < 1e-9
+        assert np.abs(cell.delta_error_rad).max() < 1e-9
+
+
+def test_shifted_cells_lie_between_grid_points_and_are_missed_by_at_least_their_shift(result):
+    shifted = result.select(shifted=True)
+    assert len(shifted) == len(result.select(shifted=False)) == 4
+    for cell in shifted:
+        assert cell.class_right.all()
+        assert np.abs(cell.distance_error_m).min() >= 0.0037 - 1e-9
+
+
+def test_the_result_does_not_depend_on_the_number_of_workers(result):
+    other = run_demo(workers=3, **SMALL)
+    assert trials_csv(other.cells) == trials_csv(result.cells)
+    assert cells_csv(other.cells) == cells_csv(result.cells)
+
+
+def test_another_seed_gives_other_frames(result):
+    other = run_demo(workers=2, seed=1, **SMALL)
+    assert trials_csv(other.cells) != trials_csv(result.cells)
+
+
+def test_the_table_of_cells_follows_from_the_table_of_trials(result):
+    trials = list(csv.DictReader(io.StringIO(trials_csv(result.cells))))
+    for row in csv.DictReader(io.StringIO(cells_csv(result.cells))):
+        own = [t for t in trials if all(t[key] == row[key] for key in ("class", "shifted", "distance_m", "delta_deg"))]
+        assert len(own) == int(row["trials"]) == 3
+        errors = [1e3 * abs(float(t["found_distance_m"]) - float(t["distance_m"])) for t in own]
+        # both tables are rounded, to 1e-6 m and 1e-4 mm
+        assert float(row["median_abs_distance_error_mm"]) == pytest.approx(sorted(errors)[1], abs=2e-3)
+        assert int(row["class_right"]) == sum(t["found_class"] == t["class"] for t in own)
+
+
+def test_the_position_error_is_the_distance_of_the_nearest_symmetric_pose(result):
+    for cell in result.cells:
+        d, delta = cell.cell.distance_m, cell.cell.delta_rad
+        truth = np.array(LANDMARK_XY_M) - d * np.array([math.cos(delta), math.sin(delta)])
+        for match, error in zip(cell.matches, cell.position_error_m, strict=True):
+            found = [
+                np.array(LANDMARK_XY_M)
+                - match.distance_m * np.array([math.cos(match.delta_rad + turn), math.sin(match.delta_rad + turn)])
+                for turn in (0, math.pi)
+            ]
+            assert error == pytest.approx(min(np.hypot(*(place - truth)) for place in found), abs=1e-9)
+
+
+class _Sources(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.sources, self.open = [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.sources += [value for name, value in attributes if name in ("src", "href")]
+        if tag not in ("img", "meta", "br", "link"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_report_loads_nothing_and_its_tags_are_balanced(written):
+    page = _Sources()
+    page.feed(written.read_text(encoding="utf-8"))
+    assert page.open == []
+    assert page.sources
+    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
+
+
+def test_the_report_states_the_seed_the_versions_and_each_class(written, result):
+    text = written.read_text(encoding="utf-8")
+    assert f"phasemark demo --seed {result.seed}" in text
+    assert "numpy" in text
+    for name in result.bank.classes:
+        assert f"<h3>{name}</h3>" in text
+
+
+def test_reports_are_not_overwritten_unasked(written, result):
+    with pytest.raises(OutputExistsError):
+        write_demo(result, written.parent)
+    assert write_demo(result, written.parent, force=True) == written
+
+
+def test_the_printed_summary_has_a_row_for_each_view(result):
+    assert [row[:3] for row in summary_rows(result.select(shifted=False))] == [
+        ("100.00", "0.00", "6/6"),
+        ("100.00", "45.00", "6/6"),
+    ]
+
+
+@pytest.mark.parametrize("wrong", [{"repetitions": 0}, {"n_frames": 0}, {"classes": ("pyramid",)}])
+def test_wrong_arguments_are_refused(wrong):
+    with pytest.raises(UsageError):
+        run_demo(**{**SMALL, **wrong})
+
+
+def test_a_stream_depends_on_seed_purpose_and_index_alone():
+    draw = stream(7, "frames", 17).random(8)
+    np.testing.assert_array_equal(stream(7, "frames", 17).random(8), draw)
+    for other in (stream(8, "frames", 17), stream(7, "poses", 17), stream(7, "frames", 18)):
+        assert not np.isin(other.random(8), draw).any()
+
+
+@pytest.mark.parametrize(("seed", "index"), [(-1, 0), (0, -1), (2**64, 0)])
+def test_a_stream_out_of_range_is_refused(seed, index):
+    with pytest.raises(UsageError, match="must be in 0"):
+        stream(seed, "frames", index)
