@@ -1,0 +1,350 @@
+"""Measure speed and accuracy on this machine: ``python benchmarks/run.py [SECTION …]``.
+
+Prints tables in Markdown and writes the numbers to out/bench.json. Times are medians of several runs; machines are
+noisy, so compare ratios within one run. Open3D stands in as a peer where it can be imported (it needs libusb-1.0-0,
+libgl1, libgomp1 and libx11-6 of Debian); without it the rest runs all the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phasemark.data import BankPlan, build_bank, open_bank
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.matcher import Matcher, kalman_filter, phasor_mean
+from phasemark.render import Background, Renderer, Views, capture, preset
+
+ROOT = Path(__file__).resolve().parent.parent
+SENSOR = preset("pmd-16x16")
+WRONG_IN_THE_REFERENCE = (5, 4, 6)  # frame, row, column: tests/test_reference.py has the proof
+SEED = 2005
+Table = dict[str, Any]
+
+
+def median_seconds(work: Callable[[], object], runs: int = 5) -> float:
+    """Return the median time of a piece of work, after one run that is not counted."""
+    work()
+    times = []
+    for _ in range(runs):
+        started = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - started)
+    return statistics.median(times)
+
+
+def random_views(n: int, seed: int = SEED) -> Views:
+    """Return views like those of the reference: D 0.75 to 2 m, any δ, bearing ± 3°, height ± 5 cm."""
+    rng = np.random.default_rng(seed)
+    return Views(
+        rng.uniform(0.75, 2.0, n),
+        rng.uniform(0, np.pi, n),
+        np.radians(rng.uniform(-3, 3, n)),
+        rng.uniform(-0.05, 0.05, n),
+    )
+
+
+def reference() -> tuple[list[dict[str, Any]], np.ndarray, np.ndarray]:
+    """Return cases, phasors and coverages of the reference frames."""
+    with np.load(ROOT / "tests" / "golden" / "reference.npz") as file:
+        return json.loads(str(file["cases"])), file["phasor"], file["coverage"]
+
+
+def render_case(renderer: Renderer, case: dict[str, Any]) -> Any:
+    """Render the view of one reference frame."""
+    view = {key: case.get(key, 0.0) for key in ("distance_m", "delta_rad", "bearing_rad", "height_m")}
+    return renderer.render(**view, background=Background(wall_m=case.get("wall_m"), floor_m=case.get("floor_m")))
+
+
+def accuracy() -> Table:
+    """Compare with frames integrated from the true solids."""
+    cases, phasor, coverage = reference()
+    renderers = {name: Renderer(build_mesh(spec), SENSOR) for name, spec in catalog().items()}
+    rows = []
+    for k, case in enumerate(cases):
+        image = render_case(renderers[case["cls"]], case)
+        compared = np.ones((16, 16), bool)
+        if k == WRONG_IN_THE_REFERENCE[0]:
+            compared[WRONG_IN_THE_REFERENCE[1:]] = False
+        rows.append(
+            {
+                "frame": k,
+                "class": case["cls"],
+                "D (m)": f"{case['distance_m']:.3f}",
+                "wall": "yes" if "wall_m" in case else "no",
+                "floor": "yes" if "floor_m" in case else "no",
+                "ε": float(f"{(np.abs(image.phasor[0] - phasor[k])[compared].max() / np.abs(phasor[k]).max()):.2g}"),
+                "coverage error": float(f"{np.abs(image.coverage[0] - coverage[k])[compared].max():.2g}"),
+            }
+        )
+    return {"rows": rows, "worst ε": max(row["ε"] for row in rows)}
+
+
+def rendering() -> Table:
+    """Time batches of 1000 views of each class, and single views; say where the time goes."""
+    views = random_views(1000)
+    sizes = [
+        seconds_per_view(
+            Renderer(build_mesh(catalog()["cylinder"]), SENSOR.with_(rows=pixels, cols=pixels)), views[:200], 1
+        )
+        for pixels in (16, 64)
+    ]
+    return {
+        "rows": [rendering_of(name, views) for name in catalog()],
+        "time of 64 × 64 over 16 × 16 pixels": round(sizes[1] / sizes[0], 2),
+    }
+
+
+def seconds_per_view(renderer: Renderer, views: Views, workers: int, background: Background | None = None) -> float:
+    """Return the median time of a view in a batch."""
+    work = partial(renderer.render_views, views, workers=workers, background=background)
+    return median_seconds(work) / len(views)
+
+
+def rendering_of(name: str, views: Views) -> dict[str, Any]:
+    """Time one class."""
+    renderer = Renderer(build_mesh(catalog()[name]), SENSOR)
+    speed = [1 / seconds_per_view(renderer, views, workers) for workers in (1, 2)]
+    single = median_seconds(lambda: [renderer.render_views(views[k : k + 1]) for k in range(100)]) / 100
+    cast, spent, rays = renderer._intersector.first_face, 0.0, 0
+
+    def timed(origins: Any, directions: Any) -> Any:
+        nonlocal spent, rays
+        started = time.perf_counter()
+        faces = cast(origins, directions)
+        spent += time.perf_counter() - started
+        rays += len(origins)
+        return faces
+
+    renderer._intersector.first_face = timed  # type: ignore[method-assign]
+    started = time.perf_counter()
+    renderer.render_views(views)
+    total = time.perf_counter() - started
+    return {
+        "class": name,
+        "faces": len(renderer.topology.faces),
+        "frames/s, 1 thread": round(speed[0]),
+        "frames/s, 2 threads": round(speed[1]),
+        "single view (ms)": round(1e3 * single, 2),
+        "rays/frame": round(rays / len(views)),
+        "ray casting's share of the time": f"{100 * spent / total:.0f} %",
+        "ray casting alone (M rays/s)": round(rays / spent / 1e6, 1),
+    }
+
+
+def banks() -> Table:
+    """Time the default banks; memory is the peak of a process that does nothing else."""
+    code = (
+        "import resource, sys, time; from phasemark.data import BankPlan, build_bank; s = time.perf_counter();"
+        "build_bank(BankPlan(layout=sys.argv[1]), sys.argv[2]).close();"
+        "print(time.perf_counter() - s, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+    )
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for layout, images in (("factored", 141 * 180 + 4 * 141), ("full", 4 * 141 * 180)):
+            path = Path(folder) / f"{layout}.h5"
+            done = subprocess.run(
+                [sys.executable, "-c", code, layout, str(path)], check=True, capture_output=True, text=True
+            )
+            seconds, mebibytes = map(float, done.stdout.split())
+            rows.append(
+                {
+                    "bank": layout,
+                    "images": images,
+                    "seconds": round(seconds, 1),
+                    "images/s": round(images / seconds),
+                    "file (MB)": round(path.stat().st_size / 1e6, 1),
+                    "peak memory (MiB)": round(mebibytes),
+                }
+            )
+    return {"rows": rows}
+
+
+def chain() -> Table:
+    """Time what comes after rendering: capture, filters, matching."""
+    image = Renderer(build_mesh(catalog()["cone"]), SENSOR).render(np.full(40, 1.0), background=Background(wall_m=3.0))
+    rng = np.random.default_rng(SEED)
+    frames = capture(image, SENSOR, rng=rng, n_frames=50)
+    count = len(frames) * frames.n_frames
+    rows = [
+        ("capture: shot noise, two taps × four phases", count, lambda: capture(image, SENSOR, rng=rng, n_frames=50)),
+        ("Kalman filter", count, lambda: kalman_filter(frames)),
+        ("mean phasor", count, lambda: phasor_mean(frames)),
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        bank = build_bank(BankPlan(), Path(folder) / "bank.h5")
+        with open_bank(bank.path) as opened:
+            matcher = Matcher(opened, background=Background(wall_m=3.0))
+            one = kalman_filter(frames)
+            many = one[np.tile(np.arange(len(one)), 10)]
+            rows.append(("match, nearest of 25 380 + 564 images", len(many), lambda: matcher.match(many)))
+            measured = [(name, n / median_seconds(work)) for name, n, work in rows]
+        bank.close()
+    return {"rows": [{"stage": name, "frames/s": round(speed)} for name, speed in measured]}
+
+
+def peer() -> Table:
+    """Compare with jittered supersampling on Open3D's RaycastingScene, at the same error."""
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        return {
+            "rows": [],
+            "note": f"Open3D cannot be imported here ({error}); it needs libusb-1.0-0, libgl1, libgomp1",
+        }
+    return {"rows": [row for k in (0, 8) for row in peer_on(k, open3d.t.geometry.RaycastingScene())]}
+
+
+def peer_on(k: int, scene: Any) -> list[dict[str, Any]]:
+    """Compare on one reference frame; the error of jitter follows a power law, which is extrapolated to ours."""
+    cases, phasor, _ = reference()
+    case, truth, brightest = cases[k], phasor[k], np.abs(phasor[k]).max()
+    mesh = build_mesh(catalog()[case["cls"]])
+    scene.add_triangles(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
+    renderer = Renderer(mesh, SENSOR)
+    our_error = np.abs(render_case(renderer, case).phasor[0] - truth).max() / brightest
+    views = Views.broadcast(
+        np.full(1000, case["distance_m"]), case["delta_rad"], case.get("bearing_rad", 0), case.get("height_m", 0)
+    )
+    background = Background(wall_m=case.get("wall_m"), floor_m=case.get("floor_m"))
+    ours = seconds_per_view(renderer, views, 2, background)
+    measured = []
+    for density in (16, 32, 64, 128, 256):
+        times, errors = [], []
+        for run in range(1 if density == 256 else 3):
+            started = time.perf_counter()
+            image = jittered(scene, case, density, np.random.default_rng([SEED, run]))
+            times.append(time.perf_counter() - started)
+            errors.append(np.abs(image - truth).max() / brightest)
+        measured.append((f"jitter {density}² (Open3D, 2 threads)", statistics.median(times), statistics.median(errors)))
+    slope, offset = np.polyfit(np.log([m[2] for m in measured]), np.log([m[1] for m in measured]), 1)
+    needed = math.exp(offset + slope * math.log(our_error))
+    return [
+        {
+            "frame": k,
+            "method": method,
+            "seconds/frame": float(f"{seconds:.3g}"),
+            "ε": float(f"{error:.2g}"),
+            "time over ours": round(seconds / ours),
+        }
+        for method, seconds, error in (
+            *measured,
+            ("jitter, extrapolated to our ε", needed, our_error),
+            ("phasemark, 2 threads", ours, our_error),
+        )
+    ]
+
+
+def jittered(scene: Any, case: dict[str, Any], density: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the phasors of one frame from density² jittered rays a pixel, cast row by row by Open3D."""
+    views = Views.broadcast(
+        case["distance_m"], case["delta_rad"], case.get("bearing_rad", 0.0), case.get("height_m", 0.0)
+    )
+    rotation, _ = views.landmark2cam()
+    turn, lens = rotation[0].astype(np.float32), views.lens_in_landmark()[0].astype(np.float32)
+    tan_h, tan_v = SENSOR.tan_half_angles
+    cos_b, sin_b = math.cos(views.bearing_rad[0]), math.sin(views.bearing_rad[0])
+    n = 16 * density
+    cell = np.arange(n, dtype=np.float32)
+    result = np.empty((16, 16), complex)
+    rays = np.empty((density, n, 6), np.float32)
+    rays[..., :3] = lens
+    for row in range(16):
+        u = (cell + rng.random((density, n), np.float32)) / density
+        v = row + (cell[:density, None] + rng.random((density, n), np.float32)) / density
+        direction = np.empty((density, n, 3), np.float32)
+        direction[..., 0] = 1.0
+        direction[..., 1] = tan_h * (1 - u / 8)
+        direction[..., 2] = tan_v * (1 - v / 8)
+        length = np.sqrt(np.einsum("ijk,ijk->ij", direction, direction))
+        rays[..., 3:] = direction @ turn
+        hit = scene.cast_rays(rays, nthreads=2)
+        t = hit["t_hit"].numpy()
+        facing = np.abs(np.einsum("ijk,ijk->ij", hit["primitive_normals"].numpy(), rays[..., 3:]))
+        albedo = np.float32(0.8)
+        seen = np.isfinite(t)
+        t, strength = np.where(seen, t, 1), np.where(seen, albedo * facing, 0)
+        if "wall_m" in case:
+            forward = direction[..., 0] * cos_b + direction[..., 1] * sin_b
+            wall = case["wall_m"] / forward
+            t, strength = np.where(seen, t, wall), np.where(seen, strength, 0.5 * forward)
+        if "floor_m" in case:
+            down = -direction[..., 2]
+            floor = case["floor_m"] / np.where(down > 0, down, 1e-9)
+            nearer = ~seen & (down > 0) & ((strength == 0) | (floor < t))
+            t, strength = np.where(nearer, floor, t), np.where(nearer, 0.5 * down, strength)
+        distance = t * length
+        light = strength / length / distance**2
+        phase = distance / SENSOR.metres_per_radian
+        pixels = (density, 16, density)
+        real = (light * np.cos(phase)).reshape(pixels).mean(axis=(0, 2), dtype=np.float64)
+        imaginary = (light * np.sin(phase)).reshape(pixels).mean(axis=(0, 2), dtype=np.float64)
+        result[row] = real + 1j * imaginary
+    return result
+
+
+SECTIONS: dict[str, tuple[str, Callable[[], Table]]] = {
+    "accuracy": ("Error against frames integrated from the true solids", accuracy),
+    "rendering": ("Rendering", rendering),
+    "peer": ("Against jittered supersampling", peer),
+    "banks": ("Banks", banks),
+    "chain": ("Capture, filters, matching", chain),
+}
+
+
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """Return rows as a Markdown table."""
+    if not rows:
+        return ""
+    lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
+    for row in rows:
+        cells = [f"{value:g}" if isinstance(value, float) else str(value) for value in row.values()]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run the sections asked for, or all."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {', '.join(SECTIONS)}; default: all")
+    names = parser.parse_args().sections or list(SECTIONS)
+    for name in names:
+        if name not in SECTIONS:
+            parser.error(f"unknown section '{name}': the sections are {', '.join(SECTIONS)}")
+    results: dict[str, Any] = {
+        "machine": f"{platform.processor() or platform.machine()}, {len(os.sched_getaffinity(0))} processors",
+        "python": platform.python_version(),
+    }
+    print(f"Machine: {results['machine']}, Python {results['python']}\n")
+    for name in names:
+        title, measure = SECTIONS[name]
+        print(f"## {title}\n", flush=True)
+        results[name] = measure()
+        print(markdown(results[name]["rows"]))
+        for key, value in results[name].items():
+            if key != "rows":
+                print(f"\n{key}: {value}")
+        print(flush=True)
+    results["peak memory (MiB)"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+    out = ROOT / "out"
+    out.mkdir(exist_ok=True)
+    (out / "bench.json").write_text(json.dumps(results, indent=2, ensure_ascii=False), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
