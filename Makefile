@@ -6,6 +6,7 @@
 #   make wheel-check   what a release would ship, built from a clean clone
 
 VENV ?= .venv
+BENCH_VENV ?= $(VENV)-bench
 ARGS ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
@@ -21,8 +22,8 @@ test: $(VENV)/.installed-test
 soak: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -m soak $(ARGS)
 
-bench: $(VENV)/.installed-bench
-	$(BIN)/python benchmarks/run.py $(ARGS)
+bench: $(BENCH_VENV)/.installed-bench
+	$(BENCH_VENV)/bin/python benchmarks/run.py $(ARGS)
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff check .
@@ -64,6 +65,9 @@ $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
 	$(PIP) install --editable '.[test]'
 	touch $(VENV)/.installed $@
 
-$(VENV)/.installed-bench: $(VENV)/.installed
-	$(PIP) install --editable '.[bench]' || echo "Open3D cannot be installed here: its rows will be missing" >&2
+# Open3D brings half a hundred packages, a pytest plugin among them, so the benchmark has an environment of its own.
+$(BENCH_VENV)/.installed-bench: pyproject.toml
+	@$(MAKE) --no-print-directory VENV=$(BENCH_VENV) $(BENCH_VENV)/.installed
+	$(BENCH_VENV)/bin/python -m pip --disable-pip-version-check --quiet install --editable '.[bench]' \
+	    || echo "Open3D cannot be installed here: its rows will be missing" >&2
 	touch $@

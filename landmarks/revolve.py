@@ -145,7 +145,7 @@ def sphere_rings(radius_m: float, tolerance_m: float, max_faces: int) -> list[Ri
 
 
 _SPHERE_STEP = 5.3
-"""Height of a band over √(tolerance · radius); measured: from 5.4 down no pixel of 60 random views exceeds the tolerance."""
+"""Height of a band over √(tolerance · radius), measured: from 5.4 down no pixel of 60 random views is off by more."""
 
 
 def _multiple_of_four(count: float, least: int = _MIN_SECTIONS) -> int:
