@@ -172,7 +172,7 @@ def _confusion_figure(result: DemoResult) -> Figure:
 def _error_figure(result: DemoResult) -> Figure:
     """Draw errors against distance, a curve for each angle: median over classes and trials, bars from 5 to 95 %."""
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
-    panels = figure.subplots(2, 3, sharex=True)
+    panels = figure.subplots(2, 3, sharex=True, sharey="col")
     quantities: tuple[tuple[str, Callable[[CellResult], NDArray[np.float64]]], ...] = (
         ("|ΔD| (mm)", lambda r: 1e3 * np.abs(r.distance_error_m)),
         ("|Δδ| (°)", lambda r: np.degrees(np.abs(r.delta_error_rad))),
