@@ -46,7 +46,7 @@ class MeshTopology:
         Edges (start, end, face, other face): the creases, −1 where there is no other face, and the edges of smooth
         regions, which matter where they are silhouettes. An edge runs along the winding of its first face.
     closed : bool
-        Whether the mesh is watertight and wound outward, so that what faces away is never seen.
+        Whether every shell of the mesh is watertight and wound outward, so that what faces away is never seen.
     """
 
     vertices: NDArray[np.float64]
@@ -93,7 +93,10 @@ class MeshTopology:
         patch = _components(len(faces), edges[~crease][:, 2:])
         corners = _corner_normals(vertices, faces, normals, patch)
         flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
-        signed_volume = np.einsum("ij,ij->i", a, np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]])).sum() / 6
+        shell = _components(len(faces), edges[other >= 0][:, 2:])
+        six_volumes = np.bincount(
+            shell, np.einsum("ij,ij->i", a, np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
+        )
         return cls(
             vertices=np.ascontiguousarray(vertices),
             faces=np.ascontiguousarray(faces, dtype=np.int32),
@@ -104,7 +107,7 @@ class MeshTopology:
             part=np.ascontiguousarray(part),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
             folds=np.ascontiguousarray(edges[fold], dtype=np.int32),
-            closed=bool(regular.all() and signed_volume > 0),
+            closed=bool(regular.all() and (six_volumes > 0).all()),
         )
 
     @classmethod

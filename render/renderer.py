@@ -181,7 +181,7 @@ class Renderer:
                 lanes = [tasks[i::workers] for i in range(workers)]
                 list(pool.map(lambda lane: self._render_tasks(lane, views, behind, (first, stop), sums), lanes))
         self.untrusted_pixels += int((sums.state == UNTRUSTED).sum())
-        phasor = sums.phasor.reshape(*shape, -1)
+        phasor = sums.phasor.reshape(*shape, len(self._orders))
         return PhasorImages(
             phasor=np.ascontiguousarray(phasor[..., 0]),
             intensity=sums.intensity.reshape(shape),
