@@ -9,7 +9,7 @@ one seen from its back). :class:`MeshTopology` finds what does not depend on the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -23,8 +23,7 @@ _COPLANAR_RAD = 1e-7
 _NEAR_M = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class MeshTopology:
+class MeshTopology(NamedTuple):
     """What the renderer needs to know of a mesh, in float64 and contiguous.
 
     Parameters
@@ -34,6 +33,8 @@ class MeshTopology:
     faces : (f, 3) int32
     planes : (f, 4) float64
         Unit normal and offset of each face: n · p = offset on it.
+    planes_by_component : (4, f) float64
+        The same, component by component.
     corner_normals : (f, 3, 3) float64
         Shading normal at each corner of each face; zero at an apex, where there is none.
     flat : (f,) bool
@@ -45,6 +46,12 @@ class MeshTopology:
     creases, folds : (e, 4) int32
         Edges (start, end, face, other face): the creases, −1 where there is no other face, and the edges of smooth
         regions, which matter where they are silhouettes. An edge runs along the winding of its first face.
+    face_folds : (f, 3) int32
+        The folds whose first face this is, −1: fewer than three.
+    fold_reach : (f,) float64
+        How far the normal turns, |n − n'|, over the face's folds at most; −1 if it has none.
+    radius_m : float
+        Distance of the farthest vertex from the origin.
     closed : bool
         Whether every shell of the mesh is watertight and wound outward, so that what faces away is never seen.
     """
@@ -52,12 +59,16 @@ class MeshTopology:
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
     planes: NDArray[np.float64]
+    planes_by_component: NDArray[np.float64]
     corner_normals: NDArray[np.float64]
     flat: NDArray[np.bool_]
     patch: NDArray[np.int32]
     part: NDArray[np.int8]
     creases: NDArray[np.int32]
     folds: NDArray[np.int32]
+    face_folds: NDArray[np.int32]
+    fold_reach: NDArray[np.float64]
+    radius_m: float
     closed: bool
 
     @classmethod
@@ -93,6 +104,7 @@ class MeshTopology:
         patch = _components(len(faces), edges[~crease][:, 2:])
         corners = _corner_normals(vertices, faces, normals, patch)
         flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
+        face_folds, fold_reach = _folds_of_faces(edges[fold], normals)
         shell = _components(len(faces), edges[other >= 0][:, 2:])
         six_volumes = np.bincount(
             shell, np.einsum("ij,ij->i", a, np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
@@ -101,12 +113,16 @@ class MeshTopology:
             vertices=np.ascontiguousarray(vertices),
             faces=np.ascontiguousarray(faces, dtype=np.int32),
             planes=np.ascontiguousarray(planes),
+            planes_by_component=np.ascontiguousarray(planes.T),
             corner_normals=np.ascontiguousarray(corners),
             flat=np.ascontiguousarray(flat),
             patch=patch,
             part=np.ascontiguousarray(part),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
             folds=np.ascontiguousarray(edges[fold], dtype=np.int32),
+            face_folds=face_folds,
+            fold_reach=fold_reach,
+            radius_m=float(np.linalg.norm(vertices, axis=1).max()),
             closed=bool(regular.all() and (six_volumes > 0).all()),
         )
 
@@ -117,12 +133,16 @@ class MeshTopology:
             vertices=np.zeros((0, 3)),
             faces=np.zeros((0, 3), np.int32),
             planes=np.zeros((0, 4)),
+            planes_by_component=np.zeros((4, 0)),
             corner_normals=np.zeros((0, 3, 3)),
             flat=np.zeros(0, np.bool_),
             patch=np.zeros(0, np.int32),
             part=np.zeros(0, np.int8),
             creases=np.zeros((0, 4), np.int32),
             folds=np.zeros((0, 4), np.int32),
+            face_folds=np.zeros((0, 3), np.int32),
+            fold_reach=np.zeros(0),
+            radius_m=0.0,
             closed=True,
         )
 
@@ -159,6 +179,22 @@ def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool
     opposed = half[starts, 0] == half[second, 1]
     edges = np.column_stack([half[starts], owner[starts], other])
     return edges, (count == 2) & opposed
+
+
+def _folds_of_faces(
+    folds: NDArray[np.int64], normals: NDArray[np.float64]
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Return the folds that each face comes first in, (f, 3), and how far its normal turns over all of its folds."""
+    table = np.full((len(normals), 3), -1, np.int32)
+    reach = np.full(len(normals), -1.0)
+    order = np.argsort(folds[:, 2], kind="stable")
+    first = folds[order, 2]
+    rank = np.arange(len(first)) - np.searchsorted(first, first)
+    table[first, rank] = order
+    turn = np.linalg.norm(normals[folds[:, 2]] - normals[folds[:, 3]], axis=1)
+    for side in (2, 3):
+        np.maximum.at(reach, folds[:, side], turn)
+    return table, reach
 
 
 def _components(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -218,21 +254,24 @@ def _average_corners(vertices, faces, normals, patch, corner_of, start, cos_limi
 
 
 @njit(cache=True, nogil=True)
-def project_edges(vertices, planes, creases, folds, closed, lens, matrix, offset, scale, centre, front, segments, limb):  # type: ignore[no-untyped-def]
+def project_edges(mesh, lens, matrix, offset, scale, centre, sides, segments, limb):  # type: ignore[no-untyped-def]
     """Project the creases and silhouettes of one view.
+
+    A fold is a silhouette where the lens lies before one of its faces and behind the other. Both faces' planes pass
+    through the fold, so the lens is then no further from either than their normals' difference times its distance from
+    the fold; that leaves few faces to look at.
 
     Parameters
     ----------
-    vertices, planes, creases, folds, closed
-        As in :class:`MeshTopology`.
+    mesh : MeshTopology
     lens : (3,)
         The lens in the landmark frame.
     matrix, offset : (3, 3), (3,)
         p_image = matrix · p' + offset: landmark frame to the tilted camera's frame (x along the axis).
     scale, centre : (2,)
         u = centre[0] − scale[0] · y/x, v = centre[1] − scale[1] · z/x.
-    front : (f,) uint8, overwritten
-        Whether the lens is on the front side of each face.
+    sides : (f,) float64, overwritten
+        Distance of the lens from each face's plane, positive before its front.
     segments : (e, 4) float64, overwritten
         u, v of both ends.
     limb : (e,) int8, overwritten
@@ -244,26 +283,36 @@ def project_edges(vertices, planes, creases, folds, closed, lens, matrix, offset
     int
         How many segments were written.
     """
-    for f in range(len(planes)):
-        side = planes[f, 0] * lens[0] + planes[f, 1] * lens[1] + planes[f, 2] * lens[2] - planes[f, 3]
-        front[f] = side > 0.0
+    nx, ny, nz, d = mesh.planes_by_component
+    vertices, creases, folds, face_folds, fold_reach = (
+        mesh.vertices, mesh.creases, mesh.folds, mesh.face_folds, mesh.fold_reach
+    )  # fmt: skip
+    for f in range(len(sides)):
+        sides[f] = nx[f] * lens[0] + ny[f] * lens[1] + nz[f] * lens[2] - d[f]
     n = 0
     for e in range(len(creases)):
-        other = creases[e, 3]
+        start, end, face, other = creases[e, 0], creases[e, 1], creases[e, 2], creases[e, 3]
         # what turns its back is hidden behind the front of a closed mesh
-        if closed and not front[creases[e, 2]] and not front[other]:
+        if mesh.closed and sides[face] <= 0.0 and sides[other] <= 0.0:
             continue
-        if _project(vertices, creases[e, 0], creases[e, 1], matrix, offset, scale, centre, segments[n]):
+        if _project(vertices, start, end, matrix, offset, scale, centre, segments[n]):
             limb[n] = 0
             n += 1
-    for e in range(len(folds)):
-        f0 = front[folds[e, 2]]
-        if f0 == front[folds[e, 3]]:
+    farthest = mesh.radius_m + math.sqrt(lens[0] * lens[0] + lens[1] * lens[1] + lens[2] * lens[2])
+    for f in range(len(sides)):
+        if abs(sides[f]) > fold_reach[f] * farthest:
             continue
-        a, b = (folds[e, 0], folds[e, 1]) if f0 else (folds[e, 1], folds[e, 0])
-        if _project(vertices, a, b, matrix, offset, scale, centre, segments[n]):
-            limb[n] = 1
-            n += 1
+        for k in range(3):
+            e = face_folds[f, k]
+            if e < 0:
+                break
+            before = sides[f] > 0.0
+            if before == (sides[folds[e, 3]] > 0.0):
+                continue
+            a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
+            if _project(vertices, a, b, matrix, offset, scale, centre, segments[n]):
+                limb[n] = 1
+                n += 1
     return n
 
 

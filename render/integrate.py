@@ -1,8 +1,9 @@
 """The area integral: which rays a batch of views needs, and the sum of the phasors they bring back.
 
-Two compiled steps with one call of the intersector between them. :func:`plan_rays` fills a buffer with samples of as
-many views as fit; the intersector names the face each meets; :func:`sum_samples` computes the hit in float64, its
-amplitude and phase, and adds it to its pixel.
+Compiled steps with calls of the intersector between them. :func:`plan_rays` fills a buffer with samples of as many
+views as fit. One ray an interval scouts what is seen there (:func:`pick_scouts`); where that is a curved surface the
+other samples are cast too (:func:`share_faces`). :func:`sum_samples` computes each hit in float64, its amplitude and
+phase, and adds it to its pixel.
 """
 
 from __future__ import annotations
@@ -28,16 +29,14 @@ UNTRUSTED = 2
 
 @njit(cache=True, nogil=True)
 def plan_rays(  # type: ignore[no-untyped-def]
-    first, vertices, planes, creases, folds, closed, lens, matrix, offset, bearing, camera, level, row_range,
-    background, front, segments, limb, head, link, owner, work,
-    points, weights, regions, pixel, origins, directions, state,
+    first, mesh, lens, matrix, offset, bearing, camera, level, row_range, background,
+    sides, segments, limb, head, link, owner, work, points, weights, regions, pixel, state,
 ):  # fmt: skip
     """Place the samples of as many views as fit into the buffers, from view `first` on.
 
     Parameters
     ----------
-    vertices, planes, creases, folds, closed
-        The mesh, see :class:`phasemark.render.edges.MeshTopology`.
+    mesh : MeshTopology
     lens, matrix, offset : (n, 3), (n, 3, 3), (n, 3) float64
         The lens in the landmark frame, and the landmark frame to the tilted camera's.
     bearing : (n,) float64
@@ -48,10 +47,10 @@ def plan_rays(  # type: ignore[no-untyped-def]
     row_range : (2,) int64
         First and last-but-one image row to render.
     background : (4,) float64
-    front, segments, limb, head, link, owner, work
+    sides, segments, limb, head, link, owner, work
         Scratch, see :func:`project_edges`, :func:`bin_segments` and :func:`sample_pixel`.
-    points, weights, regions, pixel, origins, directions
-        The samples: u, v; share of the pixel; interval; view · pixels + pixel; float32 ray in the landmark frame.
+    points, weights, regions, pixel
+        The samples: u, v; share of the pixel; interval; view · pixels + pixel.
     state : (n, rows, cols) uint8, overwritten
         Per pixel :data:`SKIPPED`, :data:`SPLIT` or :data:`UNTRUSTED`.
 
@@ -65,10 +64,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
     out_rows = row_range[1] - row_range[0]
     n, region = 0, 0
     for view in range(first, len(lens)):
-        n_edges = project_edges(
-            vertices, planes, creases, folds, closed, lens[view], matrix[view], offset[view], scale, centre,
-            front, segments, limb,
-        )  # fmt: skip
+        n_edges = project_edges(mesh, lens[view], matrix[view], offset[view], scale, centre, sides, segments, limb)
         u_low, u_high, v_low, v_high = np.inf, -np.inf, np.inf, -np.inf
         for i in range(n_edges):
             u_low = min(u_low, segments[i, 0], segments[i, 2])
@@ -99,21 +95,70 @@ def plan_rays(  # type: ignore[no-untyped-def]
                 index = (view * out_rows + r - row_range[0]) * cols + c
                 for k in range(before, n):
                     pixel[k] = index
-        m = matrix[view]
-        for k in range(start, n):
-            y = (centre[0] - points[k, 0]) / scale[0]
-            z = (centre[1] - points[k, 1]) / scale[1]
-            for a in range(3):
-                origins[k, a] = lens[view, a]
-                directions[k, a] = m[0, a] + m[1, a] * y + m[2, a] * z
     return len(lens), n
 
 
 @njit(cache=True, nogil=True)
+def pick_scouts(n, regions, chosen):  # type: ignore[no-untyped-def]
+    """Choose the middle sample of every interval.
+
+    Samples of an interval lie one behind the other, and all see one smooth patch of the surface: the one in the middle
+    tells which. Returns how many indices were written to `chosen`.
+    """
+    count, start = 0, 0
+    for k in range(1, n + 1):
+        if k == n or regions[k] != regions[start]:
+            chosen[count] = (start + k - 1) // 2
+            count += 1
+            start = k
+    return count
+
+
+@njit(cache=True, nogil=True)
+def share_faces(n, regions, pixel, state, flat, scout_face, share, face, chosen):  # type: ignore[no-untyped-def]
+    """Hand the face a scout met to its interval where that is all there is to know, and list the samples left to cast.
+
+    On a flat patch the plane is the same for all samples, and where the scout met nothing nothing is met. A curved
+    patch has a face for each sample. Pixels that could not be split are cast throughout, as is everything without
+    `share`.
+
+    Returns how many indices were written to `chosen`.
+    """
+    count, start, region = 0, 0, 0
+    states = state.reshape(-1)
+    for k in range(1, n + 1):
+        if k < n and regions[k] == regions[start]:
+            continue
+        scout, found = (start + k - 1) // 2, scout_face[region]
+        known = share and states[pixel[start]] == SPLIT and (found < 0 or flat[found])
+        for i in range(start, k):
+            if known or i == scout:
+                face[i] = found
+            else:
+                chosen[count] = i
+                count += 1
+        start = k
+        region += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def aim(n, chosen, points, pixel, lens, matrix, camera, pixels_per_view, origins, directions):  # type: ignore[no-untyped-def]
+    """Write the float32 rays of some samples, landmark frame."""
+    for i in range(n):
+        k = chosen[i]
+        view = pixel[k] // pixels_per_view
+        y = (camera[2] - points[k, 0]) / camera[0]
+        z = (camera[3] - points[k, 1]) / camera[1]
+        for a in range(3):
+            origins[i, a] = lens[view, a]
+            directions[i, a] = matrix[view, 0, a] + matrix[view, 1, a] * y + matrix[view, 2, a] * z
+
+
+@njit(cache=True, nogil=True)
 def sum_samples(  # type: ignore[no-untyped-def]
-    n, points, weights, pixel, face, vertices, faces, planes, corner_normals, flat, part,
-    lens, matrix, bearing, camera, level, background, albedo, radians_per_metre, orders, vignetting,
-    pixels_per_view, phasor, intensity, coverage, upper,
+    n, points, weights, pixel, face, mesh, lens, matrix, bearing, camera, level, background, albedo,
+    radians_per_metre, orders, vignetting, pixels_per_view, phasor, intensity, coverage, upper,
 ):  # fmt: skip
     """Add the light of each sample to its pixel.
 
@@ -125,8 +170,7 @@ def sum_samples(  # type: ignore[no-untyped-def]
         As in :func:`plan_rays`.
     face : (n,) int32
         Face met, −1: none.
-    vertices, faces, planes, corner_normals, flat, part
-        The mesh, see :class:`phasemark.render.edges.MeshTopology`.
+    mesh : MeshTopology
     albedo : float
     radians_per_metre : float
         4πf / c.
@@ -139,6 +183,9 @@ def sum_samples(  # type: ignore[no-untyped-def]
         `upper` is the coverage by the landmark's upper part.
     """
     normal = np.empty(3)
+    # arrays taken out of the tuple once: inside the loop each use of it would count references
+    vertices, faces, planes, corner_normals = mesh.vertices, mesh.faces, mesh.planes, mesh.corner_normals
+    flat, part = mesh.flat, mesh.part
     for k in range(n):
         index = pixel[k]
         view = index // pixels_per_view
@@ -151,11 +198,15 @@ def sum_samples(  # type: ignore[no-untyped-def]
             dx = m[0, 0] + m[1, 0] * y + m[2, 0] * z
             dy = m[0, 1] + m[1, 1] * y + m[2, 1] * z
             dz = m[0, 2] + m[1, 2] * y + m[2, 2] * z
-            ox, oy, oz = lens[view]
-            nx, ny, nz, d = planes[f]
+            ox, oy, oz = lens[view, 0], lens[view, 1], lens[view, 2]
+            nx, ny, nz, d = planes[f, 0], planes[f, 1], planes[f, 2], planes[f, 3]
             facing = nx * dx + ny * dy + nz * dz
-            t, cos_theta = _hit(ox, oy, oz, dx, dy, dz, nx, ny, nz, d, facing, flat[f], f, vertices, faces,
-                                corner_normals, normal)  # fmt: skip
+            t = (d - nx * ox - ny * oy - nz * oz) / facing if facing != 0.0 else 0.0
+            cos_theta = abs(facing)
+            if not (flat[f] and t > 0.0):
+                t, cos_theta = _hit_curved(
+                    ox, oy, oz, dx, dy, dz, t, facing, f, vertices, faces, corner_normals, normal
+                )
             cos_theta /= length
             distance = t * length
             a = albedo * cos_theta / (distance * distance)
@@ -181,14 +232,12 @@ def sum_samples(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _hit(  # type: ignore[no-untyped-def]
-    ox, oy, oz, dx, dy, dz, nx, ny, nz, d, facing, is_flat, f, vertices, faces, corner_normals, normal
-):
-    """Return the multiple of the ray at its hit, and |cos θ| of the shading normal times the ray's length."""
-    t = (d - nx * ox - ny * oy - nz * oz) / facing if facing != 0.0 else 0.0
-    if is_flat and facing != 0.0 and t > 0.0:
-        return t, abs(facing)
-    a, b, c = faces[f]
+def _hit_curved(ox, oy, oz, dx, dy, dz, t, facing, f, vertices, faces, corner_normals, normal):  # type: ignore[no-untyped-def]
+    """Return the multiple of the ray at its hit, and |cos θ| of the shading normal times the ray's length.
+
+    `t` is the multiple at the face's plane, `facing` the product of the face's normal with the ray.
+    """
+    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
     px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
     # barycentric coordinates in the plane of the face
     e1x, e1y, e1z = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]

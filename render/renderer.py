@@ -15,7 +15,15 @@ from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.edges import MeshTopology
 from phasemark.render.footprint import MAX_SEGMENTS
-from phasemark.render.integrate import UNTRUSTED, add_background, plan_rays, sum_samples
+from phasemark.render.integrate import (
+    UNTRUSTED,
+    add_background,
+    aim,
+    pick_scouts,
+    plan_rays,
+    share_faces,
+    sum_samples,
+)
 from phasemark.render.intersect import make_intersector
 from phasemark.render.phasor import PhasorImages
 from phasemark.render.sensor import Sensor
@@ -34,11 +42,11 @@ class _Buffers:
     shape: tuple[int, int]
     n_samples: int = _SAMPLES
     n_links: int = 1 << 14
-    front: NDArray[np.uint8] = field(init=False)
+    sides: NDArray[np.float64] = field(init=False)
 
     def __post_init__(self) -> None:
         rows, cols = self.shape
-        self.front = np.empty(self.n_faces, np.uint8)
+        self.sides = np.empty(self.n_faces)
         self.segments = np.empty((self.n_edges + 1, 4))
         self.limb = np.empty(self.n_edges + 1, np.int8)
         self.head = np.empty((rows + 2, cols + 2), np.int32)
@@ -57,6 +65,8 @@ class _Buffers:
         self.weights = np.empty(n)
         self.regions = np.empty(n, np.int32)
         self.pixel = np.empty(n, np.int64)
+        self.face = np.empty(n, np.int32)
+        self.chosen = np.empty(n, np.int64)
         self.origins = np.empty((n, 3), np.float32)
         self.directions = np.empty((n, 3), np.float32)
 
@@ -222,9 +232,9 @@ class Renderer:
             while view < len(part):
                 b = buffers
                 reached, n = plan_rays(
-                    view, mesh.vertices, mesh.planes, mesh.creases, mesh.folds, mesh.closed, lens, matrix, offset,
-                    part.bearing_rad, self._camera, level, row_range, behind, b.front, b.segments, b.limb, b.head,
-                    b.link, b.owner, b.work, b.points, b.weights, b.regions, b.pixel, b.origins, b.directions, state,
+                    view, mesh, lens, matrix, offset, part.bearing_rad, self._camera, level, row_range, behind,
+                    b.sides, b.segments, b.limb, b.head, b.link, b.owner, b.work,
+                    b.points, b.weights, b.regions, b.pixel, state,
                 )  # fmt: skip
                 if reached == -1:
                     buffers.grow_links(2 * buffers.n_links)
@@ -232,10 +242,9 @@ class Renderer:
                 if reached == view:
                     buffers.grow_samples(2 * buffers.n_samples)
                     continue
-                face = self._intersector.first_face(b.origins[:n], b.directions[:n])
+                self._find_faces(n, b, state, lens, matrix, per_view)
                 sum_samples(
-                    n, b.points, b.weights, b.pixel, face, mesh.vertices, mesh.faces, mesh.planes,
-                    mesh.corner_normals, mesh.flat, mesh.part, lens, matrix, part.bearing_rad, self._camera, level,
+                    n, b.points, b.weights, b.pixel, b.face, mesh, lens, matrix, part.bearing_rad, self._camera, level,
                     behind, self.albedo, radians_per_metre, self._orders, sensor.vignetting, per_view,
                     phasor, intensity, coverage, upper,
                 )  # fmt: skip
@@ -245,6 +254,25 @@ class Renderer:
                         radians_per_metre, self._orders, sensor.vignetting, phasor, intensity,
                     )  # fmt: skip
                 view = reached
+
+    def _find_faces(
+        self,
+        n: int,
+        b: _Buffers,
+        state: NDArray[np.uint8],
+        lens: NDArray[np.float64],
+        matrix: NDArray[np.float64],
+        per_view: int,
+    ) -> None:
+        """Find the face that each of n samples sees, −1 for none, into ``b.face``."""
+
+        def cast(count: int) -> NDArray[np.int32]:
+            aim(count, b.chosen, b.points, b.pixel, lens, matrix, self._camera, per_view, b.origins, b.directions)
+            return self._intersector.first_face(b.origins[:count], b.directions[:count])
+
+        scouts = cast(pick_scouts(n, b.regions, b.chosen))
+        rest = share_faces(n, b.regions, b.pixel, state, self.topology.flat, scouts, True, b.face, b.chosen)
+        b.face[b.chosen[:rest]] = cast(rest)
 
     def _check_lens_outside(self, views: Views) -> None:
         """Refuse views whose lens lies inside the landmark, or within a millimetre of its axis-aligned box."""
