@@ -177,6 +177,7 @@ def sample_pixel(  # type: ignore[no-untyped-def]
         before, after = (head[i, j - 1], head[i, j + 1]) if sweep_v else (head[i - 1, j], head[i + 1, j])
         for near in (head[i, j], before, after):
             n_limbs = _collect_limbs(near, link, owner, segments, limb, sweep_v, limbs, n_limbs)
+    events = np.empty(_MAX_EVENTS)
     stack = np.empty((4 * _MAX_DEPTH + 4, 5))
     stack[0] = (u0, v0, u0 + width, v0 + height, 0.0)
     depth = 1
@@ -185,7 +186,9 @@ def sample_pixel(  # type: ignore[no-untyped-def]
         depth -= 1
         bu0, bv0, bu1, bv1, level = stack[depth]
         m = _clip_to_box(head[i, j], link, owner, segments, limb, bu0, bv0, bu1, bv1, sweep_v, work)
-        if m < 0 and level < _MAX_DEPTH:
+        s0, s1, x0, x1 = (bv0, bv1, bu0, bu1) if sweep_v else (bu0, bu1, bv0, bv1)
+        n_events = _events(s0, s1, work, m, events) if m >= 0 else -1
+        if n_events < 0 and level < _MAX_DEPTH:
             um, vm = 0.5 * (bu0 + bu1), 0.5 * (bv0 + bv1)
             stack[depth] = (bu0, bv0, um, vm, level + 1)
             stack[depth + 1] = (um, bv0, bu1, vm, level + 1)
@@ -193,12 +196,13 @@ def sample_pixel(  # type: ignore[no-untyped-def]
             stack[depth + 3] = (um, vm, bu1, bv1, level + 1)
             depth += 4
             continue
-        if m < 0:
+        if n_events < 0:
             m, trusted = 0, False
-        s0, s1, x0, x1 = (bv0, bv1, bu0, bu1) if sweep_v else (bu0, bu1, bv0, bv1)
+            n_events = _events(s0, s1, work, m, events)
         n, region = _sweep_box(
-            s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, inverse_area, points, weights, regions, n, region
-        )
+            events, n_events, s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, inverse_area,
+            points, weights, regions, n, region,
+        )  # fmt: skip
         if n < 0:
             return -1, region, trusted
     return n, region, trusted
@@ -250,7 +254,10 @@ def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, wo
 
 @njit(cache=True, nogil=True)
 def _events(s0, s1, work, m, events):  # type: ignore[no-untyped-def]
-    """Collect, sorted, where the order of the edges across the sweep may change."""
+    """Collect, sorted, where the order of the edges across the sweep may change.
+
+    Returns their number, or −1 if there are too many.
+    """
     n = 2
     events[0], events[1] = s0, s1
     for i in range(m):
@@ -259,7 +266,7 @@ def _events(s0, s1, work, m, events):  # type: ignore[no-untyped-def]
         n += 2
     for i in range(m):
         for j in range(i + 1, m):
-            if work[j, 0] >= work[i, 2] or n == len(events):
+            if work[j, 0] >= work[i, 2]:
                 break
             lo, hi = work[j, 0], min(work[i, 2], work[j, 2])
             if hi - lo <= _EMPTY:
@@ -273,6 +280,8 @@ def _events(s0, s1, work, m, events):  # type: ignore[no-untyped-def]
             gap_lo = work[i, 1] + ki * (lo - work[i, 0]) - work[j, 1] - kj * (lo - work[j, 0])
             gap_hi = work[i, 1] + ki * (hi - work[i, 0]) - work[j, 1] - kj * (hi - work[j, 0])
             if gap_lo * gap_hi < 0.0:
+                if n == len(events):
+                    return -1
                 events[n] = lo + (hi - lo) * gap_lo / (gap_lo - gap_hi)
                 n += 1
     events[:n].sort()
@@ -476,16 +485,15 @@ def _write(nodes, count, wide, sweep_v, scale, points, weights, regions, n, regi
 
 @njit(cache=True, nogil=True)
 def _sweep_box(  # type: ignore[no-untyped-def]
-    s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, scale, points, weights, regions, n, region
-):
+    events, n_events, s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, scale,
+    points, weights, regions, n, region,
+):  # fmt: skip
     """Sample a box slab by slab; `scale` turns areas into weights.
 
     A rim or silhouette is a chain of many short edges, each of which makes a slab. Thin slabs that follow one another
     without a change of structure are merged: their lines have corresponding nodes, and two samples with the mean and
     the variance of corresponding nodes take the place of all of them.
     """
-    events = np.empty(_MAX_EVENTS)
-    n_events = _events(s0, s1, work, m, events)
     cross, side = np.empty(m + 2), np.empty(m + 2)
     nodes, merged = np.empty((4 * m + 4, 6)), np.empty((4 * m + 4, 6))
     active, previous = np.empty(m, np.int64), np.empty(m, np.int64)

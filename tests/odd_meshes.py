@@ -1,0 +1,51 @@
+"""Meshes that are not landmarks: open, concave, star shaped, disjoint, bumpy."""
+
+import numpy as np
+import trimesh
+
+
+def bowl():
+    """Half a spherical shell without thickness, open at the top."""
+    angle = np.linspace(-np.pi / 2, 0, 32)
+    return trimesh.creation.revolve(0.12 * np.c_[np.cos(angle), np.sin(angle)].round(15), sections=128)
+
+
+def star_prism():
+    """A seven-pointed star, extruded."""
+    turn = np.linspace(0, 2 * np.pi, 15)[:-1]
+    rim = np.where(np.arange(14) % 2, 0.06, 0.14)[:, None] * np.c_[np.cos(turn), np.sin(turn)]
+    low, high = np.c_[rim, np.full(14, -0.1)], np.c_[rim, np.full(14, 0.1)]
+    vertices = np.vstack([low, high, [[0, 0, -0.1], [0, 0, 0.1]]])
+    i, j = np.arange(14), np.roll(np.arange(14), -1)
+    faces = np.vstack(
+        [np.c_[i, j, j + 14], np.c_[i, j + 14, i + 14], np.c_[j, i, i * 0 + 28], np.c_[i + 14, j + 14, i * 0 + 29]]
+    )
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def l_bracket():
+    """Two legs at a right angle, as one concave solid."""
+    outline = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, -0.05], [-0.05, -0.05], [-0.05, 0.1], [-0.1, 0.1]])
+    low, high = np.c_[outline, np.full(6, -0.08)], np.c_[outline, np.full(6, 0.08)]
+    cap = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 5], [3, 4, 5]])
+    i, j = np.arange(6), np.roll(np.arange(6), -1)
+    faces = np.vstack([np.c_[i, j, j + 6], np.c_[i, j + 6, i + 6], cap[:, ::-1], cap + 6])
+    return trimesh.Trimesh(np.vstack([low, high]), faces, process=False)
+
+
+def hidden_box():
+    """A box half hidden by a smaller one before it."""
+    near = trimesh.creation.box((0.05, 0.1, 0.1)).apply_translation((-0.15, 0.03, -0.02))
+    return trimesh.util.concatenate([near, trimesh.creation.box((0.1, 0.25, 0.2))])
+
+
+def blob():
+    """A ball whose surface waves gently, with a little noise."""
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    x, y, _ = ball.vertices.T
+    noise = np.random.default_rng(3).normal(size=len(x))
+    radius = 0.1 * (1 + 0.05 * np.sin(3 * x) * np.cos(2 * y + 1) + 2e-5 * noise)
+    return trimesh.Trimesh(ball.vertices * radius[:, None], ball.faces, process=False)
+
+
+ODD = {"bowl": bowl, "star prism": star_prism, "L bracket": l_bracket, "hidden box": hidden_box, "blob": blob}

@@ -1,0 +1,190 @@
+"""Images computed by other means than the renderer's: dense sampling, quadrature of closed forms, finer pixels."""
+
+import itertools
+import math
+
+import numpy as np
+
+from phasemark.render import Views
+from phasemark.render.intersect import make_intersector
+
+
+def image_points(sensor, row, col, n):
+    """Return n evenly scattered points (n, 2) in a pixel's active area: a Kronecker sequence on 1/φ₂, 1/φ₂².
+
+    φ₂ = 1.3247… is the real root of x³ = x + 1. No row or column of points lines up with an edge, so that the area
+    beside a straight edge converges like n^(−3/4) rather than n^(−1/2).
+    """
+    k = np.arange(1, n + 1)
+    unit = np.column_stack([k * 0.7548776662466927, k * 0.5698402909980532]) % 1.0
+    return np.array([col + 0.5, row + 0.5]) + (unit - 0.5) * sensor.fill_factor
+
+
+def brute_force(renderer, pixels, *, n=160_000, kind="auto", wall_m=None, **view):
+    """Return (phasor, intensity, coverage) of some pixels by shading n rays in each.
+
+    Shares with the renderer the mesh with its corner normals, and the intersector; neither the placing of the rays,
+    nor the frames of reference, nor the shading.
+
+    Parameters
+    ----------
+    pixels : sequence of (row, col)
+    wall_m : float, optional
+        A wall of albedo ½.
+    view
+        As for Renderer.render; one view.
+    """
+    sensor, mesh = renderer.sensor, renderer.topology
+    intersector = make_intersector(mesh.vertices, mesh.faces, kind)
+    views = Views.broadcast(**view)
+    lens = views.lens_in_landmark()[0]
+    rotation = views.landmark2cam()[0][0]
+    out = []
+    for row, col in pixels:
+        u, v = image_points(sensor, row, col, n).T
+        cam = sensor.ray_directions(u, v)
+        d = cam @ rotation  # camera to landmark: the rotation's transpose
+        origins = np.tile(lens.astype(np.float32), (n, 1))
+        face = intersector.first_face(origins, d.astype(np.float32))
+        hit = face >= 0
+        f, dh = face[hit], d[hit]
+        normal, offset = mesh.planes[f, :3], mesh.planes[f, 3]
+        t = (offset - normal @ lens) / np.einsum("ij,ij->i", normal, dh)
+        shading = shading_normals(mesh, f, lens + t[:, None] * dh)
+        away = np.sign(np.einsum("ij,ij->i", normal, dh))
+        cos = np.maximum(away * np.einsum("ij,ij->i", shading, dh), 0)
+        range_m, light = np.zeros(n), np.zeros(n)
+        range_m[hit], light[hit] = t, renderer.albedo * cos / t**2
+        if wall_m is not None:
+            forward = cam @ [math.cos(views.bearing_rad[0]), math.sin(views.bearing_rad[0]), 0]
+            range_m[~hit] = (wall_m / forward)[~hit]
+            light[~hit] = (0.5 * forward**3 / wall_m**2)[~hit]
+        if sensor.vignetting:
+            light *= (cam @ sensor.cam2level[:, 0]) ** 4
+        phase = range_m / sensor.metres_per_radian
+        out.append(((light * np.exp(1j * phase)).mean(), light.mean(), hit.mean()))
+    phasor, intensity, coverage = zip(*out, strict=True)
+    return np.array(phasor), np.array(intensity), np.array(coverage)
+
+
+def shading_normals(mesh, face, point):
+    """Interpolate the corner normals of faces at points on them, by ratios of areas."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[face]], 1, 0)
+
+    def area(p, q, r):
+        return np.einsum("ij,ij->i", np.cross(q - p, r - p), mesh.planes[face, :3])
+
+    share = np.column_stack([area(point, b, c), area(point, c, a), area(point, a, b)])
+    normal = np.einsum("ik,ikx->ix", share / share.sum(axis=1, keepdims=True), mesh.corner_normals[face])
+    size = np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.where(size > 0, normal / np.where(size > 0, size, 1), mesh.planes[face, :3])
+
+
+def pixel_nodes(low, high, n):
+    """Return Gauss-Legendre nodes and weights between bounds."""
+    x, w = np.polynomial.legendre.leggauss(n)
+    return low + (high - low) * (x + 1) / 2, (high - low) * w / 2
+
+
+def integrate_pixels(sensor, light, cuts_v=(), n=16, orders=(1,)):
+    """Integrate a smooth scene over all pixels of a sensor.
+
+    Parameters
+    ----------
+    light : callable
+        From ray directions (..., 3) in the level camera frame to (amplitude, range_m).
+    cuts_v : sequence of float
+        Rows v where the scene changes at once; pixels are split there.
+
+    Returns
+    -------
+    phasors, intensity : dict of order to (rows, cols) complex128, (rows, cols) float64
+    """
+    width, height = sensor.fill_factor
+    phasors = {k: np.zeros((sensor.rows, sensor.cols), complex) for k in orders}
+    intensity = np.zeros((sensor.rows, sensor.cols))
+    for row in range(sensor.rows):
+        low, high = row + 0.5 - height / 2, row + 0.5 + height / 2
+        bounds = [low, *sorted(cut for cut in cuts_v if low < cut < high), high]
+        pieces = [pixel_nodes(a, b, n) for a, b in itertools.pairwise(bounds)]
+        v, wv = (np.concatenate(part) for part in zip(*pieces, strict=True))
+        for col in range(sensor.cols):
+            u, wu = pixel_nodes(col + 0.5 - width / 2, col + 0.5 + width / 2, n)
+            amplitude, range_m = light(sensor.ray_directions(u[None, :], v[:, None]))
+            weighted = amplitude * wv[:, None] * wu / (width * height)
+            intensity[row, col] = weighted.sum()
+            for k in orders:
+                phasors[k][row, col] = (weighted * np.exp(1j * k * range_m / sensor.metres_per_radian)).sum()
+    return phasors, intensity
+
+
+def plane_light(normal, distance_m, albedo):
+    """Return the light of the plane normal · p = distance_m; normal away from the lens, distance positive."""
+
+    def light(d):
+        facing = d @ np.asarray(normal, float)
+        range_m = distance_m / facing
+        return albedo * facing / range_m**2, range_m
+
+    return light
+
+
+def sphere_pixels(sensor, centre, radius, albedo, n=1500):
+    """Integrate a sphere over the pixels of a level sensor in closed form along rows of constant z.
+
+    Along z = const. the sphere is seen between the roots of a quadratic in y, and its light there is smooth in the
+    angle τ with y = middle + half · sin τ; 12 Gauss points in τ and n midpoints in z per pixel.
+
+    Returns
+    -------
+    phasor, intensity, coverage : (rows, cols)
+    """
+    tan_h, tan_v = sensor.tan_half_angles
+    cx, cy, cz = centre
+    k = cx**2 + cy**2 + cz**2 - radius**2
+    shape = (sensor.rows, sensor.cols)
+    phasor, intensity, coverage = np.zeros(shape, complex), np.zeros(shape), np.zeros(shape)
+    x, w = np.polynomial.legendre.leggauss(12)
+    v = (np.arange(sensor.rows * n) + 0.5) / n
+    z = tan_v * (1 - 2 * v / sensor.rows)
+    m = cx + z * cz
+    a, b, c = cy**2 - k, cy * m, m**2 - k * (1 + z**2)
+    root = np.sqrt(np.maximum(b**2 - a * c, 0))
+    middle, half = -b / a, root / -a
+    for col in range(sensor.cols):
+        right, left = (tan_h * (1 - 2 * edge / sensor.cols) for edge in (col + 1, col))
+        inside = half > 0
+        safe = np.where(inside, half, 1)
+        t0 = np.arcsin(np.clip((right - middle) / safe, -1, 1))
+        t1 = np.arcsin(np.clip((left - middle) / safe, -1, 1))
+        inside &= t1 > t0
+        i = np.flatnonzero(inside)
+        tau = t0[i, None] + (t1 - t0)[i, None] * (x + 1) / 2
+        y = middle[i, None] + half[i, None] * np.sin(tau)
+        weight = (t1 - t0)[i, None] * w / 2 * half[i, None] * np.cos(tau) * sensor.cols / (2 * tan_h)
+        d = np.stack(np.broadcast_arrays(1.0, y, z[i, None]), axis=-1)
+        d /= np.linalg.norm(d, axis=-1, keepdims=True)
+        amplitude, range_m = sphere_light(d, np.array(centre), radius, albedo)
+        light = weight * amplitude
+        rows = i // n
+        for target, value in (
+            (intensity, light.sum(axis=1)),
+            (coverage, weight.sum(axis=1)),
+            (phasor, (light * np.exp(1j * range_m / sensor.metres_per_radian)).sum(axis=1)),
+        ):
+            np.add.at(target[:, col], rows, value / n)
+    return phasor, intensity, coverage
+
+
+def sphere_light(d, centre, radius, albedo):
+    """Return amplitude and range of a sphere along unit rays that meet it."""
+    along = d @ centre
+    range_m = along - np.sqrt(np.maximum(along**2 - centre @ centre + radius**2, 0))
+    cos = -np.einsum("...i,...i", range_m[..., None] * d - centre, d) / radius
+    return albedo * np.maximum(cos, 0) / range_m**2, range_m
+
+
+def mean_of_blocks(image, factor):
+    """Average blocks of factor × factor pixels of (n, rows, cols)."""
+    n, rows, cols = image.shape
+    return image.reshape(n, rows // factor, factor, cols // factor, factor).mean(axis=(2, 4))
