@@ -157,10 +157,11 @@ def sample_pixel(  # type: ignore[no-untyped-def]
     along = np.zeros(4)
     entry = head[i, j]
     while entry >= 0:
-        s = segments[owner[entry]]
-        kind = 2 * limb[owner[entry]]
-        along[kind] += abs(min(max(s[2], c), c + 1) - min(max(s[0], c), c + 1))
-        along[kind + 1] += abs(min(max(s[3], r), r + 1) - min(max(s[1], r), r + 1))
+        k = owner[entry]
+        ua, va, ub, vb = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
+        lo, hi = _clip(ua, va, ub, vb, c, r, c + 1, r + 1)
+        along[2 * limb[k]] += max(hi - lo, 0.0) * abs(ub - ua)
+        along[2 * limb[k] + 1] += max(hi - lo, 0.0) * abs(vb - va)
         entry = link[entry]
     has_limb = along[2] > 0.0 or along[3] > 0.0
     if has_limb:
@@ -171,12 +172,12 @@ def sample_pixel(  # type: ignore[no-untyped-def]
         sweep_v = along[1] >= along[0]
     curved = sideways or upright or has_limb
     # the pixel itself and its neighbours across the sweep may hold the limb this pixel's surface ends at
-    limbs = np.empty((_MAX_LIMBS if curved else 0, 5))
-    n_limbs = 0
+    limbs = np.empty((2, _MAX_LIMBS if curved else 0, 4))
+    n_limbs = np.zeros(2, np.int64)
     if curved:
         before, after = (head[i, j - 1], head[i, j + 1]) if sweep_v else (head[i - 1, j], head[i + 1, j])
         for near in (head[i, j], before, after):
-            n_limbs = _collect_limbs(near, link, owner, segments, limb, sweep_v, limbs, n_limbs)
+            _collect_limbs(near, link, owner, segments, limb, sweep_v, limbs, n_limbs)
     events = np.empty(_MAX_EVENTS)
     stack = np.empty((4 * _MAX_DEPTH + 4, 5))
     stack[0] = (u0, v0, u0 + width, v0 + height, 0.0)
@@ -208,6 +209,21 @@ def sample_pixel(  # type: ignore[no-untyped-def]
     return n, region, trusted
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
+    """Return the shares (lo, hi) of a segment between which it lies in a box; lo ≥ hi where it does not."""
+    du, dv = ub - ua, vb - va
+    lo, hi = 0.0, 1.0
+    for p, q in ((-du, ua - u0), (du, u1 - ua), (-dv, va - v0), (dv, v1 - va)):
+        if p < 0.0:
+            lo = max(lo, q / p)
+        elif p > 0.0:
+            hi = min(hi, q / p)
+        elif q < 0.0:
+            hi = -1.0
+    return lo, hi
+
+
 @njit(cache=True, nogil=True)
 def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, work):  # type: ignore[no-untyped-def]
     """Clip a pixel's segments to a box.
@@ -220,18 +236,10 @@ def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, wo
     while entry >= 0:
         k = owner[entry]
         entry = link[entry]
-        ua, va, ub, vb = segments[k]
+        ua, va, ub, vb = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
         du, dv = ub - ua, vb - va
-        lo, hi = 0.0, 1.0
-        inside = True
-        for p, q in ((-du, ua - u0), (du, u1 - ua), (-dv, va - v0), (dv, v1 - va)):
-            if p == 0.0:
-                inside = inside and q >= 0.0
-            elif p < 0.0:
-                lo = max(lo, q / p)
-            else:
-                hi = min(hi, q / p)
-        if not inside or lo >= hi:
+        lo, hi = _clip(ua, va, ub, vb, u0, v0, u1, v1)
+        if lo >= hi:
             continue
         if m == MAX_SEGMENTS:
             return -1
@@ -289,42 +297,43 @@ def _events(s0, s1, work, m, events):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _collect_limbs(entry, link, owner, segments, limb, sweep_v, limbs, n):  # type: ignore[no-untyped-def]
-    """Append a pixel's limbs: rows of s, x at the low end, s, x at the high end, and the side of the surface.
+def _collect_limbs(entry, link, owner, segments, limb, sweep_v, limbs, count):  # type: ignore[no-untyped-def]
+    """Append a pixel's limbs: rows of s, x at the low end, s, x at the high end.
 
-    Returns their number; what no longer fits into `limbs` is left out.
+    Those whose surface lies towards larger x go to ``limbs[0]``, the others to ``limbs[1]``; `count` has their numbers.
+    What no longer fits is left out.
     """
-    while entry >= 0 and n < len(limbs):
+    while entry >= 0:
         k = owner[entry]
         entry = link[entry]
         if not limb[k]:
             continue
         if sweep_v:
-            xa, sa, xb, sb = segments[k]
-            side = 1.0 if sb > sa else -1.0
+            xa, sa, xb, sb = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
+            which = 0 if sb > sa else 1
         else:
-            sa, xa, sb, xb = segments[k]
-            side = -1.0 if sb > sa else 1.0
-        if sa == sb:
+            sa, xa, sb, xb = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
+            which = 1 if sb > sa else 0
+        n = count[which]
+        if sa == sb or n == limbs.shape[1]:
             continue
         if sa > sb:
             sa, xa, sb, xb = sb, xb, sa, xa
-        limbs[n, 0], limbs[n, 1], limbs[n, 2], limbs[n, 3], limbs[n, 4] = sa, xa, sb, xb, side
-        n += 1
-    return n
+        limbs[which, n, 0], limbs[which, n, 1], limbs[which, n, 2], limbs[which, n, 3] = sa, xa, sb, xb
+        count[which] += 1
 
 
 @njit(cache=True, nogil=True)
-def _nearest_limb(limbs, n_limbs, s, side, bound):  # type: ignore[no-untyped-def]
-    """Find the limb nearest to `bound`, beyond it and with its surface on our side, on or near the line at `s`.
+def _nearest_limb(limbs, n, s, side, bound):  # type: ignore[no-untyped-def]
+    """Find, of limbs with their surface on our side, the one nearest to `bound` and beyond it, on or near a line.
 
     A limb that ends before it reaches the line (at a rim, say) still shapes the surface beside its end.
     """
     best = -np.inf if side > 0 else np.inf
     closest = _REACH
-    for i in range(n_limbs):
+    for i in range(n):
         gap = max(limbs[i, 0] - s, s - limbs[i, 2], 0.0)
-        if limbs[i, 4] != side or gap > closest:
+        if gap > closest:
             continue
         t = min(max((s - limbs[i, 0]) / (limbs[i, 2] - limbs[i, 0]), 0.0), 1.0)
         x = limbs[i, 1] + t * (limbs[i, 3] - limbs[i, 1])
@@ -566,16 +575,17 @@ def _line_nodes(s, line_weight, cross, side, k, limbs, n_limbs, curved, nodes): 
         a, b = cross[i], cross[i + 1]
         if b - a <= _EMPTY:
             continue
-        if curved and left == -np.inf and not behind_limb:
-            left = _nearest_limb(limbs, n_limbs, s, 1.0, a)
-        right = np.inf
         j = i + 1
         while j < k and side[j] == 0:
             j += 1
+        before_limb = j < k and side[j] > 0
+        if curved and left == -np.inf and not behind_limb and not before_limb:
+            left = _nearest_limb(limbs[0], n_limbs[0], s, 1.0, a)
+        right = np.inf
         if j < k and side[j] < 0:
             right = cross[j]
-        elif curved and j == k:
-            right = _nearest_limb(limbs, n_limbs, s, -1.0, b)
+        elif curved and j == k and not behind_limb:
+            right = _nearest_limb(limbs[1], n_limbs[1], s, -1.0, b)
         placed = _place(a, b, left, right, nodes[count:])
         for g in range(count, count + placed):
             weight, x = nodes[g, 0] * line_weight, nodes[g, 2]
