@@ -469,12 +469,12 @@ def _write(nodes, count, wide, sweep_v, scale, points, weights, regions, n, regi
     """
     if n + 2 * count > len(weights):
         return -1, region
-    last = -1.0
+    last, current = -1.0, region
     for g in range(count):
         total = nodes[g, 0]
         s, x = nodes[g, 1] / total, nodes[g, 2] / total
         if nodes[g, 3] != last:
-            region += 1
+            current, region = region, region + 1
             last = nodes[g, 3]
         copies, ds, dx = 1, 0.0, 0.0
         if wide > _NARROW:
@@ -487,7 +487,7 @@ def _write(nodes, count, wide, sweep_v, scale, points, weights, regions, n, regi
             points[n, 0] = x + direction * dx if sweep_v else s + direction * ds
             points[n, 1] = s + direction * ds if sweep_v else x + direction * dx
             weights[n] = total * scale / copies
-            regions[n] = region
+            regions[n] = current
             n += 1
     return n, region
 
