@@ -30,6 +30,8 @@ _THIN = 0.15
 """Intervals narrower than this (pixels) get one Gauss point."""
 _NARROW = 0.04
 """Slabs narrower than this (pixels) get one line."""
+_SPREAD = 0.02
+"""Merged nodes that scatter by more than this (pixels, standard deviation) become two samples instead of one."""
 _MERGED = 0.3
 """Thin slabs are merged up to this width (pixels)."""
 _REACH = 0.5
@@ -460,8 +462,8 @@ def _line_position(lines, g, pinched_low, pinched_high):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True)
-def _write(nodes, count, wide, sweep_v, scale, points, weights, regions, n, region):  # type: ignore[no-untyped-def]
-    """Write the nodes of a line, or of lines merged over a width, as samples.
+def _write(nodes, count, sweep_v, scale, points, weights, regions, n, region):  # type: ignore[no-untyped-def]
+    """Write the nodes of a line, or of merged lines, as samples.
 
     Merged nodes have a total weight, a mean (s, x), and a variance of s. Two samples of half the weight at one standard
     deviation before and behind the mean, along the regression line of x on s, have the same moments up to the second
@@ -477,11 +479,13 @@ def _write(nodes, count, wide, sweep_v, scale, points, weights, regions, n, regi
             current, region = region, region + 1
             last = nodes[g, 3]
         copies, ds, dx = 1, 0.0, 0.0
-        if wide > _NARROW:
-            variance = nodes[g, 4] / total - s * s
-            if variance > 1e-6:
-                copies, ds = 2, math.sqrt(variance)
-                dx = (nodes[g, 5] / total - s * x) / ds
+        variance = nodes[g, 4] / total - s * s
+        if variance > 1e-12:
+            ds = math.sqrt(variance)
+            dx = (nodes[g, 5] / total - s * x) / ds
+            copies = 2 if ds > _SPREAD or abs(dx) > _SPREAD else 1
+        if copies == 1:
+            ds, dx = 0.0, 0.0
         for sign in range(copies):
             direction = 1.0 - 2.0 * sign
             points[n, 0] = x + direction * dx if sweep_v else s + direction * ds
@@ -543,7 +547,7 @@ def _sweep_box(  # type: ignore[no-untyped-def]
                         merged[j, i] += nodes[j, i]
                 n_lines += 1
             else:
-                n, region = _write(merged, n_merged, stop - start, sweep_v, scale, points, weights, regions, n, region)
+                n, region = _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
                 if n < 0:
                     return -1, region
                 n_merged, start, start_line, n_lines = count, lo, s, 1
@@ -552,11 +556,11 @@ def _sweep_box(  # type: ignore[no-untyped-def]
             stop, n_previous = hi, n_active
             previous[:n_active] = active[:n_active]
             if not mergeable:
-                n, region = _write(merged, n_merged, 0.0, sweep_v, scale, points, weights, regions, n, region)
+                n, region = _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
                 if n < 0:
                     return -1, region
                 n_merged, stop = 0, -np.inf
-    return _write(merged, n_merged, stop - start, sweep_v, scale, points, weights, regions, n, region)
+    return _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
 
 
 @njit(cache=True, nogil=True)
