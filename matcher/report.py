@@ -197,11 +197,11 @@ def _error_figure(result: DemoResult) -> Figure:
                 )  # fmt: skip
             axes.set_title(half)
             axes.set_ylabel(label)
-            axes.set_ylim(bottom=0)
             axes.grid(alpha=0.3)
         row[0].legend(frameon=False)
-    for axes in panels[-1]:
+    for axes in panels[-1]:  # the axes of a column share their limits, which are set once all is drawn
         axes.set_xlabel("distance D (cm)")
+        axes.set_ylim(bottom=0)
     return figure
 
 

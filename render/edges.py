@@ -39,6 +39,8 @@ class MeshTopology(NamedTuple):
         Shading normal at each corner of each face; zero at an apex, where there is none.
     flat : (f,) bool
         Whether the three corner normals are the face's own.
+    plain : (f,) bool
+        Whether all faces of the face's smooth patch are flat, which makes the patch a plane.
     patch : (f,) int32
         Number of the smooth patch, faces joined without a crease between them.
     part : (f,) int8
@@ -62,6 +64,7 @@ class MeshTopology(NamedTuple):
     planes_by_component: NDArray[np.float64]
     corner_normals: NDArray[np.float64]
     flat: NDArray[np.bool_]
+    plain: NDArray[np.bool_]
     patch: NDArray[np.int32]
     part: NDArray[np.int8]
     creases: NDArray[np.int32]
@@ -116,6 +119,7 @@ class MeshTopology(NamedTuple):
             planes_by_component=np.ascontiguousarray(planes.T),
             corner_normals=np.ascontiguousarray(corners),
             flat=np.ascontiguousarray(flat),
+            plain=np.bincount(patch, ~flat)[patch] == 0,
             patch=patch,
             part=np.ascontiguousarray(part),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
@@ -136,6 +140,7 @@ class MeshTopology(NamedTuple):
             planes_by_component=np.zeros((4, 0)),
             corner_normals=np.zeros((0, 3, 3)),
             flat=np.zeros(0, np.bool_),
+            plain=np.zeros(0, np.bool_),
             patch=np.zeros(0, np.int32),
             part=np.zeros(0, np.int8),
             creases=np.zeros((0, 4), np.int32),

@@ -112,7 +112,7 @@ def _has_limb(entry, link, owner, limb):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def sample_pixel(  # type: ignore[no-untyped-def]
-    r, c, width, height, segments, limb, head, link, owner, work, points, weights, regions, n, region
+    r, c, bent, width, height, segments, limb, head, link, owner, work, points, weights, regions, n, region
 ):
     """Place the samples of one pixel.
 
@@ -120,6 +120,8 @@ def sample_pixel(  # type: ignore[no-untyped-def]
     ----------
     r, c : int
         Row and column.
+    bent : bool
+        Whether the pixel may see the inside of a curved surface, which takes more points than a flat one.
     width, height : float
         Fill factor.
     segments, limb, head, link, owner
@@ -145,13 +147,14 @@ def sample_pixel(  # type: ignore[no-untyped-def]
     sideways = _has_limb(head[i, j - 1], link, owner, limb) or _has_limb(head[i, j + 1], link, owner, limb)
     upright = _has_limb(head[i - 1, j], link, owner, limb) or _has_limb(head[i + 1, j], link, owner, limb)
     if head[i, j] < 0 and not sideways and not upright:
-        if n + 4 > len(weights):
+        count = 3 if bent else 2
+        if n + count * count > len(weights):
             return -1, region, True
-        for a in range(2):
-            for b in range(2):
-                points[n, 0] = u0 + width * _G2X[b]
-                points[n, 1] = v0 + height * _G2X[a]
-                weights[n] = 0.25
+        for a in range(count):
+            for b in range(count):
+                points[n, 0] = u0 + width * (_G3X[b] if bent else _G2X[b])
+                points[n, 1] = v0 + height * (_G3X[a] if bent else _G2X[a])
+                weights[n] = _G3W[a] * _G3W[b] if bent else 0.25
                 regions[n] = region
                 n += 1
         return n, region + 1, True
@@ -203,7 +206,7 @@ def sample_pixel(  # type: ignore[no-untyped-def]
             m, trusted = 0, False
             n_events = _events(s0, s1, work, m, events)
         n, region = _sweep_box(
-            events, n_events, s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, inverse_area,
+            events, n_events, s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, bent, inverse_area,
             points, weights, regions, n, region,
         )  # fmt: skip
         if n < 0:
@@ -498,7 +501,7 @@ def _write(nodes, count, sweep_v, scale, points, weights, regions, n, region):  
 
 @njit(cache=True, nogil=True)
 def _sweep_box(  # type: ignore[no-untyped-def]
-    events, n_events, s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, scale,
+    events, n_events, s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, bent, scale,
     points, weights, regions, n, region,
 ):  # fmt: skip
     """Sample a box slab by slab; `scale` turns areas into weights.
@@ -508,7 +511,7 @@ def _sweep_box(  # type: ignore[no-untyped-def]
     the variance of corresponding nodes take the place of all of them.
     """
     cross, side = np.empty(m + 2), np.empty(m + 2)
-    nodes, merged = np.empty((4 * m + 4, 6)), np.empty((4 * m + 4, 6))
+    nodes, merged = np.empty((5 * m + 5, 6)), np.empty((5 * m + 5, 6))
     active, previous = np.empty(m, np.int64), np.empty(m, np.int64)
     start_cross, start_slope = np.empty(m + 2), np.empty(m + 2)
     started, n_active, n_previous = 0, 0, 0
@@ -529,7 +532,7 @@ def _sweep_box(  # type: ignore[no-untyped-def]
             for i in range(n_active):
                 cross[i + 1] = min(max(_edge_at(work, active[i], s), cross[i]), x1)
                 side[i + 1] = work[active[i], 4]
-            count = _line_nodes(s, share * slab, cross, side, k, limbs, n_limbs, curved, nodes)
+            count = _line_nodes(s, share * slab, cross, side, k, limbs, n_limbs, curved, bent, nodes)
             follows = mergeable and n_merged == count and n_previous == n_active and hi - start <= _MERGED
             if follows and g == 0:
                 follows = lo - stop <= _EMPTY and _continues(work, m, previous, active, n_active, stop, lo)
@@ -564,7 +567,7 @@ def _sweep_box(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _line_nodes(s, line_weight, cross, side, k, limbs, n_limbs, curved, nodes):  # type: ignore[no-untyped-def]
+def _line_nodes(s, line_weight, cross, side, k, limbs, n_limbs, curved, bent, nodes):  # type: ignore[no-untyped-def]
     """Place the nodes of one line.
 
     Rows are w, w·s, w·x, the interval, w·s², w·s·x with the weight w; returns their number.
@@ -590,7 +593,7 @@ def _line_nodes(s, line_weight, cross, side, k, limbs, n_limbs, curved, nodes): 
             right = cross[j]
         elif curved and j == k and not behind_limb:
             right = _nearest_limb(limbs[1], n_limbs[1], s, -1.0, b)
-        placed = _place(a, b, left, right, nodes[count:])
+        placed = _place(a, b, left, right, bent, nodes[count:])
         for g in range(count, count + placed):
             weight, x = nodes[g, 0] * line_weight, nodes[g, 2]
             nodes[g, 0], nodes[g, 1], nodes[g, 2], nodes[g, 3] = weight, weight * s, weight * x, float(i)
@@ -600,7 +603,7 @@ def _line_nodes(s, line_weight, cross, side, k, limbs, n_limbs, curved, nodes): 
 
 
 @njit(cache=True, nogil=True)
-def _place(a, b, left, right, nodes):  # type: ignore[no-untyped-def]
+def _place(a, b, left, right, bent, nodes):  # type: ignore[no-untyped-def]
     """Place Gauss points on one interval [a, b], with limbs at `left` and `right` (±inf: none).
 
     Column 0 of `nodes` gets the weight, which adds up to b − a, column 2 the place; returns their number.
@@ -611,13 +614,13 @@ def _place(a, b, left, right, nodes):  # type: ignore[no-untyped-def]
         middle, half = 0.5 * (left + right), 0.5 * (right - left)
         t0 = math.asin(max((a - middle) / half, -1.0))
         t1 = math.asin(min((b - middle) / half, 1.0))
-        count = 4
+        count = 5
     elif near_left:
         t0, t1, count = math.sqrt(max(a - left, 0.0)), math.sqrt(b - left), 4
     elif near_right:
         t0, t1, count = math.sqrt(right - a), math.sqrt(max(right - b, 0.0)), 4
     else:
-        count = 1 if b - a < _THIN else 2
+        count = 1 if b - a < _THIN else (3 if bent and b - a > _MERGED else 2)
         t0, t1 = a, b
     total = 0.0
     for g in range(count):
@@ -625,8 +628,12 @@ def _place(a, b, left, right, nodes):  # type: ignore[no-untyped-def]
             t, w = 0.5 * (t0 + t1), 1.0
         elif count == 2:
             t, w = t0 + _G2X[g] * (t1 - t0), _G2W[g]
-        else:
+        elif count == 3:
+            t, w = t0 + _G3X[g] * (t1 - t0), _G3W[g]
+        elif count == 4:
             t, w = t0 + _G4X[g] * (t1 - t0), _G4W[g]
+        else:
+            t, w = t0 + _G5X[g] * (t1 - t0), _G5W[g]
         if near_left and near_right:
             x, w = middle + half * math.sin(t), w * math.cos(t)
         elif near_left:

@@ -71,6 +71,13 @@ def plan_rays(  # type: ignore[no-untyped-def]
             u_high = max(u_high, segments[i, 0], segments[i, 2])
             v_low = min(v_low, segments[i, 1], segments[i, 3])
             v_high = max(v_high, segments[i, 1], segments[i, 3])
+        bent_low_u, bent_high_u, bent_low_v, bent_high_v = np.inf, -np.inf, np.inf, -np.inf
+        for i in range(n_edges):
+            if limb[i]:
+                bent_low_u = min(bent_low_u, segments[i, 0], segments[i, 2])
+                bent_high_u = max(bent_high_u, segments[i, 0], segments[i, 2])
+                bent_low_v = min(bent_low_v, segments[i, 1], segments[i, 3])
+                bent_high_v = max(bent_high_v, segments[i, 1], segments[i, 3])
         cos_b, sin_b = math.cos(bearing[view]), math.sin(bearing[view])
         if background_edge(background, cos_b, sin_b, level, scale, centre, rows, cols, segments[n_edges]):
             limb[n_edges] = 0
@@ -85,8 +92,9 @@ def plan_rays(  # type: ignore[no-untyped-def]
                     state[view, r - row_range[0], c] = SKIPPED
                     continue
                 before = n
+                bent = c < bent_high_u and c + 1 > bent_low_u and r < bent_high_v and r + 1 > bent_low_v
                 n, region, trusted = sample_pixel(
-                    r, c, camera[6], camera[7], segments, limb, head, link, owner, work,
+                    r, c, bent, camera[6], camera[7], segments, limb, head, link, owner, work,
                     points, weights, regions, n, region,
                 )  # fmt: skip
                 if n < 0:
@@ -115,10 +123,10 @@ def pick_scouts(n, regions, chosen):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def share_faces(n, regions, pixel, state, flat, scout_face, share, face, chosen):  # type: ignore[no-untyped-def]
+def share_faces(n, regions, pixel, state, plain, scout_face, share, face, chosen):  # type: ignore[no-untyped-def]
     """Hand the face a scout met to its interval where that is all there is to know, and list the samples left to cast.
 
-    On a flat patch the plane is the same for all samples, and where the scout met nothing nothing is met. A curved
+    On a plain patch the plane is the same for all samples, and where the scout met nothing nothing is met. A curved
     patch has a face for each sample. Pixels that could not be split are cast throughout, as is everything without
     `share`.
 
@@ -130,7 +138,7 @@ def share_faces(n, regions, pixel, state, flat, scout_face, share, face, chosen)
         if k < n and regions[k] == regions[start]:
             continue
         scout, found = (start + k - 1) // 2, scout_face[region]
-        known = share and states[pixel[start]] == SPLIT and (found < 0 or flat[found])
+        known = share and states[pixel[start]] == SPLIT and (found < 0 or plain[found])
         for i in range(start, k):
             if known or i == scout:
                 face[i] = found

@@ -88,6 +88,9 @@ class PhasorImages:
         Share of the active area that sees the landmark, 0 … 1.
     sensor : Sensor
     views : Views
+    upper_coverage : (n, rows, cols) float64, or None
+        Share of the active area that sees the landmark's upper part; the rest of `coverage` sees the lower one. None
+        where parts are not told apart.
     harmonics : mapping of int to (n, rows, cols) complex128
         S_k for the orders k > 1 that were asked for.
     """
@@ -97,6 +100,7 @@ class PhasorImages:
     coverage: NDArray[np.float64]
     sensor: Sensor
     views: Views
+    upper_coverage: NDArray[np.float64] | None = None
     harmonics: Mapping[int, NDArray[np.complex128]] = field(default_factory=dict)
 
     def __len__(self) -> int:

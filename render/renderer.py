@@ -27,6 +27,7 @@ from phasemark.render.integrate import (
 from phasemark.render.intersect import make_intersector
 from phasemark.render.phasor import PhasorImages
 from phasemark.render.sensor import Sensor
+from phasemark.render.shells import unite_shells
 from phasemark.render.view import Views
 
 _SAMPLES = 1 << 17
@@ -77,8 +78,8 @@ class Renderer:
     Parameters
     ----------
     mesh : trimesh.Trimesh or None
-        The landmark, metres, landmark frame (PHYSICS section 1). Open or inverted meshes are rendered two-sided. None:
-        no landmark, only what stands behind it.
+        The landmark, metres, landmark frame (PHYSICS section 1). Open or inverted meshes are rendered two-sided, closed
+        shells that run through one another as their union. None: no landmark, only what stands behind it.
     sensor : Sensor
     albedo : float
         Of the Lambertian landmark, in (0, 1].
@@ -117,7 +118,7 @@ class Renderer:
             raise UsageError(f"'harmonics' must be whole orders of 2 or more, got {tuple(harmonics)!r}")
         self.sensor = sensor
         self.albedo = float(albedo)
-        self.topology = MeshTopology.empty() if mesh is None else MeshTopology.from_mesh(mesh)
+        self.topology = MeshTopology.empty() if mesh is None else MeshTopology.from_mesh(unite_shells(mesh))
         self._orders = np.array([1, *harmonics], dtype=np.int64)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
         tan_h, tan_v = sensor.tan_half_angles
@@ -196,6 +197,7 @@ class Renderer:
             phasor=np.ascontiguousarray(phasor[..., 0]),
             intensity=sums.intensity.reshape(shape),
             coverage=np.minimum(sums.coverage.reshape(shape), 1.0),
+            upper_coverage=np.minimum(sums.upper.reshape(shape), 1.0),
             sensor=self.sensor,
             views=views,
             harmonics={
@@ -271,7 +273,8 @@ class Renderer:
             return self._intersector.first_face(b.origins[:count], b.directions[:count])
 
         scouts = cast(pick_scouts(n, b.regions, b.chosen))
-        rest = share_faces(n, b.regions, b.pixel, state, self.topology.flat, scouts, True, b.face, b.chosen)
+        mesh = self.topology
+        rest = share_faces(n, b.regions, b.pixel, state, mesh.plain, scouts, mesh.closed, b.face, b.chosen)
         b.face[b.chosen[:rest]] = cast(rest)
 
     def _check_lens_outside(self, views: Views) -> None:

@@ -47,7 +47,12 @@ class Views:
             A value is not finite, a distance is not positive, or the shapes do not broadcast.
         """
         names = ("distance_m", "delta_rad", "bearing_rad", "height_m")
-        values = [np.asarray(value, dtype=float) for value in (distance_m, delta_rad, bearing_rad, height_m)]
+        values = []
+        for name, given in zip(names, (distance_m, delta_rad, bearing_rad, height_m), strict=True):
+            try:
+                values.append(np.asarray(given, dtype=float))
+            except (TypeError, ValueError):
+                raise UsageError(f"'{name}' must be numbers, got {given!r}") from None
         for name, value in zip(names, values, strict=True):
             bad = value[~np.isfinite(value)]
             if bad.size:

@@ -563,3 +563,44 @@ def test_any_view_has_sound_values_that_move_continuously(name, distance_m, delt
 def test_the_quadrature_helper_is_right():
     x, w = pixel_nodes(2.0, 3.0, 8)
     assert (w * x**5).sum() == pytest.approx((3**6 - 2**6) / 6, rel=1e-14)
+
+
+def test_shells_that_run_through_one_another_look_like_their_union():
+    left, right = trimesh.creation.box((0.15, 0.1, 0.1)), trimesh.creation.box((0.15, 0.1, 0.1))
+    left.apply_translation((-0.025, 0, 0))
+    right.apply_translation((0.025, 0, 0))
+    both = trimesh.util.concatenate([left, right])
+    whole = trimesh.creation.box((0.2, 0.1, 0.1))
+    views = {"distance_m": [0.8, 1.1], "delta_rad": [0.4, 1.9], "height_m": [0.03, -0.02]}
+    crossed, single = (Renderer(mesh, preset("pmd-16x16")).render(**views) for mesh in (both, whole))
+    # the seams of the union cut some pixels in more pieces: another quadrature of the same light
+    np.testing.assert_allclose(crossed.phasor, single.phasor, atol=1e-7)
+    np.testing.assert_allclose(crossed.coverage, single.coverage, atol=1e-12)
+
+
+def test_crossed_boxes_agree_with_finer_pixels():
+    beam, post = trimesh.creation.box((0.3, 0.05, 0.05)), trimesh.creation.box((0.06, 0.06, 0.25))
+    post.apply_transform(trimesh.transformations.rotation_matrix(0.8, (1, 0.3, 0.2)))
+    mesh, fine = trimesh.util.concatenate([beam, post]), 8
+    sensor = preset("pmd-16x16")
+    image = Renderer(mesh, sensor).render(0.9, 0.7).phasor[0]
+    finer = Renderer(mesh, sensor.with_(rows=16 * fine, cols=16 * fine)).render(0.9, 0.7).phasor[0]
+    averaged = finer.reshape(16, fine, 16, fine).mean(axis=(1, 3))
+    # without the curve where they cross as an edge the difference is 1e-2
+    assert np.abs(image - averaged).max() < 1e-5 * np.abs(averaged).max()
+
+
+def test_coverage_is_told_apart_by_part():
+    from phasemark.landmarks import build_mesh, catalog
+
+    image = Renderer(build_mesh(catalog()["sphere"]), preset("pmd-16x16")).render(1.0, 0.3)
+    # at the interface's height the upper rows see the upper part, the lower rows the lower one
+    np.testing.assert_allclose(image.upper_coverage[:, :8], image.coverage[:, :8], atol=1e-12)
+    assert image.upper_coverage[:, 8:].max() == 0
+    assert image.coverage[:, 8:].max() == 1
+
+
+@pytest.mark.parametrize("wrong", ["near", [1 + 2j], [None, "x"]])
+def test_a_view_that_is_no_number_is_refused(wrong):
+    with pytest.raises(UsageError, match="distance_m"):
+        Renderer(None, preset("pmd-16x16")).render(wrong)
