@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -69,7 +72,7 @@ _SensorOption = Annotated[
 ]
 _Wall = Annotated[float | None, typer.Option("--wall", metavar="M", help="Distance of a wall behind the landmark.")]
 _Floor = Annotated[float | None, typer.Option("--floor", metavar="M", help="How far a floor lies below the lens.")]
-_Workers = Annotated[int | None, typer.Option("--workers", help="Threads; the result does not depend on it.")]
+_Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; the result does not depend on it.")]
 
 
 def _print_version(wanted: bool) -> None:
@@ -208,10 +211,8 @@ def _landmark_check(
     if as_json:
         _echo_json({"file": str(file), **report})
         return
-    warnings = report.pop("warnings")
+    del report["warnings"]  # reading the file has put them on stderr
     _echo_facts({"file": file, **report})
-    for warning in warnings:
-        _report(warning)
 
 
 @app.command("render")
@@ -233,7 +234,6 @@ def _render(
 ) -> None:
     """Render one noise-free frame: a picture, the phasors, and a sketch in the terminal."""
     import io as bytes_io
-    import math
 
     import numpy as np
 
@@ -387,8 +387,6 @@ def _match(
 
     All frames of a file are averaged: the camera stands still. A file of shape (n, frames, rows, cols) has n positions.
     """
-    import math
-
     from phasemark.data import open_bank, read_frames
     from phasemark.matcher import Matcher, kalman_filter, phasor_mean
 
@@ -397,8 +395,8 @@ def _match(
         raise UsageError(f"unknown filter '{filter_name}': give {' or '.join(filters)}")
     if prior is not None and landmark_xy is None:
         raise UsageError("--prior needs --landmark-xy: without it there is no robot position")
-    if plot is not None:
-        _refuse_existing([plot], force)
+    if plot is not None and plot.suffix.lower() != ".png":
+        raise UsageError(f"the picture must be a .png file, got '{plot}'")
     background = _background(wall, floor)
     with open_bank(bank) as opened:
         measured = read_frames(
@@ -412,10 +410,11 @@ def _match(
             flip_v=flip_v,
             rotate=rotate,
         )
+        plots = [] if plot is None else _numbered(plot, len(measured.range_m))
+        _refuse_existing(plots, force)
         filtered = filters[filter_name](measured)
         matches = Matcher(opened, method, background=background).match(filtered)
-        if plot is not None:
-            _save_match_pictures(plot, filtered, matches, opened, background, force)
+        _save_match_pictures(plots, filtered, matches, opened, background, force)
     answers = []
     for match in matches:
         answer = match.as_dict()
@@ -426,8 +425,8 @@ def _match(
         _echo_json({"bank": str(bank), "frames": str(frames), "matches": answers})
         return
     _echo_matches(answers)
-    if plot is not None:
-        typer.echo(plot)
+    for path in plots:
+        typer.echo(path)
 
 
 @app.command("demo")
@@ -435,7 +434,7 @@ def _demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, the tables and the bank.")] = Path(
         "out/demo"
     ),
-    seed: Annotated[int, typer.Option("--seed", help="Root of all random numbers.")] = 2005,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")] = 2005,
     workers: _Workers = None,
     as_json: _Json = False,
     force: _Force = False,
@@ -446,12 +445,13 @@ def _demo(
 
     outputs = [out / name for name in ("bank.h5", "report.html", "cells.csv", "trials.csv")]
     _refuse_existing(outputs, force)
-    out.mkdir(parents=True, exist_ok=True)
+    _make_folder(out)
     with _Progress("matching") as progress:
         result = run_demo(outputs[0], seed=seed, workers=workers, force=force, progress=progress)
     report = write_demo(result, out, force=force)
     if as_json:
-        _echo_json({"report": str(report), "seconds": result.seconds, "cells": cell_rows(result.cells)})
+        cells = [{key: _plain(value) for key, value in row.items()} for row in cell_rows(result.cells)]
+        _echo_json({"report": str(report), "seconds": result.seconds, "cells": cells})
         return
     header = ("D (cm)", "δ (°)", "class right", "|ΔD| mm", "worst", "|Δδ| °", "worst", "position mm", "worst")
     for title, shifted in (("on the bank's grid", False), ("between grid points", True)):
@@ -461,25 +461,29 @@ def _demo(
     typer.echo(report)
 
 
+def _numbered(path: Path, n: int) -> list[Path]:
+    """Return the names of n pictures; more than one get a number before the suffix."""
+    return [path] if n == 1 else [path.with_stem(f"{path.stem}-{k}") for k in range(n)]
+
+
 def _save_match_pictures(
-    path: Path,
+    paths: Sequence[Path],
     filtered: FilteredFrames,
     matches: Matches,
     bank: Bank,
     background: Background | None,
     force: bool,
 ) -> None:
-    """Draw each match; more than one get a number before the suffix."""
+    """Draw one picture a match; none if there are no paths."""
     import io as bytes_io
 
     from phasemark.data import write_atomically
     from phasemark.matcher.picture import match_picture
 
-    for k, match in enumerate(matches):
+    for k, path in enumerate(paths):
         buffer = bytes_io.BytesIO()
-        match_picture(filtered, match, bank, background, k).savefig(buffer, format="png", dpi=120)
-        target = path if len(matches) == 1 else path.with_stem(f"{path.stem}-{k}")
-        write_atomically(target, buffer.getvalue(), force=force)
+        match_picture(filtered, matches[k], bank, background, k).savefig(buffer, format="png", dpi=120)
+        write_atomically(path, buffer.getvalue(), force=force)
 
 
 def _poses(
@@ -490,8 +494,6 @@ def _poses(
     prior: tuple[float, float, float] | None,
 ) -> list[dict[str, Any]]:
     """Return the robot poses of a match as plain numbers, best first; none if there is no landmark."""
-    import math
-
     from phasemark.matcher import robot_poses
 
     if match.class_name is None:
@@ -534,9 +536,7 @@ def _echo_matches(answers: Sequence[dict[str, Any]]) -> None:
 def _load_landmark(
     name_or_file: str, unit: str | None, up: str, origin: str, *, from_catalog: bool = False
 ) -> tuple[str, Trimesh]:
-    """Return the name and mesh of a class of the catalogue, or of a mesh file; warnings go to stderr."""
-    import warnings
-
+    """Return the name and mesh of a class of the catalogue, or of a mesh file."""
     from phasemark.landmarks import build_mesh, catalog, read_mesh
 
     specs = catalog()
@@ -545,12 +545,7 @@ def _load_landmark(
     path = Path(name_or_file)
     if from_catalog or not (path.suffix or path.exists()):
         raise UsageError(f"unknown class '{name_or_file}': the catalogue has {', '.join(specs)}")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        mesh = read_mesh(path, unit=unit, up=up, origin=origin)
-    for warning in caught:
-        _report(str(warning.message))
-    return path.stem, mesh
+    return path.stem, read_mesh(path, unit=unit, up=up, origin=origin)
 
 
 def _name_and_file(text: str) -> tuple[str, str]:
@@ -576,9 +571,19 @@ def _background(wall: float | None, floor: float | None) -> Background | None:
     return None if wall is None and floor is None else Background(wall_m=wall, floor_m=floor)
 
 
+def _make_folder(path: Path) -> None:
+    """Make a folder for outputs, and those above it; one that is there already will do."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise UsageError(f"{path}: is no folder, or lies in something that is none") from None
+
+
 def _refuse_existing(paths: Iterable[Path], force: bool) -> None:
     """Refuse outputs that exist before any work is done."""
     for path in paths:
+        if path.is_dir():
+            raise UsageError(f"{path}: is a folder, give the name of a file")
         if path.exists() and not force:
             raise OutputExistsError(f"{path}: exists already; --force replaces it")
 
@@ -626,9 +631,17 @@ def _echo_facts(facts: Mapping[str, Any]) -> None:
         typer.echo(f"{key.replace('_', ' ').ljust(width)}  {value}")
 
 
-def _report(message: str) -> None:
-    """Write one line to stderr."""
-    typer.echo(f"note: {message}", err=True)
+@contextmanager
+def _warnings_as_notes() -> Iterator[None]:
+    """Write each thing the library warns of as one line, ``note: …``, to stderr."""
+
+    def show(message: Warning | str, *where: object, **more: object) -> None:
+        typer.echo(f"note: {_one_line(str(message))}", err=True)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = show
+        yield
 
 
 def _load_sensor(name_or_file: str) -> Sensor:
@@ -645,6 +658,11 @@ def _load_sensor(name_or_file: str) -> Sensor:
 
 def _sensor_facts(sensor: Sensor) -> dict[str, Any]:
     return {**sensor.model_dump(mode="json"), "unambiguous_range_m": sensor.unambiguous_range_m}
+
+
+def _plain(value: str | int | float) -> str | int | float | None:
+    """Return None for a number that JSON does not have."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _echo_json(value: object) -> None:
@@ -665,8 +683,11 @@ def _report_error(message: str) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    line = "".join(char if char.isprintable() else " " for char in message)
-    Console(stderr=True).print(Text.assemble(("error: ", "bold red"), line), soft_wrap=True)
+    Console(stderr=True).print(Text.assemble(("error: ", "bold red"), _one_line(message)), soft_wrap=True)
+
+
+def _one_line(message: str) -> str:
+    return "".join(char if char.isprintable() else " " for char in message)
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
@@ -708,7 +729,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without '×' or 'σ' is no reason to fail
     try:
         try:
-            _run(list(sys.argv[1:] if arguments is None else arguments))
+            with _warnings_as_notes():
+                _run(list(sys.argv[1:] if arguments is None else arguments))
         finally:
             sys.stdout.flush()
     except PhasemarkError as error:

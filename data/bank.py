@@ -32,6 +32,8 @@ VIEW_DIMS: dict[GroupName, tuple[str, ...]] = {
 }
 PHASOR_DIMS = ("frequency", "row", "col", "iq")
 IMAGE_DIMS = ("row", "col")
+_COVERAGE_SLACK = 0.01
+"""How far a coverage may lie outside 0 … 1: more than any error of the integral, less than damage."""
 LAYOUT_GROUPS: dict[str, tuple[GroupName, ...]] = {"factored": ("lower", "upper"), "full": ("full",)}
 
 
@@ -115,7 +117,11 @@ class BankGroup:
     @cached_property
     def coverage(self) -> NDArray[np.float32]:
         """Share of the pixel that sees the landmark, 0 … 1, (views, row, col)."""
-        return _frozen(self._read("coverage"))
+        coverage = self._read("coverage")
+        outside = coverage[(coverage < -_COVERAGE_SLACK) | (coverage > 1 + _COVERAGE_SLACK)]
+        if outside.size:
+            raise InputFileError(f"{self._path}: '{self.name}/coverage' must be in 0 … 1, got {outside.flat[0]:g}")
+        return _frozen(coverage)
 
     @cached_property
     def _phasors(self) -> NDArray[np.complex64]:
@@ -252,6 +258,10 @@ class Bank:
             faces = group["faces"][...].astype(np.int64)
             part = group["part"][...].astype(np.uint8) if "part" in group else None
             period_deg, albedo = float(group.attrs["delta_period_deg"]), float(group.attrs["albedo"])
+        if not 1 <= period_deg <= 360:  # as the plan has it: a symmetry of 1 … 360
+            raise InputFileError(
+                f"{self.path}: 'delta_period_deg' of '{class_name}' must be in [1, 360], got {period_deg:g}"
+            )
         if not (vertices.ndim == faces.ndim == 2 and vertices.shape[1:] == faces.shape[1:] == (3,) and faces.size):
             raise InputFileError(f"{self.path}: 'meshes/{class_name}' must hold rows of three, of vertices and faces")
         if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
@@ -270,6 +280,8 @@ class Bank:
         """Return what the bank holds, in plain numbers and text."""
         groups = [group for group in (self.lower, self.upper, self.full) if group is not None]
         views = {group.name: int(np.prod(self._file[group.name]["phasor"].shape[:-4])) for group in groups}
+        with _reading(self.path):
+            hashes = {name: str(self._file[f"meshes/{name}"].attrs["sha256"]) for name in self.classes}
         return {
             "path": str(self.path),
             "size_bytes": int(self._file.id.get_filesize()),
@@ -287,7 +299,7 @@ class Bank:
             "rows": self.sensor.rows,
             "cols": self.sensor.cols,
             "modulation_hz": self.sensor.modulation_hz,
-            "mesh_sha256": {name: str(self._file[f"meshes/{name}"].attrs["sha256"]) for name in self.classes},
+            "mesh_sha256": hashes,
             "versions": self.versions,
         }
 

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import os
+import tokenize
 import warnings
 import zipfile
 from collections.abc import Collection, Mapping
@@ -30,6 +31,10 @@ QUANTITIES = ("range", "z")
 _FIELDS = ("range", "amplitude", "intensity", "status", "valid")
 _ELECTRONS = ("e", "e-", "electron", "electrons")
 _NOT_A_NUMBER = ("", "nan")
+_UNREADABLE = (
+    OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile, csv.Error,
+    tokenize.TokenError,  # NumPy tokenizes the header of an NPY file
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -227,7 +232,9 @@ def _read(path: Path, shape: tuple[int, int]) -> _Raw:
         return _Raw({"range": _parse_csv(path.read_bytes(), shape, path)}, flat=True)
     except PhasemarkError:
         raise
-    except (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
+    except MemoryError:
+        raise InputFileError(f"{path}: holds or announces more frames than fit into memory") from None
+    except _UNREADABLE as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
         raise InputFileError(f"{path}: cannot be read ({reason})") from None
 

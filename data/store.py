@@ -72,6 +72,8 @@ def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bo
         The temporary file.
     """
     path = Path(path)
+    if not path.name:
+        raise UsageError(f"'{path}' is not a file name")
     targets = [path, checksum_path(path)] if checksum else [path]
     for target in targets:
         _refuse_unwritable(target, force=force)
@@ -206,8 +208,6 @@ def verify_checksum(path: str | os.PathLike[str]) -> str:
 
 
 def _refuse_unwritable(path: Path, *, force: bool) -> None:
-    if not path.name:
-        raise UsageError(f"'{path}' is not a file name")
     if not path.parent.is_dir():
         raise UsageError(f"{path}: the folder '{path.parent}' does not exist: make it first")
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import re
 import struct
@@ -17,6 +18,9 @@ from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.landmarks.mesh import MAX_FACES
+
+# Without a handler of its own, what trimesh logs about a damaged file, tracebacks included, would go to stderr.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 FORMATS = ("stl", "ply", "obj", "off")
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}

@@ -170,7 +170,7 @@ class Sensor(BaseModel):
             table = tomllib.loads(path.read_text(encoding="utf-8"))
         except OSError as error:
             raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:  # the last: nested without end
             raise InputFileError(f"{path}: not a TOML file ({error})") from None
         try:
             return cls(**table)

@@ -3,6 +3,8 @@
 import json
 import math
 import shutil
+import subprocess
+import sys
 
 import h5py
 import numpy as np
@@ -195,7 +197,24 @@ MISTAKES = [
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--filter", "median", contains="kalman"),
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--prior", 1, 2, 3, contains="--landmark-xy"),
     _case(2, "match", "bank.h5", "frames.csv", *MATCH[:4], "--wall", -1, contains="wall_m"),
-    _case(4, "match", "bank.h5", "frames.csv", *MATCH, "--plot", "bank.h5", contains="--force"),
+    _case(4, "match", "bank.h5", "frames.csv", *MATCH, "--plot", "taken.png", contains="--force"),
+    _case(4, "match", "bank.h5", "frames.npz", *MATCH, "--plot", "two.png", contains="two-1.png"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--plot", "m.jpg", contains=".png"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--plot", "no/such/folder/m.png", contains="folder"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--landmark-xy", "nan", 1, contains="landmark_xy_m"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--landmark-xy", 2, 1, "--pan", "inf", contains="pan_rad"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--rotate", 45, contains="270"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--invalid-means", "far", contains="no-return"),
+    _case(3, "match", "bank.h5", "long.csv", *MATCH, contains="long.csv"),
+    _case(3, "match", "bank.h5", "header.npy", *MATCH, contains="header.npy"),
+    _case(3, "match", "bank.h5", "giant.h5", *MATCH, contains="memory"),
+    _case(3, "match", "bank.h5", "cut.npz", *MATCH, contains="cut.npz"),
+    _case(3, "match", "bank.h5", "bank.h5", *MATCH, contains="phasemark-bank"),
+    _case(3, "match", "bank.h5", ".", *MATCH, contains="directory"),
+    _case(3, "match", "coverage.h5", "frames.csv", *MATCH, contains="lower/coverage"),
+    _case(3, "match", "period.h5", "frames.csv", *MATCH, contains="delta_period_deg"),
+    _case(3, "match", "schema.h5", "frames.csv", *MATCH, contains="update phasemark"),
+    _case(3, "bank", "info", "nohash.h5", contains="sha256"),
     _case(2, "bank", "build", "--class", "pyramid", "-o", "x.h5", contains="pyramid"),
     _case(2, "bank", "build", "--distance", "1:2:0", "-o", "x.h5", contains="1:2:0"),
     _case(2, "bank", "build", "--distance", "1:2:-0.1", "-o", "x.h5", contains="1:2:-0.1"),
@@ -209,6 +228,14 @@ MISTAKES = [
     _case(3, "bank", "build", "--mesh", "part=cut.stl", "--unit", "m", "-o", "x.h5", contains="cut.stl"),
     _case(3, "bank", "build", "plan-that-is-not-there.toml", "-o", "x.h5", contains="plan-that-is-not-there.toml"),
     _case(2, "bank", "build", "bad.toml", "-o", "x.h5", contains="distanz"),
+    _case(3, "bank", "build", "nested.toml", "-o", "x.h5", contains="nested.toml"),
+    _case(3, "bank", "build", "--sensor", "nested.toml", "-o", "x.h5", contains="nested.toml"),
+    _case(2, "bank", "build", *SMALL, "-o", "", contains="not a file name"),
+    _case(2, "bank", "build", *SMALL, "-o", "..", contains=".."),
+    _case(2, "bank", "build", *SMALL, "--workers", 0, "-o", "x.h5", contains="--workers"),
+    _case(2, "bank", "build", *SMALL, "--class", "cone", "--class", "cone", "-o", "x.h5", contains="two landmarks"),
+    _case(2, "bank", "build", *SMALL, "--mesh", "none=box.stl", "--unit", "m", "-o", "x.h5", contains="no landmark"),
+    _case(2, "bank", "build", *SMALL, "--mesh", "a/b=box.stl", "--unit", "m", "-o", "x.h5", contains="a/b"),
     _case(4, "bank", "build", *SMALL, "-o", "bank.h5", contains="bank.h5"),
     _case(2, "bank", "build", *SMALL, "-o", "no/such/folder/x.h5", contains="folder"),
     _case(3, "bank", "info", "none.h5", contains="none.h5"),
@@ -232,8 +259,31 @@ MISTAKES = [
     _case(3, "landmark", "check", "cut.stl", "--unit", "m", contains="cut off"),
     _case(3, "landmark", "check", "none.stl", "--unit", "m", contains="none.stl"),
     _case(3, "landmark", "check", "frames.csv", "--unit", "m", contains="csv"),
+    _case(2, "landmark", "show", "cone", "-o", "box.stl", contains="folder"),
+    _case(2, "landmark", "export", "box.stl", "-o", "x.stl", contains="catalogue"),
     _case(4, "demo", "-o", ".", contains="bank.h5"),
+    _case(2, "demo", "-o", "new", "--seed", -1, contains="--seed"),
+    _case(2, "demo", "-o", "new", "--seed", 2**64, contains="--seed"),
+    _case(2, "demo", "-o", "new", "--workers", 0, contains="--workers"),
+    _case(2, "demo", "-o", "box.stl", contains="folder"),
+    _case(2, "demo", "-o", "box.stl/new", contains="folder"),
 ]
+
+
+def _cover_twice(file):
+    file["lower/coverage"][...] = 2.0
+
+
+def _drop_hash(file):
+    del file["meshes/cone"].attrs["sha256"]
+
+
+BANK_DAMAGE = {
+    "coverage.h5": _cover_twice,
+    "period.h5": lambda file: file["meshes/cone"].attrs.__setitem__("delta_period_deg", 0.0),
+    "schema.h5": lambda file: file.attrs.__setitem__("schema_version", 99),
+    "nohash.h5": _drop_hash,
+}
 
 
 @pytest.fixture(scope="module")
@@ -251,6 +301,17 @@ def bad_files(folder):
     (folder / "cut.stl").write_bytes((folder / "box.stl").read_bytes()[:-100])
     (folder / "bad.toml").write_text('distanz = "1:2:0.1"\n')
     (folder / "taken.png").write_bytes(b"mine")
+    (folder / "two-1.png").write_bytes(b"mine")
+    (folder / "nested.toml").write_text("a = " + "[" * 5000)
+    (folder / "long.csv").write_text("1" * 200_000 + ",1" * 255)  # one cell longer than Python's csv reads
+    (folder / "header.npy").write_bytes((folder / "small.npy").read_bytes().replace(b"), }", b"    "))
+    (folder / "cut.npz").write_bytes((folder / "frames.npz").read_bytes()[:-40])
+    with h5py.File(folder / "giant.h5", "w") as file:  # 1 PB, none of it written
+        file.create_dataset("range", shape=(10**12, 16, 16), dtype="f4", chunks=(1, 16, 16))
+    for name, damage in BANK_DAMAGE.items():
+        shutil.copy(folder / "bank.h5", folder / name)
+        with h5py.File(folder / name, "r+") as file:
+            damage(file)
     return folder
 
 
@@ -264,6 +325,60 @@ def test_a_mistake_is_one_line_and_leaves_nothing_behind(run, bad_files, monkeyp
     assert err.startswith("error: ")
     assert contains in err
     assert {path.name: path.stat().st_mtime_ns for path in bad_files.iterdir()} == before
+
+
+def test_a_warning_is_one_note_and_no_error(run, folder, tmp_path):
+    # a landmark of 0.3 mm is read all the same, but its unit is doubted, once
+    assert run("landmark", "export", "post", "-o", tmp_path / "post.stl")[0] == 0
+    code, _, err = run("landmark", "check", tmp_path / "post.stl", "--unit", "mm")
+    assert code == 0
+    assert err.splitlines() == [f"note: {tmp_path / 'post.stl'}: it is 0.0003 m large: is the unit right?"]
+    frames = np.loadtxt(folder / "frames.csv", delimiter=",")
+    frames[3, 7] = -1.0
+    np.savetxt(tmp_path / "frames.csv", frames, delimiter=",")
+    code, out, err = run("match", folder / "bank.h5", tmp_path / "frames.csv", *MATCH, "--json")
+    assert code == 0
+    assert json.loads(out)["matches"][0]["class"] == "cone"
+    assert len(err.splitlines()) == 1
+    assert err.startswith("note: ")
+    assert "frame 3, row 0, column 7" in err
+
+
+def test_what_the_mesh_library_logs_stays_off_the_screen(tmp_path):
+    # In a process of its own: under pytest the root logger has handlers, and logging's last resort is never asked.
+    facet = "facet normal x y z\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"
+    corners = ["0 0 0", "0.1 0 0", "0 0.1 0", "0 0 0.1"]
+    faces = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)]
+    text = "".join(facet.format(*(corners[k] for k in face)) for face in faces)
+    (tmp_path / "a.stl").write_text(f"solid a\n{text}endsolid a\n")
+    program = "import sys; from phasemark.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "landmark", "check", str(tmp_path / "a.stl"), "--unit", "m"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["bank", "build", "--class", "cone", *SMALL, "-o", "x.h5"],
+        ["render", "--class", "cone", "--distance", "1", "-o", "x.png"],
+        ["landmark", "export", "sphere", "-o", "x.obj"],
+        ["landmark", "show", "cone"],
+    ],
+    ids=lambda arguments: " ".join(arguments[:2]),
+)
+def test_a_full_disk_exits_with_5_and_leaves_nothing(run, tmp_path, monkeypatch, arguments):
+    resource = pytest.importorskip("resource")  # POSIX
+    monkeypatch.chdir(tmp_path)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5000, hard))  # Python ignores SIGXFSZ: writing fails with EFBIG
+    try:
+        code, out, err = run(*arguments)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (code, out) == (5, "")
+    assert len(err.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_bank_of_another_sensor_than_the_frames_is_refused(run, folder, tmp_path):

@@ -173,3 +173,37 @@ def test_a_sound_mesh_raises_no_warning():
         report = check_mesh(read_mesh(CONTENT["ply"], unit="m", file_type="ply"))
     assert (report.faces, report.vertices, report.bodies, report.outward) == (12, 8, 1, True)
     assert report.volume_m3 == pytest.approx(0.006, rel=1e-6)
+
+
+def _damaged(content, rng):
+    """Cut, flip, splice or repeat a part of a file."""
+    data = bytearray(content)
+    start, stop = sorted(rng.integers(len(data), size=2))
+    match rng.integers(4):
+        case 0:
+            del data[start:]
+        case 1:
+            for at in rng.integers(min(len(data), 400), size=3):  # counts and formats stand in front
+                data[at] = rng.integers(256)
+        case 2:
+            del data[start:stop]
+        case _:
+            data[start:start] = rng.choice([b"nan", b"-1", b"1e400", b"9" * 30, b"\n\n", b"\x00\xff"])
+    return bytes(data)
+
+
+@pytest.mark.parametrize("kind", list(CONTENT))
+@pytest.mark.filterwarnings("ignore::phasemark.landmarks.MeshWarning")
+def test_damage_anywhere_is_one_line_or_leaves_a_mesh_that_can_be_rendered(kind):
+    rng = np.random.default_rng(2005)
+    refusals = []
+    for _ in range(150):
+        try:
+            mesh = read_mesh(_damaged(CONTENT[kind], rng), unit="m", file_type=kind.split()[-1])
+        except InputFileError as error:
+            refusals.append(str(error))
+        else:
+            assert np.isfinite(mesh.vertices).all()
+            assert 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices)
+    assert not [line for line in refusals if "\n" in line]
+    assert len(refusals) > 50  # a third at the least: or the damage is none
