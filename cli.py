@@ -244,6 +244,8 @@ def _render(
         raise UsageError("say what to render: either --class NAME or --mesh NAME=FILE")
     if out.suffix.lower() != ".png":
         raise UsageError(f"the picture must be a .png file, got '{out}'")
+    if class_name is not None and unit is not None:
+        raise UsageError("--unit belongs to --mesh: the catalogue is in metres")
     data = out.with_suffix(".npz")
     _refuse_existing([out, data], force)
     if class_name is not None:

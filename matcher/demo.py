@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -163,6 +164,7 @@ def run_demo(
     for name, value in (("n_frames", n_frames), ("repetitions", repetitions)):
         if value < 1:
             raise UsageError(f"'{name}' must be at least 1, got {value}")
+    stream(seed, "demo frames", 0)  # a wrong seed is refused before the bank is built
     started = time.perf_counter()
     fields: dict[str, Any] = {"classes": tuple(classes), "sensor": SENSOR, "delta_deg": bank_delta_deg}
     if bank_distance_m is not None:
@@ -204,14 +206,17 @@ def run_demo(
 
 
 class _Clock:
-    """Adds the time since its last lap to a stage."""
+    """Adds the time since its last lap to a stage; several clocks may share the sums."""
+
+    _lock = Lock()
 
     def __init__(self, seconds: dict[str, float]) -> None:
         self._seconds, self._last = seconds, time.perf_counter()
 
     def lap(self, stage: str) -> None:
         now = time.perf_counter()
-        self._seconds[stage] += now - self._last
+        with self._lock:
+            self._seconds[stage] += now - self._last
         self._last = now
 
 

@@ -102,6 +102,9 @@ class Frames:
                     f"'{name}' must be finite{' and not negative' if least == 0 else ''} where the range is valid, got "
                     f"{measured[position, frame, row, col]} at position {position}, frame {frame}, row {row}, col {col}"
                 )
+        if amplitude is not None:  # without amplitude there is no phase (PHYSICS section 4)
+            codes[usable & (amplitude == 0)] |= int(Flag.NO_RETURN)
+            usable &= codes == 0
         ranges = ranges.reshape(shape)
         ranges[~usable] = np.nan
         self.range_m: NDArray[np.float64] = ranges

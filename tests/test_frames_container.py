@@ -26,3 +26,12 @@ def test_wrapped_ranges_and_differences_stay_in_their_intervals():
     np.testing.assert_allclose(wrapped, [0, 0, 0, period / 2, period - 0.25], rtol=0, atol=1e-12)  # rounding
     np.testing.assert_allclose(wrap_difference_m([14.9, -14.9, 0.1], SENSOR), [14.9 - period, period - 14.9, 0.1])
     assert wrap_difference_m(period / 2, SENSOR) == -period / 2
+
+
+def test_a_range_without_amplitude_is_no_return():
+    amplitude = np.full((1, 1, 16, 16), 100.0)
+    amplitude[0, 0, 3, 4] = 0.0
+    frames = Frames(np.ones((1, 1, 16, 16)), amplitude, sensor=preset("pmd-16x16"))
+    assert frames.flags[0, 0, 3, 4] == Flag.NO_RETURN
+    assert np.isnan(frames.range_m[0, 0, 3, 4])
+    assert frames.valid.sum() == 255
