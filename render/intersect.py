@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 
 _LEAF = 4
-_HAIR = np.array([1.0e-6, -0.7e-6, 0.4e-6], dtype=np.float32)
-"""A turn of about a microradian: 4e-5 of a pixel of 16 × 16, a few float32 roundings."""
 
 
 class Intersector(Protocol):
@@ -47,12 +45,6 @@ class EmbreeIntersector:
     def first_face(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
         """Return the index of the first face met by each ray, −1 where none is."""
         faces: NDArray[np.int32] = self._scene.run(origins, directions)
-        # a ray aimed exactly at a vertex can slip between its faces: what missed is tried again, a hair beside
-        missed = np.flatnonzero(faces < 0)
-        if missed.size:
-            beside = directions[missed]
-            beside = beside + np.abs(beside).max(axis=1, keepdims=True) * _HAIR
-            faces[missed] = self._scene.run(origins[missed], beside)
         return faces
 
 
