@@ -144,8 +144,8 @@ def sphere_rings(radius_m: float, tolerance_m: float, max_faces: int) -> list[Ri
     return rings(radius_m * math.sqrt(4 * math.pi * radius_m**2 / _area(_skin(rings(radius_m)))))
 
 
-_SPHERE_STEP = 5.3
-"""Height of a band over √(tolerance · radius), measured: from 5.4 down no pixel of 60 random views is off by more."""
+_SPHERE_STEP = 4.7
+"""Height of a band over √(tolerance · radius), measured: the worst pixel of 400 views from 0.75 m is off by 0.92e-4."""
 
 
 def _multiple_of_four(count: float, least: int = _MIN_SECTIONS) -> int:

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 
 CREASE_RAD = math.radians(30.0)
+CLUSTER = 32
+"""Faces that are looked at together for silhouettes."""
 _COPLANAR_RAD = 1e-7
 _NEAR_M = 1e-6
 
@@ -33,8 +35,6 @@ class MeshTopology(NamedTuple):
     faces : (f, 3) int32
     planes : (f, 4) float64
         Unit normal and offset of each face: n · p = offset on it.
-    planes_by_component : (4, f) float64
-        The same, component by component.
     corner_normals : (f, 3, 3) float64
         Shading normal at each corner of each face; zero at an apex, where there is none.
     flat : (f,) bool
@@ -45,6 +45,8 @@ class MeshTopology(NamedTuple):
         Number of the smooth patch, faces joined without a crease between them.
     part : (f,) int8
         0 for the landmark's lower part, 1 for the upper one.
+    concave : (e,) bool
+        Whether a crease is the bottom of a valley; then it is seen only from before both of its faces.
     creases, folds : (e, 4) int32
         Edges (start, end, face, other face): the creases, −1 where there is no other face, and the edges of smooth
         regions, which matter where they are silhouettes. An edge runs along the winding of its first face.
@@ -52,6 +54,11 @@ class MeshTopology(NamedTuple):
         The folds whose first face this is, −1: fewer than three.
     fold_reach : (f,) float64
         How far the normal turns, |n − n'|, over the face's folds at most; −1 if it has none.
+    smooth_faces : (g,) int32
+        Faces with folds, neighbours near one another; each :data:`CLUSTER` of them are a cluster.
+    clusters : (c, 10) float64
+        Per cluster a point, a mean normal, its offset from the point's plane, how far the faces' normals and offsets
+        differ from those at most, and the largest fold_reach.
     radius_m : float
         Distance of the farthest vertex from the origin.
     closed : bool
@@ -61,16 +68,18 @@ class MeshTopology(NamedTuple):
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
     planes: NDArray[np.float64]
-    planes_by_component: NDArray[np.float64]
     corner_normals: NDArray[np.float64]
     flat: NDArray[np.bool_]
     plain: NDArray[np.bool_]
     patch: NDArray[np.int32]
     part: NDArray[np.int8]
     creases: NDArray[np.int32]
+    concave: NDArray[np.bool_]
     folds: NDArray[np.int32]
     face_folds: NDArray[np.int32]
     fold_reach: NDArray[np.float64]
+    smooth_faces: NDArray[np.int32]
+    clusters: NDArray[np.float64]
     radius_m: float
     closed: bool
 
@@ -107,7 +116,11 @@ class MeshTopology(NamedTuple):
         patch = _components(len(faces), edges[~crease][:, 2:])
         corners = _corner_normals(vertices, faces, normals, patch)
         flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
+        # the corner of the other face off the edge lies before the first face's plane
+        off_edge = vertices[faces[other]].sum(axis=1) - vertices[edges[:, 0]] - vertices[edges[:, 1]]
+        concave = np.einsum("ij,ij->i", planes[first, :3], off_edge) > planes[first, 3]
         face_folds, fold_reach = _folds_of_faces(edges[fold], normals)
+        smooth_faces, clusters = _cluster_faces(vertices[faces].mean(axis=1), planes, fold_reach)
         shell = _components(len(faces), edges[other >= 0][:, 2:])
         six_volumes = np.bincount(
             shell, np.einsum("ij,ij->i", a, np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
@@ -116,16 +129,18 @@ class MeshTopology(NamedTuple):
             vertices=np.ascontiguousarray(vertices),
             faces=np.ascontiguousarray(faces, dtype=np.int32),
             planes=np.ascontiguousarray(planes),
-            planes_by_component=np.ascontiguousarray(planes.T),
             corner_normals=np.ascontiguousarray(corners),
             flat=np.ascontiguousarray(flat),
             plain=np.bincount(patch, ~flat)[patch] == 0,
             patch=patch,
             part=np.ascontiguousarray(part),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
+            concave=np.ascontiguousarray(concave[crease]),
             folds=np.ascontiguousarray(edges[fold], dtype=np.int32),
             face_folds=face_folds,
             fold_reach=fold_reach,
+            smooth_faces=smooth_faces,
+            clusters=clusters,
             radius_m=float(np.linalg.norm(vertices, axis=1).max()),
             closed=bool(regular.all() and (six_volumes > 0).all()),
         )
@@ -137,16 +152,18 @@ class MeshTopology(NamedTuple):
             vertices=np.zeros((0, 3)),
             faces=np.zeros((0, 3), np.int32),
             planes=np.zeros((0, 4)),
-            planes_by_component=np.zeros((4, 0)),
             corner_normals=np.zeros((0, 3, 3)),
             flat=np.zeros(0, np.bool_),
             plain=np.zeros(0, np.bool_),
             patch=np.zeros(0, np.int32),
             part=np.zeros(0, np.int8),
             creases=np.zeros((0, 4), np.int32),
+            concave=np.zeros(0, np.bool_),
             folds=np.zeros((0, 4), np.int32),
             face_folds=np.zeros((0, 3), np.int32),
             fold_reach=np.zeros(0),
+            smooth_faces=np.zeros(0, np.int32),
+            clusters=np.zeros((0, 10)),
             radius_m=0.0,
             closed=True,
         )
@@ -202,6 +219,39 @@ def _folds_of_faces(
     return table, reach
 
 
+def _cluster_faces(
+    centres: NDArray[np.float64], planes: NDArray[np.float64], fold_reach: NDArray[np.float64]
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Order the faces with folds along a Z-curve through space, and bound each cluster's planes.
+
+    See :class:`MeshTopology` for what is returned.
+    """
+    smooth = np.flatnonzero(fold_reach >= 0)
+    if not len(smooth):
+        return np.zeros(0, np.int32), np.zeros((0, 10))
+    low = centres[smooth].min(axis=0)
+    cell = np.ptp(centres[smooth], axis=0).max() / 1023 or 1.0
+    grid = ((centres[smooth] - low) / cell).astype(np.int64)
+    key = np.zeros(len(smooth), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            key |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
+    smooth = smooth[np.argsort(key, kind="stable")]
+    starts = np.arange(0, len(smooth), CLUSTER)
+    size = np.diff(np.append(starts, len(smooth)))
+    point = np.add.reduceat(centres[smooth], starts) / size[:, None]
+    normal = np.add.reduceat(planes[smooth, :3], starts) / size[:, None]
+    # offset of each face from the cluster's point
+    own = np.repeat(np.arange(len(starts)), size)
+    offset = planes[smooth, 3] - np.einsum("ij,ij->i", planes[smooth, :3], point[own])
+    mean_offset = np.add.reduceat(offset, starts) / size
+    turn = np.linalg.norm(planes[smooth, :3] - normal[own], axis=1)
+    bounds = [
+        np.maximum.reduceat(values, starts) for values in (turn, np.abs(offset - mean_offset[own]), fold_reach[smooth])
+    ]
+    return smooth.astype(np.int32), np.ascontiguousarray(np.column_stack([point, normal, mean_offset, *bounds]))
+
+
 def _components(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int32]:
     """Give the nodes of each connected component one number."""
     from scipy.sparse import coo_array
@@ -219,9 +269,11 @@ def _corner_normals(
 ) -> NDArray[np.float64]:
     """Average, at each corner, the normals of the vertex's faces that lie within 30° of the corner's own face.
 
-    Weighted by the angle of the face at the vertex, which makes the average independent of how a quadrilateral is
-    split. A vertex whose faces fan out further without a crease between them is an apex, as a cone has one: no normal
-    serves there, and the corner gets none (zero), so that the other two are blended along its generatrices.
+    Weighted by sin α / (|a| |b|), a and b being the edges of the face at the vertex and α the angle between them
+    (N. Max, Weights for computing vertex normals from facet normals, 1999): exact where the vertex and its neighbours
+    lie on a sphere, and independent of how a quadrilateral is split whose corners lie on a circle. A vertex whose faces
+    fan out further without a crease between them is an apex, as a cone has one: no normal serves there, and the corner
+    gets none (zero), so that the other two are blended along its generatrices.
     """
     corner_of = np.argsort(faces.ravel(), kind="stable")
     start = np.searchsorted(faces.ravel()[corner_of], np.arange(len(vertices) + 1))
@@ -238,7 +290,7 @@ def _average_corners(vertices, faces, normals, patch, corner_of, start, cos_limi
             a = vertices[faces[f, (k + 1) % 3]] - p
             b = vertices[faces[f, (k + 2) % 3]] - p
             cross = np.cross(a, b)
-            weight[f, k] = math.atan2(math.sqrt(np.dot(cross, cross)), np.dot(a, b))
+            weight[f, k] = math.sqrt(np.dot(cross, cross)) / (np.dot(a, a) * np.dot(b, b))
     out = np.zeros((n_faces, 3, 3))
     for f in range(n_faces):
         for k in range(3):
@@ -259,12 +311,12 @@ def _average_corners(vertices, faces, normals, patch, corner_of, start, cos_limi
 
 
 @njit(cache=True, nogil=True)
-def project_edges(mesh, lens, matrix, offset, scale, centre, sides, segments, limb):  # type: ignore[no-untyped-def]
+def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  # type: ignore[no-untyped-def]
     """Project the creases and silhouettes of one view.
 
     A fold is a silhouette where the lens lies before one of its faces and behind the other. Both faces' planes pass
     through the fold, so the lens is then no further from either than their normals' difference times its distance from
-    the fold; that leaves few faces to look at.
+    the fold; that leaves few faces to look at, and few clusters of faces.
 
     Parameters
     ----------
@@ -275,8 +327,6 @@ def project_edges(mesh, lens, matrix, offset, scale, centre, sides, segments, li
         p_image = matrix · p' + offset: landmark frame to the tilted camera's frame (x along the axis).
     scale, centre : (2,)
         u = centre[0] − scale[0] · y/x, v = centre[1] − scale[1] · z/x.
-    sides : (f,) float64, overwritten
-        Distance of the lens from each face's plane, positive before its front.
     segments : (e, 4) float64, overwritten
         u, v of both ends.
     limb : (e,) int8, overwritten
@@ -288,37 +338,51 @@ def project_edges(mesh, lens, matrix, offset, scale, centre, sides, segments, li
     int
         How many segments were written.
     """
-    nx, ny, nz, d = mesh.planes_by_component
-    vertices, creases, folds, face_folds, fold_reach = (
-        mesh.vertices, mesh.creases, mesh.folds, mesh.face_folds, mesh.fold_reach
+    vertices, planes, creases, concave, folds = mesh.vertices, mesh.planes, mesh.creases, mesh.concave, mesh.folds
+    face_folds, fold_reach, smooth_faces, clusters = (
+        mesh.face_folds, mesh.fold_reach, mesh.smooth_faces, mesh.clusters
     )  # fmt: skip
-    for f in range(len(sides)):
-        sides[f] = nx[f] * lens[0] + ny[f] * lens[1] + nz[f] * lens[2] - d[f]
     n = 0
     for e in range(len(creases)):
         start, end, face, other = creases[e, 0], creases[e, 1], creases[e, 2], creases[e, 3]
-        # what turns its back is hidden behind the front of a closed mesh
-        if mesh.closed and sides[face] <= 0.0 and sides[other] <= 0.0:
-            continue
+        # a closed mesh hides what turns its back, and a valley from everywhere but between its slopes
+        if mesh.closed:
+            before, before_other = _height(planes, face, lens) > 0.0, _height(planes, other, lens) > 0.0
+            if not (before or before_other) or (concave[e] and not (before and before_other)):
+                continue
         if _project(vertices, start, end, matrix, offset, scale, centre, segments[n]):
             limb[n] = 0
             n += 1
     farthest = mesh.radius_m + math.sqrt(lens[0] * lens[0] + lens[1] * lens[1] + lens[2] * lens[2])
-    for f in range(len(sides)):
-        if abs(sides[f]) > fold_reach[f] * farthest:
+    for c in range(len(clusters)):
+        px, py, pz, nx, ny, nz, d, turn, slack, reach = clusters[c]
+        dx, dy, dz = lens[0] - px, lens[1] - py, lens[2] - pz
+        away = math.sqrt(dx * dx + dy * dy + dz * dz)
+        if abs(nx * dx + ny * dy + nz * dz - d) > turn * away + slack + reach * farthest:
             continue
-        for k in range(3):
-            e = face_folds[f, k]
-            if e < 0:
-                break
-            before = sides[f] > 0.0
-            if before == (sides[folds[e, 3]] > 0.0):
+        for i in range(c * CLUSTER, min((c + 1) * CLUSTER, len(smooth_faces))):
+            f = smooth_faces[i]
+            height = _height(planes, f, lens)
+            if abs(height) > fold_reach[f] * farthest:
                 continue
-            a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
-            if _project(vertices, a, b, matrix, offset, scale, centre, segments[n]):
-                limb[n] = 1
-                n += 1
+            before = height > 0.0
+            for k in range(3):
+                e = face_folds[f, k]
+                if e < 0:
+                    break
+                if before == (_height(planes, folds[e, 3], lens) > 0.0):
+                    continue
+                a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
+                if _project(vertices, a, b, matrix, offset, scale, centre, segments[n]):
+                    limb[n] = 1
+                    n += 1
     return n
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _height(planes, f, lens):  # type: ignore[no-untyped-def]
+    """Return how far before the front of a face the lens is."""
+    return planes[f, 0] * lens[0] + planes[f, 1] * lens[1] + planes[f, 2] * lens[2] - planes[f, 3]
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -14,6 +14,7 @@ The sweep runs along the limb, so that lines cross it.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -24,20 +25,76 @@ MAX_SEGMENTS = 128
 _MAX_LIMBS = 256
 _MAX_DEPTH = 5
 _MAX_EVENTS = 4 * MAX_SEGMENTS + 64
+_MAX_SLABS = 256
+_MAX_LINKS = 4096
 _EMPTY = 1e-10
 """Pieces narrower than this (pixels) are not sampled."""
 _THIN = 0.15
 """Intervals narrower than this (pixels) get one Gauss point."""
+_WIDE = 0.3
+"""Intervals wider than this (pixels) get three Gauss points on a curved surface, the others two."""
 _NARROW = 0.04
-"""Slabs narrower than this (pixels) get one line."""
-_SPREAD = 0.02
-"""Merged nodes that scatter by more than this (pixels, standard deviation) become two samples instead of one."""
-_MERGED = 0.3
-"""Thin slabs are merged up to this width (pixels)."""
+"""Strips narrower than this (pixels) get one line."""
+_TRIFLE = 4e-5
+"""Area times squared extent (pixels⁴) under which a piece gets one line."""
+_STRIP, _LIMB_STRIP = 0.6, 0.25
+"""Largest extent (pixels) of a piece that is given one Gauss rule: in general, and where a limb runs across it."""
+_PARALLEL = 0.1
+"""A limb runs along an interval if it keeps its distance (pixels) from both ends as well as this."""
+_SHRINKS = 0.3
+"""An interval shrinks to a point at an end of a strip where it is narrower than this share of its middle."""
+_KINK = 0.005
+"""Links at an angle are one smooth curve where the shorter one sticks out by less than this (pixels)."""
+_TURN = 0.4
+"""Sine of the angle by which the curves of one strip may turn."""
+_FELT = 1.5
+"""A limb shapes the surface up to this far (pixels)."""
 _REACH = 0.5
 """How far along the sweep (pixels) the end of a limb is felt."""
 _PINCH = 1e-6
 """Edges closer than this (pixels) at the end of a slab meet there."""
+
+
+class Scratch(NamedTuple):
+    """Scratch of one thread for the pixel at hand.
+
+    Parameters
+    ----------
+    edges : (MAX_SEGMENTS, 6) float64
+        The pixel's edges: s, x of both ends (s rising), side of the surface where the edge is a limb, slope dx/ds.
+    events : (_MAX_EVENTS,) float64
+        Where slabs begin and end.
+    active : (MAX_SEGMENTS,) int64
+        Edges across the slab at hand, in the order of x.
+    slabs : (_MAX_SLABS, 2) float64
+        Begin and end of the slabs of a strip.
+    links : (_MAX_LINKS,) int64
+        Edges of the slabs of a strip, slab by slab.
+    limbs : (2, _MAX_LIMBS, 4) float64
+        Limbs of the pixel and its neighbours, see :func:`_collect_limbs`.
+    n_limbs : (2,) int64
+    """
+
+    edges: NDArray[np.float64]
+    events: NDArray[np.float64]
+    active: NDArray[np.int64]
+    slabs: NDArray[np.float64]
+    links: NDArray[np.int64]
+    limbs: NDArray[np.float64]
+    n_limbs: NDArray[np.int64]
+
+    @classmethod
+    def empty(cls) -> Scratch:
+        """Return scratch for one thread."""
+        return cls(
+            edges=np.empty((MAX_SEGMENTS, 6)),
+            events=np.empty(_MAX_EVENTS),
+            active=np.empty(MAX_SEGMENTS, np.int64),
+            slabs=np.empty((_MAX_SLABS, 2)),
+            links=np.empty(_MAX_LINKS, np.int64),
+            limbs=np.empty((2, _MAX_LIMBS, 4)),
+            n_limbs=np.zeros(2, np.int64),
+        )
 
 
 def gauss_legendre(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -112,7 +169,7 @@ def _has_limb(entry, link, owner, limb):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def sample_pixel(  # type: ignore[no-untyped-def]
-    r, c, bent, width, height, segments, limb, head, link, owner, work, points, weights, regions, n, region
+    r, c, bent, width, height, segments, limb, head, link, owner, scratch, points, weights, regions, n, region
 ):
     """Place the samples of one pixel.
 
@@ -126,8 +183,7 @@ def sample_pixel(  # type: ignore[no-untyped-def]
         Fill factor.
     segments, limb, head, link, owner
         As :func:`project_edges` and :func:`bin_segments` left them.
-    work : (MAX_SEGMENTS, 5) float64
-        Scratch.
+    scratch : Scratch
     points : (m, 2) float64
         u, v of the samples, written from `n` on.
     weights : (m,) float64
@@ -176,14 +232,12 @@ def sample_pixel(  # type: ignore[no-untyped-def]
     else:
         sweep_v = along[1] >= along[0]
     curved = sideways or upright or has_limb
-    # the pixel itself and its neighbours across the sweep may hold the limb this pixel's surface ends at
-    limbs = np.empty((2, _MAX_LIMBS if curved else 0, 4))
-    n_limbs = np.zeros(2, np.int64)
+    scratch.n_limbs[:] = 0
     if curved:
+        # the pixel itself and its neighbours across the sweep may hold the limb this pixel's surface ends at
         before, after = (head[i, j - 1], head[i, j + 1]) if sweep_v else (head[i - 1, j], head[i + 1, j])
         for near in (head[i, j], before, after):
-            _collect_limbs(near, link, owner, segments, limb, sweep_v, limbs, n_limbs)
-    events = np.empty(_MAX_EVENTS)
+            _collect_limbs(near, link, owner, segments, limb, sweep_v, scratch.limbs, scratch.n_limbs)
     stack = np.empty((4 * _MAX_DEPTH + 4, 5))
     stack[0] = (u0, v0, u0 + width, v0 + height, 0.0)
     depth = 1
@@ -191,9 +245,9 @@ def sample_pixel(  # type: ignore[no-untyped-def]
     while depth > 0:
         depth -= 1
         bu0, bv0, bu1, bv1, level = stack[depth]
-        m = _clip_to_box(head[i, j], link, owner, segments, limb, bu0, bv0, bu1, bv1, sweep_v, work)
+        m = _clip_to_box(head[i, j], link, owner, segments, limb, bu0, bv0, bu1, bv1, sweep_v, scratch.edges)
         s0, s1, x0, x1 = (bv0, bv1, bu0, bu1) if sweep_v else (bu0, bu1, bv0, bv1)
-        n_events = _events(s0, s1, work, m, events) if m >= 0 else -1
+        n_events = _events(s0, s1, scratch.edges, m, scratch.events) if m >= 0 else -1
         if n_events < 0 and level < _MAX_DEPTH:
             um, vm = 0.5 * (bu0 + bu1), 0.5 * (bv0 + bv1)
             stack[depth] = (bu0, bv0, um, vm, level + 1)
@@ -204,10 +258,10 @@ def sample_pixel(  # type: ignore[no-untyped-def]
             continue
         if n_events < 0:
             m, trusted = 0, False
-            n_events = _events(s0, s1, work, m, events)
+            n_events = _events(s0, s1, scratch.edges, m, scratch.events)
         n, region = _sweep_box(
-            events, n_events, s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, bent, inverse_area,
-            points, weights, regions, n, region,
+            n_events, s0, s1, x0, x1, sweep_v, scratch, m, curved, bent, inverse_area, points, weights, regions,
+            n, region,
         )  # fmt: skip
         if n < 0:
             return -1, region, trusted
@@ -230,12 +284,12 @@ def _clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, work):  # type: ignore[no-untyped-def]
+def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, edges):  # type: ignore[no-untyped-def]
     """Clip a pixel's segments to a box.
 
-    Rows of `work` are s, x of both ends (s rising) and the limb's side, sorted by where they begin. The side is +1
-    where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number, or −1 if there
-    are too many.
+    Rows of `edges` are s, x of both ends (s rising), the limb's side and the slope, sorted by where they begin. The
+    side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number, or
+    −1 if there are too many.
     """
     m = 0
     while entry >= 0:
@@ -255,18 +309,20 @@ def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, wo
             sa, xa, sb, xb = ua + lo * du, va + lo * dv, ua + hi * du, va + hi * dv
             side = -1.0 if du > 0 else 1.0
         if sa <= sb:
-            work[m, 0], work[m, 1], work[m, 2], work[m, 3] = sa, xa, sb, xb
+            edges[m, 0], edges[m, 1], edges[m, 2], edges[m, 3] = sa, xa, sb, xb
         else:
-            work[m, 0], work[m, 1], work[m, 2], work[m, 3] = sb, xb, sa, xa
-        work[m, 4] = side if limb[k] else 0.0
+            edges[m, 0], edges[m, 1], edges[m, 2], edges[m, 3] = sb, xb, sa, xa
+        edges[m, 4] = side if limb[k] else 0.0
+        length = edges[m, 2] - edges[m, 0]
+        edges[m, 5] = (edges[m, 3] - edges[m, 1]) / length if length > 0.0 else 0.0
         m += 1
     if m > 1:
-        work[:m] = work[np.argsort(work[:m, 0])]
+        edges[:m] = edges[np.argsort(edges[:m, 0])]
     return m
 
 
 @njit(cache=True, nogil=True)
-def _events(s0, s1, work, m, events):  # type: ignore[no-untyped-def]
+def _events(s0, s1, edges, m, events):  # type: ignore[no-untyped-def]
     """Collect, sorted, where the order of the edges across the sweep may change.
 
     Returns their number, or −1 if there are too many.
@@ -274,24 +330,22 @@ def _events(s0, s1, work, m, events):  # type: ignore[no-untyped-def]
     n = 2
     events[0], events[1] = s0, s1
     for i in range(m):
-        events[n] = work[i, 0]
-        events[n + 1] = work[i, 2]
+        events[n] = edges[i, 0]
+        events[n + 1] = edges[i, 2]
         n += 2
     for i in range(m):
         for j in range(i + 1, m):
-            if work[j, 0] >= work[i, 2]:
+            if edges[j, 0] >= edges[i, 2]:
                 break
-            lo, hi = work[j, 0], min(work[i, 2], work[j, 2])
+            lo, hi = edges[j, 0], min(edges[i, 2], edges[j, 2])
             if hi - lo <= _EMPTY:
                 continue
-            if max(work[i, 1], work[i, 3]) < min(work[j, 1], work[j, 3]):
+            if max(edges[i, 1], edges[i, 3]) < min(edges[j, 1], edges[j, 3]):
                 continue
-            if max(work[j, 1], work[j, 3]) < min(work[i, 1], work[i, 3]):
+            if max(edges[j, 1], edges[j, 3]) < min(edges[i, 1], edges[i, 3]):
                 continue
-            ki = (work[i, 3] - work[i, 1]) / (work[i, 2] - work[i, 0])
-            kj = (work[j, 3] - work[j, 1]) / (work[j, 2] - work[j, 0])
-            gap_lo = work[i, 1] + ki * (lo - work[i, 0]) - work[j, 1] - kj * (lo - work[j, 0])
-            gap_hi = work[i, 1] + ki * (hi - work[i, 0]) - work[j, 1] - kj * (hi - work[j, 0])
+            gap_lo = _edge_at(edges, i, lo) - _edge_at(edges, j, lo)
+            gap_hi = _edge_at(edges, i, hi) - _edge_at(edges, j, hi)
             if gap_lo * gap_hi < 0.0:
                 if n == len(events):
                     return -1
@@ -350,7 +404,7 @@ def _nearest_limb(limbs, n, s, side, bound):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _activate(lo, hi, work, m, started, active, n_active):  # type: ignore[no-untyped-def]
+def _activate(lo, hi, edges, m, started, active, n_active):  # type: ignore[no-untyped-def]
     """Update the list of edges that span the slab [lo, hi], ordered along its middle line.
 
     Returns how many edges have started, and how many are active.
@@ -358,20 +412,20 @@ def _activate(lo, hi, work, m, started, active, n_active):  # type: ignore[no-un
     middle = 0.5 * (lo + hi)
     kept = 0
     for i in range(n_active):
-        if work[active[i], 2] >= middle:
+        if edges[active[i], 2] >= middle:
             active[kept] = active[i]
             kept += 1
     n_active = kept
-    while started < m and work[started, 0] <= middle:
-        if work[started, 2] >= middle and work[started, 2] > work[started, 0]:
+    while started < m and edges[started, 0] <= middle:
+        if edges[started, 2] >= middle and edges[started, 2] > edges[started, 0]:
             active[n_active] = started
             n_active += 1
         started += 1
     for i in range(1, n_active):
         edge = active[i]
-        x = _edge_at(work, edge, middle)
+        x = _edge_at(edges, edge, middle)
         j = i
-        while j > 0 and _edge_at(work, active[j - 1], middle) > x:
+        while j > 0 and _edge_at(edges, active[j - 1], middle) > x:
             active[j] = active[j - 1]
             j -= 1
         active[j] = edge
@@ -379,248 +433,269 @@ def _activate(lo, hi, work, m, started, active, n_active):  # type: ignore[no-un
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _edge_at(work, i, s):  # type: ignore[no-untyped-def]
+def _edge_at(edges, i, s):  # type: ignore[no-untyped-def]
     """Return where an edge meets the line at `s`."""
-    return work[i, 1] + (s - work[i, 0]) * (work[i, 3] - work[i, 1]) / (work[i, 2] - work[i, 0])
+    return edges[i, 1] + (s - edges[i, 0]) * edges[i, 5]
 
 
 @njit(cache=True, nogil=True)
-def _plan_lines(lo, hi, x0, x1, work, active, n_active, curved):  # type: ignore[no-untyped-def]
-    """Decide how many lines a slab needs, and at which of its ends a piece beside a limb shrinks to a point.
+def _continues(edges, m, first, before, after, n, stop, lo):  # type: ignore[no-untyped-def]
+    """Tell whether the edges of two neighbouring slabs are the same, or links of the same smooth curves.
 
-    The light of such a corner grows like the 3/2 power of the distance from it; lines placed at its square make that
-    smooth. One line misses how the integrand changes along slanted edges, two are exact to third order.
-
-    Returns the number of lines, and whether the slab is pinched at its low and at its high end.
-    """
-    slab = hi - lo
-    slant = 0.0
-    pinched_low, pinched_high = False, False
-    for i in range(n_active):
-        edge = active[i]
-        low, high = _edge_at(work, edge, lo), _edge_at(work, edge, hi)
-        slant = max(slant, abs(high - low))
-        if work[edge, 4] == 0.0:
-            continue
-        # what bounds the limb's own surface on its other side
-        other = i + 1 if work[edge, 4] > 0 else i - 1
-        other_low = other_high = x1 if work[edge, 4] > 0 else x0
-        if 0 <= other < n_active:
-            other_low, other_high = _edge_at(work, active[other], lo), _edge_at(work, active[other], hi)
-        pinched_low = pinched_low or abs(low - other_low) < _PINCH
-        pinched_high = pinched_high or abs(high - other_high) < _PINCH
-    if pinched_low and pinched_high:
-        return 4, True, True
-    if pinched_low or pinched_high:
-        return 3, pinched_low, pinched_high
-    if slab < _NARROW and slant < _THIN:
-        return 1, False, False
-    if slab < _MERGED:
-        return 2, False, False
-    return (5 if curved else 3), False, False
-
-
-@njit(cache=True, nogil=True)
-def _continues(work, m, before, after, n, stop, lo):  # type: ignore[no-untyped-def]
-    """Tell whether the edges of two neighbouring slabs are the same, or links of the same chains.
-
-    Not so where edges cross, begin or end alone, or where one lies along the border between the slabs.
+    Not so where edges cross, begin or end alone, where one lies along the border between the slabs, where a link stands
+    at a noticeable angle to the one before, or where the curve has turned far since its `first` link.
     """
     for i in range(n):
         old, new = before[i], after[i]
         if old == new:
             continue
-        if work[old, 4] != work[new, 4] or abs(work[old, 2] - stop) > _EMPTY or abs(work[new, 0] - lo) > _EMPTY:
+        if edges[old, 4] != edges[new, 4] or abs(edges[old, 2] - stop) > _EMPTY or abs(edges[new, 0] - lo) > _EMPTY:
             return False
-        if abs(work[old, 3] - work[new, 1]) > _PINCH:
+        if abs(edges[old, 3] - edges[new, 1]) > _PINCH:
+            return False
+        ds, dx = edges[new, 2] - edges[new, 0], edges[new, 3] - edges[new, 1]
+        length = ds * ds + dx * dx
+        old_ds, old_dx = edges[old, 2] - edges[old, 0], edges[old, 3] - edges[old, 1]
+        kink = old_ds * dx - old_dx * ds
+        if kink * kink > _KINK * _KINK * max(length, old_ds * old_ds + old_dx * old_dx):
+            return False
+        first_ds, first_dx = edges[first[i], 2] - edges[first[i], 0], edges[first[i], 3] - edges[first[i], 1]
+        turn = first_ds * dx - first_dx * ds
+        if turn * turn > _TURN * _TURN * length * (first_ds * first_ds + first_dx * first_dx):
             return False
     for i in range(m):
-        if work[i, 0] > lo + _EMPTY:
+        if edges[i, 0] > lo + _EMPTY:
             break
-        if work[i, 2] <= lo + _EMPTY and work[i, 0] >= stop - _EMPTY and abs(work[i, 3] - work[i, 1]) > _EMPTY:
+        if edges[i, 2] <= lo + _EMPTY and edges[i, 0] >= stop - _EMPTY and abs(edges[i, 3] - edges[i, 1]) > _EMPTY:
             return False
     return True
 
 
 @njit(cache=True, nogil=True)
-def _line_position(lines, g, pinched_low, pinched_high):  # type: ignore[no-untyped-def]
-    """Return the place of a line in its slab (0 … 1) and its share of it."""
-    if lines == 1:
-        return 0.5, 1.0
-    if lines == 2:
-        t, weight = _G2X[g], _G2W[g]
-    elif lines == 3:
-        t, weight = _G3X[g], _G3W[g]
-    elif lines == 4:
-        t, weight = _G4X[g], _G4W[g]
-    else:
-        t, weight = _G5X[g], _G5W[g]
-    if pinched_low and pinched_high:
-        return t * t * (3.0 - 2.0 * t), weight * 6.0 * t * (1.0 - t)
-    if pinched_low:
-        return t * t, weight * 2.0 * t
-    if pinched_high:
-        return t * (2.0 - t), weight * 2.0 * (1.0 - t)
-    return t, weight
+def _sweep_box(  # type: ignore[no-untyped-def]
+    n_events, s0, s1, x0, x1, sweep_v, scratch, m, curved, bent, scale, points, weights, regions, n, region
+):
+    """Sample a box strip by strip; `scale` turns areas into weights.
 
-
-@njit(cache=True, nogil=True)
-def _write(nodes, count, sweep_v, scale, points, weights, regions, n, region):  # type: ignore[no-untyped-def]
-    """Write the nodes of a line, or of merged lines, as samples.
-
-    Merged nodes have a total weight, a mean (s, x), and a variance of s. Two samples of half the weight at one standard
-    deviation before and behind the mean, along the regression line of x on s, have the same moments up to the second
-    (the third too, if the lines lie evenly): the two-point Gauss rule of the merged lines.
+    A rim or silhouette is a chain of many short edges, each of which begins and ends a slab. Neighbouring slabs in
+    which the same chains run side by side make one strip, in which the chains are smooth curves.
     """
-    if n + 2 * count > len(weights):
-        return -1, region
-    last, current = -1.0, region
-    for g in range(count):
-        total = nodes[g, 0]
-        s, x = nodes[g, 1] / total, nodes[g, 2] / total
-        if nodes[g, 3] != last:
-            current, region = region, region + 1
-            last = nodes[g, 3]
-        copies, ds, dx = 1, 0.0, 0.0
-        variance = nodes[g, 4] / total - s * s
-        if variance > 1e-12:
-            ds = math.sqrt(variance)
-            dx = (nodes[g, 5] / total - s * x) / ds
-            copies = 2 if ds > _SPREAD or abs(dx) > _SPREAD else 1
-        if copies == 1:
-            ds, dx = 0.0, 0.0
-        for sign in range(copies):
-            direction = 1.0 - 2.0 * sign
-            points[n, 0] = x + direction * dx if sweep_v else s + direction * ds
-            points[n, 1] = s + direction * ds if sweep_v else x + direction * dx
-            weights[n] = total * scale / copies
-            regions[n] = current
-            n += 1
+    edges, events, active, slabs, links = scratch.edges, scratch.events, scratch.active, scratch.slabs, scratch.links
+    started, n_active, n_slabs, k = 0, 0, 0, 0
+    for e in range(n_events - 1):
+        lo, hi = max(events[e], s0), min(events[e + 1], s1)
+        if hi - lo <= _EMPTY:
+            continue
+        started, n_active = _activate(lo, hi, edges, m, started, active, n_active)
+        if n_slabs > 0:
+            stop = slabs[n_slabs - 1, 1]
+            last = links[(n_slabs - 1) * k : n_slabs * k]
+            full = n_slabs == len(slabs) or (n_slabs + 1) * k > len(links)
+            joined = not full and n_active == k and lo - stop <= _EMPTY
+            if not (joined and _continues(edges, m, links[:k], last, active, k, stop, lo)):
+                n, region = _sample_strip(
+                    n_slabs, k, x0, x1, sweep_v, scratch, curved, bent, scale, points, weights, regions, n, region
+                )
+                if n < 0:
+                    return -1, region
+                n_slabs = 0
+        k = n_active
+        slabs[n_slabs, 0], slabs[n_slabs, 1] = lo, hi
+        links[n_slabs * k : (n_slabs + 1) * k] = active[:k]
+        n_slabs += 1
+    if n_slabs > 0:
+        n, region = _sample_strip(
+            n_slabs, k, x0, x1, sweep_v, scratch, curved, bent, scale, points, weights, regions, n, region
+        )
     return n, region
 
 
 @njit(cache=True, nogil=True)
-def _sweep_box(  # type: ignore[no-untyped-def]
-    events, n_events, s0, s1, x0, x1, sweep_v, work, m, limbs, n_limbs, curved, bent, scale,
-    points, weights, regions, n, region,
-):  # fmt: skip
-    """Sample a box slab by slab; `scale` turns areas into weights.
+def _sample_strip(  # type: ignore[no-untyped-def]
+    n_slabs, k, x0, x1, sweep_v, scratch, curved, bent, scale, points, weights, regions, n, region
+):
+    """Sample the k + 1 intervals between the k curves of a strip.
 
-    A rim or silhouette is a chain of many short edges, each of which makes a slab. Thin slabs that follow one another
-    without a change of structure are merged: their lines have corresponding nodes, and two samples with the mean and
-    the variance of corresponding nodes take the place of all of them.
+    An interval's light is ∫ width(s) · mean over x of f(s, x) ds. The width is known exactly; its moments give the
+    two-point Gauss rule for it as a weight, exact wherever the mean is cubic in s, and the area always.
     """
-    cross, side = np.empty(m + 2), np.empty(m + 2)
-    nodes, merged = np.empty((5 * m + 5, 6)), np.empty((5 * m + 5, 6))
-    active, previous = np.empty(m, np.int64), np.empty(m, np.int64)
-    start_cross, start_slope = np.empty(m + 2), np.empty(m + 2)
-    started, n_active, n_previous = 0, 0, 0
-    n_merged, start, stop, start_line, n_lines = 0, 0.0, -np.inf, 0.0, 0
-    for e in range(n_events - 1):
-        lo, hi = max(events[e], s0), min(events[e + 1], s1)
-        slab = hi - lo
-        if slab <= _EMPTY:
-            continue
-        started, n_active = _activate(lo, hi, work, m, started, active, n_active)
-        lines, pinched_low, pinched_high = _plan_lines(lo, hi, x0, x1, work, active, n_active, curved)
-        mergeable = slab < _MERGED and not pinched_low and not pinched_high
-        k = n_active + 1
-        cross[0], side[0], cross[k], side[k] = x0, 0.0, x1, 0.0
-        for g in range(lines):
-            t, share = _line_position(lines, g, pinched_low, pinched_high)
-            s = lo + t * slab
-            for i in range(n_active):
-                cross[i + 1] = min(max(_edge_at(work, active[i], s), cross[i]), x1)
-                side[i + 1] = work[active[i], 4]
-            count = _line_nodes(s, share * slab, cross, side, k, limbs, n_limbs, curved, bent, nodes)
-            follows = mergeable and n_merged == count and n_previous == n_active and hi - start <= _MERGED
-            if follows and g == 0:
-                follows = lo - stop <= _EMPTY and _continues(work, m, previous, active, n_active, stop, lo)
-            if follows:
-                for i in range(1, k):
-                    if n_lines == 1:
-                        start_slope[i] = (cross[i] - start_cross[i]) / (s - start_line)
-                    bent = abs(cross[i] - start_cross[i] - start_slope[i] * (s - start_line))
-                    follows = follows and bent <= 0.02 * min(cross[i] - cross[i - 1], cross[i + 1] - cross[i])
-                for j in range(count):
-                    follows = follows and nodes[j, 3] == merged[j, 3]
-            if follows:
-                for j in range(count):
-                    for i in (0, 1, 2, 4, 5):
-                        merged[j, i] += nodes[j, i]
-                n_lines += 1
-            else:
-                n, region = _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
-                if n < 0:
+    slabs = scratch.slabs
+    start, stop = slabs[0, 0], slabs[n_slabs - 1, 1]
+    for i in range(k + 1):
+        a, b, left, right = _interval(0.5 * (start + stop), n_slabs, i, k, x0, x1, scratch, curved, curved)
+        near_left, near_right = a - left < _FELT, right - b < _FELT
+        limb, width = near_left or near_right, b - a
+        a_low, b_low = _bounds(start, 0, i, k, x0, x1, scratch)
+        a_high, b_high = _bounds(stop, n_slabs - 1, i, k, x0, x1, scratch)
+        extent = max(stop - start, abs(a_high - a_low), abs(b_high - b_low))
+        steep = False
+        if limb:
+            _, _, left_low, right_low = _interval(start, n_slabs, i, k, x0, x1, scratch, near_left, near_right)
+            _, _, left_high, right_high = _interval(stop, n_slabs, i, k, x0, x1, scratch, near_left, near_right)
+            for near, at_low, at_high in ((near_left, left_low, left_high), (near_right, right_low, right_high)):
+                moved = max(abs(at_high - at_low - a_high + a_low), abs(at_high - at_low - b_high + b_low))
+                steep = steep or (near and not moved < _PARALLEL)
+        pieces = math.ceil(extent / (_LIMB_STRIP if steep else _STRIP) - 1e-9)
+        low, high = (max(b_low - a_low, 0.0), max(b_high - a_high, 0.0)) if limb else (1.0, 1.0)
+        pieces += min(low, high) < _SHRINKS * width
+        before = n
+        for piece in range(pieces):
+            lo = start + (stop - start) * _cut(piece / pieces, low, width, high)
+            hi = start + (stop - start) * _cut((piece + 1) / pieces, low, width, high)
+            nodes, area, s_a, s_b, share = _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, scratch)
+            for g in range(nodes):
+                s = s_a if g == 0 else s_b
+                weight = area * (share if g == 0 else 1.0 - share)
+                a, b, left, right = _interval(s, n_slabs, i, k, x0, x1, scratch, near_left, near_right)
+                if n + 5 > len(weights):
                     return -1, region
-                n_merged, start, start_line, n_lines = count, lo, s, 1
-                start_cross[: k + 1] = cross[: k + 1]
-                merged[:count] = nodes[:count]
-            stop, n_previous = hi, n_active
-            previous[:n_active] = active[:n_active]
-            if not mergeable:
-                n, region = _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
-                if n < 0:
-                    return -1, region
-                n_merged, stop = 0, -np.inf
-    return _write(merged, n_merged, sweep_v, scale, points, weights, regions, n, region)
+                placed = _place(a, b, left, right, bent, points[n:], weights[n:])
+                for j in range(n, n + placed):
+                    weights[j] *= weight * scale
+                    regions[j] = region
+                    x = points[j, 0]
+                    points[j, 0] = x if sweep_v else s
+                    points[j, 1] = s if sweep_v else x
+                n += placed
+        if n > before:
+            region += 1
+    return n, region
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
+    """Return where, from 0 to 1, a strip of some widths at its ends and in its middle is cut, t of the pieces on.
+
+    Beside a limb the mean over the width grows like the root of the width. Where the interval shrinks to a point the
+    cuts gather there.
+    """
+    if low < _SHRINKS * middle and high < _SHRINKS * middle:
+        return t * t * (3.0 - 2.0 * t)
+    if low < _SHRINKS * middle:
+        return t * t
+    if high < _SHRINKS * middle:
+        return t * (2.0 - t)
+    return t
 
 
 @njit(cache=True, nogil=True)
-def _line_nodes(s, line_weight, cross, side, k, limbs, n_limbs, curved, bent, nodes):  # type: ignore[no-untyped-def]
-    """Place the nodes of one line.
+def _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, scratch):  # type: ignore[no-untyped-def]
+    """Return the Gauss rule for the width of an interval from `lo` to `hi` as weight.
 
-    Rows are w, w·s, w·x, the interval, w·s², w·s·x with the weight w; returns their number.
+    Returns
+    -------
+    nodes : int
+        0 (nothing there), 1 or 2.
+    area : float
+    s_a, s_b : float
+        Nodes.
+    share : float
+        Of the first node in the area.
     """
-    count = 0
-    left, behind_limb = -np.inf, False
-    for i in range(k):
-        if side[i] > 0:
-            left, behind_limb = cross[i], False
-        elif side[i] < 0:
-            left, behind_limb = -np.inf, True
-        a, b = cross[i], cross[i + 1]
-        if b - a <= _EMPTY:
+    slabs = scratch.slabs
+    origin = 0.5 * (lo + hi)
+    m0, m1, m2, m3 = 0.0, 0.0, 0.0, 0.0
+    first_a, first_b, last_a, last_b, met = 0.0, 0.0, 0.0, 0.0, False
+    for slab in range(n_slabs):
+        begin, end = max(slabs[slab, 0], lo), min(slabs[slab, 1], hi)
+        if end <= begin:
             continue
-        j = i + 1
-        while j < k and side[j] == 0:
-            j += 1
-        before_limb = j < k and side[j] > 0
-        if curved and left == -np.inf and not behind_limb and not before_limb:
-            left = _nearest_limb(limbs[0], n_limbs[0], s, 1.0, a)
-        right = np.inf
-        if j < k and side[j] < 0:
-            right = cross[j]
-        elif curved and j == k and not behind_limb:
-            right = _nearest_limb(limbs[1], n_limbs[1], s, -1.0, b)
-        placed = _place(a, b, left, right, bent, nodes[count:])
-        for g in range(count, count + placed):
-            weight, x = nodes[g, 0] * line_weight, nodes[g, 2]
-            nodes[g, 0], nodes[g, 1], nodes[g, 2], nodes[g, 3] = weight, weight * s, weight * x, float(i)
-            nodes[g, 4], nodes[g, 5] = weight * s * s, weight * s * x
-        count += placed
-    return count
+        a, b = _bounds(begin, slab, i, k, x0, x1, scratch)
+        last_a, last_b = _bounds(end, slab, i, k, x0, x1, scratch)
+        if not met:
+            first_a, first_b, met = a, b, True
+        low, high = max(b - a, 0.0), max(last_b - last_a, 0.0)
+        h, d = end - begin, 0.5 * (begin + end) - origin
+        # moments of a trapezoid about its middle, then about the origin
+        c0, c1 = 0.5 * (low + high) * h, (high - low) * h * h / 12.0
+        c2, c3 = c0 * h * h / 12.0, c1 * h * h * (12.0 / 80.0)
+        m0 += c0
+        m1 += c1 + d * c0
+        m2 += c2 + d * (2.0 * c1 + d * c0)
+        m3 += c3 + d * (3.0 * c2 + d * (3.0 * c1 + d * c0))
+    if m0 <= _EMPTY * (hi - lo):
+        return 0, 0.0, 0.0, 0.0, 0.0
+    mean = m1 / m0
+    variance = m2 / m0 - mean * mean
+    extent = max(hi - lo, abs(last_a - first_a), abs(last_b - first_b))
+    if extent < _NARROW or m0 * extent * extent < _TRIFLE or variance < 1e-12:
+        return 1, m0, origin + mean, 0.0, 1.0
+    skew = (m3 / m0 - mean * (3.0 * m2 / m0 - 2.0 * mean * mean)) / variance
+    root = math.sqrt(skew * skew + 4.0 * variance)
+    below, above = 0.5 * (skew - root), 0.5 * (skew + root)
+    s_a, s_b = origin + mean + below, origin + mean + above
+    return 2, m0, max(s_a, lo), min(s_b, hi), above / root
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _bounds(s, slab, i, k, x0, x1, scratch):  # type: ignore[no-untyped-def]
+    """Return the ends of interval i on the line at s, which lies in a slab."""
+    links, edges = scratch.links, scratch.edges
+    a = x0 if i == 0 else _edge_at(edges, links[slab * k + i - 1], s)
+    b = x1 if i == k else _edge_at(edges, links[slab * k + i], s)
+    return a, b
 
 
 @njit(cache=True, nogil=True)
-def _place(a, b, left, right, bent, nodes):  # type: ignore[no-untyped-def]
-    """Place Gauss points on one interval [a, b], with limbs at `left` and `right` (±inf: none).
+def _interval(s, n_slabs, i, k, x0, x1, scratch, seek_left, seek_right):  # type: ignore[no-untyped-def]
+    """Return the ends of interval i on the line at s, and where its surface's limbs are, ∓inf where there is none.
 
-    Column 0 of `nodes` gets the weight, which adds up to b − a, column 2 the place; returns their number.
+    Limbs beyond the strip are looked for where `seek_left` and `seek_right` say so.
     """
-    near_left, near_right = a - left < 1.5, right - b < 1.5
+    slabs, links, edges = scratch.slabs, scratch.links, scratch.edges
+    low, high = 0, n_slabs - 1
+    while low < high:
+        middle = (low + high) // 2
+        if slabs[middle, 1] < s:
+            low = middle + 1
+        else:
+            high = middle
+    row = low * k
+    a, b = _bounds(s, low, i, k, x0, x1, scratch)
+    left, right = -np.inf, np.inf
+    behind_limb = False
+    for j in range(i - 1, -1, -1):
+        side = edges[links[row + j], 4]
+        if side != 0.0:
+            behind_limb = side < 0.0
+            if side > 0.0:
+                left = _edge_at(edges, links[row + j], s)
+            break
+    before_limb, alone = False, True
+    for j in range(i, k):
+        side = edges[links[row + j], 4]
+        if side != 0.0:
+            before_limb, alone = side > 0.0, False
+            if side < 0.0:
+                right = _edge_at(edges, links[row + j], s)
+            break
+    if not behind_limb:
+        if seek_left and left == -np.inf and not before_limb:
+            left = _nearest_limb(scratch.limbs[0], scratch.n_limbs[0], s, 1.0, a)
+        if seek_right and alone:
+            right = _nearest_limb(scratch.limbs[1], scratch.n_limbs[1], s, -1.0, b)
+    return a, b, left, right
+
+
+@njit(cache=True, nogil=True)
+def _place(a, b, left, right, bent, points, weights):  # type: ignore[no-untyped-def]
+    """Place Gauss points on one interval [a, b], with limbs at `left` and `right` (∓inf: none).
+
+    Column 0 of `points` gets the places, `weights` weights that add up to one; returns their number.
+    """
+    near_left, near_right = a - left < _FELT, right - b < _FELT
     middle, half = 0.0, 0.0
     if near_left and near_right:
         middle, half = 0.5 * (left + right), 0.5 * (right - left)
-        t0 = math.asin(max((a - middle) / half, -1.0))
-        t1 = math.asin(min((b - middle) / half, 1.0))
+        t0 = math.asin(min(max((a - middle) / half, -1.0), 1.0))
+        t1 = math.asin(max(min((b - middle) / half, 1.0), -1.0))
         count = 5
     elif near_left:
-        t0, t1, count = math.sqrt(max(a - left, 0.0)), math.sqrt(b - left), 4
+        t0, t1, count = math.sqrt(max(a - left, 0.0)), math.sqrt(max(b - left, 0.0)), 4
     elif near_right:
-        t0, t1, count = math.sqrt(right - a), math.sqrt(max(right - b, 0.0)), 4
+        t0, t1, count = math.sqrt(max(right - a, 0.0)), math.sqrt(max(right - b, 0.0)), 4
     else:
-        count = 1 if b - a < _THIN else (3 if bent and b - a > _MERGED else 2)
+        count = 1 if b - a < _THIN else (3 if bent and b - a > _WIDE else 2)
         t0, t1 = a, b
     total = 0.0
     for g in range(count):
@@ -642,9 +717,12 @@ def _place(a, b, left, right, bent, nodes):  # type: ignore[no-untyped-def]
             x, w = right - t * t, w * t
         else:
             x = t
-        nodes[g, 0] = w
-        nodes[g, 2] = x
+        points[g, 0] = x
+        weights[g] = w
         total += w
+    if total <= 0.0:  # a hair beside a limb
+        points[0, 0], weights[0] = 0.5 * (a + b), 1.0
+        return 1
     for g in range(count):  # the constant is integrated exactly, whatever the substitution
-        nodes[g, 0] *= (b - a) / total
+        weights[g] /= total
     return count

@@ -30,7 +30,7 @@ UNTRUSTED = 2
 @njit(cache=True, nogil=True)
 def plan_rays(  # type: ignore[no-untyped-def]
     first, mesh, lens, matrix, offset, bearing, camera, level, row_range, background,
-    sides, segments, limb, head, link, owner, work, points, weights, regions, pixel, state,
+    segments, limb, head, link, owner, scratch, points, weights, regions, pixel, state,
 ):  # fmt: skip
     """Place the samples of as many views as fit into the buffers, from view `first` on.
 
@@ -47,7 +47,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
     row_range : (2,) int64
         First and last-but-one image row to render.
     background : (4,) float64
-    sides, segments, limb, head, link, owner, work
+    segments, limb, head, link, owner, scratch
         Scratch, see :func:`project_edges`, :func:`bin_segments` and :func:`sample_pixel`.
     points, weights, regions, pixel
         The samples: u, v; share of the pixel; interval; view · pixels + pixel.
@@ -64,7 +64,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
     out_rows = row_range[1] - row_range[0]
     n, region = 0, 0
     for view in range(first, len(lens)):
-        n_edges = project_edges(mesh, lens[view], matrix[view], offset[view], scale, centre, sides, segments, limb)
+        n_edges = project_edges(mesh, lens[view], matrix[view], offset[view], scale, centre, segments, limb)
         u_low, u_high, v_low, v_high = np.inf, -np.inf, np.inf, -np.inf
         for i in range(n_edges):
             u_low = min(u_low, segments[i, 0], segments[i, 2])
@@ -94,7 +94,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
                 before = n
                 bent = c < bent_high_u and c + 1 > bent_low_u and r < bent_high_v and r + 1 > bent_low_v
                 n, region, trusted = sample_pixel(
-                    r, c, bent, camera[6], camera[7], segments, limb, head, link, owner, work,
+                    r, c, bent, camera[6], camera[7], segments, limb, head, link, owner, scratch,
                     points, weights, regions, n, region,
                 )  # fmt: skip
                 if n < 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.edges import MeshTopology
-from phasemark.render.footprint import MAX_SEGMENTS
+from phasemark.render.footprint import Scratch
 from phasemark.render.integrate import (
     UNTRUSTED,
     add_background,
@@ -39,19 +39,16 @@ class _Buffers:
     """Scratch of one thread; grows when a view needs more."""
 
     n_edges: int
-    n_faces: int
     shape: tuple[int, int]
     n_samples: int = _SAMPLES
     n_links: int = 1 << 14
-    sides: NDArray[np.float64] = field(init=False)
 
     def __post_init__(self) -> None:
         rows, cols = self.shape
-        self.sides = np.empty(self.n_faces)
         self.segments = np.empty((self.n_edges + 1, 4))
         self.limb = np.empty(self.n_edges + 1, np.int8)
         self.head = np.empty((rows + 2, cols + 2), np.int32)
-        self.work = np.empty((MAX_SEGMENTS, 5))
+        self.scratch = Scratch.empty()
         self.grow_links(self.n_links)
         self.grow_samples(self.n_samples)
 
@@ -215,7 +212,7 @@ class Renderer:
     ) -> None:
         """Render slices of the views into `sums`, in one thread."""
         mesh, sensor = self.topology, self.sensor
-        buffers = _Buffers(len(mesh.creases) + len(mesh.folds), len(mesh.faces), (sensor.rows, sensor.cols))
+        buffers = _Buffers(len(mesh.creases) + len(mesh.folds), (sensor.rows, sensor.cols))
         level = np.ascontiguousarray(sensor.cam2level)
         row_range = np.array(rows, np.int64)
         radians_per_metre = 1 / sensor.metres_per_radian
@@ -235,7 +232,7 @@ class Renderer:
                 b = buffers
                 reached, n = plan_rays(
                     view, mesh, lens, matrix, offset, part.bearing_rad, self._camera, level, row_range, behind,
-                    b.sides, b.segments, b.limb, b.head, b.link, b.owner, b.work,
+                    b.segments, b.limb, b.head, b.link, b.owner, b.scratch,
                     b.points, b.weights, b.regions, b.pixel, state,
                 )  # fmt: skip
                 if reached == -1:
