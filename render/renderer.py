@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -30,6 +31,9 @@ from phasemark.render.phasor import PhasorImages
 from phasemark.render.sensor import Sensor
 from phasemark.render.shells import unite_shells
 from phasemark.render.view import Views
+
+Variant = Literal["exact", "hard"]
+"""The area integral, or what the centre ray of each pixel sees."""
 
 _SAMPLES = 1 << 17
 _VIEWS_PER_TASK = 64
@@ -137,6 +141,7 @@ class Renderer:
         *,
         background: Background | None = None,
         rows: tuple[int, int] | None = None,
+        variant: Variant = "exact",
         workers: int = 1,
     ) -> PhasorImages:
         """Render views; the arguments broadcast against each other and are flattened in C order.
@@ -149,6 +154,9 @@ class Renderer:
             What stands behind the landmark; None: nothing.
         rows : (first, stop), optional
             Render only these image rows.
+        variant : {"exact", "hard"}
+            "hard" is for comparison: each pixel gets what its centre ray alone sees, its coverage is 0 or 1, and
+            nothing is mixed.
         workers : int
             Threads; the result does not depend on their number.
 
@@ -163,7 +171,7 @@ class Renderer:
             A view that is not finite, a lens inside the landmark, a wall before it or a floor above its foot.
         """
         views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m)
-        return self.render_views(views, background=background, rows=rows, workers=workers)
+        return self.render_views(views, background=background, rows=rows, variant=variant, workers=workers)
 
     def render_views(
         self,
@@ -171,14 +179,17 @@ class Renderer:
         *,
         background: Background | None = None,
         rows: tuple[int, int] | None = None,
+        variant: Variant = "exact",
         workers: int = 1,
     ) -> PhasorImages:
         """Render a batch of views; see :meth:`render`."""
         first, stop = rows if rows is not None else (0, self.sensor.rows)
         if not 0 <= first < stop <= self.sensor.rows:
             raise UsageError(f"'rows' must lie in 0 … {self.sensor.rows}, got {(first, stop)!r}")
+        if variant not in ("exact", "hard"):
+            raise UsageError(f"'variant' must be exact or hard, got {variant!r}")
         self._check(views, background, workers)
-        return self._integrate(views, background, (first, stop), workers)
+        return self._render(views, background, (first, stop), workers, variant)
 
     def jacobian(
         self,
@@ -229,7 +240,7 @@ class Renderer:
         self._check(views, background, workers)
         # a step may take a landmark that stands on the floor a hair into it
         whole = (0, self.sensor.rows)
-        return differentiate(lambda v: self._integrate(v, background, whole, workers).phasor, views, parameters)
+        return differentiate(lambda v: self._render(v, background, whole, workers).phasor, views, parameters)
 
     def _check(self, views: Views, background: Background | None, workers: int) -> None:
         """Refuse what cannot be rendered."""
@@ -239,21 +250,27 @@ class Renderer:
         if background is not None:
             background.check_behind(self.topology.vertices, views)
 
-    def _integrate(
-        self, views: Views, background: Background | None, rows: tuple[int, int], workers: int
+    def _render(
+        self,
+        views: Views,
+        background: Background | None,
+        rows: tuple[int, int],
+        workers: int,
+        variant: Variant = "exact",
     ) -> PhasorImages:
         """Render rows of views that have been checked."""
+        run = self._render_tasks if variant == "exact" else self._cast_centres
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)
         sums = _Sums(shape, len(self._orders))
         behind = (background or Background()).parameters()
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
         if workers == 1 or len(tasks) <= 1:
-            self._render_tasks(tasks, views, behind, (first, stop), sums)
+            run(tasks, views, behind, rows, sums)
         else:
             with ThreadPoolExecutor(workers) as pool:
                 lanes = [tasks[i::workers] for i in range(workers)]
-                list(pool.map(lambda lane: self._render_tasks(lane, views, behind, (first, stop), sums), lanes))
+                list(pool.map(lambda lane: run(lane, views, behind, rows, sums), lanes))
         self.untrusted_pixels += int((sums.state == UNTRUSTED).sum())
         phasor = sums.phasor.reshape(*shape, len(self._orders))
         return PhasorImages(
@@ -319,6 +336,37 @@ class Renderer:
                         radians_per_metre, self._orders, sensor.vignetting, phasor, intensity,
                     )  # fmt: skip
                 view = reached
+
+    def _cast_centres(
+        self,
+        tasks: Iterable[slice],
+        views: Views,
+        behind: NDArray[np.float64],
+        rows: tuple[int, int],
+        sums: _Sums,
+    ) -> None:
+        """Render slices of the views with one ray a pixel into `sums`, in one thread."""
+        mesh, sensor = self.topology, self.sensor
+        level = np.ascontiguousarray(sensor.cam2level)
+        v, u = np.mgrid[slice(*rows), : sensor.cols] + 0.5
+        centres = np.column_stack([u.ravel(), v.ravel()])
+        per_view = len(centres)
+        for task in tasks:
+            part = views[task]
+            rotation, _ = part.landmark2cam()
+            matrix = np.ascontiguousarray(level.T @ rotation)
+            lens = part.lens_in_landmark()
+            n = len(part) * per_view
+            points, pixel = np.tile(centres, (len(part), 1)), np.arange(n)
+            origins, directions = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+            aim(n, pixel, points, pixel, lens, matrix, self._camera, per_view, origins, directions)
+            pixels = slice(task.start * per_view, task.stop * per_view)
+            sum_samples(
+                n, points, np.ones(n), pixel, self._intersector.first_face(origins, directions), mesh, lens, matrix,
+                part.bearing_rad, self._camera, level, behind, self.albedo, 1 / sensor.metres_per_radian, self._orders,
+                sensor.vignetting, per_view,
+                sums.phasor[pixels], sums.intensity[pixels], sums.coverage[pixels], sums.upper[pixels],
+            )  # fmt: skip
 
     def _find_faces(
         self,
