@@ -230,6 +230,9 @@ def _render(
     sensor: _SensorOption = "pmd-16x16",
     wall: _Wall = None,
     floor: _Floor = None,
+    variant: Annotated[
+        str, typer.Option("--variant", help="exact, or hard: what the centre ray of each pixel sees, nothing mixed.")
+    ] = "exact",
     force: _Force = False,
 ) -> None:
     """Render one noise-free frame: a picture, the phasors, and a sketch in the terminal."""
@@ -254,8 +257,15 @@ def _render(
         assert mesh_file is not None
         _, path = _name_and_file(mesh_file)
         _, mesh = _load_landmark(path, unit, up, origin)
+    if variant not in ("exact", "hard"):
+        raise UsageError(f"--variant must be exact or hard, got '{variant}'")
     image = Renderer(mesh, _load_sensor(sensor), albedo=mesh.metadata.get("albedo", 0.8)).render(
-        distance, math.radians(delta), math.radians(bearing), height, background=_background(wall, floor)
+        distance,
+        math.radians(delta),
+        math.radians(bearing),
+        height,
+        background=_background(wall, floor),
+        variant="hard" if variant == "hard" else "exact",
     )
     arrays = {
         "phasor": image.phasor[0],

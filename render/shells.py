@@ -5,6 +5,8 @@ from __future__ import annotations
 import manifold3d
 import numpy as np
 import trimesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 
 def unite_shells(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -23,9 +25,9 @@ def unite_shells(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     trimesh.Trimesh
         Part labels are lost in a union; they follow from the height again.
     """
-    if mesh.body_count < 2:
+    shells = _shells(mesh)
+    if len(shells) < 2:
         return mesh
-    shells = mesh.split(only_watertight=False)
     if not _may_intersect(np.array([shell.bounds for shell in shells])):
         return mesh
     if not all(shell.is_volume for shell in shells):
@@ -48,6 +50,18 @@ def unite_shells(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         metadata=dict(mesh.metadata),
         process=False,
     )
+
+
+def _shells(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """Take a mesh apart where no edge joins its faces; holes stay holes."""
+    n, (first, second) = len(mesh.faces), np.asarray(mesh.face_adjacency).reshape(-1, 2).T
+    label = connected_components(coo_array((np.ones(len(first), bool), (first, second)), shape=(n, n)))[1]
+    order = np.argsort(label, kind="stable")
+    shells = []
+    for faces in np.split(mesh.faces[order], np.flatnonzero(np.diff(label[order])) + 1):
+        used, renumbered = np.unique(faces, return_inverse=True)
+        shells.append(trimesh.Trimesh(mesh.vertices[used], renumbered.reshape(-1, 3), process=False))
+    return shells
 
 
 def _may_intersect(bounds: np.ndarray) -> bool:

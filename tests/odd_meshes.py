@@ -49,3 +49,14 @@ def blob():
 
 
 ODD = {"bowl": bowl, "star prism": star_prism, "L bracket": l_bracket, "hidden box": hidden_box, "blob": blob}
+
+
+def scan():
+    """Return what a laser scanner makes of a lump: 200 000 faces, noise on every vertex, and no floor."""
+    ball = trimesh.creation.uv_sphere(radius=1.0, count=(256, 256))
+    x, y, z = ball.vertices.T
+    bumps = 0.08 * np.sin(3 * x + 1) * np.cos(2 * y) + 0.04 * np.sin(5 * z) * np.cos(4 * x)
+    noise = 2e-6 * np.random.default_rng(4).normal(size=len(x))
+    vertices = ball.vertices * (0.1 * (1 + bumps) + noise)[:, None]
+    kept = vertices[ball.faces][..., 2].min(axis=1) > -0.085
+    return trimesh.Trimesh(vertices, ball.faces[kept], process=False)

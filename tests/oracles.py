@@ -188,3 +188,110 @@ def mean_of_blocks(image, factor):
     """Average blocks of factor × factor pixels of (n, rows, cols)."""
     n, rows, cols = image.shape
     return image.reshape(n, rows // factor, factor, cols // factor, factor).mean(axis=(2, 4))
+
+
+class RayShader:
+    """Light along single rays of one view; shares the mesh with its corner normals and the intersector, no more.
+
+    Parameters
+    ----------
+    renderer : Renderer
+    view : Views
+        One view.
+    """
+
+    def __init__(self, renderer, view, kind="auto"):
+        self.sensor, self.albedo, self.mesh = renderer.sensor, renderer.albedo, renderer.topology
+        self.intersector = make_intersector(self.mesh.vertices, self.mesh.faces, kind)
+        self.lens = view.lens_in_landmark()[0]
+        self.rotation = view.landmark2cam()[0][0]
+
+    def __call__(self, uv, light=True):
+        """Return S, intensity, coverage, range and smooth patch (−1: none) of points (n, 2) of the image."""
+        d = self.sensor.ray_directions(*uv.T) @ self.rotation
+        origins = np.broadcast_to(self.lens.astype(np.float32), d.shape).copy()
+        face = self.intersector.first_face(origins, d.astype(np.float32))
+        hit = face >= 0
+        f, dh = face[hit], d[hit]
+        normal = self.mesh.planes[f, :3]
+        facing = np.einsum("ij,ij->i", normal, dh)
+        t = (self.mesh.planes[f, 3] - normal @ self.lens) / facing
+        range_m, patch, out = np.zeros(len(uv)), np.full(len(uv), -1), np.zeros((len(uv), 3), complex)
+        range_m[hit], patch[hit] = t, self.mesh.patch[f]
+        if light:
+            shading = shading_normals(self.mesh, f, self.lens + t[:, None] * dh)
+            amplitude = self.albedo * np.maximum(np.sign(facing) * np.einsum("ij,ij->i", shading, dh), 0) / t**2
+            out[hit, 0] = amplitude * np.exp(1j * t / self.sensor.metres_per_radian)
+            out[hit, 1], out[hit, 2] = amplitude, 1
+        return out, range_m, patch
+
+
+def adaptive_images(renderer, view, *, tolerance=1e-5, first=4, last=10):
+    """Integrate all pixels of one view on quadtrees.
+
+    It knows nothing of projected edges: where the rays of a cell, its corners' among them, meet different smooth
+    patches, or one patch at ranges that differ by more than eight times the cell's own width, the cell is quartered
+    until it is 2^-last pixels wide; no straight edge passes between the corners of a cell unseen. Elsewhere a cell is
+    done when its quarters add up to what it held, to `tolerance` · brightest · width, so that the errors of a pixel's
+    cells, of either sign, add up to `tolerance`. The smallest cells get four jittered rays, so that along an edge of
+    any slope their errors cancel: 2^(-1.5 last) / 3 of a pixel remains.
+
+    Returns
+    -------
+    phasor, intensity, coverage : (rows, cols)
+    """
+    sensor = renderer.sensor
+    shade = RayShader(renderer, view)
+    rng = np.random.default_rng(1)
+    pitch = 2 * sensor.tan_half_angles[0] / sensor.cols
+    quarters = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) / 4
+    gauss = quarters * 2 / math.sqrt(3)
+    corners = quarters * 2 * (1 - 1e-9)
+
+    def integrate(centre, width, jitter=False):
+        values = np.empty((len(centre), 3), complex)
+        for start in range(0, len(centre), 1 << 16):
+            part = centre[start : start + (1 << 16), None]
+            if jitter:
+                places = quarters + rng.uniform(-0.25, 0.25, (len(part), 4, 2))
+            else:
+                places = gauss
+            light, _, _ = shade((part + width * places).reshape(-1, 2))
+            values[start : start + (1 << 16)] = width**2 * light.reshape(-1, 4, 3).mean(axis=1)
+        return values
+
+    def mixed(centre, width):
+        out = np.empty(len(centre), bool)
+        places = np.vstack([corners, quarters, [[0, 0]]])
+        for start in range(0, len(centre), 1 << 16):
+            points = centre[start : start + (1 << 16), None] + width * places
+            _, range_m, patch = (item.reshape(-1, len(places)) for item in shade(points.reshape(-1, 2), light=False))
+            steep = np.ptp(range_m, axis=1) > 8 * width * pitch * range_m.max(axis=1)
+            out[start : start + (1 << 16)] = steep | (patch.min(axis=1) != patch.max(axis=1))
+        return out
+
+    total = np.zeros((sensor.rows * sensor.cols, 3), complex)
+
+    def add(centre, value):
+        index = np.floor(centre[:, 1]).astype(int) * sensor.cols + np.floor(centre[:, 0]).astype(int)
+        for k in range(3):
+            total[:, k] += np.bincount(index, value[:, k].real, len(total))
+            total[:, k] += 1j * np.bincount(index, value[:, k].imag, len(total))
+
+    width = 0.5**first
+    v, u = np.mgrid[0 : sensor.rows : width, 0 : sensor.cols : width] + width / 2
+    centre = np.column_stack([u.ravel(), v.ravel()])
+    value = integrate(centre, width)
+    brightest = np.abs(value[:, 1]).max() / width**2
+    for _ in range(first, last):
+        settled = ~mixed(centre, width)
+        children = (centre[:, None] + width * quarters).reshape(-1, 2)
+        finer = integrate(children, width / 2)
+        change = np.abs(finer.reshape(-1, 4, 3).sum(axis=1) - value)[:, :2].max(axis=1) / brightest
+        settled &= change <= tolerance * width
+        add(children[np.repeat(settled, 4)], finer[np.repeat(settled, 4)])
+        again = np.repeat(~settled, 4)
+        centre, value, width = children[again], finer[again], width / 2
+    add(centre, integrate(centre, width, jitter=True))
+    images = total.reshape(sensor.rows, sensor.cols, 3)
+    return images[..., 0], images[..., 1].real, images[..., 2].real

@@ -109,6 +109,12 @@ def test_render_writes_picture_and_phasors(run, tmp_path):
         np.testing.assert_array_equal(data["coverage"], expected.coverage[0])
 
 
+def test_a_hard_render_has_no_mixed_pixel(run, tmp_path):
+    run("render", "--class", "cone", "--distance", 1.0, "--variant", "hard", "-o", tmp_path / "f.png")
+    with np.load(tmp_path / "f.npz") as data:
+        assert set(np.unique(data["coverage"])) == {0.0, 1.0}
+
+
 def test_what_render_writes_match_reads(run, folder, tmp_path):
     run("render", "--class", "cone", "--distance", 1.0, "--delta", 40, "--wall", 3, "-o", tmp_path / "f.png")
     code, out, _ = run("match", folder / "bank.h5", tmp_path / "f.npz", "--wall", 3, "--json")
@@ -248,6 +254,7 @@ MISTAKES = [
     _case(2, "render", "--class", "cone", "--distance", "nan", "-o", "x.png", contains="distance_m"),
     _case(2, "render", "--class", "cone", "--distance", 1, "--wall", 0.9, "-o", "x.png", contains="wall_m"),
     _case(2, "render", "--class", "cone", "--distance", 1, "--floor", 0.1, "-o", "x.png", contains="floor_m"),
+    _case(2, "render", "--class", "cone", "--distance", 1, "--variant", "soft", "-o", "x.png", contains="--variant"),
     _case(2, "render", "--class", "cone", "--distance", 1, "-o", "x.jpg", contains=".png"),
     _case(4, "render", "--class", "cone", "--distance", 1, "-o", "taken.png", contains="taken.png"),
     _case(2, "render", "--class", "cone", "-o", "x.png", contains="--distance"),

@@ -578,6 +578,17 @@ def test_shells_that_run_through_one_another_look_like_their_union():
     np.testing.assert_allclose(crossed.coverage, single.coverage, atol=1e-12)
 
 
+def test_a_hole_in_one_of_two_shells_stays_a_hole():
+    cut = trimesh.creation.box((0.2, 0.2, 0.2))
+    front = cut.face_normals[:, 0] < -0.5
+    cut.update_faces(~front)
+    inside = trimesh.creation.box((0.25, 0.02, 0.02)).apply_translation((0.02, 0, 0))  # pierces the back
+    both = trimesh.util.concatenate([cut, inside])
+    image = Renderer(both, PMD).render(1.0)
+    # through the open front the inner face of the back is seen, 1.1 m away, and not the front, 0.9 m away
+    assert image.range_m[0, 6, 6] == pytest.approx(1.1, abs=0.01)
+
+
 def test_crossed_boxes_agree_with_finer_pixels():
     beam, post = trimesh.creation.box((0.3, 0.05, 0.05)), trimesh.creation.box((0.06, 0.06, 0.25))
     post.apply_transform(trimesh.transformations.rotation_matrix(0.8, (1, 0.3, 0.2)))
