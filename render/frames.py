@@ -27,7 +27,11 @@ class Flag(IntFlag):
     SATURATED = 4
     """A tap reached its full well or the top of the converter; also MISSING."""
     DEAD = 8
-    """The pixel is known to be dead or hot; also MISSING."""
+    """The pixel is known to be dead; also MISSING."""
+    HOT = 16
+    """The pixel is known to be hot; also MISSING."""
+    NEAR_WRAP = 32
+    """The range may be on the wrong side of the wrap at 0 and c / 2f; also MISSING."""
 
 
 class Frames:
