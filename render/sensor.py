@@ -573,6 +573,13 @@ class Sensor(BaseModel):
         v, u = np.mgrid[: self.rows, : self.cols] + 0.5
         return self.ray_directions(u, v)
 
+    def axis_cosine(self) -> NDArray[np.float64]:
+        """Return the cosine between each pixel's ray and the camera's own optical axis, (rows, cols).
+
+        z = range · cosine. Tilting the camera turns both, so mounting does not enter.
+        """
+        return np.asarray(self.pixel_directions() @ self.cam2level[:, 0])
+
 
 def preset_names() -> list[str]:
     """Return the names of the shipped presets."""
