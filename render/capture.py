@@ -168,8 +168,29 @@ def capture_moving(
 ) -> Frames:
     """Take noisy frames while the camera moves: the four phase images see four views, about mid-frame.
 
-    Each of the `n_frames` frames starts from the same views; a drive is a list of views. See :func:`capture` and
-    :func:`~phasemark.render.render_moving` for the parameters and errors.
+    Parameters
+    ----------
+    renderer : Renderer
+    views : Views
+        The views at mid-frame: the truth of every frame.
+    sensor : Sensor
+        The camera, with the renderer's optics and timing.
+    motion : Motion
+    rng, n_frames, keep_taps, workers
+        As in :func:`capture`; each of the frames starts from the same views.
+    background : Background, optional
+        As seen at mid-frame; see :func:`~phasemark.render.render_moving`.
+
+    Returns
+    -------
+    Frames
+        (n, n_frames, rows, cols).
+
+    Raises
+    ------
+    UsageError
+        As :func:`capture` and :func:`~phasemark.render.render_moving`; or sensor and renderer time phase images
+        differently.
     """
     if renderer.sensor.phase_image_interval_s != sensor.phase_image_interval_s:
         raise UsageError(

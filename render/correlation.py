@@ -19,7 +19,17 @@ _NEGLIGIBLE = 1e-12  # of the fundamental: what rounding leaves of an order that
 
 
 class Harmonic(NamedTuple):
-    """One order k > 1 of the correlation, relative to the first."""
+    """One order k > 1 of the correlation, relative to the first.
+
+    Parameters
+    ----------
+    order : int
+        k.
+    amplitude : float
+        a_k; the first order has 1.
+    phase_rad : float
+        θ_k; the first order has 0.
+    """
 
     order: int
     amplitude: float
@@ -27,7 +37,13 @@ class Harmonic(NamedTuple):
 
 
 def square_harmonics(max_order: int) -> tuple[Harmonic, ...]:
-    """Return the orders of a square wave correlated with a square wave: a_k = 1/k², odd k to `max_order`."""
+    """Return the orders of a square wave correlated with a square wave: a_k = 1/k², odd k.
+
+    Parameters
+    ----------
+    max_order : int
+        Highest order.
+    """
     return tuple(Harmonic(k, 1 / k**2, 0.0) for k in range(3, max_order + 1, 2))
 
 
