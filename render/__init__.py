@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from phasemark.render.ablation import Ablation, ablate
 from phasemark.render.background import Background
 from phasemark.render.capture import capture, capture_moving
 from phasemark.render.correlation import Harmonic, pulse_harmonics, square_harmonics
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PAPER_CMAP",
+    "Ablation",
     "Background",
     "CameraUnit",
     "Flag",
@@ -31,6 +33,7 @@ __all__ = [
     "Renderer",
     "Sensor",
     "Views",
+    "ablate",
     "camera_unit",
     "capture",
     "capture_moving",

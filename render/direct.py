@@ -8,6 +8,7 @@ from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor import PhasorImages
 from phasemark.render.sensor import Sensor
 from phasemark.render.streams import Term, draw_key, fill_normal, fill_uniform
+from phasemark.render.unit import camera_unit
 
 
 def capture_direct(
@@ -25,8 +26,7 @@ def capture_direct(
     `min_intensity` does, or beyond `max_range_m`. `range_std_m` is one figure for all pixels. There is no amplitude.
     """
     shape = (len(image), n_frames, sensor.rows, sensor.cols)
-    mean_m = image.range_m[:, None]
-    range_m = np.repeat(mean_m, n_frames, axis=1)
+    range_m = np.repeat(image.range_m[:, None] + sensor.range_offset_m, n_frames, axis=1)
     key = draw_key(rng)
     if sensor.range_std_m > 0:
         n = sensor.rows * sensor.cols
@@ -40,6 +40,5 @@ def capture_direct(
     furthest_m = np.inf if sensor.max_range_m is None else sensor.max_range_m
     seen = (image.intensity > 0) & (image.intensity >= sensor.min_intensity) & (image.range_m <= furthest_m)
     flags = np.where(seen, 0, int(Flag.NO_RETURN)).astype(np.uint8)
-    for row, col in sensor.dead_pixels:
-        flags[:, row, col] = int(Flag.DEAD | Flag.MISSING)
+    flags[:, camera_unit(sensor).dead] = int(Flag.DEAD | Flag.MISSING)
     return Frames(range_m, flags=np.broadcast_to(flags[:, None], shape), sensor=sensor)

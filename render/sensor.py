@@ -54,6 +54,9 @@ _OPTICS = (
     "modulation_hz",
 )
 
+# What is no error of a camera with taps, beside its optics.
+_WITHOUT_ERRORS = ("frame_rate_hz", "phase_interval_s", "contrast", "signal_e")
+
 DIRECT_MODULATION_HZ = 1e4
 """Highest `modulation_hz` of a direct sensor: at 10 m a phase of 4e-3 rad, whose mixing moves a mean range by 1e-6."""
 
@@ -411,6 +414,25 @@ class Sensor(BaseModel):
     def with_(self, **changes: Any) -> Sensor:
         """Return a copy with some fields changed, validated again."""
         return Sensor(**{**self.model_dump(), **changes})
+
+    def without_errors(self, *, shot_noise: bool = False) -> Sensor:
+        """Return the camera without its errors: optics, modulation frequency, contrast and signal alone.
+
+        Parameters
+        ----------
+        shot_noise : bool
+            Whether the light still arrives as a Poisson process; then the validity threshold stays as well.
+        """
+        if self.kind == "direct":
+            return self.with_(range_std_m=0.0, range_offset_m=0.0, dead_share=0.0, dead_pixels=())
+        kept = {name: getattr(self, name) for name in (*_OPTICS, *_WITHOUT_ERRORS) if name != "centre_px"}
+        threshold = self.max_phase_std_rad if shot_noise else None
+        return Sensor(
+            **kept,
+            principal_point_px=self.principal_point_px,
+            shot_noise=shot_noise,
+            max_phase_std_rad=threshold,
+        )
 
     @classmethod
     def from_intrinsics(
