@@ -520,6 +520,28 @@ class Sensor(BaseModel):
         rx = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
         return np.asarray(ry @ rx)
 
+    @classmethod
+    def field_groups(cls) -> dict[str, tuple[str, ...]]:
+        """Return the fields in groups, in the order of light's way through the camera: title → names."""
+        titles = {
+            "kind": "kind",
+            "rows": "geometry",
+            "modulation_hz": "modulation and timing",
+            "signal_e": "electrons per phase image",
+            "full_well_e": "read-out",
+            "phase_offset_std_rad": "offsets of one physical camera",
+            "blur_share": "stray light",
+            "dead_share": "defects",
+            "max_phase_std_rad": "validity",
+            "max_range_m": "direct time of flight only",
+        }
+        groups: dict[str, tuple[str, ...]] = {}
+        title = ""
+        for name in cls.model_fields:
+            title = titles.get(name, title)
+            groups[title] = (*groups.get(title, ()), name)
+        return groups
+
     @property
     def quantity(self) -> Literal["range", "z"]:
         """What the camera itself reports: range along the ray, or the distance z along the optical axis."""
