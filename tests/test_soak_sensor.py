@@ -41,8 +41,7 @@ def test_range_noise_meets_the_law_within_one_percent(cell):
     tail = FALSE_ALARM / len(CELLS) / 2
     low, high = np.sqrt(stats.chi2.ppf([tail, 1 - tail], N - 1) / (N - 1))
     assert low < std / (law * exact_over_law(law / sensor.metres_per_radian)) < high
-    if law <= 0.2:  # beyond, what the law leaves out and the sampling error together pass 1 %
-        assert std / law == pytest.approx(1, abs=0.01)
+    assert std / law == pytest.approx(1, abs=0.01)
 
 
 @pytest.mark.parametrize("s", [0.5, 2.0, 8.0, 30.0])
