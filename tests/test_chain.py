@@ -272,6 +272,16 @@ def test_a_sine_does_not_wiggle():
     assert np.abs(phase_error(one_pixel(shot_noise=False))).max() < 1e-12
 
 
+def test_an_offset_delays_every_order():
+    # a camera that sees everything 0.7 m too far sees at 2.3 m what another sees at 3 m, wiggling included
+    sensor = one_pixel(shot_noise=False, modulation="square")
+    late = sensor.with_(range_offset_m=0.7)
+    ranges = np.array([2.3, 4.1, 9.0])
+    seen, expected = take(pure_image(ranges, late), late), take(pure_image(ranges + 0.7, sensor), sensor)
+    np.testing.assert_allclose(seen.range_m, expected.range_m, rtol=0, atol=1e-11)  # rounding
+    assert np.abs(expected.range_m.ravel() - ranges - 0.7).max() > 0.05
+
+
 def test_even_orders_cancel_in_the_range_but_not_in_the_taps():
     sensor = one_pixel(shot_noise=False, modulation="harmonics", harmonics=((2, 0.2, 0.4), (4, 0.1, 1.0)))
     assert np.abs(phase_error(sensor)).max() < 1e-12
