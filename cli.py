@@ -127,9 +127,18 @@ def _sensor_show(
     if as_json:
         _echo_json({"name": name_or_file, **_sensor_facts(sensor)})
         return
-    typer.echo(f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {sensor.metres_per_radian:.6f} m per radian")
-    for key, value in sensor.model_dump(mode="json").items():
-        typer.echo(f"# {key} is not set" if value is None else f"{key} = {json.dumps(value)}")
+    if sensor.kind == "direct":
+        typer.echo("# direct time of flight: no taps, no phasors; its own quantity is z, along the optical axis")
+    else:
+        typer.echo(
+            f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {sensor.metres_per_radian:.6f} m per radian"
+        )
+    fields = sensor.model_dump(mode="json")
+    for title, names in sensor.field_groups().items():
+        typer.echo(f"\n# {title}")
+        for name in names:
+            value = fields[name]
+            typer.echo(f"# {name} is not set" if value is None else f"{name} = {json.dumps(value)}")
 
 
 @_landmark_app.command("list")

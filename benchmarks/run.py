@@ -28,7 +28,7 @@ import numpy as np
 from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter, phasor_mean
-from phasemark.render import Background, Renderer, Views, capture, preset
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, camera_unit, capture, preset
 
 ROOT = Path(__file__).resolve().parent.parent
 SENSOR = preset("pmd-16x16")
@@ -200,6 +200,80 @@ def chain() -> Table:
     return {"rows": [{"stage": name, "frames/s": round(speed)} for name, speed in measured]}
 
 
+def capturing() -> Table:
+    """Time the sensor's chain, beside the same chain written plainly in NumPy."""
+    rng = np.random.default_rng(SEED)
+    every = preset("pmd-16x16-wiggle")
+    cases = (
+        ("shot noise", SENSOR),
+        ("shot, ambient, read noise", SENSOR.with_(ambient_e=20_000, read_noise_e=40)),
+        ("every term", every),
+    )
+    rows = []
+    for title, sensor in cases:
+        renderer = Renderer(build_mesh(catalog()["cone"]), sensor)
+        image = renderer.render(np.full(40, 1.0), background=Background(wall_m=3.0))
+        count, speeds = len(image) * 50, {}
+        for workers in (1, 2):
+            speeds[workers] = count / median_seconds(
+                lambda n=workers, i=image, s=sensor: capture(i, s, rng=rng, n_frames=50, workers=n)
+            )
+        plain = count / median_seconds(lambda i=image, s=sensor: plain_capture(i, s, rng, 50))
+        rows.append(
+            {
+                "terms": title,
+                "frames/s, one thread": round(speeds[1]),
+                "frames/s, two threads": round(speeds[2]),
+                "plain NumPy, frames/s": round(plain),
+                "two threads over NumPy": round(speeds[2] / plain, 1),
+            }
+        )
+    return {"rows": rows}
+
+
+def plain_capture(image: PhasorImages, sensor: Sensor, rng: np.random.Generator, n_frames: int) -> np.ndarray:
+    """Return ranges by the chain of PHYSICS section 4, each term one NumPy expression, one view at a time."""
+    unit = camera_unit(sensor)
+    kernel = (1 - sensor.blur_share - sensor.veil_share) * np.eye(sensor.rows * sensor.cols)
+    row, col = np.divmod(np.arange(sensor.rows * sensor.cols), sensor.cols)
+    for share, sigma in ((sensor.blur_share, sensor.blur_px), (sensor.veil_share, sensor.veil_px)):
+        square = np.subtract.outer(row, row) ** 2 + np.subtract.outer(col, col) ** 2
+        weight = np.exp(-square / (2 * sigma**2))
+        kernel += share * weight / weight.sum(axis=0)
+    harmonics = ((1, 1.0, 0.0), *sensor.correlation_harmonics)
+    tau = np.arange(4)[:, None, None, None] * np.pi / 2
+    sign = np.array([1.0, -1.0])[:, None, None]
+    shape = (sensor.rows, sensor.cols)
+    ranges = np.empty((len(image), n_frames, *shape))
+    for view in range(len(image)):
+        wave = np.zeros((4, 2, *shape))
+        for k, a, theta in harmonics:
+            s = (kernel @ image.harmonic(k)[view].ravel()).reshape(shape)
+            wave += (a * s * np.exp(1j * (k * (tau + unit.delay_rad) + theta))).real
+        intensity = (kernel @ image.intensity[view].ravel()).reshape(shape)
+        mean = 0.5 * (sensor.signal_e * intensity + sensor.ambient_e)
+        mean = np.maximum(mean + 0.5 * sign * sensor.contrast * sensor.signal_e * wave, 0)
+        taps = rng.poisson(mean * unit.response + unit.dark_e, (n_frames, 4, 2, *shape)).astype(float)
+        saturated = np.zeros((n_frames, *shape), bool)
+        if sensor.full_well_e is not None:
+            saturated |= (taps >= sensor.full_well_e).any(axis=(1, 2))
+            taps = np.minimum(taps, sensor.full_well_e)
+        if sensor.read_noise_e:
+            taps += sensor.read_noise_e * rng.standard_normal(taps.shape)
+        if sensor.adc_bits is not None:
+            codes = np.clip(np.rint(taps * sensor.gain + sensor.black_level), 0, 2**sensor.adc_bits - 1)
+            saturated |= (codes == 2**sensor.adc_bits - 1).any(axis=(1, 2))
+            taps = (codes - sensor.black_level) / sensor.gain
+        d = taps[:, :, 0] - taps[:, :, 1]
+        amplitude = 0.5 * np.hypot(d[:, 3] - d[:, 1], d[:, 0] - d[:, 2])
+        variance = np.maximum(taps.sum(axis=(1, 2)) / 4, 0) + sensor.read_variance_e2
+        valid = amplitude * (sensor.max_phase_std_rad or np.inf) >= np.sqrt(variance / 2)
+        phase = np.arctan2(d[:, 3] - d[:, 1], d[:, 0] - d[:, 2]) % (2 * np.pi)
+        valid &= ~(saturated | unit.dead | unit.hot)
+        ranges[view] = np.where(valid, phase * sensor.metres_per_radian, np.nan)
+    return ranges
+
+
 def peer() -> Table:
     """Compare with jittered supersampling on Open3D's RaycastingScene, at the same error."""
     try:
@@ -305,6 +379,7 @@ SECTIONS: dict[str, tuple[str, Callable[[], Table]]] = {
     "rendering": ("Rendering", rendering),
     "peer": ("Against jittered supersampling", peer),
     "banks": ("Banks", banks),
+    "capture": ("Capturing noisy frames", capturing),
     "chain": ("Capture, filters, matching", chain),
 }
 

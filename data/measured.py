@@ -134,7 +134,7 @@ def read_frames(
     arrays = {name: _upright(values, flip_h, flip_v, rotate) for name, values in arrays.items()}
     range_m = arrays["range"].astype(np.float64) * unit_scale
     if settled_quantity == "z":
-        range_m = range_m / _axis_cosine(sensor)
+        range_m = range_m / sensor.axis_cosine()
     valid = _upright(valid, flip_h, flip_v, rotate) & np.isfinite(range_m)
     valid &= ~_impossible(range_m, valid, sensor, path)
     try:
@@ -148,15 +148,6 @@ def read_frames(
         )
     except UsageError as error:  # an amplitude or intensity that cannot be
         raise InputFileError(f"{path}: {error}") from None
-
-
-def _axis_cosine(sensor: Sensor) -> NDArray[np.float64]:
-    """Return the cosine between each pixel's ray and the camera's own optical axis, (rows, cols): z = range · cosine.
-
-    Tilting the camera turns both, so mounting does not enter.
-    """
-    optical_axis = sensor.cam2level[:, 0]
-    return np.asarray(sensor.pixel_directions() @ optical_axis)
 
 
 def _upright(values: NDArray[Any], flip_h: bool, flip_v: bool, rotate: int) -> NDArray[Any]:

@@ -2,14 +2,18 @@
 
 from typing import TYPE_CHECKING
 
+from phasemark.render.ablation import Ablation, ablate
 from phasemark.render.background import Background
-from phasemark.render.capture import capture
+from phasemark.render.capture import capture, capture_moving
+from phasemark.render.correlation import Harmonic, pulse_harmonics, square_harmonics
 from phasemark.render.frames import Flag, Frames
+from phasemark.render.motion import Motion, render_moving
 from phasemark.render.noise import measured_range_std, predicted_range_std
 from phasemark.render.phasor import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
 from phasemark.render.planar import PlanarLandmark, planar_images
 from phasemark.render.renderer import Renderer
 from phasemark.render.sensor import Sensor, preset, preset_names
+from phasemark.render.unit import CameraUnit, camera_unit
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:
@@ -17,22 +21,32 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PAPER_CMAP",
+    "Ablation",
     "Background",
+    "CameraUnit",
     "Flag",
     "Frames",
+    "Harmonic",
+    "Motion",
     "PhasorImages",
     "PlanarLandmark",
     "Renderer",
     "Sensor",
     "Views",
+    "ablate",
+    "camera_unit",
     "capture",
+    "capture_moving",
     "measured_range_std",
     "phasor_to_range_m",
     "planar_images",
     "predicted_range_std",
     "preset",
     "preset_names",
+    "pulse_harmonics",
     "range_picture",
+    "render_moving",
+    "square_harmonics",
     "terminal_picture",
     "wrap_difference_m",
     "wrap_range_m",

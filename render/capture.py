@@ -1,8 +1,16 @@
-"""From light to frames: two taps, four phase images, and the noise of each (PHYSICS section 4).
+"""From light to frames: two taps, four phase images, and the errors of each (PHYSICS section 4).
 
-The chain is a row of pure functions in the order in which the camera does things::
+The chain is a row of functions in the order in which the camera does things::
 
-    tap_means → add_dark → add_shot_noise → add_read_noise → demodulate → validity_flags
+    spread_light          stray light, on intensity and every S_k           stray.py
+    tap_means             offsets, harmonics, contrast, ambient light       taps.py, unit.py
+    collect               PRNU, dark current, DSNU, dead and hot pixels     taps.py, unit.py
+    add_shot_noise        Poisson                                           electrons.py
+    fill_well             clip at full well, flagged                        electrons.py
+    add_read_noise        Gaussian                                          electrons.py
+    convert, decode       gain, black level, round, clip; nominal inverse   electrons.py
+    demodulate            phasor and intensity of the four phase images     taps.py
+    validity_flags        why a pixel is not valid                          here
 
 :func:`capture` runs it over as many frames as are wanted. Arrays of taps are (..., 4, 2, rows, cols): phase images
 τ = 0, π/2, π, 3π/2, then taps a and b.
@@ -10,44 +18,58 @@ The chain is a row of pure functions in the order in which the camera does thing
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from enum import IntEnum
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
+from phasemark.render.background import Background
+from phasemark.render.direct import capture_direct
+from phasemark.render.electrons import ReadOut, read_taps
 from phasemark.render.frames import Flag, Frames
+from phasemark.render.motion import Motion, render_moving
 from phasemark.render.noise import phase_image_variance
 from phasemark.render.phasor import PhasorImages, phasor_to_range_m
+from phasemark.render.renderer import Renderer
 from phasemark.render.sensor import Sensor
-
-N_PHASES = 4
-N_TAPS = 2
-
-# Re[S e^{iτ}] at τ = 0, π/2, π, 3π/2 is Re S, −Im S, −Re S, Im S, exactly.
-_REAL_WEIGHT = np.array([1.0, 0.0, -1.0, 0.0])
-_IMAG_WEIGHT = np.array([0.0, -1.0, 0.0, 1.0])
-_TAP_SIGN = np.array([1.0, -1.0])
+from phasemark.render.stray import spread_light
+from phasemark.render.streams import draw_key
+from phasemark.render.taps import N_PHASES, N_TAPS, collect, demodulate, tap_means
+from phasemark.render.unit import CameraUnit, camera_unit
+from phasemark.render.view import Views
 
 # float32 files may round |S_1| just above the intensity; anything more is not an image.
 _ROUNDING = 1e-6
 
-# Above this a float64 can no longer count electrons one by one, and Poisson draws stop being exact.
+# Above this a float64 can no longer count electrons one by one.
 _MOST_ELECTRONS = 2.0**53
+
+# The words of the random streams' counters.
+_MOST_FRAMES = 2**32
 
 # Taps held at once: small enough for the caches, large enough to hide the cost of a NumPy call.
 _TAPS_PER_BLOCK = 2**17
 
 
-def capture(image: PhasorImages, sensor: Sensor, *, rng: np.random.Generator, n_frames: int = 1) -> Frames:
+def capture(
+    image: PhasorImages | Sequence[PhasorImages],
+    sensor: Sensor,
+    *,
+    rng: np.random.Generator,
+    n_frames: int = 1,
+    first_view: int = 0,
+    first_frame: int = 0,
+    keep_taps: bool = False,
+    workers: int = 1,
+) -> Frames:
     """Take noisy frames of noise-free images.
 
     Parameters
     ----------
-    image : PhasorImages
-        n views.
+    image : PhasorImages, or four of them
+        n views; or what a moving camera sees during each phase image, from :func:`~phasemark.render.render_moving`.
     sensor : Sensor
         The camera; it may differ from the one the image was rendered for in electrons, noise and validity, not in
         geometry or modulation.
@@ -56,179 +78,226 @@ def capture(image: PhasorImages, sensor: Sensor, *, rng: np.random.Generator, n_
         its own stream, so that switching one term off leaves the others' noise as it was.
     n_frames : int
         Frames of each view, with independent noise.
+    first_view, first_frame : int
+        Numbers of the first view and frame in a longer run. A sample's noise depends on `rng`'s state and on the
+        numbers of view, frame and pixel alone, so a run captured piece by piece, each from a generator in the same
+        state, has the same bytes as a run captured at once.
+    keep_taps : bool
+        Whether to keep what each tap reported, as ``frames.taps_e``.
+    workers : int
+        Threads; the result does not depend on their number.
 
     Returns
     -------
     Frames
-        (n, n_frames, rows, cols). A pixel below the validity threshold, or where nothing returns light, has range NaN
-        and :attr:`Flag.NO_RETURN`.
+        (n, n_frames, rows, cols). An invalid pixel has range NaN, and its flags say why. A direct sensor gives neither
+        amplitude nor intensity; its own quantity is ``frames.z_m``.
 
     Raises
     ------
     UsageError
-        `n_frames` is not positive; the image was rendered for other optics; it is not finite, or its phasor is
-        larger than its intensity allows.
+        A number is out of range; the image was rendered for other optics or lacks a harmonic the sensor needs; it is
+        not finite, or its phasor is larger than its intensity allows; taps or motion are asked of a direct sensor.
     """
-    if not isinstance(n_frames, int | np.integer) or n_frames < 1:
-        raise UsageError(f"'n_frames' must be a whole number of at least 1, got {n_frames!r}")
-    if difference := sensor.optics_difference(image.sensor):
-        raise UsageError(f"the image was rendered for another camera: {difference}")
-    _check_image(image, sensor)
+    images = (image,) if isinstance(image, PhasorImages) else tuple(image)
+    _check_numbers(n_frames, first_view, first_frame, workers, images)
+    for one in images:
+        if difference := sensor.optics_difference(one.sensor):
+            raise UsageError(f"the image was rendered for another camera: {difference}")
+        _check_image(one, sensor)
+    if sensor.kind == "direct":
+        if keep_taps or len(images) > 1:
+            what = "'keep_taps'" if keep_taps else "motion during phase images"
+            raise UsageError(f"{what} must be left out for a direct sensor: it has neither taps nor phase images")
+        return capture_direct(images[0], sensor, rng, n_frames, first_view, first_frame)
 
-    shape = (len(image) * n_frames, sensor.rows, sensor.cols)
+    n_views = len(images[0])
+    shape = (n_views * n_frames, sensor.rows, sensor.cols)
     range_m, amplitude_e, intensity_e = np.empty(shape), np.empty(shape), np.empty(shape)
     flags = np.empty(shape, dtype=np.uint8)
-    streams = NoiseStreams.from_rng(rng)
-    for block in _blocks(shape):
-        # The frames of a block belong to few views: compute each view's means once, then repeat them.
-        view = np.arange(block.start, block.stop) // n_frames
-        views = slice(view[0], view[-1] + 1)
-        phasor = image.phasor[views]
-        means = add_dark(tap_means(phasor, image.intensity[views], sensor), sensor)
-        taps = add_shot_noise(means[view - view[0]], sensor, streams.shot)
-        taps = add_read_noise(taps, sensor, streams.read)
+    kept = np.empty((shape[0], N_PHASES, N_TAPS, *shape[1:])) if keep_taps else None
+    key, unit, read_out = draw_key(rng), camera_unit(sensor), ReadOut.of(sensor)
+
+    def take(block: slice) -> None:
+        views = slice(block.start // n_frames, (block.stop - 1) // n_frames + 1)
+        means, lit = _expected_taps(images, views, sensor, unit)
+        n = block.stop - block.start
+        taps = np.empty((n, N_PHASES, N_TAPS, *shape[1:])) if kept is None else kept[block]
+        saturated = np.empty((n, *shape[1:]), np.bool_)
+        read_taps(
+            means.reshape(*means.shape[:3], -1), block.start, block.stop, n_frames, first_view, first_frame, key,
+            read_out, taps.reshape(*taps.shape[:3], -1), saturated.reshape(n, -1),
+        )  # fmt: skip
         phasor_e, intensity_e[block] = demodulate(taps)
         range_m[block] = phasor_to_range_m(phasor_e, sensor)
         amplitude_e[block] = np.abs(phasor_e)
-        lit = np.not_equal(phasor, 0)[view - view[0]]
-        flags[block] = validity_flags(amplitude_e[block], intensity_e[block], lit, sensor)
+        of_frame = np.arange(block.start, block.stop) // n_frames - views.start
+        flags[block] = validity_flags(
+            range_m[block], amplitude_e[block], intensity_e[block], lit[of_frame], saturated, unit, sensor
+        )
 
-    full = (len(image), n_frames, sensor.rows, sensor.cols)
+    blocks = list(_blocks(shape))
+    if workers == 1 or len(blocks) <= 1:
+        for block in blocks:
+            take(block)
+    else:
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(take, blocks))
+    full = (n_views, n_frames, sensor.rows, sensor.cols)
     return Frames(
         range_m.reshape(full),
         amplitude_e.reshape(full),
         intensity_e.reshape(full),
         flags=flags.reshape(full),
+        taps_e=None if kept is None else kept.reshape(*full[:2], N_PHASES, N_TAPS, *full[2:]),
         sensor=sensor,
     )
 
 
-def tap_means(phasor: NDArray[np.complex128], intensity: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
-    """Return the mean electrons that light brings to each tap, ambient light included.
-
-    ½ (N₀·intensity + N_amb) ± ½ K N₀ Re[S_1 e^{iτ}], τ = 0, π/2, π, 3π/2.
+def capture_moving(
+    renderer: Renderer,
+    views: Views,
+    sensor: Sensor,
+    motion: Motion,
+    *,
+    rng: np.random.Generator,
+    n_frames: int = 1,
+    background: Background | None = None,
+    keep_taps: bool = False,
+    workers: int = 1,
+) -> Frames:
+    """Take noisy frames while the camera moves: the four phase images see four views, about mid-frame.
 
     Parameters
     ----------
-    phasor, intensity : (..., rows, cols)
-        S_1 and the mean amplitude.
+    renderer : Renderer
+    views : Views
+        The views at mid-frame: the truth of every frame.
     sensor : Sensor
+        The camera, with the renderer's optics and timing.
+    motion : Motion
+    rng, n_frames, keep_taps, workers
+        As in :func:`capture`; each of the frames starts from the same views.
+    background : Background, optional
+        As seen at mid-frame; see :func:`~phasemark.render.render_moving`.
 
     Returns
     -------
-    ndarray, shape (..., 4, 2, rows, cols)
-        e- per tap and phase image.
+    Frames
+        (n, n_frames, rows, cols).
+
+    Raises
+    ------
+    UsageError
+        As :func:`capture` and :func:`~phasemark.render.render_moving`; or sensor and renderer time phase images
+        differently.
     """
-    common = 0.5 * (sensor.signal_e * intensity + sensor.ambient_e)
-    signal = 0.5 * sensor.contrast * sensor.signal_e * phasor[..., None, :, :]
-    modulated = _REAL_WEIGHT[:, None, None] * signal.real + _IMAG_WEIGHT[:, None, None] * signal.imag
-    means = common[..., None, None, :, :] + _TAP_SIGN[:, None, None] * modulated[..., :, None, :, :]
-    return np.asarray(np.maximum(means, 0.0))  # full contrast leaves a tap empty: −1e-12 by rounding
+    if renderer.sensor.phase_image_interval_s != sensor.phase_image_interval_s:
+        raise UsageError(
+            f"the sensor takes a phase image every {sensor.phase_image_interval_s:g} s, but the renderer's every "
+            f"{renderer.sensor.phase_image_interval_s:g} s"
+        )
+    images = render_moving(renderer, views, motion, background=background, workers=workers)
+    return capture(images, sensor, rng=rng, n_frames=n_frames, keep_taps=keep_taps, workers=workers)
 
 
-def add_dark(means: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
-    """Add the mean dark current, half of it to each tap; e-."""
-    return means + 0.5 * sensor.dark_e if sensor.dark_e else means
+def _expected_taps(
+    images: Sequence[PhasorImages], views: slice, sensor: Sensor, unit: CameraUnit
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the mean electrons of all taps of some views, and where modulated light arrives at all."""
+    per_image, lit = [], []
+    for image in images:
+        phasors: Mapping[int, NDArray[np.complex128]] = {
+            k: spread_light(image.harmonic(k)[views], sensor) for k in (1, *sensor.harmonic_orders)
+        }
+        per_image.append(tap_means(phasors, spread_light(image.intensity[views], sensor), sensor, unit.delay_rad))
+        lit.append(np.not_equal(phasors[1], 0))
+    if len(images) == 1:
+        means = per_image[0]
+    else:  # phase image i of what is seen at its time
+        means = np.stack([image_means[:, i] for i, image_means in enumerate(per_image)], axis=1)
+    return collect(_not_negative(means, views.start), unit), np.logical_and.reduce(lit)
 
 
-def add_shot_noise(means: NDArray[np.float64], sensor: Sensor, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw the electrons that arrive, independently in every tap and phase image: Poisson(means); e-."""
-    return rng.poisson(means).astype(np.float64) if sensor.shot_noise else means
-
-
-def add_read_noise(electrons: NDArray[np.float64], sensor: Sensor, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Add Gaussian noise of `read_noise_e` r.m.s., independently in every tap and phase image; e-."""
-    if sensor.read_noise_e == 0:
-        return electrons
-    return electrons + sensor.read_noise_e * rng.standard_normal(electrons.shape)
-
-
-def demodulate(taps: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
-    """Turn four phase images into a phasor and an intensity.
-
-    With D_i = N_a − N_b: phasor_e = ½ [(D₀ − D₂) + i (D₃ − D₁)], so that its argument is the measured phase, its
-    modulus is amplitude_e with mean K·N₀·|S_1|; and intensity_e = ¼ Σ (N_a + N_b).
-
-    Parameters
-    ----------
-    taps : (..., 4, 2, rows, cols)
-        e- per tap and phase image.
-
-    Returns
-    -------
-    phasor_e : (..., rows, cols) complex128
-    intensity_e : (..., rows, cols) float64
-    """
-    tap_a, tap_b = taps[..., 0, :, :], taps[..., 1, :, :]
-    d = tap_a - tap_b
-    phasor_e = np.empty((*d.shape[:-3], *d.shape[-2:]), dtype=np.complex128)
-    phasor_e.real = 0.5 * (d[..., 0, :, :] - d[..., 2, :, :])
-    phasor_e.imag = 0.5 * (d[..., 3, :, :] - d[..., 1, :, :])
-    return phasor_e, (tap_a + tap_b).sum(axis=-3) / N_PHASES
+def _not_negative(means: NDArray[np.float64], first_view: int) -> NDArray[np.float64]:
+    """Refuse taps that count less than nothing; full contrast leaves a tap empty, which rounding makes −1e-12."""
+    negative = (means < -_ROUNDING * np.abs(means).max(axis=(1, 2), keepdims=True)).any(axis=(1, 2))
+    if negative.any():
+        view, row, col = np.argwhere(negative)[0]
+        raise UsageError(
+            f"view {first_view + view}, row {row}, column {col}: a tap's mean is negative, for its phasor is larger "
+            "than its intensity allows at this contrast"
+        )
+    return np.maximum(means, 0.0)
 
 
 def validity_flags(
+    range_m: NDArray[np.float64],
     amplitude_e: NDArray[np.float64],
     intensity_e: NDArray[np.float64],
     lit: NDArray[np.bool_],
+    saturated: NDArray[np.bool_],
+    unit: CameraUnit,
     sensor: Sensor,
 ) -> NDArray[np.uint8]:
-    """Flag the pixels whose range one frame cannot tell.
+    """Flag the pixels whose range one frame cannot tell, and say why.
 
-    A pixel is valid when amplitude_e > 0 and, if the sensor sets `max_phase_std_rad`, when the noise law at the
-    measured amplitude and intensity predicts no more:
-    amplitude_e ≥ √(variance under its root) / (√2 · max_phase_std_rad).
+    A pixel returns light when amplitude_e > 0, amplitude_e ≥ `min_amplitude_e` and, if the sensor sets
+    `max_phase_std_rad`, the noise law at the measured amplitude and intensity predicts no more:
+    amplitude_e ≥ √(variance under its root) / (√2 · max_phase_std_rad). A pixel that is dead, hot or saturated says
+    nothing, neither range nor *no return*.
 
     Parameters
     ----------
-    amplitude_e, intensity_e : ndarray
+    range_m, amplitude_e, intensity_e : (..., rows, cols)
         As measured.
-    lit : ndarray of bool
+    lit : (..., rows, cols) bool
         False where no modulated light returns (S = 0): there is no range to measure, whatever the noise says.
+    saturated : (..., rows, cols) bool
+        Whether a tap reached its full well or the highest code.
+    unit : CameraUnit
+        Which pixels are dead or hot.
     sensor : Sensor
 
     Returns
     -------
     ndarray of uint8
-        0, or :attr:`Flag.NO_RETURN`.
+        :class:`Flag` of each pixel, 0 where it is valid.
     """
-    valid = lit & (amplitude_e > 0)
+    returned = lit & (amplitude_e > 0) & (amplitude_e >= sensor.min_amplitude_e)
     if sensor.max_phase_std_rad is not None:
         noise = np.sqrt(0.5 * phase_image_variance(intensity_e, sensor))
-        valid &= amplitude_e * sensor.max_phase_std_rad >= noise
-    return np.where(valid, 0, int(Flag.NO_RETURN)).astype(np.uint8)
+        returned &= amplitude_e * sensor.max_phase_std_rad >= noise
+    flags = np.where(returned, 0, int(Flag.NO_RETURN)).astype(np.uint8)
+    if sensor.wrap_guard_m > 0:
+        edge_m = np.minimum(range_m, sensor.unambiguous_range_m - range_m)
+        flags[returned & (edge_m < sensor.wrap_guard_m)] = int(Flag.NEAR_WRAP | Flag.MISSING)
+    broken = unit.dead * int(Flag.DEAD) + unit.hot * int(Flag.HOT) + saturated * int(Flag.SATURATED)
+    return np.where(broken > 0, broken | int(Flag.MISSING), flags).astype(np.uint8)
 
 
-class _Term(IntEnum):
-    """The noise terms by number; a number keeps its stream for good."""
-
-    SHOT = 0
-    READ = 1
-
-
-class NoiseStreams(NamedTuple):
-    """One random stream for each noise term."""
-
-    shot: np.random.Generator
-    read: np.random.Generator
-
-    @classmethod
-    def from_rng(cls, rng: np.random.Generator) -> NoiseStreams:
-        """Key the streams with 256 bits drawn from `rng`.
-
-        Drawing the key, rather than spawning children, works for every bit generator and makes the next call with the
-        same `rng` independent of this one.
-        """
-        key = rng.integers(0, 2**32, size=8, dtype=np.uint32).tolist()
-
-        def stream(term: _Term) -> np.random.Generator:
-            return np.random.Generator(np.random.PCG64DXSM(np.random.SeedSequence(key, spawn_key=(int(term),))))
-
-        return cls(shot=stream(_Term.SHOT), read=stream(_Term.READ))
+def _check_numbers(
+    n_frames: int, first_view: int, first_frame: int, workers: int, images: Sequence[PhasorImages]
+) -> None:
+    for name, value, least in (
+        ("n_frames", n_frames, 1),
+        ("first_view", first_view, 0),
+        ("first_frame", first_frame, 0),
+        ("workers", workers, 1),
+    ):
+        if not isinstance(value, int | np.integer) or value < least:
+            raise UsageError(f"'{name}' must be a whole number of at least {least}, got {value!r}")
+    if len(images) not in (1, N_PHASES) or len({len(one) for one in images}) > 1:
+        raise UsageError(
+            f"'image' must be one set of images, or {N_PHASES} of equal length, one for each phase image, got "
+            f"{[len(one) for one in images]} views"
+        )
+    if max(first_frame + n_frames, first_view + len(images[0])) > _MOST_FRAMES:
+        raise UsageError("a run has at most 2^32 views, and 2^32 frames of each")
 
 
 def _blocks(shape: tuple[int, int, int]) -> Iterator[slice]:
-    """Cut the frames into blocks. Streams are read in the order of the frames, so the cuts leave no trace."""
+    """Cut the frames into blocks; a frame's noise depends on its number alone, so the cuts leave no trace."""
     n, rows, cols = shape
     step = max(1, _TAPS_PER_BLOCK // (N_PHASES * N_TAPS * rows * cols))
     for start in range(0, n, step):
@@ -237,17 +306,16 @@ def _blocks(shape: tuple[int, int, int]) -> Iterator[slice]:
 
 def _check_image(image: PhasorImages, sensor: Sensor) -> None:
     """Refuse an image that no light can make, naming the first pixel that shows it."""
-    finite = np.isfinite(image.phasor) & np.isfinite(image.intensity)
+    finite = np.isfinite(image.intensity)
+    for order in (1, *sensor.harmonic_orders):
+        if order > 1 and order not in image.harmonics:
+            raise UsageError(
+                f"the image lacks harmonic {order}, which the sensor's correlation needs: render it with a Renderer "
+                "for this sensor, or with harmonics=sensor.harmonic_orders"
+            )
+        finite &= np.isfinite(image.harmonic(order))
     if not finite.all():
         raise UsageError(f"{_where(~finite)}: phasor and intensity must be finite")
-    offset = sensor.ambient_e / sensor.signal_e
-    negative = sensor.contrast * image.amplitude > (image.intensity + offset) * (1 + _ROUNDING)
-    if negative.any():
-        pixel = tuple(np.argwhere(negative)[0])
-        raise UsageError(
-            f"{_where(negative)}: a tap's mean is negative, for the amplitude {image.amplitude[pixel]:.4g} at contrast "
-            f"{sensor.contrast:g} must not exceed the intensity, got {image.intensity[pixel]:.4g}"
-        )
     brightest = sensor.signal_e * image.intensity.max(initial=0.0) + sensor.ambient_e + sensor.dark_e
     if brightest > _MOST_ELECTRONS:
         raise UsageError(

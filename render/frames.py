@@ -14,6 +14,8 @@ from phasemark.render.sensor import Sensor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_TAPS = (4, 2)  # phase images, taps
+
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
@@ -27,7 +29,11 @@ class Flag(IntFlag):
     SATURATED = 4
     """A tap reached its full well or the top of the converter; also MISSING."""
     DEAD = 8
-    """The pixel is known to be dead or hot; also MISSING."""
+    """The pixel is known to be dead; also MISSING."""
+    HOT = 16
+    """The pixel is known to be hot; also MISSING."""
+    NEAR_WRAP = 32
+    """The range may be on the wrong side of the wrap at 0 and c / 2f; also MISSING."""
 
 
 class Frames:
@@ -45,6 +51,8 @@ class Frames:
         :class:`Flag` of every pixel. Without it an invalid pixel gets the flag that `invalid_means` names.
     sensor : Sensor
         The camera that took the frames.
+    taps_e : array_like, optional
+        What each tap reported in each phase image, electrons; in the shape of `range_m` with (4, 2) before the rows.
     invalid_means : {"missing", "no-return"}
         What an invalid pixel without flags stands for. Unknown cause is "missing".
 
@@ -63,9 +71,10 @@ class Frames:
         *,
         sensor: Sensor,
         flags: ArrayLike | None = None,
+        taps_e: ArrayLike | None = None,
         invalid_means: Literal["missing", "no-return"] = "missing",
     ) -> None:
-        ranges = np.array(range_m, dtype=np.float64)
+        given = ranges = np.array(range_m, dtype=np.float64)
         if ranges.ndim not in (2, 3, 4):
             raise UsageError(f"'range_m' must have shape (n, frames, rows, cols), got {ranges.shape}")
         shape = (1,) * (4 - ranges.ndim) + ranges.shape
@@ -111,6 +120,13 @@ class Frames:
         self.amplitude_e = amplitude
         self.intensity_e = intensity
         self.flags: NDArray[np.uint8] = codes
+        self.taps_e: NDArray[np.float64] | None = None
+        if taps_e is not None:
+            taps: NDArray[np.float64] = np.array(taps_e, dtype=np.float64)
+            expected = (*given.shape[:-2], *_TAPS, *given.shape[-2:])
+            if taps.shape != expected:
+                raise UsageError(f"'taps_e' has shape {taps.shape}, but must have {expected}")
+            self.taps_e = taps.reshape(*shape[:2], *_TAPS, *shape[2:])
         self.sensor = sensor
 
     def __len__(self) -> int:
@@ -124,12 +140,18 @@ class Frames:
             None if self.intensity_e is None else self.intensity_e[index],
             sensor=self.sensor,
             flags=self.flags[index],
+            taps_e=None if self.taps_e is None else self.taps_e[index],
         )
 
     @property
     def valid(self) -> NDArray[np.bool_]:
         """True where the range may be used, (n, frames, rows, cols)."""
         return np.equal(self.flags, 0)
+
+    @property
+    def z_m(self) -> NDArray[np.float64]:
+        """Distance along the optical axis, range · cosine of the ray of the pixel's centre; (n, frames, rows, cols)."""
+        return self.range_m * self.sensor.axis_cosine()
 
     @property
     def n_frames(self) -> int:

@@ -13,8 +13,9 @@ from phasemark.render.sensor import Sensor
 def predicted_range_std(amplitude: ArrayLike, intensity: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
     """Return the standard deviation of the range in one frame, from noise-free amplitude and intensity.
 
-    σ = (c / 4πf) · √(N₀·intensity + N_amb + N_dark + 2σ_r²) / (√2 · K · N₀ · |S_1|), PHYSICS section 4. It is the
-    limit of high signal: 0.5 % low at a phase noise of 0.1 rad, 1 % at 0.14 rad.
+    σ = (c / 4πf) · √(N₀·intensity + N_amb + N_dark + 2σ_r² + q²/6) / (√2 · K · N₀ · |S_1|), PHYSICS section 4. It is
+    the limit of high signal: 0.5 % low at a phase noise of 0.1 rad, 1 % at 0.14 rad. Patterns (PRNU, DSNU) and stray
+    light are not in it. For a direct sensor, which has no law, it is the figure the sensor states, `range_std_m`.
 
     Parameters
     ----------
@@ -44,7 +45,7 @@ def measured_range_std(amplitude_e: ArrayLike, intensity_e: ArrayLike, sensor: S
     """Return the standard deviation of the range in one frame, from measured amplitude and intensity.
 
     The law of :func:`predicted_range_std` in the electrons a frame reports, whose means are amplitude_e = K·N₀·|S_1|
-    and intensity_e = N₀·intensity + N_amb + N_dark: σ = (c / 4πf) · √(intensity_e + 2σ_r²) / (√2 · amplitude_e).
+    and intensity_e = N₀·intensity + N_amb + N_dark: σ = (c / 4πf) · √(intensity_e + 2σ_r² + q²/6) / (√2 · amplitude_e).
 
     Parameters
     ----------
@@ -65,6 +66,8 @@ def measured_phase_std(amplitude_e: ArrayLike, intensity_e: ArrayLike, sensor: S
     amplitude, variance = np.broadcast_arrays(
         np.asarray(amplitude_e, dtype=np.float64), phase_image_variance(intensity_e, sensor)
     )
+    if sensor.kind == "direct":
+        return np.full(amplitude.shape, sensor.range_std_m / sensor.metres_per_radian)
     std = np.full(amplitude.shape, np.inf)
     np.divide(np.sqrt(variance), math.sqrt(2) * amplitude, out=std, where=np.not_equal(amplitude, 0))
     return std
@@ -81,4 +84,4 @@ def phase_image_variance(intensity_e: ArrayLike, sensor: Sensor) -> NDArray[np.f
     sensor : Sensor
     """
     shot = np.maximum(np.asarray(intensity_e, dtype=np.float64), 0.0) if sensor.shot_noise else 0.0
-    return np.asarray(shot + np.zeros(np.shape(intensity_e)) + 2 * sensor.read_noise_e**2)
+    return np.asarray(shot + np.zeros(np.shape(intensity_e)) + sensor.read_variance_e2)

@@ -85,8 +85,8 @@ class Renderer:
     sensor : Sensor
     albedo : float
         Of the Lambertian landmark, in (0, 1].
-    harmonics : sequence of int
-        Harmonic orders k > 1 wanted beside the signal.
+    harmonics : sequence of int, optional
+        Harmonic orders k > 1 wanted beside the signal; None: those that the sensor's taps need.
     intersector : {"auto", "embree", "float64"}
         What finds the face a ray meets; "auto" is Embree where the package embreex is installed.
 
@@ -111,11 +111,12 @@ class Renderer:
         sensor: Sensor,
         *,
         albedo: float = 0.8,
-        harmonics: Sequence[int] = (),
+        harmonics: Sequence[int] | None = None,
         intersector: str = "auto",
     ) -> None:
         if not 0 < albedo <= 1:
             raise UsageError(f"'albedo' must be in (0, 1], got {albedo!r}")
+        harmonics = sensor.harmonic_orders if harmonics is None else harmonics
         if any(order < 2 or order != int(order) for order in harmonics):
             raise UsageError(f"'harmonics' must be whole orders of 2 or more, got {tuple(harmonics)!r}")
         self.sensor = sensor

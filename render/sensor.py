@@ -6,13 +6,20 @@ import math
 import tomllib
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from phasemark import InputFileError, UsageError
+from phasemark.render.correlation import (
+    SQUARE_PEAK,
+    Harmonic,
+    correlation_peak,
+    pulse_harmonics,
+    square_harmonics,
+)
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 
@@ -22,6 +29,16 @@ _Fraction = Annotated[float, Field(gt=0, le=1)]
 _HalfAngleDeg = Annotated[float, Field(gt=0, lt=85)]
 _TiltDeg = Annotated[float, Field(ge=-45, le=45)]
 _PixelCount = Annotated[int, Field(ge=1, le=4096)]
+_Share = Annotated[float, Field(ge=0, lt=1)]
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Order = Annotated[int, Field(ge=2, le=199)]
+_Pixel = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
+_PulseShape = tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...]
+
+PATTERN_BOUND = 3.0
+"""Fixed patterns are normal and end at this many standard deviations: no pixel of a camera that works lies beyond."""
+
+_LEAST_PULSE_SAMPLES = 8
 
 # What an image's rays and phases depend on: cameras that agree in these see the same noise-free image.
 _OPTICS = (
@@ -37,15 +54,65 @@ _OPTICS = (
     "modulation_hz",
 )
 
+# What is no error of a camera with taps, beside its optics.
+_WITHOUT_ERRORS = ("frame_rate_hz", "phase_interval_s", "contrast", "signal_e")
+
+DIRECT_MODULATION_HZ = 1e4
+"""Highest `modulation_hz` of a direct sensor: at 10 m a phase of 4e-3 rad, whose mixing moves a mean range by 1e-6."""
+
+# What only a camera with taps has, and what only a direct one has.
+_PHASE_ONLY = (
+    "phase_interval_s",
+    "contrast",
+    "modulation",
+    "max_harmonic",
+    "harmonics",
+    "emitted_pulse",
+    "reference_pulse",
+    "signal_e",
+    "ambient_e",
+    "dark_e",
+    "shot_noise",
+    "read_noise_e",
+    "prnu",
+    "dsnu_e",
+    "full_well_e",
+    "adc_bits",
+    "gain",
+    "black_level",
+    "phase_offset_std_rad",
+    "tap_phase_offset_std_rad",
+    "blur_share",
+    "blur_px",
+    "veil_share",
+    "veil_px",
+    "hot_share",
+    "hot_pixels",
+    "hot_e",
+    "max_phase_std_rad",
+    "min_amplitude_e",
+    "wrap_guard_m",
+)
+_DIRECT_ONLY = ("max_range_m", "min_intensity", "range_std_m")
+
+_ROUNDING = 1e-9  # of a limit that files state in decimals
+
 
 class Sensor(BaseModel):
     """A time-of-flight camera (PHYSICS sections 2 and 4).
 
     Frozen, and valid once built; :meth:`with_` derives a changed copy. Every error term is neutral by default, so
-    ``Sensor(rows=16, cols=16, half_angle_h_deg=11, half_angle_v_deg=11)`` is a camera with shot noise alone.
+    ``Sensor(rows=16, cols=16, half_angle_h_deg=11, half_angle_v_deg=11)`` is a camera with shot noise alone. What is
+    given as a standard deviation of a *pattern* differs from pixel to pixel and stays as it is in time: `unit_seed`
+    draws it, and one seed is one physical camera. Formulas and their sources stand in ``docs/sensor.md``.
 
     Parameters
     ----------
+    kind : {"phase", "direct"}
+        "phase": amplitude-modulated light, two taps, four phase images. "direct": direct time of flight with z made on
+        the chip; only geometry, footprint and dropout are modelled, and every field about taps, harmonics or phasors
+        is refused. Its `modulation_hz` must be at most 10 kHz: so low that phasors do not mix, and the range of a
+        pixel is the light-weighted mean over its footprint.
     rows, cols : int
         Size of the image, pixels.
     half_angle_h_deg, half_angle_v_deg : float
@@ -62,27 +129,81 @@ class Sensor(BaseModel):
         Modulation frequency f; the range wraps at c / 2f.
     frame_rate_hz : float
         Frames a second, four phase images each.
+    phase_interval_s : float, optional
+        Time T from one phase image to the next; None: 1 / (4 · frame rate), the most there can be.
     contrast : float
         Demodulation contrast K, in (0, 1].
+    modulation : {"sine", "square", "harmonics", "pulse"}
+        What light and reference correlate to: a sine alone; square with square, a_k = 1/k² for odd k; the orders
+        stated in `harmonics`; or those of `emitted_pulse` and `reference_pulse`.
+    max_harmonic : int
+        Highest order of "square" and "pulse".
+    harmonics : tuple of (k, a_k, θ_k)
+        Orders k > 1 of the correlation for "harmonics": amplitude relative to the first, phase in radians.
+    emitted_pulse, reference_pulse : tuple of float
+        One period of light and reference for "pulse", evenly sampled, of one length, at least 8 samples, any unit.
     signal_e : float
-        Electrons per phase image, both taps, that intensity 1 produces.
+        Electrons N₀ per phase image, both taps, that intensity 1 produces.
     ambient_e, dark_e : float
         Unmodulated electrons per phase image, both taps: ambient light and dark current.
-    read_noise_e : float
-        Read noise, e- r.m.s. per tap and phase image.
     shot_noise : bool
         Whether electrons arrive as a Poisson process.
+    read_noise_e : float
+        Read noise, e- r.m.s. per tap and phase image.
+    prnu : float
+        Photo-response non-uniformity: standard deviation of the taps' relative sensitivity, a pattern.
+    dsnu_e : float
+        Dark-signal non-uniformity: standard deviation of a tap's dark electrons per phase image, a pattern; at most
+        dark_e / 6, for a dark signal is never negative.
+    full_well_e : float, optional
+        Electrons at which a tap saturates; None: never.
+    adc_bits : int, optional
+        Bits of the converter; None: electrons are read as they are.
+    gain : float
+        Codes per electron; needs `adc_bits`.
+    black_level : float
+        Code of no electrons; needs `adc_bits`.
+    phase_offset_std_rad : float
+        Phase offset of each pixel, a pattern.
+    tap_phase_offset_std_rad : float
+        Phase offset of each tap beside its pixel's, a pattern.
+    range_offset_m : float
+        Added to every range: the delay between light and reference.
+    unit_seed : int
+        Which physical camera: draws all patterns and defective pixels.
+    blur_share, blur_px : float
+        Stray light near its pixel: share of the light that goes there, and the standard deviation of a Gaussian.
+    veil_share, veil_px : float
+        Stray light far from its pixel, likewise.
+    dead_share, hot_share : float
+        Expected share of dead and hot pixels, drawn by `unit_seed`.
+    dead_pixels, hot_pixels : tuple of (row, col)
+        Pixels that are dead or hot for certain. Dead: no electrons. Both are flagged and invalid.
+    hot_e : float
+        Additional dark electrons of a hot pixel per phase image, both taps.
     max_phase_std_rad : float or None
         A pixel is valid when its predicted one-frame phase noise is at most this; None: any amplitude above zero.
+    min_amplitude_e : float
+        A pixel is valid when its measured amplitude is at least this, electrons.
+    wrap_guard_m : float
+        A range nearer to 0 or to c / 2f than this may be on the wrong side of the wrap, and is invalid.
+    max_range_m : float, optional
+        "direct" only: nothing returns from beyond.
+    min_intensity : float
+        "direct" only: nothing returns from a pixel that gets less light than this; 1 is albedo 1 facing at 1 m.
+    range_std_m : float
+        "direct" only: standard deviation of a range. A figure to weight measurements with, not a model of the chip.
 
     Raises
     ------
     UsageError
-        With one line that names the field, its value and its range.
+        With one line that names the field, its value and its range, or the two fields that contradict each other.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
 
+    kind: Literal["phase", "direct"] = "phase"
+    # geometry
     rows: _PixelCount
     cols: _PixelCount
     half_angle_h_deg: _HalfAngleDeg
@@ -92,36 +213,226 @@ class Sensor(BaseModel):
     roll_deg: _TiltDeg = 0.0
     fill_factor: tuple[_Fraction, _Fraction] = (1.0, 1.0)
     vignetting: bool = False
+    # modulation and timing
     modulation_hz: _Positive = 10e6
     frame_rate_hz: _Positive = 3.0
+    phase_interval_s: _Positive | None = None
     contrast: _Fraction = 0.5
+    modulation: Literal["sine", "square", "harmonics", "pulse"] = "sine"
+    max_harmonic: _Order = 49
+    harmonics: tuple[tuple[_Order, _Fraction, _Finite], ...] = ()
+    emitted_pulse: _PulseShape = ()
+    reference_pulse: _PulseShape = ()
+    # electrons
     signal_e: _Positive = 35_571.0
     ambient_e: _NonNegative = 0.0
     dark_e: _NonNegative = 0.0
-    read_noise_e: _NonNegative = 0.0
     shot_noise: bool = True
+    read_noise_e: _NonNegative = 0.0
+    prnu: Annotated[float, Field(ge=0, le=0.3)] = 0.0
+    dsnu_e: _NonNegative = 0.0
+    # read-out
+    full_well_e: _Positive | None = None
+    adc_bits: Annotated[int, Field(ge=1, le=32)] | None = None
+    gain: _Positive = 1.0
+    black_level: _NonNegative = 0.0
+    # offsets
+    phase_offset_std_rad: Annotated[float, Field(ge=0, le=1)] = 0.0
+    tap_phase_offset_std_rad: Annotated[float, Field(ge=0, le=1)] = 0.0
+    range_offset_m: _Finite = 0.0
+    unit_seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    # stray light
+    blur_share: _Share = 0.0
+    blur_px: _Positive = 1.0
+    veil_share: _Share = 0.0
+    veil_px: _Positive = 8.0
+    # defects
+    dead_share: _Share = 0.0
+    hot_share: _Share = 0.0
+    dead_pixels: tuple[_Pixel, ...] = ()
+    hot_pixels: tuple[_Pixel, ...] = ()
+    hot_e: _NonNegative = 10_000.0
+    # validity
     max_phase_std_rad: _Positive | None = None
+    min_amplitude_e: _NonNegative = 0.0
+    wrap_guard_m: _NonNegative = 0.0
+    # direct time of flight
+    max_range_m: _Positive | None = None
+    min_intensity: _NonNegative = 0.0
+    range_std_m: _NonNegative = 0.0
 
     def __init__(self, **data: Any) -> None:
         try:
             super().__init__(**data)
         except ValidationError as error:
             first = error.errors()[0]
-            raise UsageError.of_field(
-                first["loc"], first["type"], first["msg"], first["input"], whole="principal_point_px"
-            ) from None
+            if not first["loc"]:  # a finding about several fields names them itself
+                raise UsageError(first["msg"].removeprefix("Value error, ")) from None
+            raise UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"]) from None
 
     @model_validator(mode="after")
     def _principal_point_near_the_image(self) -> Self:
         if self.principal_point_px is not None:
             u0, v0 = self.principal_point_px
             if not (abs(u0 - self.cols / 2) <= self.cols and abs(v0 - self.rows / 2) <= self.rows):
-                raise ValueError("must lie within one image width and height of the image's centre")
+                raise ValueError(
+                    "'principal_point_px' must lie within one image width and height of the image's centre, got "
+                    f"{self.principal_point_px}"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _fields_suit_the_kind(self) -> Self:
+        foreign = _PHASE_ONLY if self.kind == "direct" else _DIRECT_ONLY
+        for name in foreign:
+            value = getattr(self, name)
+            if value != type(self).model_fields[name].default:
+                why = (
+                    "a direct sensor has no taps, harmonics or phasors"
+                    if self.kind == "direct"
+                    else "it belongs to 'kind' = 'direct'"
+                )
+                raise ValueError(f"'{name}' must be left out for 'kind' = '{self.kind}', got {value}: {why}")
+        if self.kind == "direct" and self.modulation_hz > DIRECT_MODULATION_HZ:
+            raise ValueError(
+                f"'modulation_hz' must be at most {DIRECT_MODULATION_HZ:g} for 'kind' = 'direct', which mixes no "
+                f"phasors, got {self.modulation_hz:g}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _correlation_can_be(self) -> Self:
+        for names, owner in ((("harmonics",), "harmonics"), (("emitted_pulse", "reference_pulse"), "pulse")):
+            for name in names:
+                if bool(getattr(self, name)) != (self.modulation == owner):
+                    verb = "must be given for" if self.modulation == owner else "must be left out unless"
+                    raise ValueError(
+                        f"'{name}' {verb} 'modulation' = '{owner}', got 'modulation' = '{self.modulation}'"
+                    )
+        orders = [k for k, _, _ in self.harmonics]
+        if len(set(orders)) < len(orders):
+            raise ValueError(f"'harmonics' must name each order once, got the orders {orders}")
+        if self.modulation == "pulse":
+            n, m = len(self.emitted_pulse), len(self.reference_pulse)
+            if n != m or n < _LEAST_PULSE_SAMPLES:
+                raise ValueError(
+                    f"'emitted_pulse' and 'reference_pulse' must have the same number of samples, at least "
+                    f"{_LEAST_PULSE_SAMPLES}, got {n} and {m}"
+                )
+            try:
+                pulse_harmonics(self.emitted_pulse, self.reference_pulse, self.max_harmonic)
+            except ValueError as error:
+                raise ValueError(f"'emitted_pulse' and 'reference_pulse' {error}") from None
+        # The whole square wave, not its first orders, must fit: K ≤ 8/π².
+        peak = SQUARE_PEAK if self.modulation == "square" else correlation_peak(self.correlation_harmonics)
+        if self.contrast * peak > 1 + _ROUNDING:
+            raise ValueError(
+                f"'contrast' must be at most {1 / peak:.4g} with 'modulation' = '{self.modulation}', or a tap would "
+                f"count less than nothing, got {self.contrast:g}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _times_and_shares_fit(self) -> Self:
+        longest = 1 / (4 * self.frame_rate_hz)
+        if self.phase_interval_s is not None and self.phase_interval_s > longest * (1 + _ROUNDING):
+            raise ValueError(
+                f"'phase_interval_s' must be at most 1 / (4 · frame_rate_hz) = {longest:.6g}, got "
+                f"{self.phase_interval_s:g}"
+            )
+        if self.blur_share + self.veil_share >= 1:
+            raise ValueError(
+                f"'blur_share' + 'veil_share' must be below 1, got {self.blur_share:g} + {self.veil_share:g}"
+            )
+        if self.dead_share + self.hot_share >= 1:
+            raise ValueError(
+                f"'dead_share' + 'hot_share' must be below 1, got {self.dead_share:g} + {self.hot_share:g}"
+            )
+        for name in ("dead_pixels", "hot_pixels"):
+            for row, col in getattr(self, name):
+                if row >= self.rows or col >= self.cols:
+                    raise ValueError(
+                        f"'{name}' must lie in the image of {self.rows} × {self.cols} pixels, got ({row}, {col})"
+                    )
+        if both := sorted(set(self.dead_pixels) & set(self.hot_pixels)):
+            raise ValueError(f"'dead_pixels' and 'hot_pixels' must not share a pixel, got {both[0]} in both")
+        if not self.wrap_guard_m < self.unambiguous_range_m / 2:
+            raise ValueError(
+                f"'wrap_guard_m' must be below c / 4f = {self.unambiguous_range_m / 2:.4g}, got {self.wrap_guard_m:g}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _read_out_can_be(self) -> Self:
+        if self.adc_bits is None:
+            for name in ("gain", "black_level"):
+                value = getattr(self, name)
+                if value != type(self).model_fields[name].default:
+                    raise ValueError(f"'{name}' must be left out without a converter ('adc_bits'), got {value:g}")
+        elif self.black_level >= 2**self.adc_bits - 1:
+            raise ValueError(
+                f"'black_level' must be below the converter's highest code, {2**self.adc_bits - 1}, got "
+                f"{self.black_level:g}"
+            )
+        if self.dsnu_e > self.dark_e / 6 * (1 + _ROUNDING):
+            raise ValueError(
+                f"'dsnu_e' must be at most dark_e / 6 = {self.dark_e / 6:g}: a tap's dark signal, dark_e / 2, varies "
+                f"by up to {PATTERN_BOUND:g} standard deviations and cannot be negative, got {self.dsnu_e:g}"
+            )
+        offset_e = (self.ambient_e + self.dark_e) / 2
+        if self.saturation_e <= offset_e:
+            limit = "full_well_e" if self.full_well_e == self.saturation_e else "gain"
+            raise ValueError(
+                f"'{limit}' leaves no room for light: a tap saturates at {self.saturation_e:.6g} e-, and ambient light "
+                f"and dark current alone bring {offset_e:.6g} e-"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _threshold_can_be_met(self) -> Self:
+        if not math.isfinite(self.saturation_e):
+            return self
+        # The brightest pixel that does not saturate: ½ (A/K + N_amb + N_dark + A · peak) = saturation.
+        peak = correlation_peak(self.correlation_harmonics)
+        offset_e = self.ambient_e + self.dark_e
+        amplitude_e = (2 * self.saturation_e - offset_e) / (1 / self.contrast + peak)
+        if self.min_amplitude_e >= amplitude_e:
+            raise ValueError(
+                f"'min_amplitude_e' must be below {amplitude_e:.6g}, the amplitude at which a tap saturates at "
+                f"{self.saturation_e:.6g} e- (full well or converter), got {self.min_amplitude_e:g}"
+            )
+        if self.max_phase_std_rad is not None:
+            shot = amplitude_e / self.contrast + offset_e if self.shot_noise else 0.0
+            least = math.sqrt((shot + self.read_variance_e2) / 2) / amplitude_e
+            if self.max_phase_std_rad <= least:
+                raise ValueError(
+                    f"'max_phase_std_rad' must be above {least:.4g}, the noise of the brightest pixel that does not "
+                    f"saturate at {self.saturation_e:.6g} e- (full well or converter), got {self.max_phase_std_rad:g}"
+                )
         return self
 
     def with_(self, **changes: Any) -> Sensor:
         """Return a copy with some fields changed, validated again."""
         return Sensor(**{**self.model_dump(), **changes})
+
+    def without_errors(self, *, shot_noise: bool = False) -> Sensor:
+        """Return the camera without its errors: optics, modulation frequency, contrast and signal alone.
+
+        Parameters
+        ----------
+        shot_noise : bool
+            Whether the light still arrives as a Poisson process; then the validity threshold stays as well.
+        """
+        if self.kind == "direct":
+            return self.with_(range_std_m=0.0, range_offset_m=0.0, dead_share=0.0, dead_pixels=())
+        kept = {name: getattr(self, name) for name in (*_OPTICS, *_WITHOUT_ERRORS) if name != "centre_px"}
+        threshold = self.max_phase_std_rad if shot_noise else None
+        return Sensor(
+            **kept,
+            principal_point_px=self.principal_point_px,
+            shot_noise=shot_noise,
+            max_phase_std_rad=threshold,
+        )
 
     @classmethod
     def from_intrinsics(
@@ -209,6 +520,69 @@ class Sensor(BaseModel):
         rx = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
         return np.asarray(ry @ rx)
 
+    @classmethod
+    def field_groups(cls) -> dict[str, tuple[str, ...]]:
+        """Return the fields in groups, in the order of light's way through the camera: title → names."""
+        titles = {
+            "kind": "kind",
+            "rows": "geometry",
+            "modulation_hz": "modulation and timing",
+            "signal_e": "electrons per phase image",
+            "full_well_e": "read-out",
+            "phase_offset_std_rad": "offsets of one physical camera",
+            "blur_share": "stray light",
+            "dead_share": "defects",
+            "max_phase_std_rad": "validity",
+            "max_range_m": "direct time of flight only",
+        }
+        groups: dict[str, tuple[str, ...]] = {}
+        title = ""
+        for name in cls.model_fields:
+            title = titles.get(name, title)
+            groups[title] = (*groups.get(title, ()), name)
+        return groups
+
+    @property
+    def quantity(self) -> Literal["range", "z"]:
+        """What the camera itself reports: range along the ray, or the distance z along the optical axis."""
+        return "z" if self.kind == "direct" else "range"
+
+    @property
+    def correlation_harmonics(self) -> tuple[Harmonic, ...]:
+        """The orders k > 1 of the correlation with their a_k and θ_k, in rising order; empty for a sine."""
+        if self.modulation == "square":
+            return square_harmonics(self.max_harmonic)
+        if self.modulation == "pulse":
+            return pulse_harmonics(self.emitted_pulse, self.reference_pulse, self.max_harmonic)
+        return tuple(Harmonic(*entry) for entry in sorted(self.harmonics))
+
+    @property
+    def harmonic_orders(self) -> tuple[int, ...]:
+        """Which S_k, k > 1, the taps need beside S_1; a Renderer for this sensor renders them unless told otherwise."""
+        return tuple(k for k, _, _ in self.correlation_harmonics)
+
+    @property
+    def phase_image_interval_s(self) -> float:
+        """Time from one phase image to the next: `phase_interval_s`, or 1 / (4 · frame rate)."""
+        return self.phase_interval_s or 1 / (4 * self.frame_rate_hz)
+
+    @property
+    def code_e(self) -> float:
+        """Electrons per code q, 0 without a converter."""
+        return 0.0 if self.adc_bits is None else 1 / self.gain
+
+    @property
+    def saturation_e(self) -> float:
+        """Electrons at which a tap saturates: full well or the converter's highest code, whichever comes first."""
+        well = math.inf if self.full_well_e is None else self.full_well_e
+        top = math.inf if self.adc_bits is None else (2**self.adc_bits - 1 - self.black_level) / self.gain
+        return min(well, top)
+
+    @property
+    def read_variance_e2(self) -> float:
+        """Variance that reading adds to one phase image's N_a − N_b, 2σ_r² + q²/6 (PHYSICS section 4), e-²."""
+        return 2 * self.read_noise_e**2 + self.code_e**2 / 6
+
     @property
     def metres_per_radian(self) -> float:
         """Range per radian of phase, c / 4πf."""
@@ -242,6 +616,13 @@ class Sensor(BaseModel):
         """Return unit ray directions of all pixel centres, level camera frame, (rows, cols, 3)."""
         v, u = np.mgrid[: self.rows, : self.cols] + 0.5
         return self.ray_directions(u, v)
+
+    def axis_cosine(self) -> NDArray[np.float64]:
+        """Return the cosine between each pixel's ray and the camera's own optical axis, (rows, cols).
+
+        z = range · cosine. Tilting the camera turns both, so mounting does not enter.
+        """
+        return np.asarray(self.pixel_directions() @ self.cam2level[:, 0])
 
 
 def preset_names() -> list[str]:

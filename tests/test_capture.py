@@ -18,14 +18,8 @@ from phasemark.render import (
     predicted_range_std,
     preset,
 )
-from phasemark.render.capture import (
-    NoiseStreams,
-    add_dark,
-    add_read_noise,
-    add_shot_noise,
-    demodulate,
-    tap_means,
-)
+from phasemark.render.taps import demodulate, tap_means
+from phasemark.render.unit import camera_unit
 
 # The chain's module; its function of the same name hides it from `import phasemark.render.capture as ...`.
 chain = importlib.import_module("phasemark.render.capture")
@@ -70,14 +64,13 @@ def two_surfaces(near_m, far_m, share, sensor):
 def test_tap_means_follow_the_cosine_at_four_delays():
     sensor = one_pixel(contrast=0.4, signal_e=1000, ambient_e=300, dark_e=50)
     phasor, intensity = 0.6 * np.exp(2.1j), 0.7
-    means = tap_means(np.array([[phasor]]), np.array([[intensity]]), sensor)
-    assert means.shape == (4, 2, 1, 1)
+    means = tap_means({1: np.array([[[phasor]]])}, np.array([[[intensity]]]), sensor)
+    assert means.shape == (1, 4, 2, 1, 1)
     for i in range(4):
         for tap, sign in enumerate((1, -1)):
             tau = i * math.pi / 2
             light = 0.5 * (1000 * 0.7 + 300) + sign * 0.5 * 0.4 * 1000 * 0.6 * math.cos(2.1 + tau)
-            assert means[i, tap, 0, 0] == pytest.approx(light, rel=1e-12)  # rounding alone
-    np.testing.assert_allclose(add_dark(means, sensor) - means, 25, rtol=1e-12)
+            assert means[0, i, tap, 0, 0] == pytest.approx(light, rel=1e-12)  # rounding alone
 
 
 def test_a_quarter_turn_of_phase_is_an_eighth_of_the_modulation_wavelength():
@@ -155,13 +148,15 @@ def test_noise_law_of_measured_electrons_is_the_same_law():
 def test_taps_and_phase_images_have_independent_noise_of_the_right_size():
     sensor = one_pixel(contrast=0.6, signal_e=2000, ambient_e=100, dark_e=40, read_noise_e=15)
     n = 50_000
-    means = add_dark(tap_means(np.full((n, 1, 1), 0.8j), np.full((n, 1, 1), 0.9), sensor), sensor)
-    streams = NoiseStreams.from_rng(np.random.default_rng(5))
-    taps = add_read_noise(add_shot_noise(means, sensor, streams.shot), sensor, streams.read).reshape(n, 8)
-    variance = means[0].ravel() + 15**2
+    image = images_of([[[0.8j]]], [[[0.9]]], sensor)
+    taps = capture(image, sensor, rng=np.random.default_rng(5), n_frames=n, keep_taps=True).taps_e.reshape(n, 8)
+    tau = np.arange(4) * np.pi / 2
+    cosine = 0.3 * 2000 * 0.8 * np.cos(np.pi / 2 + tau)
+    mean = np.stack([970 + cosine, 970 - cosine], axis=1).ravel()  # ½ (2000 · 0.9 + 100 + 40) ± ½ K N₀ Re[S e^{iτ}]
+    variance = mean + 15**2
     n_cells = 8 + 8 + 28
     z = stats.norm.ppf(1 - FALSE_ALARM / n_cells / 2)
-    assert (np.abs(taps.mean(axis=0) - means[0].ravel()) < z * np.sqrt(variance / n)).all()
+    assert (np.abs(taps.mean(axis=0) - mean) < z * np.sqrt(variance / n)).all()
     low, high = variance_interval(n, n_cells)
     ratio = taps.var(axis=0, ddof=1) / variance
     assert ((low < ratio) & (ratio < high)).all()
@@ -251,14 +246,21 @@ def test_no_return_is_flagged_and_has_no_range():
 
 def test_validity_begins_at_the_stated_phase_noise():
     sensor = one_pixel(shot_noise=False, read_noise_e=1e-9, max_phase_std_rad=0.1, signal_e=1000, ambient_e=0)
+
     # the variance under the root is 2 σ_r²; at 0.1 rad the amplitude is √2 σ_r / (√2 · 0.1)
-    flags = chain.validity_flags(
-        np.array([0.999e-8, 1.001e-8]), np.array([500.0, 500.0]), np.array([True, True]), sensor
-    )
+    def flags_of(amplitude_e, camera):
+        yes, unit = np.array([[True]]), camera_unit(camera)
+        values = [np.array([[value]]) for value in amplitude_e]
+        return [
+            chain.validity_flags(np.ones((1, 1)), value, np.full((1, 1), 500.0), yes, ~yes, unit, camera).item()
+            for value in values
+        ]
+
+    flags = flags_of([0.999e-8, 1.001e-8], sensor)
     np.testing.assert_array_equal(flags, [int(Flag.NO_RETURN), 0])
     with_shot = sensor.with_(shot_noise=True, read_noise_e=30)
     threshold = math.sqrt(500 + 2 * 30**2) / (math.sqrt(2) * 0.1)
-    flags = chain.validity_flags(threshold * np.array([0.999, 1.001]), np.full(2, 500.0), np.full(2, True), with_shot)
+    flags = flags_of([0.999 * threshold, 1.001 * threshold], with_shot)
     np.testing.assert_array_equal(flags, [int(Flag.NO_RETURN), 0])
 
 
@@ -382,8 +384,3 @@ def test_images_that_no_light_can_make_are_refused_by_pixel():
     image.phasor[1, 2, 3] = np.nan
     with pytest.raises(UsageError, match="view 1, row 2, column 3: phasor and intensity must be finite"):
         capture(image, sensor, rng=np.random.default_rng(0))
-
-
-def test_each_noise_term_has_a_stream_of_its_own():
-    streams = NoiseStreams.from_rng(np.random.default_rng(1))
-    assert not np.isin(streams.shot.random(100), streams.read.random(100)).any()

@@ -194,12 +194,14 @@ def test_a_single_frame_without_amplitudes_is_matched_with_the_noise_law(bank):
     assert math.degrees(match.delta_rad) == pytest.approx(60)
 
 
-def test_good_fits_pass_the_test_at_about_its_false_alarm_rate(bank):
-    # on grid points the linearised χ² is exact up to the pixels at the threshold; N = 200, false-alarm rate 5 %:
-    # the 99.9 % interval of a binomial is 1 to 22 refusals
+def test_good_fits_pass_the_test_at_about_its_false_alarm_rate(tmp_path):
+    # on the points of a fine grid the linearised χ² is exact up to the pixels at the threshold; N = 200, false-alarm
+    # rate 5 %: the 99.9 % interval of a binomial is 1 to 22 refusals
     image = Renderer(build_mesh(catalog()["cone"]), SENSOR).render(np.full(200, 1.0), math.radians(30))
     frames = capture(image, SENSOR, rng=np.random.default_rng(8), n_frames=20)
-    matches = Matcher(bank, false_alarm=0.05).match(kalman_filter(frames))
+    plan = BankPlan(classes=("cone", "cylinder"), distance_m="0.98:1.02:0.01", delta_deg="20:40:1")
+    with build_bank(plan, tmp_path / "fine.h5") as fine:
+        matches = Matcher(fine, false_alarm=0.05).match(kalman_filter(frames))
     assert 1 <= np.sum(~matches.accepted) <= 22
 
 

@@ -1,0 +1,181 @@
+"""The read-out of the taps, in EMVA 1288's order: electrons arrive, wells fill, taps are read and converted.
+
+Shot noise → full well → read noise → gain, black level, converter → decoding (PHYSICS section 4). Each step is one
+function on a row of taps, in place; :func:`read_taps` runs them over frames. Electrons are per tap and phase image.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from phasemark.render.sensor import Sensor
+from phasemark.render.streams import Term, fill_normal, fill_uniform, uniform_pair
+
+EXACT_POISSON_BELOW = 500.0
+"""Mean in electrons below which counts are drawn from the Poisson distribution itself. Above it one normal of the same
+mean and variance stands in: its distribution function is off by 0.066 / √mean at most, 0.3 % here."""
+
+_INVERSION_BELOW = 10.0
+_SHOT, _READ = int(Term.SHOT), int(Term.READ)
+
+
+class ReadOut(NamedTuple):
+    """What a sensor does to the electrons of a tap, in the form the kernel wants."""
+
+    shot_noise: bool
+    full_well_e: float
+    read_noise_e: float
+    has_converter: bool
+    gain: float
+    black_level: float
+    top_code: float
+
+    @classmethod
+    def of(cls, sensor: Sensor) -> ReadOut:
+        """Take the fields of a sensor."""
+        return cls(
+            sensor.shot_noise,
+            math.inf if sensor.full_well_e is None else sensor.full_well_e,
+            sensor.read_noise_e,
+            sensor.adc_bits is not None,
+            sensor.gain,
+            sensor.black_level,
+            2.0 ** (sensor.adc_bits or 0) - 1,
+        )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def add_shot_noise(taps, uniform, normal, first_sample, frame, view, key):
+    """Turn mean electrons into arrived ones: Poisson, or above `EXACT_POISSON_BELOW` a normal of its mean and variance.
+
+    `taps`, `uniform` and `normal` are (2, n): taps a and b of n pixels, with one uniform number and its normal deviate.
+    """
+    for tap in range(2):
+        for i in range(taps.shape[1]):
+            mean = taps[tap, i]
+            if mean >= EXACT_POISSON_BELOW:
+                taps[tap, i] = mean + math.sqrt(mean) * normal[tap, i]
+            elif mean >= _INVERSION_BELOW:
+                sample = 2 * (first_sample + i) + tap
+                taps[tap, i] = _poisson_by_rejection(mean, sample, frame, view, key)
+            else:
+                taps[tap, i] = _poisson_by_inversion(mean, uniform[tap, i])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _poisson_by_inversion(mean, u):
+    """Return the Poisson count at the quantile u, by adding up probabilities from zero."""
+    count, term = 0, math.exp(-mean)
+    total = term
+    while u > total and term > 0.0:
+        count += 1
+        term *= mean / count
+        total += term
+    return float(count)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _poisson_by_rejection(mean, sample, frame, view, key):
+    """Return a Poisson count by transformed rejection (Hörmann 1993, PTRS), for means of 10 and more."""
+    b = 0.931 + 2.53 * math.sqrt(mean)
+    a = -0.059 + 0.02483 * b
+    inverse_alpha = 1.1239 + 1.1328 / (b - 3.4)
+    quick = 0.9277 - 3.6224 / (b - 2.0)
+    attempt = 0
+    while True:
+        attempt += 1
+        u, v = uniform_pair(sample, frame, view, _SHOT, attempt, key)
+        u -= 0.5
+        us = 0.5 - abs(u)
+        count = math.floor((2.0 * a / us + b) * u + mean + 0.43)
+        if us >= 0.07 and v <= quick:
+            return float(count)
+        if count < 0 or (us < 0.013 and v > us):
+            continue
+        log_probability = count * math.log(mean) - mean - math.lgamma(count + 1.0)
+        if math.log(v * inverse_alpha / (a / (us * us) + b)) <= log_probability:
+            return float(count)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def fill_well(taps, full_well_e, saturated):
+    """Clip taps (2, n) at the full well, and note the pixels where one reached it."""
+    for tap in range(2):
+        for i in range(taps.shape[1]):
+            saturated[i] |= taps[tap, i] >= full_well_e
+            taps[tap, i] = min(taps[tap, i], full_well_e)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def add_read_noise(taps, read_noise_e, normal):
+    """Add Gaussian noise of `read_noise_e` r.m.s. to taps (2, n)."""
+    for tap in range(2):
+        for i in range(taps.shape[1]):
+            taps[tap, i] += read_noise_e * normal[tap, i]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def convert(taps, gain, black_level, top_code, saturated):
+    """Turn electrons (2, n) into codes: gain and black level, whole codes, clipped to 0 … `top_code` (noted)."""
+    for tap in range(2):
+        for i in range(taps.shape[1]):
+            code = max(np.rint(taps[tap, i] * gain + black_level), 0.0)
+            saturated[i] |= code >= top_code
+            taps[tap, i] = min(code, top_code)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def decode(taps, gain, black_level):
+    """Turn codes (2, n) into the electrons they stand for with nominal gain and black level."""
+    for tap in range(2):
+        for i in range(taps.shape[1]):
+            taps[tap, i] = (taps[tap, i] - black_level) / gain
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def read_taps(means, start, stop, n_frames, first_view, first_frame, key, out, taps, saturated):
+    """Read frames start … stop of all views' frames, counted view by view.
+
+    Parameters
+    ----------
+    means : (views, 4, 2, pixels) float64
+        Mean electrons of every tap, of the views from the one that frame `start` belongs to.
+    start, stop, n_frames : int
+        Frame i is frame i % n_frames of view i // n_frames.
+    first_view, first_frame : int
+        Numbers of the first view and of each view's first frame in the counters of the random streams.
+    key : (2,) uint64
+    out : ReadOut
+    taps : (stop − start, 4, 2, pixels) float64
+        Filled with the electrons that the camera reports.
+    saturated : (stop − start, pixels) bool
+        Filled: whether a tap of the pixel reached its full well or the highest code.
+    """
+    n = means.shape[3]
+    words, chosen = np.empty((4, n), np.uint64), np.empty(2 * n, np.int32)
+    uniform, normal = np.empty((2, n)), np.empty((2, n))
+    for i in range(start, stop):
+        mean = means[i // n_frames - start // n_frames]
+        view, frame = first_view + i // n_frames, first_frame + i % n_frames
+        over = saturated[i - start]
+        over[:] = False
+        for phase in range(4):
+            row = taps[i - start, phase]
+            row[:] = mean[phase]
+            if out.shot_noise:
+                fill_uniform(phase * n, frame, view, _SHOT, key, words, uniform)
+                fill_normal(uniform.reshape(-1), chosen, normal.reshape(-1))
+                add_shot_noise(row, uniform, normal, phase * n, frame, view, key)
+            if out.full_well_e < math.inf:
+                fill_well(row, out.full_well_e, over)
+            if out.read_noise_e > 0.0:
+                fill_uniform(phase * n, frame, view, _READ, key, words, uniform)
+                fill_normal(uniform.reshape(-1), chosen, normal.reshape(-1))
+                add_read_noise(row, out.read_noise_e, normal)
+            if out.has_converter:
+                convert(row, out.gain, out.black_level, out.top_code, over)
+                decode(row, out.gain, out.black_level)

@@ -1,0 +1,130 @@
+"""Motion of the camera during the four phase images of a frame (PHYSICS sections 1 and 4)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from phasemark import UsageError
+from phasemark.render.background import Background
+from phasemark.render.phasor import PhasorImages
+from phasemark.render.renderer import Renderer
+from phasemark.render.sensor import Sensor
+from phasemark.render.taps import N_PHASES
+from phasemark.render.view import Views
+
+_SAME_LINE_RAD = 1e-9  # rounding of an angle, or of metres
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Constant velocities of a camera that drives on the level, in its own frame.
+
+    Parameters
+    ----------
+    forward_m_s : float
+        Along the optical axis's heading.
+    sideways_m_s : float
+        To the left.
+    yaw_rate_rad_s : float
+        Counter-clockwise.
+
+    Raises
+    ------
+    UsageError
+        A velocity is not finite.
+    """
+
+    forward_m_s: float = 0.0
+    sideways_m_s: float = 0.0
+    yaw_rate_rad_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("forward_m_s", "sideways_m_s", "yaw_rate_rad_s"):
+            value = getattr(self, name)
+            if not math.isfinite(value):
+                raise UsageError(f"'{name}' must be finite, got {value!r}")
+
+    def views_after(self, views: Views, time_s: float) -> Views:
+        """Return the views a time later (earlier, if negative).
+
+        In the camera's level frame of time 0 the lens then stands at p = ∫ Rz(ωt') (forward, sideways) dt', an arc, and
+        the axis at D (cos b, sin b). So (D', b') are the polar coordinates of Rz(−ωt) (D (cos b, sin b) − p); and the
+        heading δ − b of the optical axis in the landmark frame grows by ωt (PHYSICS section 1).
+
+        Raises
+        ------
+        UsageError
+            The lens would stand on the landmark's axis.
+        """
+        turn = self.yaw_rate_rad_s * time_s
+        along = time_s * np.sinc(turn / math.pi)  # ∫ cos ωt'
+        across = time_s * math.sin(turn / 2) * np.sinc(turn / (2 * math.pi))  # ∫ sin ωt'
+        x = views.distance_m * np.cos(views.bearing_rad) - (self.forward_m_s * along - self.sideways_m_s * across)
+        y = views.distance_m * np.sin(views.bearing_rad) - (self.forward_m_s * across + self.sideways_m_s * along)
+        bearing = np.arctan2(y, x) - turn
+        return Views.broadcast(
+            np.hypot(x, y), views.delta_rad - views.bearing_rad + bearing + turn, bearing, views.height_m
+        )
+
+
+def phase_image_times_s(sensor: Sensor) -> tuple[float, ...]:
+    """Return when the four phase images are taken, (i − 1.5)·T from mid-frame, seconds."""
+    return tuple((i - 1.5) * sensor.phase_image_interval_s for i in range(N_PHASES))
+
+
+def render_moving(
+    renderer: Renderer,
+    views: Views,
+    motion: Motion,
+    *,
+    background: Background | None = None,
+    workers: int = 1,
+) -> tuple[PhasorImages, PhasorImages, PhasorImages, PhasorImages]:
+    """Render what a moving camera sees during each of the four phase images of a frame.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        Its sensor times the phase images.
+    views : Views
+        The views at mid-frame: the truth that the frame is labelled with.
+    motion : Motion
+    background : Background, optional
+        Given as seen at mid-frame. A wall stands square to each view's own line of sight (PHYSICS section 3), so the
+        motion must keep that line: turning on the spot, or driving along it.
+    workers : int
+
+    Returns
+    -------
+    tuple of four PhasorImages
+        For :func:`~phasemark.render.capture`; n views each.
+
+    Raises
+    ------
+    UsageError
+        The motion leads into the landmark, or past a wall.
+    """
+    images = []
+    for time_s in phase_image_times_s(renderer.sensor):
+        moved = motion.views_after(views, time_s)
+        behind = None if background is None else _after_motion(background, views, moved, motion, time_s)
+        images.append(renderer.render_views(moved, background=behind, workers=workers))
+    first, second, third, fourth = images
+    return first, second, third, fourth
+
+
+def _after_motion(background: Background, views: Views, moved: Views, motion: Motion, time_s: float) -> Background:
+    """Return the background as the moved camera sees it."""
+    if background.wall_m is None or not len(views):
+        return background
+    swing = moved.bearing_rad + motion.yaw_rate_rad_s * time_s - views.bearing_rad
+    nearer = views.distance_m - moved.distance_m
+    if np.abs(np.sin(swing)).max() > _SAME_LINE_RAD or np.ptp(nearer) > _SAME_LINE_RAD:
+        raise UsageError(
+            "'wall_m' cannot be rendered for this motion: a wall stands square to the line of sight, which must not "
+            "swing; add the wall to the mesh instead"
+        )
+    return replace(background, wall_m=background.wall_m - float(nearer[0]))

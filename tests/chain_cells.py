@@ -1,0 +1,81 @@
+"""One-pixel cameras and scenes of given phasors, for the tests of the chain from light to frames."""
+
+import math
+
+import numpy as np
+from scipy import special
+
+from phasemark.render import PhasorImages, Sensor, Views
+
+FALSE_ALARM = 1e-3  # of a whole test, whatever the number of cells
+
+
+def one_pixel(**fields):
+    return Sensor(**{"rows": 1, "cols": 1, "half_angle_h_deg": 1, "half_angle_v_deg": 1, **fields})
+
+
+def images_of(phasor, intensity, sensor, harmonics=None):
+    """PhasorImages of given pixels, (n, rows, cols)."""
+    phasor = np.asarray(phasor, complex)
+    views = Views.broadcast(np.ones(len(phasor)))
+    return PhasorImages(
+        phasor, np.asarray(intensity, float), np.ones(phasor.shape), sensor, views, harmonics=harmonics or {}
+    )
+
+
+def pure_image(range_m, sensor, amplitude=1.0, intensity=None):
+    """PhasorImages (n, rows, cols) of unmixed pixels at given ranges, every harmonic that the sensor needs included."""
+    phase = np.asarray(range_m, float) / sensor.metres_per_radian
+    phase = np.broadcast_to(phase.reshape(-1, 1, 1), (phase.size, sensor.rows, sensor.cols))
+    light = np.full(phase.shape, amplitude if intensity is None else intensity, float)
+    harmonics = {k: amplitude * np.exp(1j * k * phase) for k in sensor.harmonic_orders}
+    return images_of(amplitude * np.exp(1j * phase), light, sensor, harmonics)
+
+
+def wrapped(difference_m, sensor):
+    period = sensor.unambiguous_range_m
+    return (difference_m + period / 2) % period - period / 2
+
+
+def noise_law_m(sensor, amplitude, intensity):
+    """The range noise law, written out a second time from PHYSICS section 4."""
+    code_e = 0 if sensor.adc_bits is None else 1 / sensor.gain
+    shot = sensor.signal_e * intensity + sensor.ambient_e + sensor.dark_e
+    root = math.sqrt(shot + 2 * sensor.read_noise_e**2 + code_e**2 / 6)
+    return 299_792_458 / (4 * math.pi * 10e6) * root / (math.sqrt(2) * sensor.contrast * sensor.signal_e * amplitude)
+
+
+def phase_density(psi, s):
+    """Exact density of the phase error of a phasor in Gaussian noise, PHYSICS section 4."""
+    root = math.sqrt(s) * np.cos(psi)
+    return (np.exp(-s) + math.sqrt(math.pi) * root * np.exp(root**2 - s) * (1 + special.erf(root))) / (2 * np.pi)
+
+
+def exact_over_law(phase_std_rad):
+    """Standard deviation of the exact phase density over that of the law, which is its limit of high signal."""
+    s = 1 / (2 * phase_std_rad**2)
+    psi = np.linspace(-1, 1, 20_001) * min(math.pi, 12 * phase_std_rad)
+    weight = phase_density(psi, s)
+    return math.sqrt((psi**2 * weight).sum() / weight.sum()) / phase_std_rad
+
+
+def noise_table():
+    """Return the cells of distance, albedo, ambient light, contrast, read noise and converter with a law of ≤ 0.3 m.
+
+    A code is 20 electrons, at most as much as the noise of a tap: quantisation is uniform.
+    """
+    cells = []
+    for distance_m in (0.8, 1.5, 3.0):
+        for albedo in (0.2, 0.8):
+            for ambient_e in (0.0, 20_000.0):
+                for contrast in (0.3, 0.5):
+                    for read_noise_e in (0.0, 60.0):
+                        for converter in ({}, {"adc_bits": 12, "gain": 0.05, "black_level": 100.0}):
+                            sensor = one_pixel(
+                                ambient_e=ambient_e, contrast=contrast, read_noise_e=read_noise_e, **converter
+                            )
+                            amplitude = albedo / distance_m**2
+                            law = noise_law_m(sensor, amplitude, amplitude)
+                            if law <= 0.3:
+                                cells.append((sensor, distance_m, amplitude, law))
+    return cells

@@ -1,0 +1,193 @@
+"""The fields of a sensor: ranges, contradictions, presets."""
+
+import math
+import tomllib
+from importlib import resources
+
+import numpy as np
+import pytest
+from chain_cells import FALSE_ALARM, pure_image
+from scipy import stats
+
+from phasemark import UsageError
+from phasemark.render import (
+    Background,
+    Flag,
+    Renderer,
+    ablate,
+    capture,
+    measured_range_std,
+    predicted_range_std,
+    preset,
+    preset_names,
+)
+
+PMD = preset("pmd-16x16")
+DIRECT = preset("vl53l5cx-8x8")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"prnu": 0.5}, "'prnu' must be less than or equal to 0.3, got 0.5"),
+        ({"adc_bits": 0}, "'adc_bits' must be greater than or equal to 1, got 0"),
+        ({"full_well_e": -1}, "'full_well_e' must be greater than 0, got -1"),
+        ({"unit_seed": -1}, "'unit_seed' must be greater than or equal to 0, got -1"),
+        ({"range_offset_m": math.nan}, "'range_offset_m' must be a finite number, got nan"),
+        ({"modulation": "triangle"}, "'modulation' must be 'sine', 'square', 'harmonics' or 'pulse', got 'triangle'"),
+        ({"blur_share": 1.0}, "'blur_share' must be less than 1, got 1.0"),
+        ({"black_levle": 3}, "unknown key 'black_levle'"),
+        ({"modulation": "square", "contrast": 0.82}, "'contrast' must be at most 0.8106 with 'modulation' = 'square'"),
+        (
+            {"modulation": "harmonics", "harmonics": ((3, 1.0, 0.0),), "contrast": 0.51},
+            "'contrast' must be at most 0.5 with 'modulation' = 'harmonics'",
+        ),
+        ({"harmonics": ((3, 0.1, 0.0),)}, "'harmonics' must be left out unless 'modulation' = 'harmonics'"),
+        ({"modulation": "harmonics"}, "'harmonics' must be given for 'modulation' = 'harmonics'"),
+        ({"modulation": "harmonics", "harmonics": ((3, 0.1, 0), (3, 0.1, 0))}, "must name each order once"),
+        (
+            {"modulation": "pulse", "emitted_pulse": (1,) * 8, "reference_pulse": (1,) * 9},
+            "must have the same number of samples, at least 8, got 8 and 9",
+        ),
+        (
+            {"modulation": "pulse", "emitted_pulse": (1,) * 8, "reference_pulse": (1, 0) * 4},
+            "must have a first harmonic in both",
+        ),
+        (
+            {"full_well_e": 30_000, "min_amplitude_e": 20_000},
+            "'min_amplitude_e' must be below 20000, .* saturates at 30000",
+        ),
+        ({"full_well_e": 100.0}, "'max_phase_std_rad' must be above 0.1225, .* not saturate at 100 e-"),
+        ({"full_well_e": 10_000, "ambient_e": 20_000}, "'full_well_e' leaves no room for light: .* 10000 e-"),
+        ({"adc_bits": 8, "gain": 0.1, "ambient_e": 20_000}, "'gain' leaves no room for light"),
+        ({"gain": 0.2}, "'gain' must be left out without a converter \\('adc_bits'\\), got 0.2"),
+        ({"black_level": 9.0}, "'black_level' must be left out without a converter"),
+        (
+            {"adc_bits": 8, "black_level": 255.0},
+            "'black_level' must be below the converter's highest code, 255, got 255",
+        ),
+        ({"dark_e": 12, "dsnu_e": 2.1}, "'dsnu_e' must be at most dark_e / 6 = 2: .*, got 2.1"),
+        (
+            {"phase_interval_s": 0.1},
+            "'phase_interval_s' must be at most 1 / \\(4 · frame_rate_hz\\) = 0.0833333, got 0.1",
+        ),
+        ({"blur_share": 0.6, "veil_share": 0.4}, "'blur_share' \\+ 'veil_share' must be below 1, got 0.6 \\+ 0.4"),
+        ({"dead_share": 0.6, "hot_share": 0.4}, "'dead_share' \\+ 'hot_share' must be below 1"),
+        ({"dead_pixels": ((16, 0),)}, "'dead_pixels' must lie in the image of 16 × 16 pixels, got \\(16, 0\\)"),
+        ({"dead_pixels": ((1, 2),), "hot_pixels": ((1, 2),)}, "must not share a pixel, got \\(1, 2\\) in both"),
+        ({"wrap_guard_m": 7.5}, "'wrap_guard_m' must be below c / 4f = 7.495, got 7.5"),
+        ({"principal_point_px": (90, 3)}, "'principal_point_px' must lie within .*, got \\(90.0, 3.0\\)"),
+        ({"max_range_m": 4.0}, "'max_range_m' must be left out for 'kind' = 'phase', got 4.0"),
+    ],
+)
+def test_a_field_that_cannot_be_is_refused_in_one_line(changes, message):
+    with pytest.raises(UsageError, match=message) as caught:
+        PMD.with_(**changes)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("change", [{"modulation": "square"}, {"prnu": 0.01}, {"veil_share": 0.1}, {"contrast": 0.4}])
+def test_a_direct_sensor_refuses_taps_harmonics_and_phasors(change):
+    (name,) = change
+    with pytest.raises(UsageError, match=f"'{name}' must be left out .*: a direct sensor has no taps, harmonics"):
+        DIRECT.with_(**change)
+    with pytest.raises(UsageError, match="'modulation_hz' must be at most 10000 for 'kind' = 'direct'"):
+        DIRECT.with_(modulation_hz=1e7)
+
+
+def test_every_term_is_neutral_by_default():
+    # with shot noise off a bare sensor is the ideal one
+    bare = type(PMD)(rows=16, cols=16, half_angle_h_deg=11, half_angle_v_deg=11, shot_noise=False)
+    assert bare == preset("ideal")
+    image = pure_image([1.0, 7.0], bare, 0.5)
+    frames = capture(image, bare, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(frames.range_m[:, 0], image.range_m, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [name for name in preset_names() if name != "ideal"])
+def test_every_number_of_a_preset_says_where_it_comes_from(name):
+    text = resources.files("phasemark.render").joinpath(f"{name}.toml").read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+    assert len(lines) == len(tomllib.loads(text))
+    for line in lines:
+        source = line.split("#")[1].strip()
+        assert source.split()[0].rstrip(":,;") in {"published", "measured", "assumed", "follows", "one", "none"}, line
+
+
+def test_the_noise_law_counts_quantisation_once():
+    sensor = PMD.with_(adc_bits=12, gain=0.05, black_level=10.0)
+    bare = predicted_range_std(0.5, 0.5, PMD) ** 2
+    ratio = predicted_range_std(0.5, 0.5, sensor) ** 2 / bare
+    assert ratio == pytest.approx(1 + 20**2 / 6 / (35_571 * 0.5), rel=1e-12)
+    both = measured_range_std(0.25 * 35_571, 0.5 * 35_571, sensor)
+    assert both == pytest.approx(predicted_range_std(0.5, 0.5, sensor), rel=1e-12)
+
+
+# Direct time of flight
+
+
+def test_a_direct_sensor_reports_z_and_a_wall_has_one():
+    exact = DIRECT.with_(range_std_m=0.0)
+    image = Renderer(None, exact).render(1.0, background=Background(wall_m=2.0))
+    frames = capture(image, exact, rng=np.random.default_rng(0))
+    assert exact.quantity == "z"
+    # the footprint's mean range over the range of its centre: half the variance of its angles, 4e-4 of 2 m at most
+    np.testing.assert_allclose(frames.z_m, 2.0, rtol=0, atol=2e-3)
+    assert np.ptp(frames.range_m) > 0.2
+    assert frames.amplitude_e is None
+    assert frames.taps_e is None
+
+
+def test_a_direct_sensor_does_not_mix_phasors():
+    phase = np.array([3.0, 6.0]) / DIRECT.metres_per_radian
+    weight = np.array([0.5 / 9, 0.5 / 36])
+    image = pure_image(1.0, DIRECT)
+    image.phasor[:] = (weight * np.exp(1j * phase)).sum()
+    image.intensity[:] = weight.sum()
+    exact = DIRECT.with_(range_std_m=0.0, max_range_m=None)
+    frames = capture(image, exact, rng=np.random.default_rng(0))
+    mean = (weight * [3.0, 6.0]).sum() / weight.sum()
+    np.testing.assert_allclose(frames.range_m, mean, rtol=1e-7)  # φ² / 6 of it, and rounding of small angles
+
+
+def test_a_direct_sensor_drops_out_beyond_its_range_and_below_its_light():
+    sensor = DIRECT.with_(min_intensity=0.1, dead_pixels=((0, 0),))
+    image = pure_image([3.9, 4.1, 3.9], sensor, 0.2)
+    image.intensity[2] = 0.05
+    frames = capture(image, sensor, rng=np.random.default_rng(0), n_frames=2)
+    assert (frames.flags[:, :, 0, 0] == Flag.DEAD | Flag.MISSING).all()
+    assert [set(frames.flags[i, :, 1:].ravel().tolist()) for i in range(3)] == [{0}, {1}, {1}]
+
+
+def test_a_direct_sensor_has_the_spread_it_states():
+    image = pure_image(2.0, DIRECT, 0.5)
+    n = 2000
+    frames = capture(image, DIRECT, rng=np.random.default_rng(0), n_frames=n)
+    z = stats.norm.ppf(1 - FALSE_ALARM / 2)
+    assert np.std(frames.range_m) == pytest.approx(0.004, rel=z / math.sqrt(2 * 64 * n))
+    assert predicted_range_std(0.5, 0.5, DIRECT) == pytest.approx(0.004)
+
+
+def test_a_direct_sensor_has_no_taps_to_keep():
+    image = pure_image(2.0, DIRECT, 0.5)
+    with pytest.raises(UsageError, match="'keep_taps' must be left out for a direct sensor"):
+        capture(image, DIRECT, rng=np.random.default_rng(0), keep_taps=True)
+    with pytest.raises(UsageError, match="motion during phase images must be left out"):
+        capture([image] * 4, DIRECT, rng=np.random.default_rng(0))
+
+
+# Ablation
+
+
+def test_the_variants_of_a_frame_add_one_error_after_another():
+    sensor = preset("pmd-16x16-wiggle")
+    hard, mixed = pure_image(1.0, sensor, 0.8), pure_image(1.1, sensor, 0.8)
+    variants = ablate(hard, mixed, sensor, rng=np.random.default_rng(3), n_frames=50)
+    np.testing.assert_allclose(variants.hard.range_m, 1.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(variants.mixed.range_m, 1.1, rtol=0, atol=1e-12)
+    z = stats.norm.ppf(1 - FALSE_ALARM / 2)
+    law = predicted_range_std(0.8, 0.8, PMD)
+    assert np.std(variants.shot.range_m) == pytest.approx(law, rel=z / math.sqrt(2 * 256 * 50))
+    # fixed patterns stay when noise is averaged: 0.02 rad are 5 cm
+    seen = variants.full.valid.all(axis=1)
+    assert np.std(variants.full.range_m.mean(axis=1)[seen]) > 0.03
