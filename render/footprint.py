@@ -181,7 +181,7 @@ def _has_limb(entry, link, owner, limb):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def sample_pixel(  # type: ignore[no-untyped-def]
-    r, c, bent, width, height, segments, limb, head, link, owner, scratch, points, weights, regions, n, region
+    r, c, bent, width, height, splits, segments, limb, head, link, owner, scratch, points, weights, regions, n, region
 ):
     """Place the samples of one pixel.
 
@@ -193,6 +193,8 @@ def sample_pixel(  # type: ignore[no-untyped-def]
         Whether the pixel may see the inside of a curved surface, which takes more points than a flat one.
     width, height : float
         Fill factor.
+    splits : int
+        Boxes a side that the active area is cut into before anything else.
     segments, limb, head, link, owner
         As :func:`project_edges` and :func:`bin_segments` left them.
     scratch : Scratch
@@ -216,16 +218,19 @@ def sample_pixel(  # type: ignore[no-untyped-def]
     upright = _has_limb(head[i - 1, j], link, owner, limb) or _has_limb(head[i + 1, j], link, owner, limb)
     if head[i, j] < 0 and not sideways and not upright:
         count = 3 if bent else 2
-        if n + count * count > len(weights):
+        if n + (splits * count) ** 2 > len(weights):
             return -1, region, True
-        for a in range(count):
-            for b in range(count):
-                points[n, 0] = u0 + width * (_G3X[b] if bent else _G2X[b])
-                points[n, 1] = v0 + height * (_G3X[a] if bent else _G2X[a])
-                weights[n] = _G3W[a] * _G3W[b] if bent else 0.25
-                regions[n] = region
-                n += 1
-        return n, region + 1, True
+        for box in range(splits * splits):
+            row, col = divmod(box, splits)
+            for a in range(count):
+                for b in range(count):
+                    points[n, 0] = u0 + width / splits * (col + (_G3X[b] if bent else _G2X[b]))
+                    points[n, 1] = v0 + height / splits * (row + (_G3X[a] if bent else _G2X[a]))
+                    weights[n] = (_G3W[a] * _G3W[b] if bent else 0.25) / (splits * splits)
+                    regions[n] = region
+                    n += 1
+            region += 1
+        return n, region, True
     # sweep along the limb if there is one, else along where one is near, else along most of the edges
     crease_u, crease_v, limb_u, limb_v = 0.0, 0.0, 0.0, 0.0
     entry = head[i, j]
@@ -254,10 +259,18 @@ def sample_pixel(  # type: ignore[no-untyped-def]
         for near in (head[i, j], before, after):
             _collect_limbs(near, link, owner, segments, limb, sweep_v, scratch.limbs, scratch.n_limbs)
     stack = scratch.boxes
-    stack[0] = (u0, v0, u0 + width, v0 + height, 0.0)
-    depth = 1
-    trusted = True
-    while depth > 0:
+    box, depth, trusted = 0, 0, True
+    while depth > 0 or box < splits * splits:
+        if depth == 0:
+            row, col = divmod(box, splits)
+            stack[0] = (
+                u0 + width * col / splits,
+                v0 + height * row / splits,
+                u0 + width * (col + 1) / splits,
+                v0 + height * (row + 1) / splits,
+                0.0,
+            )
+            box, depth = box + 1, 1
         depth -= 1
         bu0, bv0, bu1, bv1, level = stack[depth]
         m = _clip_to_box(head[i, j], link, owner, segments, limb, bu0, bv0, bu1, bv1, sweep_v, scratch)

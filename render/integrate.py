@@ -29,7 +29,7 @@ UNTRUSTED = 2
 
 @njit(cache=True, nogil=True)
 def plan_rays(  # type: ignore[no-untyped-def]
-    first, mesh, lens, matrix, offset, bearing, camera, level, row_range, background,
+    first, mesh, lens, matrix, offset, bearing, camera, level, row_range, splits, background,
     segments, limb, head, link, owner, scratch, points, weights, regions, pixel, state,
 ):  # fmt: skip
     """Place the samples of as many views as fit into the buffers, from view `first` on.
@@ -46,6 +46,8 @@ def plan_rays(  # type: ignore[no-untyped-def]
         Tilted to level camera frame.
     row_range : (2,) int64
         First and last-but-one image row to render.
+    splits : int
+        Boxes a side that every pixel is cut into.
     background : (4,) float64
     segments, limb, head, link, owner, scratch
         Scratch, see :func:`project_edges`, :func:`bin_segments` and :func:`sample_pixel`.
@@ -94,7 +96,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
                 before = n
                 bent = c < bent_high_u and c + 1 > bent_low_u and r < bent_high_v and r + 1 > bent_low_v
                 n, region, trusted = sample_pixel(
-                    r, c, bent, camera[6], camera[7], segments, limb, head, link, owner, scratch,
+                    r, c, bent, camera[6], camera[7], splits, segments, limb, head, link, owner, scratch,
                     points, weights, regions, n, region,
                 )  # fmt: skip
                 if n < 0:
