@@ -35,7 +35,7 @@ class MeshTopology(NamedTuple):
     faces : (f, 3) int32
     planes : (f, 4) float64
         Unit normal and offset of each face: n · p = offset on it.
-    corner_shares : (f, 2, 4) float64
+    corner_shares : (f, 2, 4) float32
         The barycentric coordinates of a point on a face that belong to its second and third corner: the products of
         the rows with (x, y, z, 1).
     corner_normals : (f, 3, 3) float32
@@ -71,7 +71,7 @@ class MeshTopology(NamedTuple):
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
     planes: NDArray[np.float64]
-    corner_shares: NDArray[np.float64]
+    corner_shares: NDArray[np.float32]
     corner_normals: NDArray[np.float32]
     flat: NDArray[np.bool_]
     plain: NDArray[np.bool_]
@@ -157,7 +157,7 @@ class MeshTopology(NamedTuple):
             vertices=np.zeros((0, 3)),
             faces=np.zeros((0, 3), np.int32),
             planes=np.zeros((0, 4)),
-            corner_shares=np.zeros((0, 2, 4)),
+            corner_shares=np.zeros((0, 2, 4), np.float32),
             corner_normals=np.zeros((0, 3, 3), np.float32),
             flat=np.zeros(0, np.bool_),
             plain=np.zeros(0, np.bool_),
@@ -267,7 +267,7 @@ def _components(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int32]:
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
 
 
-def _corner_shares(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def _corner_shares(corners: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return ``corner_shares`` of faces, given their corners (f, 3, 3)."""
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     d11, d12, d22 = (np.einsum("ij,ij->i", x, y) for x, y in ((first, first), (first, second), (second, second)))
@@ -280,7 +280,7 @@ def _corner_shares(corners: NDArray[np.float64]) -> NDArray[np.float64]:
         axis=1,
     )
     constant = -np.einsum("fkx,fx->fk", gradient, corners[:, 0])
-    return np.ascontiguousarray(np.concatenate([gradient, constant[..., None]], axis=2))
+    return np.ascontiguousarray(np.concatenate([gradient, constant[..., None]], axis=2), dtype=np.float32)
 
 
 def _corner_normals(

@@ -33,6 +33,8 @@ _THIN = 0.15
 """Intervals narrower than this (pixels) get one Gauss point."""
 _WIDE = 0.3
 """Intervals wider than this (pixels) get three Gauss points on a curved surface, the others two."""
+_BESIDE_LIMB = (0.1, 0.6)
+"""Intervals beside a limb get two Gauss points, or three, or four where they are wider than this (pixels)."""
 _NARROW = 0.04
 """Strips narrower than this (pixels) get one line."""
 _TRIFLE = 4e-5
@@ -742,15 +744,16 @@ def _place(a, b, left, right, bent, points, weights):  # type: ignore[no-untyped
     """
     near_left, near_right = a - left < _FELT, right - b < _FELT
     middle, half = 0.0, 0.0
+    count = 2 + (b - a > _BESIDE_LIMB[0]) + (b - a > _BESIDE_LIMB[1])
     if near_left and near_right:
         middle, half = 0.5 * (left + right), 0.5 * (right - left)
         t0 = math.asin(min(max((a - middle) / half, -1.0), 1.0))
         t1 = math.asin(max(min((b - middle) / half, 1.0), -1.0))
         count = 5
     elif near_left:
-        t0, t1, count = math.sqrt(max(a - left, 0.0)), math.sqrt(max(b - left, 0.0)), 4
+        t0, t1 = math.sqrt(max(a - left, 0.0)), math.sqrt(max(b - left, 0.0))
     elif near_right:
-        t0, t1, count = math.sqrt(max(right - a, 0.0)), math.sqrt(max(right - b, 0.0)), 4
+        t0, t1 = math.sqrt(max(right - a, 0.0)), math.sqrt(max(right - b, 0.0))
     else:
         count = 1 if b - a < _THIN else (3 if bent and b - a > _WIDE else 2)
         t0, t1 = a, b
