@@ -72,6 +72,7 @@ _SensorOption = Annotated[
 ]
 _Wall = Annotated[float | None, typer.Option("--wall", metavar="M", help="Distance of a wall behind the landmark.")]
 _Floor = Annotated[float | None, typer.Option("--floor", metavar="M", help="How far a floor lies below the lens.")]
+_Seed = Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")]
 _Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; the result does not depend on it.")]
 
 
@@ -139,6 +140,37 @@ def _sensor_show(
         for name in names:
             value = fields[name]
             typer.echo(f"# {name} is not set" if value is None else f"{name} = {json.dumps(value)}")
+
+
+@_sensor_app.command("characterise")
+def _sensor_characterise(
+    name_or_file: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, its pictures and numbers.")],
+    n_frames: Annotated[
+        int | None, typer.Option("--frames", min=2, help="Frames at each point; by default 51200 readings a point.")
+    ] = None,
+    seed: _Seed = 2005,
+    as_json: _Json = False,
+    force: _Force = False,
+) -> None:
+    """Measure a sensor before flat fields, as EMVA 1288 would, and compare it with what its numbers predict."""
+    from phasemark.data import summary_sentences, write_characterisation
+    from phasemark.data.characterisation import NAMES
+    from phasemark.data.seeds import stream
+    from phasemark.render import characterise
+
+    sensor = _load_sensor(name_or_file)
+    _refuse_existing([out / name for name in NAMES], force)
+    _make_folder(out)
+    found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
+    report = write_characterisation(found, name_or_file, out, seed=seed, force=force)[0]
+    if as_json:
+        facts = found.as_dict()
+        _echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
+        return
+    for sentence in (*summary_sentences(found, name_or_file), *found.notes):
+        typer.echo(sentence)
+    typer.echo(report)
 
 
 @_landmark_app.command("list")
@@ -455,7 +487,7 @@ def _demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, the tables and the bank.")] = Path(
         "out/demo"
     ),
-    seed: Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")] = 2005,
+    seed: _Seed = 2005,
     workers: _Workers = None,
     as_json: _Json = False,
     force: _Force = False,

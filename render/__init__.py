@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from phasemark.render.ablation import Ablation, ablate
 from phasemark.render.background import Background
 from phasemark.render.capture import capture, capture_moving
+from phasemark.render.characterise import Characterisation, Comparison, Quantity, characterise
 from phasemark.render.correlation import Harmonic, pulse_harmonics, square_harmonics
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.motion import Motion, render_moving
@@ -24,12 +25,15 @@ __all__ = [
     "Ablation",
     "Background",
     "CameraUnit",
+    "Characterisation",
+    "Comparison",
     "Flag",
     "Frames",
     "Harmonic",
     "Motion",
     "PhasorImages",
     "PlanarLandmark",
+    "Quantity",
     "Renderer",
     "Sensor",
     "Views",
@@ -37,6 +41,7 @@ __all__ = [
     "camera_unit",
     "capture",
     "capture_moving",
+    "characterise",
     "measured_range_std",
     "phasor_to_range_m",
     "planar_images",

@@ -42,6 +42,11 @@ _FLAGS_BEGIN = 0.01  # share of the frames
 _Float = NDArray[np.float64]
 
 
+def _plain(value: float) -> float | None:
+    """Return None for a number that JSON does not have."""
+    return value if math.isfinite(value) else None
+
+
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Simulated points beside predicted ones.
@@ -155,10 +160,10 @@ class Quantity:
         half = Z95 * self.std_error
         return {
             "title": self.title,
-            "predicted": self.predicted,
-            "simulated": self.simulated,
-            "low95": self.simulated - half,
-            "high95": self.simulated + half,
+            "predicted": _plain(self.predicted),
+            "simulated": _plain(self.simulated),
+            "low95": _plain(self.simulated - half),
+            "high95": _plain(self.simulated + half),
             "samples": self.samples,
         }
 
@@ -241,8 +246,7 @@ class Characterisation:
             "quantities": {one.name: one.as_dict() for one in self.quantities},
             "comparisons": [one.as_dict() for one in self.comparisons],
             "maps": {
-                name: [[float(v) if math.isfinite(v) else None for v in row] for row in values]
-                for name, values in self.maps.items()
+                name: [[_plain(float(value)) for value in row] for row in values] for name, values in self.maps.items()
             },
             "defects": {name: np.argwhere(mask).tolist() for name, mask in self.defects.items()},
             "notes": list(self.notes),
@@ -403,7 +407,9 @@ def _photon_transfer(bench: _Bench) -> _Part:
         )  # fmt: skip
         # the root of a variance that is compatible with 0 has the error of √(its error)
         noise = math.sqrt(max(offset, 0.0)) / per_e
-        noise_error = min(offset_error / (2 * noise * per_e**2) if noise > 0 else math.inf, math.sqrt(offset_error) / per_e)
+        noise_error = min(
+            offset_error / (2 * noise * per_e**2) if noise > 0 else math.inf, math.sqrt(offset_error) / per_e
+        )
         quantities.append(
             Quantity("dark_noise_e", "noise floor of a tap, read noise and quantisation (e-)", math.sqrt(floor), noise,
                      noise_error, used_samples)
@@ -432,7 +438,9 @@ def _range_noise(bench: _Bench, albedo: float) -> _Part:
     good = law <= _LARGEST_PHASE_STD_RAD * sensor.metres_per_radian
     clear = good & [one.clear_of_limits for one in curve]
     if not clear.any():
-        return _Part(notes=(f"Range noise on albedo {albedo:g} has no distance where nothing clips and the law holds.",))
+        return _Part(
+            notes=(f"Range noise on albedo {albedo:g} has no distance where nothing clips and the law holds.",)
+        )
     places = np.unique(np.linspace(0, clear.sum() - 1, 14).round().astype(int))
     distances = line[clear][places]
     predicted, found, errors = [], [], []
@@ -592,7 +600,7 @@ def _saturation(bench: _Bench) -> _Part:
     quantities = []
     for name, words, at in (("begin", "1 % of frames are", _FLAGS_BEGIN), ("half", "half of the frames are", 0.5)):
         true_signal = _crossing(predicted_share, at, 0.0, top)
-        signal, signal_error = _interpolated(signals, share, error, at)
+        signal, signal_error = _found_beside(points, at, true_signal)
         quantities.append(
             Quantity(f"saturation_flags_{name}_e", f"signal at which {words} flagged as saturated (e-)",
                      true_signal, signal, signal_error, bench.samples * len(signals))
@@ -609,6 +617,15 @@ def _crossing(function: Callable[[float], float], level: float, low: float, high
         else:
             high = middle
     return 0.5 * (low + high)
+
+
+def _found_beside(points: Comparison, level: float, true_x: float) -> tuple[float, float]:
+    """Return where the simulated share crosses a level, and its standard error.
+
+    The predicted points, interpolated alike, miss the true place by what the interpolation is wrong: subtracted.
+    """
+    found, error = _interpolated(points.x, points.simulated, points.std_error, level)
+    return found + true_x - _interpolated(points.x, points.predicted, points.std_error, level)[0], error
 
 
 def _interpolated(x: _Float, share: _Float, error: _Float, level: float) -> tuple[float, float]:
@@ -656,13 +673,12 @@ def _threshold(bench: _Bench, albedo: float) -> _Part:
         shares.append(lost.mean())
         predicted.append(probability)
         errors.append(math.sqrt(max(probability * (1 - probability), 0.0) / bench.samples))
-    error, share = np.array(errors), np.array(shares)
-    found, found_error = _interpolated(distances, share, error, 0.5)
     points = Comparison(
         "threshold", f"albedo {albedo:g}", "distance_m", "no_return_share",
-        distances, np.array(predicted), share, error, np.full(len(distances), bench.samples),
+        distances, np.array(predicted), np.array(shares), np.array(errors), np.full(len(distances), bench.samples),
         np.zeros(len(distances), np.bool_), distances, np.array(predicted),
     )  # fmt: skip
+    found, found_error = _found_beside(points, 0.5, middle)
     return _Part((points,), (Quantity(name, title, middle, found, found_error, bench.samples * len(distances)),))
 
 
@@ -730,12 +746,8 @@ def _dropout(bench: _Bench, albedo: float) -> _Part:
         return _Part(notes=(f"Albedo {albedo:g} never drops out.",))
     distances = edge * (1 + np.array([-0.02, -0.01, -1e-3, 1e-3, 0.01, 0.02]))
     share = np.array(
-        [
-            (bench.frames(d, albedo / d**2).flags[0] & int(Flag.NO_RETURN) > 0)[:, bench.alive].mean()
-            for d in distances
-        ]
+        [(bench.frames(d, albedo / d**2).flags[0] & int(Flag.NO_RETURN) > 0)[:, bench.alive].mean() for d in distances]
     )
-    found, found_error = _interpolated(distances, share, np.zeros(len(distances)), 0.5)
     expected = (distances > edge).astype(np.float64)
     points = Comparison(
         "threshold", f"albedo {albedo:g}", "distance_m", "no_return_share",
@@ -743,7 +755,7 @@ def _dropout(bench: _Bench, albedo: float) -> _Part:
         np.zeros(len(distances), np.bool_), np.array([distances[0], edge, edge, distances[-1]]),
         np.array([0.0, 0.0, 1.0, 1.0]),
     )  # fmt: skip
+    found, found_error = _found_beside(points, 0.5, edge)
     name = f"threshold_distance_albedo_{albedo:g}_m"
     title = f"distance at which it drops out, albedo {albedo:g} (m)"
     return _Part((points,), (Quantity(name, title, edge, found, found_error, bench.samples * len(distances)),))
-
