@@ -19,12 +19,12 @@ NAMES = (REPORT, "characterisation.json", "points.csv", *(f"{name}.png" for name
 """What :func:`write_characterisation` may write; a sensor that lacks a figure lacks its picture."""
 
 _CAPTIONS = {
-    "photon_transfer": "Variance of the taps over time against their mean, steady light of rising strength. The slope is"
-    " the gain, the floor is read noise and quantisation, and where taps saturate the variance collapses.",
-    "range_noise": "Standard deviation of the range in one frame, of surfaces that face the camera. The curve is the noise"
-    " law of this very camera, its patterns and the exact density of the phase included; dotted, the law alone.",
-    "linearity": "Error of the mean range along a delay line that keeps the light constant. The curve is worked out from"
-    " the correlation curve, sampled in time; beyond c / 2f the range wraps and the errors repeat.",
+    "photon_transfer": "Variance of the taps over time against their mean, steady light of rising strength. The slope"
+    " is the gain, the floor is read noise and quantisation, and where taps saturate the variance collapses.",
+    "range_noise": "Standard deviation of the range in one frame, of surfaces that face the camera. The curve is the"
+    " noise law of this very camera, its patterns and the exact density of the phase included; dotted, the law alone.",
+    "linearity": "Error of the mean range along a delay line that keeps the light constant. The curve is worked out"
+    " from the correlation curve, sampled in time; beyond c / 2f the range wraps and the errors repeat.",
     "fixed_pattern": "What stays from frame to frame: each pixel's range offset, its sensitivity, its dark signal.",
     "saturation": "Share of frames in which a pixel is flagged, against the signal.",
     "threshold": "Share of frames in which a pixel shows no return, against distance.",
@@ -81,10 +81,10 @@ def summary_sentences(found: Characterisation, name: str) -> list[str]:
 def _noise_sentence(found: Characterisation, name: str) -> str:
     sensor, where, albedo = found.sensor, found.reference_range_m, ALBEDOS[-1]
     std = float(predicted_range_std(albedo / where**2, albedo / where**2, sensor))
-    noise = f"{name} measures a white surface (albedo {albedo:g}) {where:g} m away with {_length(std)} of noise in one frame"
+    noise = f"{name} measures a surface of albedo {albedo:g} at {where:g} m with {_length(std)} of noise in one frame"
     ends = []
     if begin := found.quantity("saturation_flags_begin_e"):
-        ends.append(f"saturates from {begin.simulated:.3g} electrons of signal on (predicted {begin.predicted:.3g})")
+        ends.append(f"saturates from {begin.simulated:.0f} electrons of signal on (predicted {begin.predicted:.0f})")
     if lost := found.quantity(f"threshold_distance_albedo_{albedo:g}_m"):
         ends.append(f"loses it at {lost.simulated:.2f} m (predicted {lost.predicted:.2f} m)")
     return f"{noise}{''.join(f', {end}' for end in ends)}."

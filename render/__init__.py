@@ -7,6 +7,7 @@ from phasemark.render.background import Background
 from phasemark.render.capture import capture, capture_moving
 from phasemark.render.characterise import Characterisation, Comparison, Quantity, characterise
 from phasemark.render.correlation import Harmonic, pulse_harmonics, square_harmonics
+from phasemark.render.fit import Estimate, SensorFit, fit_sensor
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.motion import Motion, render_moving
 from phasemark.render.noise import measured_range_std, predicted_range_std
@@ -27,6 +28,7 @@ __all__ = [
     "CameraUnit",
     "Characterisation",
     "Comparison",
+    "Estimate",
     "Flag",
     "Frames",
     "Harmonic",
@@ -36,12 +38,14 @@ __all__ = [
     "Quantity",
     "Renderer",
     "Sensor",
+    "SensorFit",
     "Views",
     "ablate",
     "camera_unit",
     "capture",
     "capture_moving",
     "characterise",
+    "fit_sensor",
     "measured_range_std",
     "phasor_to_range_m",
     "planar_images",

@@ -36,6 +36,7 @@ _FEWEST_FRAMES = 8
 _NEAREST_M, _FURTHEST_M = 0.2, 100.0
 _LARGEST_PHASE_STD_RAD = 0.15  # beyond, counts of electrons are so few that no Gaussian density is exact
 _LINEARITY_SPAN = 1.5  # unambiguous ranges
+_LINEARITY_POINTS = 53  # prime: every period of an error is met at other phases
 _EMVA_LINEAR_SHARE = 0.7  # of saturation: EMVA 1288's range for the photon-transfer fit
 _FLAGS_BEGIN = 0.01  # share of the frames
 
@@ -474,7 +475,7 @@ def _linearity(bench: _Bench) -> _Part:
 
     line = np.linspace(0.0, span, 721)
     curve = np.array([error_curve(d)[0] for d in line])
-    ranges = span * (np.arange(48) + 0.5) / 48
+    ranges = span * (np.arange(_LINEARITY_POINTS) + 0.5) / _LINEARITY_POINTS
     predicted, found, errors, clear = [], [], [], []
     for range_m in ranges:
         mean, expected = error_curve(range_m)
@@ -504,7 +505,7 @@ def _linearity(bench: _Bench) -> _Part:
 
 
 def _patterns(bench: _Bench) -> _Part:
-    """What stays from frame to frame: range offsets, sensitivity and dark signal of every pixel."""
+    """Measure what stays from frame to frame: range offset, sensitivity and dark signal of every pixel."""
     sensor, amplitude, n = bench.open, bench.safe_amplitude, bench.n_frames
     where = bench.reference_range_m
     expected = expected_flat_field(sensor, where, amplitude)
@@ -701,8 +702,8 @@ def _return_probability(expected: ExpectedFlatField) -> _Float:
 
 def _direct_parts(bench: _Bench) -> list[_Part]:
     note = (
-        "It is a direct time-of-flight sensor: photon transfer, saturation, wiggling and amplitude thresholds belong to "
-        "taps and phases, which it does not have."
+        "It is a direct time-of-flight sensor: photon transfer, saturation, wiggling and amplitude thresholds belong "
+        "to taps and phases, which it does not have."
     )
     return [_direct_range(bench), *(_dropout(bench, albedo) for albedo in ALBEDOS), _Part(notes=(note,))]
 

@@ -69,7 +69,7 @@ def characterisation_figures(found: Characterisation) -> dict[str, Figure]:
 
 def _curve_figure(name: str, series: tuple[Comparison, ...], found: Characterisation) -> Figure:
     compared = any(one.degrees_of_freedom for one in series)
-    figure = Figure(figsize=(8.6, 5.6 if compared else 4.2), layout="constrained")
+    figure = Figure(figsize=(8.6, 6.2 if compared else 4.6), layout="constrained")
     if compared:
         axes, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
         _draw_deviations(below, series)
@@ -89,7 +89,8 @@ def _curve_figure(name: str, series: tuple[Comparison, ...], found: Characterisa
     _mark_limits(axes, name, found)
     axes.set(title=_TITLES[name], ylabel=_LABELS[series[0].y_name])
     axes.grid(alpha=0.3, which="both" if logarithmic else "major")
-    axes.legend(frameon=False, fontsize="small")
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize="small")
     lowest.set_xlabel(_LABELS[series[0].x_name])
     return figure
 
@@ -98,8 +99,8 @@ def _draw_series(axes: Axes, one: Comparison, colour: str, marker: str, *, alone
     name = "" if alone else f", {one.label}"
     axes.plot(one.curve_x, one.curve_y, color=colour, linewidth=1.2, label=f"predicted{name}")
     if one.law_y is not None:
-        axes.plot(one.curve_x, one.law_y, color="0.45", linewidth=1.0, linestyle=":",
-                  label=f"noise law without patterns{name}")  # fmt: skip
+        label = "noise law without patterns" if colour == _STYLES[0][0] else None
+        axes.plot(one.curve_x, one.law_y, color="0.45", linewidth=1.0, linestyle=":", label=label)
     axes.errorbar(
         one.x, one.simulated, yerr=one.half95, color=colour, marker=marker, linestyle="none", markersize=4.5,
         capsize=2, label=f"simulated{name}, 95 %, N = {one.samples[0]} a point",
