@@ -213,8 +213,8 @@ def _sensor_fit(
 ) -> None:
     """Fit a sensor to measured frames of a flat board that fills the image, square to the camera.
 
-    Give the board's distance for each file, in order: FRAMES FRAMES --distance 1.0 --distance 2.0. Geometry and whatever
-    the frames do not tell come from --sensor; the file says of each number whether it was measured or assumed.
+    Give the board's distance for each file, in order: FRAMES FRAMES --distance 1.0 --distance 2.0. Geometry and
+    whatever the frames do not tell come from --sensor; the file says of each number whether it is measured or assumed.
     """
     from phasemark.data import read_frames, write_atomically
     from phasemark.render import fit_sensor

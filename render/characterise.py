@@ -112,16 +112,16 @@ class Comparison:
             "label": self.label,
             "x_name": self.x_name,
             "y_name": self.y_name,
-            "chi2": self.chi2,
+            "chi2": _plain(self.chi2),
             "degrees_of_freedom": self.degrees_of_freedom,
-            "p_value": self.p_value,
+            "p_value": _plain(self.p_value),
             "points": [
                 {
                     "x": float(x),
                     "predicted": float(predicted),
-                    "simulated": float(simulated),
-                    "low95": float(simulated - half),
-                    "high95": float(simulated + half),
+                    "simulated": _plain(float(simulated)),
+                    "low95": _plain(float(simulated - half)),
+                    "high95": _plain(float(simulated + half)),
                     "samples": int(samples),
                     "compared": bool(compared),
                 }
@@ -211,7 +211,7 @@ class Characterisation:
     def disagreements(self) -> tuple[Comparison, ...]:
         """Series whose χ² does not pass at `AGREEMENT`, corrected for the number of series."""
         limit = (1 - AGREEMENT) / max(len(self.comparisons), 1)
-        return tuple(one for one in self.comparisons if one.p_value < limit)
+        return tuple(one for one in self.comparisons if not one.p_value >= limit)  # NaN is no agreement
 
     @property
     def chi2(self) -> float:
@@ -239,9 +239,9 @@ class Characterisation:
             "agreement": {
                 "agrees": not self.disagreements,
                 "level": AGREEMENT,
-                "chi2": self.chi2,
+                "chi2": _plain(self.chi2),
                 "degrees_of_freedom": self.degrees_of_freedom,
-                "p_value": self.p_value,
+                "p_value": _plain(self.p_value),
                 "disagreeing": [f"{one.figure}: {one.label}" for one in self.disagreements],
             },
             "quantities": {one.name: one.as_dict() for one in self.quantities},
@@ -334,7 +334,7 @@ class _Bench:
         image = flat_field(sensor, self.reference_range_m, amplitude, modulated=False)
         taps = capture(image, sensor, rng=self._rng, n_frames=self.n_frames, keep_taps=True).taps_e
         assert taps is not None
-        return taps[0][..., self.alive]
+        return np.asarray(taps[0][..., self.alive])
 
     def range_errors(self, frames: Frames, truth_m: _Float | float) -> _Float:
         """Return wrapped errors of the ranges, (frames, working pixels)."""
@@ -473,7 +473,7 @@ def _linearity(bench: _Bench) -> _Part:
         expected = expected_flat_field(sensor, range_m, amplitude)
         return bench.mean(wrap_difference_m(expected.range_m - range_m, sensor)), expected
 
-    line = np.linspace(0.0, span, 721)
+    line = np.linspace(0.0, span, 361)
     curve = np.array([error_curve(d)[0] for d in line])
     ranges = span * (np.arange(_LINEARITY_POINTS) + 0.5) / _LINEARITY_POINTS
     predicted, found, errors, clear = [], [], [], []
@@ -579,7 +579,7 @@ def _saturation(bench: _Bench) -> _Part:
     low, high = (_crossing(predicted_share, share, 0.0, top) for share in (1e-3, 1 - 1e-3))
     margin = 0.05 * (high - low) + 1e-3 * high
     signals = np.linspace(low - margin, high + margin, 17)
-    line = np.linspace(low - 3 * margin, high + 3 * margin, 120)
+    line = np.linspace(low - 3 * margin, high + 3 * margin, 60)
     shares, errors, predicted = [], [], []
     for signal_e in signals:
         frames = bench.frames(bench.reference_range_m, signal_e / sensor.signal_e)
@@ -611,7 +611,7 @@ def _saturation(bench: _Bench) -> _Part:
 
 def _crossing(function: Callable[[float], float], level: float, low: float, high: float) -> float:
     """Return where a function that rises from `low` to `high` reaches a level, by bisection: it may jump."""
-    for _ in range(48):
+    for _ in range(32):
         middle = 0.5 * (low + high)
         if function(middle) < level:
             low = middle
@@ -641,7 +641,7 @@ def _interpolated(x: _Float, share: _Float, error: _Float, level: float) -> tupl
     step = float(x[j] - x[j - 1])
     if share[j - 1] == 0 or share[j] == 1:
         return float(x[j] + x[j - 1]) / 2, step / 2
-    left, right, at = stats.norm.ppf([share[j - 1], share[j], level])
+    left, right, at = (float(stats.norm.ppf(value)) for value in (share[j - 1], share[j], level))
     slope = (right - left) / step * float(stats.norm.pdf(at))
     return float(x[j - 1]) + (at - left) / (right - left) * step, max(float(error[j - 1]), float(error[j])) / slope
 

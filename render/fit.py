@@ -351,8 +351,8 @@ class _Data:
         kept[usable[:, alive].sum(axis=1).argmax()] = True
         for index in np.flatnonzero(~kept):
             notes.append(
-                f"The frames at {distance_m[index]:g} m were left out: {100 * usable[index, alive].mean():.0f} % of "
-                "the pixels answer there."
+                f"The frames at {distance_m[int(index)]:g} m were left out: "
+                f"{100 * usable[index, alive].mean():.0f} % of the pixels answer there."
             )
         good = usable[kept].all(axis=0)
         lost = int((self.share < _DEAD_SHARE).all(axis=0).sum())
@@ -507,7 +507,7 @@ def _fit_offsets(
 
     centre = _circular_mean(mean, base)
     found = optimize.least_squares(residual, [centre], x_scale=max(float(temporal.min()), 1e-6))
-    error = float(1 / math.sqrt((found.jac**2).sum()))
+    error = 1 / float(np.linalg.norm(_jacobian(found)))
     if m > 1:
         error *= math.sqrt(max(2 * found.cost / (m - 1), 1.0))
     where = "one distance" if m == 1 else f"{m} distances"
@@ -531,6 +531,11 @@ def _fit_offsets(
 def _circular_mean(values_m: _Float, sensor: Sensor) -> float:
     turn = np.exp(1j * values_m / sensor.metres_per_radian).sum()
     return float(np.angle(turn) * sensor.metres_per_radian)
+
+
+def _jacobian(found: optimize.OptimizeResult) -> _Float:
+    """Return the Jacobian of a least-squares solution, (residuals, parameters)."""
+    return np.asarray(found["jac"], dtype=np.float64)
 
 
 def _fit_wiggling(
@@ -561,7 +566,8 @@ def _fit_wiggling(
     start[1:] = 1e-3
     found = optimize.least_squares(residual, start, x_scale=0.01)
     scatter = max(2 * found.cost / max(m - len(start), 1), 1.0)
-    covariance = np.linalg.inv(found.jac.T @ found.jac) * scatter
+    jacobian = _jacobian(found)
+    covariance = np.linalg.inv(jacobian.T @ jacobian) * scatter
     offset_m = float(found.x[0]) * sensor.metres_per_radian
     found_harmonics = harmonics(found.x)
     parts = []

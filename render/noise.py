@@ -134,7 +134,7 @@ def _moment_table() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[n
     stds = np.geomspace(0.003, _HOPELESS_STD_RAD, 530)
     ratio, kurtosis = np.empty_like(stds), np.empty_like(stds)
     for i, std in enumerate(stds):
-        psi = np.linspace(-1, 1, 2001) * min(math.pi, 10 * std)
+        psi = np.linspace(-1, 1, 2001) * min(math.pi, 20 * std)
         weight = phase_density(psi, 1 / (2 * std**2))
         weight /= np.trapezoid(weight, psi)
         second, fourth = np.trapezoid(psi**2 * weight, psi), np.trapezoid(psi**4 * weight, psi)
