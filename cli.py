@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from phasemark.data import Bank
     from phasemark.landmarks import LandmarkSpec
     from phasemark.matcher import FilteredFrames, Match, Matches
-    from phasemark.render import Background, Sensor
+    from phasemark.render import Background, Estimate, Sensor
 
 __all__ = ["app", "main"]
 
@@ -250,10 +250,7 @@ def _sensor_fit(
     fields = fit.sensor.model_dump(mode="json")
     _echo_table(
         ("field", "value", "std error", "from"),
-        (
-            (name, _short(fields[name]), "assumed" if one.std_error is None else f"{one.std_error:.2g}", one.note)
-            for name, one in fit.estimates.items()
-        ),
+        ((name, _short(fields[name]), _error_of(one), one.note) for name, one in fit.estimates.items()),
     )
     for note in fit.notes:
         typer.echo(note)
@@ -794,6 +791,13 @@ def _load_sensor(name_or_file: str) -> Sensor:
 
 def _sensor_facts(sensor: Sensor) -> dict[str, Any]:
     return {**sensor.model_dump(mode="json"), "unambiguous_range_m": sensor.unambiguous_range_m}
+
+
+def _error_of(estimate: Estimate) -> str:
+    """Write the standard error of an estimate; pixels are counted and have none."""
+    if estimate.std_error is None:
+        return "assumed"
+    return f"{estimate.std_error:.2g}" if estimate.std_error > 0 else ""
 
 
 def _short(value: object) -> str:

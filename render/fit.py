@@ -654,7 +654,7 @@ def _fit_noise(
         std = math.sqrt(float(variance.mean()))
         estimates["range_std_m"] = Estimate(std, std / math.sqrt(2 * degrees), "noise of single frames")
         return {"range_std_m": std}
-    law = _NoiseData.of(data)
+    law, scale_error = _NoiseData.of(data), 0.0
     amplitude = None if data.amplitude is None else data.amplitude[:, good]
     intensity = None if data.intensity is None else data.intensity[:, good]
     if amplitude is not None:  # the mean square of a noisy amplitude is A² + 2σ²
@@ -672,11 +672,11 @@ def _fit_noise(
             notes.append(
                 f"Photon transfer gives {scale:.4g} ± {error:.2g} electrons a unit of amplitude and intensity."
             )
-            amplitude = amplitude * scale
+            amplitude, scale_error = amplitude * scale, error / scale
             intensity = None if intensity is None else intensity * scale
     if amplitude is None:
         return _noise_of_ranges(law, base, estimates, notes)
-    return _noise_of_electrons(law, base, amplitude, intensity, estimates, notes)
+    return _noise_of_electrons(law, base, amplitude, intensity, scale_error, estimates, notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -787,13 +787,17 @@ def _noise_of_electrons(
     base: Sensor,
     amplitude_e: _Float,
     intensity_e: _Float | None,
+    scale_error: float,
     estimates: dict[str, Estimate],
     notes: list[str],
 ) -> dict[str, Any]:
-    """Turn amplitudes, and intensities if there are any, in electrons into signal, contrast and noise."""
+    """Turn amplitudes, and intensities if there are any, in electrons into signal, contrast and noise.
+
+    `scale_error` is the relative error of the electron itself; the contrast, a ratio, does not know it.
+    """
     boards = len(amplitude_e)
     # wiggling and stray light scale A/S from board to board, patterns from pixel to pixel
-    modulated, modulated_error = _mean_of_boards(amplitude_e / law.light, law)
+    modulated, modulated_error = _mean_of_boards(amplitude_e / law.light)
     variance_e2 = 2 * law.phase_variance * amplitude_e**2  # N₀S + N_amb + N_dark + V
     light = intensity_e if intensity_e is not None else variance_e2
     what = "intensity" if intensity_e is not None else "noise · amplitude²"
@@ -807,12 +811,12 @@ def _noise_of_electrons(
         signal_error, offset_error = np.sqrt(np.diag(covariance))
         ambient = max(offset - (constant - base.ambient_e), 0.0)
         estimates["ambient_e"] = Estimate(
-            float(ambient), float(offset_error), f"{what} without light, less the assumed dark current"
-            + ("" if intensity_e is not None else " and read noise"),
+            float(ambient), math.hypot(offset_error, scale_error * offset), 
+            f"{what} without light, less the assumed dark current" + ("" if intensity_e is not None else " and read noise"),
         )  # fmt: skip
         changes["ambient_e"] = float(ambient)
     else:
-        mean, mean_error = _mean_of_boards(light / law.light, law) if intensity_e is not None else (
+        mean, mean_error = _mean_of_boards(light / law.light) if intensity_e is not None else (
             (float(((variance_e2 - constant) / law.light).mean()), law.one_term(variance_e2 / law.light)[1])
         )  # fmt: skip
         signal = mean - (constant / float(law.light.mean()) if intensity_e is not None else 0.0)
@@ -828,13 +832,17 @@ def _noise_of_electrons(
         )
     contrast = modulated / signal
     contrast_error = contrast * math.hypot(modulated_error / modulated, signal_error / signal)
-    estimates["signal_e"] = Estimate(float(signal), float(signal_error), f"{what} against light, {boards} level(s)")
+    estimates["signal_e"] = Estimate(
+        float(signal),
+        math.hypot(signal_error, scale_error * signal),
+        f"{what} against light at {boards} distance{'s' if boards > 1 else ''}",
+    )
     estimates["contrast"] = Estimate(
         float(contrast), float(contrast_error), f"amplitude, {modulated:.5g} electrons at |S| = 1, over signal_e"
     )
     changes |= {"signal_e": float(signal), "contrast": float(contrast)}
     if intensity_e is not None:
-        extra, extra_error = _excess(variance_e2, intensity_e, law)
+        extra, extra_error = _excess(variance_e2, intensity_e, law, scale_error)
         per_tap = (extra - base.code_e**2 / 6) / 2
         read_noise = math.sqrt(max(per_tap, 0.0))
         error = min(extra_error / (4 * read_noise) if read_noise > 0 else math.inf, math.sqrt(extra_error / 2))
@@ -847,7 +855,7 @@ def _noise_of_electrons(
     return changes
 
 
-def _mean_of_boards(values: _Float, law: _NoiseData) -> tuple[float, float]:
+def _mean_of_boards(values: _Float) -> tuple[float, float]:
     """Return the mean over boards and pixels, and its standard error from their spread, boards as a whole included."""
     own = values.std(ddof=1) / math.sqrt(values.size) if values.size > 1 else 0.0
     boards = values.mean(axis=1)
@@ -875,14 +883,17 @@ def _line_over_boards(light: _Float, intensity_e: _Float) -> tuple[_Float, _Floa
     return mean, own
 
 
-def _excess(variance_e2: _Float, intensity_e: _Float, law: _NoiseData) -> tuple[float, float]:
+def _excess(variance_e2: _Float, intensity_e: _Float, law: _NoiseData, scale_error: float) -> tuple[float, float]:
     """Return the mean of 2σ_φ²A² − I, each value weighted by what chance leaves of it, and its standard error."""
     weight = law.degrees / (2 * np.maximum(intensity_e, 1.0) ** 2)
     total = float(weight.sum())
     mean = float((weight * (variance_e2 - intensity_e)).sum()) / total
     # the noise itself has more variance than its electrons alone
     expected = np.maximum(intensity_e + max(mean, 0.0), 1.0)
-    return mean, math.sqrt(float((weight**2 * 2 * expected**2 / law.degrees).sum())) / total
+    chance = math.sqrt(float((weight**2 * 2 * expected**2 / law.degrees).sum())) / total
+    # a wrong electron scales the noise by its square and the intensity by itself
+    lever = float((weight * (2 * variance_e2 - intensity_e)).sum()) / total
+    return mean, math.hypot(chance, scale_error * lever)
 
 
 def _possible_contrast(fields: dict[str, Any], estimates: dict[str, Estimate], notes: list[str]) -> float:
