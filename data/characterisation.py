@@ -30,6 +30,13 @@ _CAPTIONS = {
     "threshold": "Share of frames in which a pixel shows no return, against distance.",
 }
 
+_DIRECT_CAPTIONS = {
+    "range_noise": "Standard deviation of the range in one frame, of a surface that faces the camera, beside the one"
+    " figure that the sensor states.",
+    "linearity": "Error of the mean range against distance, beside the sensor's global offset.",
+    "threshold": "Share of frames in which a pixel drops out, against distance.",
+}
+
 
 def write_characterisation(
     found: Characterisation, name: str, folder: Path, *, seed: int, force: bool = False
@@ -74,7 +81,18 @@ def write_characterisation(
 
 
 def summary_sentences(found: Characterisation, name: str) -> list[str]:
-    """Say in three sentences what was found: how well it measures, what is systematic, and whether theory agrees."""
+    """Say in three sentences what was found: how well it measures, what is systematic, and whether theory agrees.
+
+    Parameters
+    ----------
+    found : Characterisation
+    name : str
+        What the sensor is called.
+
+    Returns
+    -------
+    list of str
+    """
     return [_noise_sentence(found, name), _systematic_sentence(found), _agreement_sentence(found)]
 
 
@@ -127,6 +145,7 @@ def _agreement_sentence(found: Characterisation) -> str:
 
 def _report(found: Characterisation, name: str, seed: int, pictures: dict[str, bytes]) -> str:
     sensor = found.sensor
+    captions = _CAPTIONS if sensor.kind == "phase" else _DIRECT_CAPTIONS
     return page_template("phasemark.data", "characterisation.html.j2").render(
         name=name,
         summary=summary_sentences(found, name),
@@ -135,8 +154,8 @@ def _report(found: Characterisation, name: str, seed: int, pictures: dict[str, b
         figures=[
             {
                 "title": title.replace("_", " ").capitalize(),
-                "caption": _CAPTIONS[title],
-                "picture": embedded_png(png, _CAPTIONS[title]),
+                "caption": captions[title],
+                "picture": embedded_png(png, captions[title]),
                 "tests": [one for one in found.of_figure(title) if one.degrees_of_freedom],
             }
             for title, png in pictures.items()

@@ -37,7 +37,7 @@ _TITLES = {
     "saturation": "Saturation",
     "threshold": "Where the return is lost",
 }
-_LOG = {"photon_transfer": True, "range_noise": True}
+_LOGARITHMIC = ("photon_transfer", "range_noise")
 _MAPS = {
     "range_offset_m": ("range offset", "mm", 1e3),
     "response_percent": ("sensitivity, mean of both taps", "% of the mean", 1.0),
@@ -69,7 +69,7 @@ def characterisation_figures(found: Characterisation) -> dict[str, Figure]:
 
 def _curve_figure(name: str, series: tuple[Comparison, ...], found: Characterisation) -> Figure:
     compared = any(one.degrees_of_freedom for one in series)
-    figure = Figure(figsize=(8.6, 6.2 if compared else 4.6), layout="constrained")
+    figure = Figure(figsize=(8.6, (5.8 if compared else 4.2) + 0.4 * len(series)), layout="constrained")
     if compared:
         axes, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
         _draw_deviations(below, series)
@@ -78,13 +78,14 @@ def _curve_figure(name: str, series: tuple[Comparison, ...], found: Characterisa
         lowest = axes = figure.subplots()
     for one, (colour, marker) in zip(series, _STYLES, strict=False):
         _draw_series(axes, one, colour, marker, alone=len(series) == 1)
-    logarithmic = _LOG.get(name, False) and all((one.simulated > 0).any() for one in series)
+    logarithmic = name in _LOGARITHMIC and found.sensor.kind == "phase"
+    logarithmic &= all((one.simulated > 0).any() for one in series)
     if logarithmic:
         axes.set_xscale("log")
         axes.set_yscale("log")
         positive = np.concatenate([one.simulated[one.simulated > 0] for one in series])
         axes.set_ylim(positive.min() / 3, positive.max() * 3)
-    elif name in ("range_noise", "photon_transfer"):
+    elif name in _LOGARITHMIC:
         axes.set_ylim(bottom=0)
     _mark_limits(axes, name, found)
     axes.set(title=_TITLES[name], ylabel=_LABELS[series[0].y_name])

@@ -810,10 +810,12 @@ def _noise_of_electrons(
             (signal, offset), covariance = law.two_terms(variance_e2, law.light, np.ones_like(law.light))
         signal_error, offset_error = np.sqrt(np.diag(covariance))
         ambient = max(offset - (constant - base.ambient_e), 0.0)
+        note = f"{what} without light, less the assumed dark current"
         estimates["ambient_e"] = Estimate(
-            float(ambient), math.hypot(offset_error, scale_error * offset), 
-            f"{what} without light, less the assumed dark current" + ("" if intensity_e is not None else " and read noise"),
-        )  # fmt: skip
+            float(ambient),
+            math.hypot(offset_error, scale_error * offset),
+            note if intensity_e is not None else f"{note} and read noise",
+        )
         changes["ambient_e"] = float(ambient)
     else:
         mean, mean_error = _mean_of_boards(light / law.light) if intensity_e is not None else (

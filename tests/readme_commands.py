@@ -162,6 +162,7 @@ def _write_board(path: Path) -> None:
 GIVEN: dict[str, Callable[[Path], None]] = {
     "board_1m.npz": _write_board,
     "board_2m.npz": _write_board,
+    "board_3m.npz": _write_board,
     "measured.csv": _write_measured,
     "my_part.stl": _write_part,
 }
