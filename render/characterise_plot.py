@@ -37,6 +37,7 @@ _TITLES = {
     "saturation": "Saturation",
     "threshold": "Where the return is lost",
 }
+_LEAST_REACH = 1e-6  # of an axis: nothing below is anything but rounding
 _LOGARITHMIC = ("photon_transfer", "range_noise")
 _MAPS = {
     "range_offset_m": ("range offset", "mm", 1e3),
@@ -79,14 +80,15 @@ def _curve_figure(name: str, series: tuple[Comparison, ...], found: Characterisa
     for one, (colour, marker) in zip(series, _STYLES, strict=False):
         _draw_series(axes, one, colour, marker, alone=len(series) == 1)
     logarithmic = name in _LOGARITHMIC and found.sensor.kind == "phase"
-    logarithmic &= all((one.simulated > 0).any() for one in series)
+    logarithmic &= all((one.predicted > 0).any() for one in series)  # a camera without noise has rounding to show
     if logarithmic:
         axes.set_xscale("log")
         axes.set_yscale("log")
         positive = np.concatenate([one.simulated[one.simulated > 0] for one in series])
         axes.set_ylim(positive.min() / 3, positive.max() * 3)
-    elif name in _LOGARITHMIC:
-        axes.set_ylim(bottom=0)
+    else:
+        low, high = axes.get_ylim()
+        axes.set_ylim(0.0 if name in _LOGARITHMIC else min(low, -_LEAST_REACH), max(high, _LEAST_REACH))
     _mark_limits(axes, name, found)
     axes.set(title=_TITLES[name], ylabel=_LABELS[series[0].y_name])
     axes.grid(alpha=0.3, which="both" if logarithmic else "major")
