@@ -80,7 +80,9 @@ def _curve_figure(name: str, series: tuple[Comparison, ...], found: Characterisa
     for one, (colour, marker) in zip(series, _STYLES, strict=False):
         _draw_series(axes, one, colour, marker, alone=len(series) == 1)
     logarithmic = name in _LOGARITHMIC and found.sensor.kind == "phase"
-    logarithmic &= all((one.predicted > 0).any() for one in series)  # a camera without noise has rounding to show
+    logarithmic &= all(
+        ((one.predicted > 0) & (one.simulated > 0)).any() for one in series
+    )  # a camera without noise has rounding to show
     if logarithmic:
         axes.set_xscale("log")
         axes.set_yscale("log")

@@ -243,6 +243,8 @@ def fit_sensor(
     data = _Data.of(frames, distance_m, albedos, base).of_usable_boards(distance_m, notes)
     if assumed_albedo and base.kind == "phase":
         notes.append("The board's albedo was assumed to be 0.8: signal_e times albedo is what was measured.")
+    if not (data.variance_m2[:, data.good] > 0).any():
+        raise UsageError("the frames have no noise: every range is the same in all of them; is one frame repeated?")
     correlation, correlation_error = data.frame_correlation()
     if abs(correlation) > _CORRELATED_SIGMAS * correlation_error:
         notes.append(

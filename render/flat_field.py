@@ -27,6 +27,7 @@ from phasemark.render.view import Views
 
 _CLEAR_SIGMAS = 6.0  # a tap this far from its limits reaches them in one of 1e9 readings
 _LEAST_NOISE_CODES = 0.5  # below, a converter's steps show and q²/12 is not their variance (PHYSICS section 4)
+_LOOK_UP_ABOVE, _LOOK_UP_NODES = 4096, 2401  # taps
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
@@ -149,8 +150,20 @@ class ExpectedFlatField:
         return np.asarray(1 - self._clear_probability().prod(axis=(0, 1)))
 
     def _clear_probability(self) -> NDArray[np.float64]:
-        """Return the probability that a tap stays below full well and highest code: an integral over its electrons."""
+        """Return the probability that each tap stays below full well and highest code.
+
+        It depends on the tap's mean alone: many taps look it up on a grid of 1/100 standard deviation about saturation.
+        """
         sensor, mean = self.sensor, self.tap_e
+        if mean.size <= _LOOK_UP_ABOVE or not sensor.shot_noise or not math.isfinite(sensor.saturation_e):
+            return self._clear_probability_of(mean)
+        reach = 12 * math.sqrt(sensor.saturation_e + sensor.read_noise_e**2) + 12
+        grid = np.linspace(max(sensor.saturation_e - reach, 0.0), sensor.saturation_e + reach, _LOOK_UP_NODES)
+        return np.interp(mean, grid, self._clear_probability_of(grid))
+
+    def _clear_probability_of(self, mean: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the probability for taps of these means: a sum or an integral over their electrons."""
+        sensor = self.sensor
         well = math.inf if sensor.full_well_e is None else sensor.full_well_e
         top = math.inf
         if sensor.adc_bits is not None:  # codes are rounded: the highest begins half a code below itself

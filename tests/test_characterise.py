@@ -16,6 +16,7 @@ from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.render import Sensor, camera_unit, capture, characterise, preset
 from phasemark.render.characterise import fit_line
+from phasemark.render.characterise_plot import characterisation_figures
 from phasemark.render.flat_field import board_image, expected_flat_field, flat_field
 from phasemark.render.noise import exact_phase_moments, phase_density
 
@@ -91,6 +92,24 @@ def test_a_pixel_saturates_as_often_as_predicted(fields):
         p = expected_flat_field(sensor, 1.0, amplitude).saturation_probability.item()
         frames = capture(pure_image(1.0, sensor, amplitude), sensor, rng=np.random.default_rng(3), n_frames=n)
         assert (frames.flags > 0).mean() == pytest.approx(p, abs=z * math.sqrt(p * (1 - p) / n))
+
+
+@pytest.mark.parametrize(
+    "fields", [{"full_well_e": 20_000, "read_noise_e": 30.0}, {"full_well_e": 120, "signal_e": 200}]
+)
+def test_a_large_image_looks_its_saturation_up_and_finds_the_same(fields):
+    sensor = Sensor(rows=30, cols=30, half_angle_h_deg=5, half_angle_v_deg=5, prnu=0.02, **fields)
+    expected = expected_flat_field(sensor, 1.0, 1.4 * sensor.saturation_e / sensor.signal_e)
+    looked_up, exact = expected._clear_probability(), expected._clear_probability_of(expected.tap_e)
+    assert ((exact > 0.1) & (exact < 0.9)).any()
+    np.testing.assert_allclose(looked_up, exact, rtol=0, atol=1e-4)  # linear between nodes
+
+
+def test_a_converter_coarser_than_all_noise_still_gets_its_figures():
+    sensor = one_pixel(shot_noise=False, adc_bits=8, gain=0.001)
+    found = characterise(sensor, rng=np.random.default_rng(0), n_frames=2)
+    assert found.degrees_of_freedom == 0
+    assert "photon_transfer" in characterisation_figures(found)
 
 
 def test_a_board_has_cosine_law_light_and_slanted_ranges():

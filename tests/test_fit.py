@@ -239,6 +239,11 @@ def test_frames_without_a_valid_pixel_are_refused():
         fit_sensor([Frames(np.full((20, 16, 16), np.nan), sensor=PMD)], [1.0], base=PMD)
 
 
+def test_one_frame_repeated_is_refused():
+    with pytest.raises(UsageError, match="no noise"):
+        fit_sensor([Frames(np.ones((20, 16, 16)), sensor=PMD)], [1.0], base=PMD)
+
+
 # The command and its file
 
 
