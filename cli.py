@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from phasemark.data import Bank
     from phasemark.landmarks import LandmarkSpec
     from phasemark.matcher import FilteredFrames, Match, Matches
-    from phasemark.render import Background, Sensor
+    from phasemark.render import Background, Estimate, Sensor
 
 __all__ = ["app", "main"]
 
@@ -46,6 +46,7 @@ Start with
   phasemark render --class cylinder --distance 1.0 --delta 30 --wall 4 -o frame.png
   phasemark bank build -o bank.h5   a bank of model images to match your frames against
   phasemark match bank.h5 measured.csv --unit m --quantity range
+  phasemark sensor fit frames.npz --distance 1.0 -o mycam.toml    a camera of your own, from frames of a flat board
   phasemark --help                  all commands; COMMAND --help explains one
 """
 
@@ -72,6 +73,17 @@ _SensorOption = Annotated[
 ]
 _Wall = Annotated[float | None, typer.Option("--wall", metavar="M", help="Distance of a wall behind the landmark.")]
 _Floor = Annotated[float | None, typer.Option("--floor", metavar="M", help="How far a floor lies below the lens.")]
+_FramesUnit = Annotated[str | None, typer.Option("--unit", help="Unit of the frames: m, cm or mm.")]
+_Quantity = Annotated[
+    str | None, typer.Option("--quantity", help="range (along the ray) or z (along the optical axis).")
+]
+_ValidStatus = Annotated[
+    list[int] | None, typer.Option("--valid-status", help="Value of 'status' that marks a valid pixel; repeatable.")
+]
+_FlipH = Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")]
+_FlipV = Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")]
+_Rotate = Annotated[int, typer.Option("--rotate", help="Turn the image clockwise by 0, 90, 180 or 270 degrees.")]
+_Seed = Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")]
 _Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; the result does not depend on it.")]
 
 
@@ -139,6 +151,110 @@ def _sensor_show(
         for name in names:
             value = fields[name]
             typer.echo(f"# {name} is not set" if value is None else f"{name} = {json.dumps(value)}")
+
+
+@_sensor_app.command("characterise")
+def _sensor_characterise(
+    name_or_file: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, its pictures and numbers.")],
+    n_frames: Annotated[
+        int | None, typer.Option("--frames", min=2, help="Frames at each point; by default 51200 readings a point.")
+    ] = None,
+    seed: _Seed = 2005,
+    as_json: _Json = False,
+    force: _Force = False,
+) -> None:
+    """Measure a sensor before flat fields, as EMVA 1288 would, and compare it with what its numbers predict."""
+    from phasemark.data import summary_sentences, write_characterisation
+    from phasemark.data.characterisation import NAMES
+    from phasemark.data.seeds import stream
+    from phasemark.render import characterise
+
+    sensor = _load_sensor(name_or_file)
+    _refuse_existing([out / name for name in NAMES], force)
+    _make_folder(out)
+    found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
+    report = write_characterisation(found, name_or_file, out, seed=seed, force=force)[0]
+    if as_json:
+        facts = found.as_dict()
+        _echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
+        return
+    for sentence in (*summary_sentences(found, name_or_file), *found.notes):
+        typer.echo(sentence)
+    typer.echo(report)
+
+
+@_sensor_app.command("fit")
+def _sensor_fit(
+    frames: Annotated[
+        list[Path], typer.Argument(metavar="FRAMES...", help="Frames of a flat board: CSV, NPY, NPZ or HDF5.")
+    ],
+    distance: Annotated[
+        list[float],
+        typer.Option("--distance", metavar="M", help="Distance of the board; once for each FRAMES, in order."),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
+    albedo: Annotated[
+        list[float] | None,
+        typer.Option("--albedo", help="Albedo of the board, one for all or one for each; 0.8 is assumed."),
+    ] = None,
+    sensor: _SensorOption = "pmd-16x16",
+    amplitude_unit: Annotated[
+        str, typer.Option("--amplitude-unit", help="Unit of amplitude and intensity: electrons or arbitrary.")
+    ] = "electrons",
+    unit: _FramesUnit = None,
+    quantity: _Quantity = None,
+    valid_status: _ValidStatus = None,
+    flip_h: _FlipH = False,
+    flip_v: _FlipV = False,
+    rotate: _Rotate = 0,
+    as_json: _Json = False,
+    force: _Force = False,
+) -> None:
+    """Fit a sensor to measured frames of a flat board that fills the image, square to the camera.
+
+    Give the board's distance for each file, in order: FRAMES FRAMES --distance 1.0 --distance 2.0. Geometry and
+    whatever the frames do not tell come from --sensor; the file says of each number whether it is measured or assumed.
+    """
+    from phasemark.data import read_frames, write_atomically
+    from phasemark.render import fit_sensor
+
+    if out.suffix.lower() != ".toml":
+        raise UsageError(f"the sensor must be a .toml file, got '{out}'")
+    _refuse_existing([out], force)
+    base = _load_sensor(sensor)
+    measured = [
+        read_frames(
+            path,
+            sensor=base,
+            unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
+            quantity=quantity,  # type: ignore[arg-type]
+            valid_status=valid_status,
+            flip_h=flip_h,
+            flip_v=flip_v,
+            rotate=rotate,
+        )
+        for path in frames
+    ]
+    fit = fit_sensor(
+        [one[k : k + 1] for one in measured for k in range(len(one))],  # every position of a file has its distance
+        distance,
+        base=base,
+        albedo=albedo or None,
+        amplitude_unit=amplitude_unit,  # type: ignore[arg-type]  # fit_sensor says what is right
+    )
+    write_atomically(out, fit.to_toml(base_name=sensor).encode(), force=force)
+    if as_json:
+        _echo_json({"file": str(out), **fit.as_dict()})
+        return
+    fields = fit.sensor.model_dump(mode="json")
+    _echo_table(
+        ("field", "value", "std error", "from"),
+        ((name, _short(fields[name]), _error_of(one), one.note) for name, one in fit.estimates.items()),
+    )
+    for note in fit.notes:
+        typer.echo(note)
+    typer.echo(out)
 
 
 @_landmark_app.command("list")
@@ -369,19 +485,15 @@ def _bank_info(
 def _match(
     bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank.")],
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Measured frames: CSV, NPY, NPZ or HDF5.")],
-    unit: Annotated[str | None, typer.Option("--unit", help="Unit of the frames: m, cm or mm.")] = None,
-    quantity: Annotated[
-        str | None, typer.Option("--quantity", help="range (along the ray) or z (along the optical axis).")
-    ] = None,
+    unit: _FramesUnit = None,
+    quantity: _Quantity = None,
     invalid_means: Annotated[
         str, typer.Option("--invalid-means", help="What an invalid pixel stands for: missing or no-return.")
     ] = "missing",
-    valid_status: Annotated[
-        list[int] | None, typer.Option("--valid-status", help="Value of 'status' that marks a valid pixel; repeatable.")
-    ] = None,
-    flip_h: Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")] = False,
-    flip_v: Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")] = False,
-    rotate: Annotated[int, typer.Option("--rotate", help="Turn the image clockwise by 0, 90, 180 or 270 degrees.")] = 0,
+    valid_status: _ValidStatus = None,
+    flip_h: _FlipH = False,
+    flip_v: _FlipV = False,
+    rotate: _Rotate = 0,
     filter_name: Annotated[str, typer.Option("--filter", help="kalman or phasor-mean.")] = "kalman",
     method: Annotated[
         str, typer.Option("--method", help="nearest: the paper's minimum-distance classifier.")
@@ -455,7 +567,7 @@ def _demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, the tables and the bank.")] = Path(
         "out/demo"
     ),
-    seed: Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")] = 2005,
+    seed: _Seed = 2005,
     workers: _Workers = None,
     as_json: _Json = False,
     force: _Force = False,
@@ -679,6 +791,20 @@ def _load_sensor(name_or_file: str) -> Sensor:
 
 def _sensor_facts(sensor: Sensor) -> dict[str, Any]:
     return {**sensor.model_dump(mode="json"), "unambiguous_range_m": sensor.unambiguous_range_m}
+
+
+def _error_of(estimate: Estimate) -> str:
+    """Write the standard error of an estimate; pixels are counted and have none."""
+    if estimate.std_error is None:
+        return "assumed"
+    return f"{estimate.std_error:.2g}" if estimate.std_error > 0 else ""
+
+
+def _short(value: object) -> str:
+    """Write a field's value for a table; a list of pixels as their number."""
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    return f"{len(value)} in all" if isinstance(value, list) else str(value)
 
 
 def _plain(value: str | int | float) -> str | int | float | None:

@@ -2,6 +2,7 @@
 
 from phasemark.data.bank import Bank, BankGroup, open_bank
 from phasemark.data.build import build_bank
+from phasemark.data.characterisation import summary_sentences, write_characterisation
 from phasemark.data.grid import format_grid, parse_grid
 from phasemark.data.measured import read_frames
 from phasemark.data.plan import BankPlan, MeshPlan, load_plan
@@ -21,8 +22,10 @@ __all__ = [
     "parse_grid",
     "read_checksum",
     "read_frames",
+    "summary_sentences",
     "verify_checksum",
     "versions",
     "write_atomically",
+    "write_characterisation",
     "write_checksum",
 ]
