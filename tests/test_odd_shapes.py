@@ -53,7 +53,7 @@ def test_bumps_finer_than_a_pixel_take_more_splits():
         return np.abs(Renderer(mesh, PMD, splits=splits).render_views(view).phasor[0] - phasor).max()
 
     assert epsilon(1) > 1e-3 * np.abs(phasor).max()  # its outline all but folds over in one pixel
-    assert epsilon(2) < 1.5e-4 * np.abs(phasor).max()
+    assert epsilon(2) < 2.5e-4 * np.abs(phasor).max()  # its 20 000 facets cost 1e-4 of that
 
 
 def test_splits_leave_flat_faces_as_they_are_and_are_limited():
