@@ -1,0 +1,375 @@
+"""Maximum likelihood: candidates from the bank, refined, compared, and told with their uncertainty."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from phasemark import UsageError
+from phasemark.data import Bank
+from phasemark.matcher.candidates import Search, Starts
+from phasemark.matcher.coarse import DISAGREEMENT, Observation
+from phasemark.matcher.filters import FilteredFrames
+from phasemark.matcher.likelihood import Evidence, Quantity, counts
+from phasemark.matcher.match import Candidate, Match
+from phasemark.matcher.models import VIEW, BankModel, ImageModel, RenderedModel
+from phasemark.matcher.refine import SCALE, Fits, Settings, refine
+from phasemark.matcher.surroundings import estimate_surroundings, without_background
+from phasemark.render import Background, PhasorImages, Renderer, wrap_difference_m
+
+Pixels = Literal["all", "lower"]
+MIN_RETURNS = 3
+"""Fewer returns decide nothing."""
+ROBUST_FROM = 3.0
+"""Where Huber's loss turns linear, in σ: far enough out to cost an honest frame nothing."""
+_MODES, _MODES_BEFORE_BACKGROUND = 2, 4
+_BESIDE_RAD = math.radians(1.0)
+"""Side peaks of the likelihood before a background are about so far away (PHYSICS section 7)."""
+_SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
+_FRAMES_AT_ONCE = 256
+
+
+def check_free(free: Sequence[str]) -> tuple[str, ...]:
+    """Return names of free parameters in the order of the view.
+
+    Raises
+    ------
+    UsageError
+        A name is unknown or repeated, or distance is not among them.
+    """
+    names = tuple(free)
+    for name in names:
+        if name not in VIEW:
+            raise UsageError(f"'free' must be among {', '.join(VIEW)}, got {name!r}")
+    if len(set(names)) < len(names) or "distance_m" not in names or "delta_rad" not in names:
+        raise UsageError(f"'free' must name distance_m and delta_rad, and others once each, got {names!r}")
+    return tuple(name for name in VIEW if name in names)
+
+
+class MaximumLikelihood:
+    """Estimates class and continuous view of a landmark; see :class:`~phasemark.matcher.Matcher` for the parameters."""
+
+    def __init__(
+        self,
+        bank: Bank,
+        *,
+        free: Sequence[str] = ("distance_m", "delta_rad"),
+        background: Background | Literal["auto"] | None = None,
+        false_alarm: float = 0.01,
+        on: Quantity = "ranges",
+        pixels: Pixels = "all",
+        robust: bool = False,
+        workers: int = 1,
+    ) -> None:
+        if on not in ("ranges", "phasors"):
+            raise UsageError(f"'on' must be ranges or phasors, got {on!r}")
+        if pixels not in ("all", "lower"):
+            raise UsageError(f"'pixels' must be all or lower, got {pixels!r}")
+        if bank.plan.model != "ray":
+            raise UsageError("the bank was made by the planar generator, which knows no edges: refine needs a ray bank")
+        self.bank = bank
+        self.free = check_free(free)
+        self.on: Quantity = on
+        self.false_alarm = false_alarm
+        self.auto = background == "auto"
+        self.background = background if isinstance(background, Background) else None
+        sensor = bank.sensor
+        used = np.ones((sensor.rows, sensor.cols), np.bool_)
+        if pixels == "lower":
+            used[: sensor.rows // 2] = False
+        self._used = used.ravel()
+        self._huber = ROBUST_FROM if robust else None
+        self._behind = None if self.background is None else _behind(bank, self.background)
+        can_interpolate = on == "ranges" and self.free == VIEW[:2] and BankModel.fits(bank)
+        interpolates = can_interpolate and self.background is None
+        self._rendered = None if interpolates and not self.auto else RenderedModel(bank, self.background, workers)
+        self._interpolated = BankModel(bank) if interpolates else None
+        fine = (1, 1) if self.background is not None and "bearing_rad" not in self.free else (2, 3)
+        stride = tuple(
+            max(1, min(step, (len(grid) - 1) // 4))
+            for step, grid in zip(fine, (bank.distance_m, bank.delta_rad), strict=True)
+        )
+        self._search = Search(bank, self._behind, (stride[0], stride[1]), "bearing_rad" in self.free)
+        self._symmetry = [int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes]
+
+    def match(self, frames: FilteredFrames) -> list[Match]:
+        """Match filtered frames."""
+        answers: list[Match] = []
+        for start in range(0, len(frames), _FRAMES_AT_ONCE):
+            some = frames[start : start + _FRAMES_AT_ONCE]
+            answers.extend(self._match_auto(some) if self.auto else self._match_some(some))
+        return answers
+
+    def _match_some(self, frames: FilteredFrames) -> list[Match]:
+        evidence = Evidence.from_frames(frames, self.on)
+        model = self._interpolated or self._rendered
+        assert model is not None
+        enough = self._enough(evidence)
+        starts = self._search.starts(_some(evidence.seen, enough), self._n_modes(self.background))
+        fits = self._fit(model, evidence, enough, starts, self.background, self._behind)
+        bare = bare_cost(evidence.seen, self._behind)
+        return self._answers(frames, fits, bare, [self.background] * len(frames))
+
+    def _match_auto(self, frames: FilteredFrames) -> list[Match]:
+        """Match frames one by one, each before what stands behind it."""
+        answers: list[Match] = []
+        for k in range(len(frames)):
+            one = frames[k : k + 1]
+            evidence = Evidence.from_frames(one, self.on)
+            around = estimate_surroundings(one)
+            enough = self._enough(evidence)
+            background = around.background
+            bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(one, evidence))
+            model: ImageModel | None = self._interpolated
+            behind = None
+            seen = evidence.seen
+            if background is not None:
+                assert self._rendered is not None
+                model = self._rendered.with_background(background)
+                behind = _behind(self.bank, background)
+                seen = without_background(seen, around)
+            if model is None:
+                model = self._rendered
+            assert model is not None
+            starts = self._search.starts(_some(seen, enough), self._n_modes(background))
+            fits = self._fit(model, evidence, enough, starts, background, behind)
+            answers.extend(self._answers(one, fits, bare, [background]))
+        return answers
+
+    def _n_modes(self, background: Background | None) -> int:
+        return _MODES if background is None else _MODES_BEFORE_BACKGROUND
+
+    def _enough(self, evidence: Evidence) -> NDArray[np.int64]:
+        """Return which frames have enough returns to place a landmark."""
+        return np.flatnonzero((evidence.seen.returned & self._used).sum(axis=1) >= MIN_RETURNS)
+
+    def _fit(
+        self,
+        model: ImageModel,
+        evidence: Evidence,
+        enough: NDArray[np.int64],
+        starts: Starts,
+        background: Background | None,
+        behind: PhasorImages | None,
+    ) -> Fits:
+        """Refine the modes of every frame, then let the other classes explain it from the best one's view."""
+        settings = Settings(
+            self.free, self._used, self._huber, None if behind is None else behind.phasor.reshape(-1)
+        )
+        frame, class_index, view = enough[starts.frame], starts.class_index, starts.view
+        if background is not None:
+            first = np.flatnonzero(np.r_[True, np.diff(starts.frame) > 0]) if len(frame) else np.empty(0, np.int64)
+            sides = []
+            for side in (-_BESIDE_RAD, _BESIDE_RAD):
+                moved = view[first].copy()
+                moved[:, 1] += side
+                sides.append(moved)
+            frame = np.concatenate([frame, frame[first], frame[first]])
+            class_index = np.concatenate([class_index, class_index[first], class_index[first]])
+            view = np.concatenate([view, *sides])
+        fits = refine(model, evidence, frame, class_index, view, settings)
+        best = _best_of_frame(fits)
+        others = [
+            (fits.frame[k], c, fits.view[k])
+            for k in best
+            for c in range(len(self.bank.classes))
+            if c != fits.class_index[k]
+        ]
+        if not others:
+            return fits
+        more = refine(
+            model,
+            evidence,
+            np.array([o[0] for o in others], np.int64),
+            np.array([o[1] for o in others], np.int64),
+            np.array([o[2] for o in others]),
+            settings,
+        )
+        return Fits.joined([fits, more])
+
+    def _bare_wall_cost(self, one: FilteredFrames, evidence: Evidence) -> NDArray[np.float64]:
+        """Return how badly a wall at its best distance explains all of one frame, (1,)."""
+        seen = evidence.seen
+        forward = self.bank.sensor.axis_cosine().ravel() * seen.range_m[0]
+        returned = seen.returned[0]
+        if returned.sum() < MIN_RETURNS:
+            return np.array([np.inf])
+        wall_m = float(np.average(forward[returned], weights=seen.weight[0, returned]))
+        if wall_m <= 0:
+            return np.array([np.inf])
+        return bare_cost(seen, _behind(self.bank, Background(wall_m=wall_m)))
+
+    def _answers(
+        self,
+        frames: FilteredFrames,
+        fits: Fits,
+        bare: NDArray[np.float64],
+        backgrounds: list[Background | None],
+    ) -> list[Match]:
+        p_values = p_values_of(fits.cost, fits.dof, frames, fits.frame)
+        order = np.lexsort((fits.cost, fits.frame))
+        first = np.searchsorted(fits.frame[order], np.arange(len(frames) + 1))
+        doubt = stats.chi2.isf(self.false_alarm, np.maximum(fits.dof, 1))
+        answers = []
+        for k in range(len(frames)):
+            own = order[first[k] : first[k + 1]]
+            own = own[np.isfinite(fits.cost[own])]
+            answers.append(self._answer(fits, own, p_values, doubt, float(bare[k]), backgrounds[k]))
+        return answers
+
+    def _answer(
+        self,
+        fits: Fits,
+        own: NDArray[np.int64],
+        p_values: NDArray[np.float64],
+        doubt: NDArray[np.float64],
+        bare: float,
+        background: Background | None,
+    ) -> Match:
+        """Turn the fits of one frame, best first, into an answer."""
+        names = self.bank.classes
+        if not len(own):
+            nothing = {**dict.fromkeys(names, 0.0), "none": 1.0}
+            return Match(class_name=None, accepted=False, free=self.free, class_probability=nothing)
+        kept = self._distinct(fits, own)
+        best = kept[0]
+        c = int(fits.class_index[best])
+        is_landmark = bool(fits.cost[best] < bare)
+        covariance = fits.covariance[best]
+        known = bool(np.isfinite(covariance).all())
+        none_cost = min(bare, float(doubt[best]))
+        costs = np.append(fits.cost[kept], none_cost)
+        weight = np.exp(-0.5 * np.minimum(costs - costs.min(), 1400.0))
+        weight /= weight.sum()
+        best_of_class = {names[fits.class_index[k]]: 0.0 for k in kept}
+        for k, w in zip(kept, weight, strict=False):
+            best_of_class[names[fits.class_index[k]]] += float(w)
+        probability = {**dict.fromkeys(names, 0.0), **best_of_class, "none": float(weight[-1])}
+        condition, weak = weak_direction(fits.information[best], self.free)
+        candidates = tuple(
+            Candidate(
+                names[fits.class_index[k]],
+                float(fits.view[k, 0]),
+                self._wrapped(fits.view[k, 1], fits.class_index[k]),
+                float(fits.cost[k]),
+                float(w),
+                float(fits.view[k, 2]),
+                float(fits.view[k, 3]),
+            )
+            for k, w in zip(kept, weight, strict=False)
+        )
+        return Match(
+            class_name=names[c] if is_landmark else None,
+            accepted=is_landmark and known and bool(p_values[best] >= self.false_alarm),
+            distance_m=candidates[0].distance_m,
+            delta_rad=candidates[0].delta_rad,
+            bearing_rad=candidates[0].bearing_rad,
+            height_m=candidates[0].height_m,
+            free=self.free,
+            covariance=covariance.copy() if known else None,
+            chi2=float(fits.cost[best]),
+            dof=int(fits.dof[best]),
+            p_value=float(p_values[best]),
+            class_probability=probability,
+            alternatives=candidates[1:] if is_landmark else candidates,
+            symmetry=self._symmetry[c],
+            condition_number=condition,
+            weak_direction=weak,
+            background=background,
+        )
+
+    def _distinct(self, fits: Fits, own: NDArray[np.int64]) -> list[int]:
+        """Return fits, best first, without those that came to the same place."""
+        kept: list[int] = []
+        for k in own:
+            period = 2 * math.pi / self._symmetry[fits.class_index[k]]
+            for other in kept:
+                turned = math.remainder(fits.view[k, 1] - fits.view[other, 1], period)
+                near = abs(fits.view[k, 0] - fits.view[other, 0]) < _SAME_M and abs(turned) < _SAME_RAD
+                if near and fits.class_index[k] == fits.class_index[other]:
+                    break
+            else:
+                kept.append(int(k))
+        return kept
+
+    def _wrapped(self, delta_rad: float, class_index: int) -> float:
+        return float(delta_rad % (2 * math.pi / self._symmetry[class_index]))
+
+
+def weak_direction(information: NDArray[np.float64], free: Sequence[str]) -> tuple[float, dict[str, float]]:
+    """Return the condition number of the information, and the direction known worst.
+
+    Parameters
+    ----------
+    information : (p, p) float64
+    free : sequence of str
+        Its parameters; lengths count in centimetres, angles in degrees.
+
+    Returns
+    -------
+    condition : float
+    direction : dict of str to float
+        The standard deviation along the worst direction, by parameter, metres and radians.
+    """
+    if not np.isfinite(information).all():
+        return math.inf, {}
+    scale = np.array([SCALE[name] for name in free])
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    if values[0] <= 0:
+        return math.inf, {}
+    worst = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0]) / math.sqrt(values[0]) * scale
+    return float(values[-1] / values[0]), dict(zip(free, worst.tolist(), strict=True))
+
+
+def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.float64]:
+    """Return the whitened squared distance of frames from a scene without a landmark, (n,)."""
+    if behind is None:
+        return np.asarray(DISAGREEMENT * seen.returned.sum(axis=1), np.float64)
+    sensor = behind.sensor
+    model = behind.range_m.reshape(-1)
+    lit = np.isfinite(model)
+    sure = counts(behind.phasor, behind.intensity, sensor).reshape(-1)
+    residual = wrap_difference_m(np.where(lit & seen.returned, seen.range_m - np.where(lit, model, 0.0), 0.0), sensor)
+    wrong = (seen.returned & ~lit) | (seen.not_returned & sure)
+    return np.asarray((seen.weight * residual**2).sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
+
+
+def p_values_of(
+    cost: NDArray[np.float64], dof: NDArray[np.int64], frames: FilteredFrames, frame: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the probability of a larger χ² for every fit; 0 where nothing is left to test.
+
+    Where the variances were estimated from the scatter of ν + 1 frames, each squared residual follows F(1, ν); their
+    sum is given a scaled χ² of the same mean and variance.
+    """
+    freedom = np.maximum(dof, 1).astype(np.float64)
+    if not frames.std_from_scatter:
+        p = stats.chi2.sf(cost, freedom)
+    else:
+        n = np.where(frames.n_effective > 0, frames.n_effective, np.nan).reshape(len(frames), -1)
+        nu = np.array([np.nanmedian(row) if np.isfinite(row).any() else 0.0 for row in n])[frame] - 1
+        nu = np.maximum(nu, 5.0)  # the variance of F(1, ν) exists above 4
+        mean = freedom * nu / (nu - 2)
+        variance = freedom * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
+        p = stats.chi2.sf(cost * 2 * mean / variance, 2 * mean**2 / variance)
+    return np.where(dof > 0, p, 0.0)
+
+
+def _behind(bank: Bank, background: Background) -> PhasorImages:
+    return Renderer(None, bank.sensor).render(distance_m=1.0, background=background)
+
+
+def _some(seen: Observation, index: NDArray[np.int64]) -> Observation:
+    return Observation(seen.range_m[index], seen.weight[index], seen.returned[index], seen.not_returned[index])
+
+
+def _best_of_frame(fits: Fits) -> NDArray[np.int64]:
+    """Return the index of the best fit of every frame that has one."""
+    order = np.lexsort((fits.cost, fits.frame))
+    first = np.r_[True, np.diff(fits.frame[order]) > 0] if len(order) else np.empty(0, np.bool_)
+    return order[first]

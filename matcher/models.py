@@ -1,0 +1,409 @@
+"""Model images anywhere between the views of a bank: interpolated from it, or rendered anew.
+
+*Interpolated*: 4 × 4 neighbours in (D, δ), cubic in both. The grid of 1 cm × 1° moves an edge by a tenth of a pixel, so
+all but the pixels an edge is just entering are smooth on it; those, where a neighbour sees next to nothing, are
+interpolated linearly, which cannot overshoot. On ranges without a background the error is a few thousandths of the
+Cramér–Rao bound of 50 frames in the median. Where something stands behind the landmark, or on phasors, the brightness
+of the pixels at the edges counts too: its slope jumps where an edge crosses a pixel's border, inside a cell of the
+grid, and no interpolation follows. There, and wherever bearing or height are free, views are rendered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from phasemark.data import Bank
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
+
+VIEW = ("distance_m", "delta_rad", "bearing_rad", "height_m")
+STEP = 1e-5
+"""Half the width of a difference, metres or radians: as :meth:`~phasemark.render.Renderer.jacobian` takes it."""
+_DIM = 0.05
+"""Where a neighbour is dimmer than this share of the brightest one, interpolate linearly."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelImages:
+    """Images of m views and how they change; (m, pixels) arrays.
+
+    Parameters
+    ----------
+    phasor : complex128
+    slope : (m, p, pixels) complex128
+        ∂S by each of the parameters asked for.
+    intensity, coverage : float64
+    """
+
+    phasor: NDArray[np.complex128]
+    slope: NDArray[np.complex128]
+    intensity: NDArray[np.float64]
+    coverage: NDArray[np.float64]
+
+
+class ImageModel(Protocol):
+    """What the refinement asks of a model."""
+
+    def images(
+        self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
+    ) -> ModelImages:
+        """Return the images of views (m, 4), columns :data:`VIEW`, of a class each."""
+
+    def reach(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        std: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the least and the greatest coverage nearby, (m, pixels) each: within three `std` (m, p) at least."""
+
+    def limits(self) -> tuple[float, float]:
+        """Return the nearest and the farthest distance it can show."""
+
+
+class BankModel:
+    """Model images interpolated from a bank, bearing and height 0 and nothing behind.
+
+    Parameters
+    ----------
+    bank : Bank
+        Its grid must be regular, with at least four distances and four angles.
+    """
+
+    def __init__(self, bank: Bank) -> None:
+        self._sensor = bank.sensor
+        self._distance, self._delta = bank.distance_m, bank.delta_rad
+        self._period = closing_period(bank.delta_rad)
+        shape = (len(self._distance), len(self._delta), -1)
+        if bank.full is not None:
+            self._lower = _stack(bank.full, (len(bank.classes), *shape))
+            self._upper = _Stack.empty(len(bank.classes), len(self._distance))
+        else:
+            assert bank.lower is not None
+            assert bank.upper is not None
+            self._lower = _stack(bank.lower, (1, *shape))
+            self._upper = _stack(bank.upper, (len(bank.classes), len(self._distance), -1))
+
+    @staticmethod
+    def fits(bank: Bank) -> bool:
+        """Whether a bank's grid can be interpolated."""
+        return all(
+            len(grid) >= 4 and np.allclose(np.diff(grid), (grid[-1] - grid[0]) / (len(grid) - 1), rtol=1e-6)
+            for grid in (bank.distance_m, bank.delta_rad)
+        )
+
+    def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
+        """Interpolate; only distance and δ can be free."""
+        m, pixels = len(view), self._sensor.rows * self._sensor.cols
+        phasor, slope = np.zeros((m, pixels), np.complex128), np.zeros((m, 2, pixels), np.complex128)
+        shade = np.zeros((m, 2, pixels))
+        self._interpolate(class_index, view, phasor, slope, shade)
+        order = [VIEW.index(name) for name in free]
+        picked = slope if order == [0, 1] else slope[:, order]
+        return ModelImages(phasor, picked, shade[:, 0], shade[:, 1])
+
+    def reach(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        std: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the least and greatest coverage among the 16 neighbours on the grid."""
+        m, pixels = len(view), self._sensor.rows * self._sensor.cols
+        low, high = np.empty((m, pixels)), np.empty((m, pixels))
+        first_upper = self._upper.shade.shape[-1]
+        _extremes(
+            class_index, view, *self._grid(), self._upper.shade, self._lower.shade, first_upper, low, high
+        )
+        return low, high
+
+    def limits(self) -> tuple[float, float]:
+        """Return the bank's first and last distance."""
+        return float(self._distance[0]), float(self._distance[-1])
+
+    def _interpolate(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        phasor: NDArray[np.complex128],
+        slope: NDArray[np.complex128],
+        shade: NDArray[np.float64],
+    ) -> None:
+        grid = self._grid()
+        upper, lower = self._upper, self._lower
+        _interpolate(
+            class_index, view, *grid, upper.phasor, upper.shade, lower.phasor, lower.shade, phasor, slope, shade
+        )
+
+    def _grid(self) -> tuple[float, float, float, float, bool]:
+        step_d = float(self._distance[-1] - self._distance[0]) / (len(self._distance) - 1)
+        step_a = float(self._delta[-1] - self._delta[0]) / (len(self._delta) - 1)
+        return float(self._distance[0]), step_d, float(self._delta[0]), step_a, self._period is not None
+
+
+@dataclass(frozen=True, eq=False)
+class _Stack:
+    """Images of one part: phasor (class, D[, δ], pixels) and intensity with coverage, (class, D[, δ], 2, pixels)."""
+
+    phasor: NDArray[np.complex64]
+    shade: NDArray[np.float32]
+
+    @classmethod
+    def empty(cls, n_class: int, n_distance: int) -> _Stack:
+        return cls(np.zeros((n_class, n_distance, 0), np.complex64), np.zeros((n_class, n_distance, 2, 0), np.float32))
+
+
+def _stack(group: object, shape: tuple[int, ...]) -> _Stack:
+    phasor, intensity, coverage = (
+        np.ascontiguousarray(getattr(group, name)).reshape(shape) for name in ("phasor", "intensity", "coverage")
+    )
+    return _Stack(phasor, np.stack([intensity, coverage], axis=-2))
+
+
+def closing_period(delta_rad: NDArray[np.float64]) -> float | None:
+    """Return the period over which a regular grid of angles closes: 2π / n, one step beyond its end; None if none."""
+    if len(delta_rad) < 2:
+        return None
+    step = float(delta_rad[1] - delta_rad[0])
+    turns = 2 * np.pi / (delta_rad[-1] - delta_rad[0] + step)
+    return float(2 * np.pi / round(turns)) if round(turns) >= 1 and abs(turns - round(turns)) < 1e-6 else None
+
+
+class RenderedModel:
+    """Model images rendered where they are needed, from the meshes of a bank.
+
+    Parameters
+    ----------
+    bank : Bank
+    background : Background, optional
+        What stands behind the landmark.
+    workers : int
+        Threads that render.
+    """
+
+    def __init__(self, bank: Bank, background: Background | None = None, workers: int = 1) -> None:
+        self.sensor: Sensor = bank.sensor
+        self.background = background
+        self.workers = workers
+        self._renderers = []
+        self._factored = bank.lower is not None
+        near = 0.0
+        for name in bank.classes:
+            mesh = bank.mesh(name)
+            self._renderers.append(Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"])))
+            near = max(near, float(np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max()))
+        wall = None if background is None else background.wall_m
+        far = float(bank.distance_m[-1]) * 1.25 if wall is None else wall - near - 1e-3
+        self._limits = (near + 5e-3, far)
+        """The lens outside the landmark, and the landmark before the wall."""
+
+    def with_background(self, background: Background | None) -> RenderedModel:
+        """Return the same model before another background."""
+        other = object.__new__(RenderedModel)
+        other.__dict__.update(self.__dict__)
+        other.background = background
+        near = self._limits[0]
+        wall = None if background is None else background.wall_m
+        if wall is not None:
+            other._limits = (near, wall - near)
+        return other
+
+    def limits(self) -> tuple[float, float]:
+        """Return how near the lens may come, and how far the landmark may be."""
+        return self._limits
+
+    def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
+        """Render the views and their differences, 1e-5 m or rad to either side."""
+        m, pixels, p = len(view), self.sensor.rows * self.sensor.cols, len(free)
+        phasor, slope = np.empty((m, pixels), np.complex128), np.empty((m, p, pixels), np.complex128)
+        intensity, coverage = np.empty((m, pixels)), np.empty((m, pixels))
+        half = self.sensor.rows // 2 * self.sensor.cols
+        for c in np.unique(class_index):
+            of = np.flatnonzero(class_index == c)
+            image = self._render(c, view[of])
+            phasor[of] = image.phasor.reshape(len(of), -1)
+            intensity[of] = image.intensity.reshape(len(of), -1)
+            coverage[of] = image.coverage.reshape(len(of), -1)
+            for k, name in enumerate(free):
+                axis = VIEW.index(name)
+                moved = np.repeat(view[of][None], 2, axis=0)
+                at_floor = (name == "height_m") & (np.abs(view[of, axis]) < STEP)  # one-sided, PHYSICS section 7
+                moved[0, :, axis] += np.where(at_floor, 2 * STEP, STEP)
+                moved[1, :, axis] -= np.where(at_floor, -STEP, STEP)
+                width = (moved[0] - moved[1])[:, axis]
+                # a body of revolution looks the same from every side
+                only_lower = self._factored and name == "delta_rad"
+                rows = (self.sensor.rows // 2, self.sensor.rows) if only_lower and not view[of, 3].any() else None
+                both = self._render(c, moved.reshape(-1, 4), rows).phasor.reshape(2, len(of), -1)
+                change = (both[0] - both[1]) / width[:, None]
+                if rows is None:
+                    slope[of, k] = change
+                else:
+                    slope[of, k, :half] = 0.0
+                    slope[of, k, half:] = change
+        return ModelImages(phasor, slope, intensity, coverage)
+
+    def reach(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        std: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the least and greatest coverage three standard deviations away along each parameter."""
+        low = np.full((len(view), self.sensor.rows * self.sensor.cols), np.inf)
+        high = np.zeros(low.shape)
+        for k, name in enumerate(free):
+            for side in (-3.0, 3.0):
+                moved = view.copy()
+                moved[:, VIEW.index(name)] += side * std[:, k]
+                moved[:, 0] = np.clip(moved[:, 0], *self._limits)
+                for c in np.unique(class_index):
+                    of = np.flatnonzero(class_index == c)
+                    coverage = self._render(c, moved[of]).coverage.reshape(len(of), -1)
+                    low[of], high[of] = np.minimum(low[of], coverage), np.maximum(high[of], coverage)
+        return low, high
+
+    def _render(
+        self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None
+    ) -> PhasorImages:
+        renderer = self._renderers[class_index]
+        return renderer.render_views(
+            Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows, workers=self.workers
+        )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _cell(x, n, closes):  # type: ignore[no-untyped-def]
+    """Return the first of the four neighbours of x (in steps), and x's place beyond the second of them."""
+    first = int(np.floor(x)) - 1
+    if not closes:
+        first = min(max(first, 0), n - 4)
+    return first, x - first - 1.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _cubic(t, w, dw):  # type: ignore[no-untyped-def]
+    """Fill the weights of the cubic through four neighbours at −1, 0, 1, 2, and their derivatives."""
+    w[0] = -t * (t - 1) * (t - 2) / 6
+    w[1] = (t + 1) * (t - 1) * (t - 2) / 2
+    w[2] = -(t + 1) * t * (t - 2) / 2
+    w[3] = (t + 1) * t * (t - 1) / 6
+    dw[0] = -(3 * t * t - 6 * t + 2) / 6
+    dw[1] = (3 * t * t - 4 * t - 1) / 2
+    dw[2] = -(3 * t * t - 2 * t - 2) / 2
+    dw[3] = (3 * t * t - 1) / 6
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _linear(t, w, dw):  # type: ignore[no-untyped-def]
+    """Fill the weights of the straight line between the two neighbours around t, and their derivatives."""
+    k = min(max(int(np.floor(t)), -1), 1)
+    for a in range(4):
+        w[a], dw[a] = 0.0, 0.0
+    w[k + 1], w[k + 2] = k + 1.0 - t, t - k
+    dw[k + 1], dw[k + 2] = -1.0, 1.0
+
+
+@njit(cache=True, nogil=True)
+def _interpolate(  # type: ignore[no-untyped-def]
+    class_index, view, first_d, step_d, first_a, step_a, closes,
+    upper, upper_shade, lower, lower_shade, phasor, slope, shade,
+):  # fmt: skip
+    n_d, n_a = lower.shape[1], lower.shape[2]
+    n_up, n_low = upper.shape[-1], lower.shape[-1]
+    wd, dwd, wa, dwa = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
+    ld, dld, la, dla = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
+    js = np.empty(4, np.int64)
+    for m in range(len(class_index)):
+        c = class_index[m]
+        cl = c if lower.shape[0] > 1 else 0
+        i0, td = _cell((view[m, 0] - first_d) / step_d, n_d, False)
+        x = (view[m, 1] - first_a) / step_a
+        if closes:
+            x -= n_a * np.floor(x / n_a)
+        j0, ta = _cell(x, n_a, closes)
+        for b in range(4):
+            js[b] = (j0 + b) % n_a if closes else j0 + b
+        _cubic(td, wd, dwd)
+        _cubic(ta, wa, dwa)
+        _linear(td, ld, dld)
+        _linear(ta, la, dla)
+        for q in range(n_up):
+            low, high = np.inf, 0.0
+            for a in range(4):
+                s = upper[c, i0 + a, q]
+                size = s.real * s.real + s.imag * s.imag
+                low, high = min(low, size), max(high, size)
+            if high == 0.0:
+                continue
+            smooth = low > _DIM * _DIM * high
+            value, change = 0j, 0j
+            for a in range(4):
+                s = np.complex128(upper[c, i0 + a, q])
+                value += (wd[a] if smooth else ld[a]) * s
+                change += (dwd[a] if smooth else dld[a]) * s
+                shade[m, 0, q] += ld[a] * upper_shade[c, i0 + a, 0, q]
+                shade[m, 1, q] += ld[a] * upper_shade[c, i0 + a, 1, q]
+            phasor[m, q] = value
+            slope[m, 0, q] = change / step_d
+        for q in range(n_low):
+            low, high = np.inf, 0.0
+            for a in range(4):
+                for b in range(4):
+                    s = lower[cl, i0 + a, js[b], q]
+                    size = s.real * s.real + s.imag * s.imag
+                    low, high = min(low, size), max(high, size)
+            if high == 0.0:
+                continue
+            smooth = low > _DIM * _DIM * high
+            value, by_d, by_a = 0j, 0j, 0j
+            for a in range(4):
+                along, turned = 0j, 0j
+                for b in range(4):
+                    s = np.complex128(lower[cl, i0 + a, js[b], q])
+                    along += (wa[b] if smooth else la[b]) * s
+                    turned += (dwa[b] if smooth else dla[b]) * s
+                value += (wd[a] if smooth else ld[a]) * along
+                by_d += (dwd[a] if smooth else dld[a]) * along
+                by_a += (wd[a] if smooth else ld[a]) * turned
+                if ld[a] != 0.0:
+                    for b in range(4):
+                        shade[m, 0, n_up + q] += ld[a] * la[b] * lower_shade[cl, i0 + a, js[b], 0, q]
+                        shade[m, 1, n_up + q] += ld[a] * la[b] * lower_shade[cl, i0 + a, js[b], 1, q]
+            phasor[m, n_up + q] = value
+            slope[m, 0, n_up + q] = by_d / step_d
+            slope[m, 1, n_up + q] = by_a / step_a
+
+
+@njit(cache=True, nogil=True)
+def _extremes(  # type: ignore[no-untyped-def]
+    class_index, view, first_d, step_d, first_a, step_a, closes, upper_shade, lower_shade, n_up, low, high
+):
+    n_d, n_a = lower_shade.shape[1], lower_shade.shape[2]
+    for m in range(len(class_index)):
+        c = class_index[m]
+        cl = c if lower_shade.shape[0] > 1 else 0
+        i0, _ = _cell((view[m, 0] - first_d) / step_d, n_d, False)
+        x = (view[m, 1] - first_a) / step_a
+        if closes:
+            x -= n_a * np.floor(x / n_a)
+        j0, _ = _cell(x, n_a, closes)
+        low[m], high[m] = np.inf, 0.0
+        for a in range(4):
+            for q in range(n_up):
+                cover = upper_shade[c, i0 + a, 1, q]
+                low[m, q], high[m, q] = min(low[m, q], cover), max(high[m, q], cover)
+            for b in range(4):
+                j = (j0 + b) % n_a if closes else j0 + b
+                for q in range(lower_shade.shape[-1]):
+                    cover = lower_shade[cl, i0 + a, j, 1, q]
+                    low[m, n_up + q] = min(low[m, n_up + q], cover)
+                    high[m, n_up + q] = max(high[m, n_up + q], cover)
