@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -31,6 +32,9 @@ _MODES, _MODES_BEFORE_BACKGROUND = 2, 4
 _BESIDE_RAD = math.radians(1.0)
 """Side peaks of the likelihood before a background are about so far away (PHYSICS section 7)."""
 _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
+_LIKELY = 100.0
+"""An explanation whose cost is larger by this has no probability worth telling."""
+_MOST_REFINED = 3
 _FRAMES_AT_ONCE = 256
 
 
@@ -85,10 +89,11 @@ class MaximumLikelihood:
         self._used = used.ravel()
         self._huber = ROBUST_FROM if robust else None
         self._behind = None if self.background is None else _behind(bank, self.background)
-        can_interpolate = on == "ranges" and self.free == VIEW[:2] and BankModel.fits(bank)
-        interpolates = can_interpolate and self.background is None
-        self._rendered = None if interpolates and not self.auto else RenderedModel(bank, self.background, workers)
-        self._interpolated = BankModel(bank) if interpolates else None
+        on_grid = self.free == VIEW[:2] and BankModel.fits(bank)
+        exact = on_grid and on == "ranges" and self.background is None
+        self._bank_model = BankModel(bank) if exact else None
+        self._scout = BankModel(bank, self._behind, smooth_only=True) if on_grid else None
+        self._rendered = RenderedModel(bank, self.background, workers) if self.auto or not exact else None
         fine = (1, 1) if self.background is not None and "bearing_rad" not in self.free else (2, 3)
         stride = tuple(
             max(1, min(step, (len(grid) - 1) // 4))
@@ -107,11 +112,10 @@ class MaximumLikelihood:
 
     def _match_some(self, frames: FilteredFrames) -> list[Match]:
         evidence = Evidence.from_frames(frames, self.on)
-        model = self._interpolated or self._rendered
-        assert model is not None
         enough = self._enough(evidence)
         starts = self._search.starts(_some(evidence.seen, enough), self._n_modes(self.background))
-        fits = self._fit(model, evidence, enough, starts, self.background, self._behind)
+        models = _Models(self._bank_model or self._rendered, None if self._bank_model else self._scout)
+        fits = self._fit(models, evidence, enough, starts, self.background, self._behind)
         bare = bare_cost(evidence.seen, self._behind)
         return self._answers(frames, fits, bare, [self.background] * len(frames))
 
@@ -125,19 +129,17 @@ class MaximumLikelihood:
             enough = self._enough(evidence)
             background = around.background
             bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(one, evidence))
-            model: ImageModel | None = self._interpolated
+            assert self._rendered is not None
+            models = _Models(self._bank_model or self._rendered, None if self._bank_model else self._scout)
             behind = None
             seen = evidence.seen
             if background is not None:
-                assert self._rendered is not None
-                model = self._rendered.with_background(background)
                 behind = _behind(self.bank, background)
+                scout = None if self._scout is None else self._scout.before(behind)
+                models = _Models(self._rendered.with_background(background), scout)
                 seen = without_background(seen, around)
-            if model is None:
-                model = self._rendered
-            assert model is not None
             starts = self._search.starts(_some(seen, enough), self._n_modes(background))
-            fits = self._fit(model, evidence, enough, starts, background, behind)
+            fits = self._fit(models, evidence, enough, starts, background, behind)
             answers.extend(self._answers(one, fits, bare, [background]))
         return answers
 
@@ -150,47 +152,61 @@ class MaximumLikelihood:
 
     def _fit(
         self,
-        model: ImageModel,
+        models: _Models,
         evidence: Evidence,
         enough: NDArray[np.int64],
         starts: Starts,
         background: Background | None,
         behind: PhasorImages | None,
     ) -> Fits:
-        """Refine the modes of every frame, then let the other classes explain it from the best one's view."""
+        """Refine the modes of every frame, then let the other classes explain it from the best one's view.
+
+        A scout, where there is one, does this first; of what it finds only the best is refined again.
+        """
         settings = Settings(
             self.free, self._used, self._huber, None if behind is None else behind.phasor.reshape(-1)
         )
         frame, class_index, view = enough[starts.frame], starts.class_index, starts.view
         if background is not None:
-            first = np.flatnonzero(np.r_[True, np.diff(starts.frame) > 0]) if len(frame) else np.empty(0, np.int64)
-            sides = []
-            for side in (-_BESIDE_RAD, _BESIDE_RAD):
-                moved = view[first].copy()
-                moved[:, 1] += side
-                sides.append(moved)
+            first = np.flatnonzero(np.diff(starts.frame, prepend=-1))
+            sides = [view[first] + [[0.0, side, 0.0, 0.0]] for side in (-_BESIDE_RAD, _BESIDE_RAD)]
             frame = np.concatenate([frame, frame[first], frame[first]])
             class_index = np.concatenate([class_index, class_index[first], class_index[first]])
             view = np.concatenate([view, *sides])
-        fits = refine(model, evidence, frame, class_index, view, settings)
-        best = _best_of_frame(fits)
-        others = [
-            (fits.frame[k], c, fits.view[k])
-            for k in best
-            for c in range(len(self.bank.classes))
-            if c != fits.class_index[k]
-        ]
-        if not others:
+        lead = models.scout or models.final
+        assert lead is not None
+        fits = refine(lead, evidence, frame, class_index, view, settings)
+        fits = Fits.joined([fits, self._other_classes(lead, evidence, fits, settings)])
+        if models.scout is None:
             return fits
-        more = refine(
-            model,
-            evidence,
-            np.array([o[0] for o in others], np.int64),
-            np.array([o[1] for o in others], np.int64),
-            np.array([o[2] for o in others]),
-            settings,
+        assert models.final is not None
+        # of what the scout found, the likely ones are refined again; the others keep their distance from the best
+        order = np.lexsort((fits.cost, fits.frame))
+        least = _least_of_frame(fits, len(evidence.weight))
+        likely = [k for k in order if fits.cost[k] < least[fits.frame[k]] + _LIKELY]
+        chosen: list[int] = []
+        for k in likely:
+            same = [j for j in chosen if fits.frame[j] == fits.frame[k]]
+            if len(same) < _MOST_REFINED and len(self._distinct(fits, np.array([*same, k]))) > len(same):
+                chosen.append(int(k))
+        again = fits[np.array(chosen, np.int64)]
+        final = refine(models.final, evidence, again.frame, again.class_index, again.view, settings)
+        rest = np.setdiff1d(order, likely)
+        others = fits[rest]
+        gap = others.cost - least[others.frame]
+        others.cost[:] = _least_of_frame(final, len(evidence.weight))[others.frame] + gap
+        return Fits.joined([final, others])
+
+    def _other_classes(self, model: ImageModel, evidence: Evidence, fits: Fits, settings: Settings) -> Fits:
+        """Let every class but the best explain each frame, from the view of the best."""
+        best = _best_of_frame(fits)
+        n_class = len(self.bank.classes)
+        others = np.array([(k, c) for k in best for c in range(n_class) if c != fits.class_index[k]], np.int64)
+        others = others.reshape(-1, 2)
+        source = others[:, 0]
+        return refine(
+            model, evidence, fits.frame[source], others[:, 1], fits.view[source], settings, fits.cost[source] + _LIKELY
         )
-        return Fits.joined([fits, more])
 
     def _bare_wall_cost(self, one: FilteredFrames, evidence: Evidence) -> NDArray[np.float64]:
         """Return how badly a wall at its best distance explains all of one frame, (1,)."""
@@ -301,6 +317,14 @@ class MaximumLikelihood:
         return float(delta_rad % (2 * math.pi / self._symmetry[class_index]))
 
 
+@dataclass(frozen=True, eq=False)
+class _Models:
+    """What the answer is taken from, and what finds the way to it where that is slow."""
+
+    final: ImageModel | None
+    scout: ImageModel | None
+
+
 def weak_direction(information: NDArray[np.float64], free: Sequence[str]) -> tuple[float, dict[str, float]]:
     """Return the condition number of the information, and the direction known worst.
 
@@ -366,6 +390,13 @@ def _behind(bank: Bank, background: Background) -> PhasorImages:
 
 def _some(seen: Observation, index: NDArray[np.int64]) -> Observation:
     return Observation(seen.range_m[index], seen.weight[index], seen.returned[index], seen.not_returned[index])
+
+
+def _least_of_frame(fits: Fits, n: int) -> NDArray[np.float64]:
+    """Return the lowest cost of every frame, (n,)."""
+    least = np.full(n, np.inf)
+    np.minimum.at(least, fits.frame, fits.cost)
+    return least
 
 
 def _best_of_frame(fits: Fits) -> NDArray[np.int64]:

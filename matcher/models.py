@@ -10,6 +10,7 @@ grid, and no interpolation follows. There, and wherever bearing or height are fr
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -19,11 +20,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark.data import Bank
+from phasemark.data.bank import BankGroup
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 
 VIEW = ("distance_m", "delta_rad", "bearing_rad", "height_m")
 STEP = 1e-5
-"""Half the width of a difference, metres or radians: as :meth:`~phasemark.render.Renderer.jacobian` takes it."""
+"""Width of a difference, metres or radians: see :meth:`~phasemark.render.Renderer.jacobian`."""
+_FAINT = 1e-5
+"""Coverages this close to 0 or 1 are."""
 _DIM = 0.05
 """Where a neighbour is dimmer than this share of the brightest one, interpolate linearly."""
 
@@ -63,32 +67,48 @@ class ImageModel(Protocol):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the least and the greatest coverage nearby, (m, pixels) each: within three `std` (m, p) at least."""
 
+    def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which pixels of its images may be relied on, (m, pixels)."""
+
     def limits(self) -> tuple[float, float]:
         """Return the nearest and the farthest distance it can show."""
 
 
 class BankModel:
-    """Model images interpolated from a bank, bearing and height 0 and nothing behind.
+    """Model images interpolated from a bank, bearing and height 0.
 
     Parameters
     ----------
     bank : Bank
         Its grid must be regular, with at least four distances and four angles.
+    behind : PhasorImages, optional
+        One image of what stands behind, composed with the landmark's.
+    smooth_only : bool
+        Whether to distrust pixels whose brightness has a kink nearby: those that an edge enters or leaves within two
+        steps of the grid.
     """
 
-    def __init__(self, bank: Bank) -> None:
+    def __init__(self, bank: Bank, behind: PhasorImages | None = None, *, smooth_only: bool = False) -> None:
         self._sensor = bank.sensor
+        self._smooth_only = smooth_only
+        self._behind = _behind_arrays(behind)
         self._distance, self._delta = bank.distance_m, bank.delta_rad
         self._period = closing_period(bank.delta_rad)
         shape = (len(self._distance), len(self._delta), -1)
         if bank.full is not None:
             self._lower = _stack(bank.full, (len(bank.classes), *shape))
-            self._upper = _Stack.empty(len(bank.classes), len(self._distance))
+            self._upper = np.zeros((len(bank.classes), len(self._distance), 4, 0), np.float32)
         else:
             assert bank.lower is not None
             assert bank.upper is not None
             self._lower = _stack(bank.lower, (1, *shape))
             self._upper = _stack(bank.upper, (len(bank.classes), len(self._distance), -1))
+
+    def before(self, behind: PhasorImages | None) -> BankModel:
+        """Return the same model before another background."""
+        other = copy.copy(self)
+        other._behind = _behind_arrays(behind)
+        return other
 
     @staticmethod
     def fits(bank: Bank) -> bool:
@@ -103,7 +123,9 @@ class BankModel:
         m, pixels = len(view), self._sensor.rows * self._sensor.cols
         phasor, slope = np.zeros((m, pixels), np.complex128), np.zeros((m, 2, pixels), np.complex128)
         shade = np.zeros((m, 2, pixels))
-        self._interpolate(class_index, view, phasor, slope, shade)
+        _interpolate(
+            class_index, view, *self._grid(), self._upper, self._lower, *self._behind, phasor, slope, shade
+        )
         order = [VIEW.index(name) for name in free]
         picked = slope if order == [0, 1] else slope[:, order]
         return ModelImages(phasor, picked, shade[:, 0], shade[:, 1])
@@ -118,29 +140,19 @@ class BankModel:
         """Return the least and greatest coverage among the 16 neighbours on the grid."""
         m, pixels = len(view), self._sensor.rows * self._sensor.cols
         low, high = np.empty((m, pixels)), np.empty((m, pixels))
-        first_upper = self._upper.shade.shape[-1]
-        _extremes(
-            class_index, view, *self._grid(), self._upper.shade, self._lower.shade, first_upper, low, high
-        )
+        _extremes(class_index, view, *self._grid(), self._upper, self._lower, low, high)
         return low, high
+
+    def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which pixels are smooth enough."""
+        if not self._smooth_only:
+            return np.ones((len(view), self._sensor.rows * self._sensor.cols), np.bool_)
+        low, high = self.reach(class_index, view, (), np.empty((len(view), 0)))
+        return (high < _FAINT) | (low > 1 - _FAINT) | ((low > _FAINT) & (high < 1 - _FAINT))
 
     def limits(self) -> tuple[float, float]:
         """Return the bank's first and last distance."""
         return float(self._distance[0]), float(self._distance[-1])
-
-    def _interpolate(
-        self,
-        class_index: NDArray[np.int64],
-        view: NDArray[np.float64],
-        phasor: NDArray[np.complex128],
-        slope: NDArray[np.complex128],
-        shade: NDArray[np.float64],
-    ) -> None:
-        grid = self._grid()
-        upper, lower = self._upper, self._lower
-        _interpolate(
-            class_index, view, *grid, upper.phasor, upper.shade, lower.phasor, lower.shade, phasor, slope, shade
-        )
 
     def _grid(self) -> tuple[float, float, float, float, bool]:
         step_d = float(self._distance[-1] - self._distance[0]) / (len(self._distance) - 1)
@@ -148,23 +160,19 @@ class BankModel:
         return float(self._distance[0]), step_d, float(self._delta[0]), step_a, self._period is not None
 
 
-@dataclass(frozen=True, eq=False)
-class _Stack:
-    """Images of one part: phasor (class, D[, δ], pixels) and intensity with coverage, (class, D[, δ], 2, pixels)."""
-
-    phasor: NDArray[np.complex64]
-    shade: NDArray[np.float32]
-
-    @classmethod
-    def empty(cls, n_class: int, n_distance: int) -> _Stack:
-        return cls(np.zeros((n_class, n_distance, 0), np.complex64), np.zeros((n_class, n_distance, 2, 0), np.float32))
-
-
-def _stack(group: object, shape: tuple[int, ...]) -> _Stack:
+def _stack(group: BankGroup, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return real and imaginary part, intensity and coverage of a group's images, (class, D[, δ], 4, pixels)."""
     phasor, intensity, coverage = (
-        np.ascontiguousarray(getattr(group, name)).reshape(shape) for name in ("phasor", "intensity", "coverage")
+        np.asarray(images).reshape(shape) for images in (group.phasor, group.intensity, group.coverage)
     )
-    return _Stack(phasor, np.stack([intensity, coverage], axis=-2))
+    return np.ascontiguousarray(np.stack([phasor.real, phasor.imag, intensity, coverage], axis=-2))
+
+
+def _behind_arrays(behind: PhasorImages | None) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
+    """Return phasor and intensity of a background by pixel; empty without one."""
+    if behind is None:
+        return np.empty(0, np.complex128), np.empty(0)
+    return behind.phasor.reshape(-1), behind.intensity.reshape(-1)
 
 
 def closing_period(delta_rad: NDArray[np.float64]) -> float | None:
@@ -220,9 +228,9 @@ class RenderedModel:
         return self._limits
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
-        """Render the views and their differences, 1e-5 m or rad to either side."""
+        """Render the views, and once more a step of 1e-5 m or rad along each parameter."""
         m, pixels, p = len(view), self.sensor.rows * self.sensor.cols, len(free)
-        phasor, slope = np.empty((m, pixels), np.complex128), np.empty((m, p, pixels), np.complex128)
+        phasor, slope = np.empty((m, pixels), np.complex128), np.zeros((m, p, pixels), np.complex128)
         intensity, coverage = np.empty((m, pixels)), np.empty((m, pixels))
         half = self.sensor.rows // 2 * self.sensor.cols
         for c in np.unique(class_index):
@@ -233,22 +241,20 @@ class RenderedModel:
             coverage[of] = image.coverage.reshape(len(of), -1)
             for k, name in enumerate(free):
                 axis = VIEW.index(name)
-                moved = np.repeat(view[of][None], 2, axis=0)
-                at_floor = (name == "height_m") & (np.abs(view[of, axis]) < STEP)  # one-sided, PHYSICS section 7
-                moved[0, :, axis] += np.where(at_floor, 2 * STEP, STEP)
-                moved[1, :, axis] -= np.where(at_floor, -STEP, STEP)
-                width = (moved[0] - moved[1])[:, axis]
+                moved = view[of]
+                moved[:, axis] += STEP
+                width = (moved - view[of])[:, axis]
                 # a body of revolution looks the same from every side
-                only_lower = self._factored and name == "delta_rad"
-                rows = (self.sensor.rows // 2, self.sensor.rows) if only_lower and not view[of, 3].any() else None
-                both = self._render(c, moved.reshape(-1, 4), rows).phasor.reshape(2, len(of), -1)
-                change = (both[0] - both[1]) / width[:, None]
-                if rows is None:
-                    slope[of, k] = change
-                else:
-                    slope[of, k, :half] = 0.0
-                    slope[of, k, half:] = change
+                only_lower = self._factored and name == "delta_rad" and not view[of, 3].any()
+                first = half if only_lower else 0
+                rows = (self.sensor.rows // 2, self.sensor.rows) if only_lower else None
+                there = self._render(c, moved, rows).phasor.reshape(len(of), -1)
+                slope[of, k, first:] = (there - phasor[of, first:]) / width[:, None]
         return ModelImages(phasor, slope, intensity, coverage)
+
+    def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return that every pixel may be relied on."""
+        return np.ones((len(view), self.sensor.rows * self.sensor.cols), np.bool_)
 
     def reach(
         self,
@@ -312,16 +318,71 @@ def _linear(t, w, dw):  # type: ignore[no-untyped-def]
     dw[k + 1], dw[k + 2] = -1.0, 1.0
 
 
+@njit(cache=True, nogil=True, fastmath=True)
+def _gather(block, w, by_d, by_a, sums, extreme):  # type: ignore[no-untyped-def]
+    """Add one neighbour, (4, pixels), with its weights to the sums (9, pixels) of the cubic, and widen the extremes."""
+    for q in range(block.shape[1]):
+        re, im, cover = block[0, q], block[1, q], block[3, q]
+        sums[0, q] += w * re
+        sums[1, q] += by_d * re
+        sums[2, q] += by_a * re
+        sums[3, q] += w * im
+        sums[4, q] += by_d * im
+        sums[5, q] += by_a * im
+        sums[6, q] += w * cover
+        sums[7, q] += by_d * cover
+        sums[8, q] += by_a * cover
+        size = re * re + im * im
+        extreme[0, q] = size if size < extreme[0, q] else extreme[0, q]
+        extreme[1, q] = size if size > extreme[1, q] else extreme[1, q]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _gather_linear(block, w, by_d, by_a, sums):  # type: ignore[no-untyped-def]
+    """Add one neighbour, (4, pixels), with its weights to the sums (10, pixels) of the straight interpolation."""
+    for q in range(block.shape[1]):
+        re, im, cover = block[0, q], block[1, q], block[3, q]
+        sums[0, q] += w * re
+        sums[1, q] += by_d * re
+        sums[2, q] += by_a * re
+        sums[3, q] += w * im
+        sums[4, q] += by_d * im
+        sums[5, q] += by_a * im
+        sums[6, q] += w * cover
+        sums[7, q] += by_d * cover
+        sums[8, q] += by_a * cover
+        sums[9, q] += w * block[2, q]
+
+
+@njit(cache=True, nogil=True)
+def _conclude(m, first, cubic, straight, extreme, behind, behind_intensity, phasor, slope, shade):  # type: ignore[no-untyped-def]
+    """Choose for every pixel between cubic and straight, put the background behind it, and store it."""
+    for q in range(cubic.shape[1]):
+        at = first + q
+        chosen = cubic if extreme[0, q] > _DIM * _DIM * extreme[1, q] else straight
+        phasor[m, at] = complex(chosen[0, q], chosen[3, q])
+        slope[m, 0, at] = complex(chosen[1, q], chosen[4, q])
+        slope[m, 1, at] = complex(chosen[2, q], chosen[5, q])
+        shade[m, 0, at], shade[m, 1, at] = straight[9, q], straight[6, q]
+        if len(behind):
+            phasor[m, at] += (1 - chosen[6, q]) * behind[at]
+            slope[m, 0, at] -= chosen[7, q] * behind[at]
+            slope[m, 1, at] -= chosen[8, q] * behind[at]
+            shade[m, 0, at] += (1 - straight[6, q]) * behind_intensity[at]
+
+
 @njit(cache=True, nogil=True)
 def _interpolate(  # type: ignore[no-untyped-def]
-    class_index, view, first_d, step_d, first_a, step_a, closes,
-    upper, upper_shade, lower, lower_shade, phasor, slope, shade,
+    class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, behind, behind_intensity,
+    phasor, slope, shade,
 ):  # fmt: skip
+    """Fill phasor, its slopes by D and δ, and intensity with coverage, of m views."""
     n_d, n_a = lower.shape[1], lower.shape[2]
     n_up, n_low = upper.shape[-1], lower.shape[-1]
     wd, dwd, wa, dwa = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     ld, dld, la, dla = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
-    js = np.empty(4, np.int64)
+    cubic, straight, extreme = np.empty((9, n_low)), np.empty((10, n_low)), np.empty((2, n_low))
+    cubic_up, straight_up, extreme_up = np.empty((9, n_up)), np.empty((10, n_up)), np.empty((2, n_up))
     for m in range(len(class_index)):
         c = class_index[m]
         cl = c if lower.shape[0] > 1 else 0
@@ -330,67 +391,39 @@ def _interpolate(  # type: ignore[no-untyped-def]
         if closes:
             x -= n_a * np.floor(x / n_a)
         j0, ta = _cell(x, n_a, closes)
-        for b in range(4):
-            js[b] = (j0 + b) % n_a if closes else j0 + b
         _cubic(td, wd, dwd)
         _cubic(ta, wa, dwa)
         _linear(td, ld, dld)
         _linear(ta, la, dla)
-        for q in range(n_up):
-            low, high = np.inf, 0.0
-            for a in range(4):
-                s = upper[c, i0 + a, q]
-                size = s.real * s.real + s.imag * s.imag
-                low, high = min(low, size), max(high, size)
-            if high == 0.0:
-                continue
-            smooth = low > _DIM * _DIM * high
-            value, change = 0j, 0j
-            for a in range(4):
-                s = np.complex128(upper[c, i0 + a, q])
-                value += (wd[a] if smooth else ld[a]) * s
-                change += (dwd[a] if smooth else dld[a]) * s
-                shade[m, 0, q] += ld[a] * upper_shade[c, i0 + a, 0, q]
-                shade[m, 1, q] += ld[a] * upper_shade[c, i0 + a, 1, q]
-            phasor[m, q] = value
-            slope[m, 0, q] = change / step_d
-        for q in range(n_low):
-            low, high = np.inf, 0.0
-            for a in range(4):
-                for b in range(4):
-                    s = lower[cl, i0 + a, js[b], q]
-                    size = s.real * s.real + s.imag * s.imag
-                    low, high = min(low, size), max(high, size)
-            if high == 0.0:
-                continue
-            smooth = low > _DIM * _DIM * high
-            value, by_d, by_a = 0j, 0j, 0j
-            for a in range(4):
-                along, turned = 0j, 0j
-                for b in range(4):
-                    s = np.complex128(lower[cl, i0 + a, js[b], q])
-                    along += (wa[b] if smooth else la[b]) * s
-                    turned += (dwa[b] if smooth else dla[b]) * s
-                value += (wd[a] if smooth else ld[a]) * along
-                by_d += (dwd[a] if smooth else dld[a]) * along
-                by_a += (wd[a] if smooth else ld[a]) * turned
-                if ld[a] != 0.0:
-                    for b in range(4):
-                        shade[m, 0, n_up + q] += ld[a] * la[b] * lower_shade[cl, i0 + a, js[b], 0, q]
-                        shade[m, 1, n_up + q] += ld[a] * la[b] * lower_shade[cl, i0 + a, js[b], 1, q]
-            phasor[m, n_up + q] = value
-            slope[m, 0, n_up + q] = by_d / step_d
-            slope[m, 1, n_up + q] = by_a / step_a
+        cubic[:], straight[:], extreme[0], extreme[1] = 0.0, 0.0, np.inf, 0.0
+        cubic_up[:], straight_up[:], extreme_up[0], extreme_up[1] = 0.0, 0.0, np.inf, 0.0
+        for a in range(4):
+            if n_up:
+                block = upper[c, i0 + a]
+                _gather(block, wd[a], dwd[a] / step_d, 0.0, cubic_up, extreme_up)
+                if dld[a] != 0.0:
+                    _gather_linear(block, ld[a], dld[a] / step_d, 0.0, straight_up)
+            for b in range(4):
+                block = lower[cl, i0 + a, (j0 + b) % n_a]
+                _gather(block, wd[a] * wa[b], dwd[a] * wa[b] / step_d, wd[a] * dwa[b] / step_a, cubic, extreme)
+                if dld[a] != 0.0 and dla[b] != 0.0:
+                    _gather_linear(
+                        block, ld[a] * la[b], dld[a] * la[b] / step_d, ld[a] * dla[b] / step_a, straight
+                    )
+        _conclude(m, 0, cubic_up, straight_up, extreme_up, behind, behind_intensity, phasor, slope, shade)
+        _conclude(m, n_up, cubic, straight, extreme, behind, behind_intensity, phasor, slope, shade)
 
 
 @njit(cache=True, nogil=True)
 def _extremes(  # type: ignore[no-untyped-def]
-    class_index, view, first_d, step_d, first_a, step_a, closes, upper_shade, lower_shade, n_up, low, high
+    class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, low, high
 ):
-    n_d, n_a = lower_shade.shape[1], lower_shade.shape[2]
+    """Fill the least and greatest coverage among the neighbours of m views."""
+    n_d, n_a = lower.shape[1], lower.shape[2]
+    n_up = upper.shape[-1]
     for m in range(len(class_index)):
         c = class_index[m]
-        cl = c if lower_shade.shape[0] > 1 else 0
+        cl = c if lower.shape[0] > 1 else 0
         i0, _ = _cell((view[m, 0] - first_d) / step_d, n_d, False)
         x = (view[m, 1] - first_a) / step_a
         if closes:
@@ -399,11 +432,11 @@ def _extremes(  # type: ignore[no-untyped-def]
         low[m], high[m] = np.inf, 0.0
         for a in range(4):
             for q in range(n_up):
-                cover = upper_shade[c, i0 + a, 1, q]
+                cover = upper[c, i0 + a, 3, q]
                 low[m, q], high[m, q] = min(low[m, q], cover), max(high[m, q], cover)
             for b in range(4):
                 j = (j0 + b) % n_a if closes else j0 + b
-                for q in range(lower_shade.shape[-1]):
-                    cover = lower_shade[cl, i0 + a, j, 1, q]
+                for q in range(lower.shape[-1]):
+                    cover = lower[cl, i0 + a, j, 3, q]
                     low[m, n_up + q] = min(low[m, n_up + q], cover)
                     high[m, n_up + q] = max(high[m, n_up + q], cover)

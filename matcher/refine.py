@@ -24,7 +24,11 @@ SCALE = {"distance_m": 0.01, "delta_rad": np.radians(1), "bearing_rad": np.radia
 _LONGEST_STEP = 3.0
 _MAX_ITERATIONS = 30
 _SETTLED = 1e-4
-"""A step that promises to lower the whitened squared residual by less than this is the last."""
+"""A step that promises to lower the whitened squared residual by less than this is not taken."""
+_LAST = 1e-2
+"""A step that promised less than this, and kept it, leaves less than :data:`_SETTLED`."""
+_OPTIMISM = 3.0
+"""A fit gives up where even so many times the promised decrease would not save it."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,7 @@ def refine(
     class_index: NDArray[np.int64],
     view: NDArray[np.float64],
     settings: Settings,
+    give_up_above: NDArray[np.float64] | None = None,
 ) -> Fits:
     """Move m candidates to the nearest maximum of the likelihood.
 
@@ -110,13 +115,16 @@ def refine(
     view : (m, 4) float64
         Where it starts, columns :data:`~phasemark.matcher.models.VIEW`.
     settings : Settings
+    give_up_above : (m,) float64, optional
+        Stop where the cost promises to stay above this.
 
     Returns
     -------
     Fits
         In the order of the candidates.
     """
-    problem = _Problem(model, evidence, frame, class_index, settings)
+    limit = np.full(len(frame), np.inf) if give_up_above is None else give_up_above
+    problem = _Problem(model, evidence, frame, class_index, settings, limit)
     state = problem.start(view)
     state = problem.descend(state)
     use = problem.pixels_at(state.images, state.theta)
@@ -158,7 +166,9 @@ class _Problem:
         frame: NDArray[np.int64],
         class_index: NDArray[np.int64],
         settings: Settings,
+        limit: NDArray[np.float64],
     ) -> None:
+        self.limit = limit
         self.model, self.evidence, self.settings = model, evidence, settings
         self.frame, self.class_index = frame, class_index
         self.with_albedo = evidence.on == "phasors"
@@ -167,7 +177,9 @@ class _Problem:
         self.scale = np.array([SCALE[name] for name in names])
 
     def some(self, which: NDArray[np.integer]) -> _Problem:
-        return _Problem(self.model, self.evidence, self.frame[which], self.class_index[which], self.settings)
+        return _Problem(
+            self.model, self.evidence, self.frame[which], self.class_index[which], self.settings, self.limit[which]
+        )
 
     def start(self, view: NDArray[np.float64]) -> _State:
         view = self._clipped(view.copy())
@@ -187,7 +199,8 @@ class _Problem:
     def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels count at some views, (m, pixels)."""
         intensity = images.intensity * theta[:, 4:]  # before a background the albedo's part in it is of no account
-        return counts(images.phasor, intensity, self.evidence.sensor)
+        trusted = self.model.trusted(self.class_index, theta[:, :4])
+        return counts(images.phasor, intensity, self.evidence.sensor) & trusted
 
     def descend(self, state: _State) -> _State:
         """Run Levenberg–Marquardt, each candidate with its own damping."""
@@ -197,6 +210,10 @@ class _Problem:
             sums = state.sums
             step = self._steps(sums.information[active], sums.gradient[active], damping[active])
             promise = np.einsum("mp,mp->m", sums.gradient[active], step)
+            worth = (promise > _SETTLED) & (sums.cost[active] - _OPTIMISM * promise < self.limit[active])
+            active, step, promise = active[worth], step[worth], promise[worth]
+            if not active.size:
+                break
             trial = self.some(active)
             theta = state.theta[active].copy()
             theta[:, self.columns] += step
@@ -207,9 +224,8 @@ class _Problem:
             wins = np.flatnonzero(better)
             state = state.updated(active[wins], _picked(there, wins))
             damping[active] = np.where(better, np.maximum(damping[active] * 0.1, 1e-9), damping[active] * 8)
-            active = active[(promise > _SETTLED) & (damping[active] < 1e5)]
-            if not active.size:
-                break
+            # a step that was taken and promised next to nothing was the last
+            active = active[((promise > _LAST) | ~better) & (damping[active] < 1e5)]
         return state
 
     def conclude(self, state: _State) -> Fits:
@@ -240,7 +256,8 @@ class _Problem:
         else:
             lost = np.zeros_like(returned)
             missed = absent & state.use
-        wrong = (lost | missed) & ~fitted
+        # a kink nearby excuses a pixel where it keeps it from being compared
+        wrong = (lost | missed) & ~fitted & self.model.trusted(self.class_index, state.theta[:, :4])
         n_wrong = wrong.sum(axis=1)
         return Fits(
             frame=self.frame,
