@@ -175,7 +175,11 @@ class MaximumLikelihood:
             view = np.concatenate([view, *sides])
         lead = models.scout or models.final
         assert lead is not None
-        fits = refine(lead, evidence, frame, class_index, view, settings)
+        fits = refine(lead, evidence, frame, class_index, view, settings, roughly=True)
+        likely = fits.cost < _least_of_frame(fits, len(evidence.weight))[fits.frame] + 2 * _LIKELY
+        better = fits[likely]
+        better = refine(lead, evidence, better.frame, better.class_index, better.view, settings)
+        fits = Fits.joined([better, fits[~likely]])
         fits = Fits.joined([fits, self._other_classes(lead, evidence, fits, settings)])
         if models.scout is None:
             return fits

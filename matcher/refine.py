@@ -25,8 +25,7 @@ _LONGEST_STEP = 3.0
 _MAX_ITERATIONS = 30
 _SETTLED = 1e-4
 """A step that promises to lower the whitened squared residual by less than this is not taken."""
-_LAST = 1e-2
-"""A step that promised less than this, and kept it, leaves less than :data:`_SETTLED`."""
+_ROUGH = 0.1
 _OPTIMISM = 3.0
 """A fit gives up where even so many times the promised decrease would not save it."""
 
@@ -103,6 +102,8 @@ def refine(
     view: NDArray[np.float64],
     settings: Settings,
     give_up_above: NDArray[np.float64] | None = None,
+    *,
+    roughly: bool = False,
 ) -> Fits:
     """Move m candidates to the nearest maximum of the likelihood.
 
@@ -117,6 +118,8 @@ def refine(
     settings : Settings
     give_up_above : (m,) float64, optional
         Stop where the cost promises to stay above this.
+    roughly : bool
+        Whether to stop within a fraction of a standard deviation, with the pixels that counted at the start.
 
     Returns
     -------
@@ -126,12 +129,14 @@ def refine(
     limit = np.full(len(frame), np.inf) if give_up_above is None else give_up_above
     problem = _Problem(model, evidence, frame, class_index, settings, limit)
     state = problem.start(view)
-    state = problem.descend(state)
+    state = problem.descend(state, _ROUGH if roughly else _SETTLED)
+    if roughly:
+        return problem.conclude(state)
     use = problem.pixels_at(state.images, state.theta)
     changed = np.flatnonzero((use != state.use).any(axis=1))
     if changed.size:
         again = problem.some(changed)
-        moved = again.descend(again.state(state.theta[changed], use[changed]))
+        moved = again.descend(again.state(state.theta[changed], use[changed]), _SETTLED)
         state = state.updated(changed, moved)
     return problem.conclude(state)
 
@@ -202,7 +207,7 @@ class _Problem:
         trusted = self.model.trusted(self.class_index, theta[:, :4])
         return counts(images.phasor, intensity, self.evidence.sensor) & trusted
 
-    def descend(self, state: _State) -> _State:
+    def descend(self, state: _State, settled: float) -> _State:
         """Run Levenberg–Marquardt, each candidate with its own damping."""
         damping = np.full(len(state.theta), 1e-3)
         active = np.arange(len(state.theta))
@@ -210,7 +215,7 @@ class _Problem:
             sums = state.sums
             step = self._steps(sums.information[active], sums.gradient[active], damping[active])
             promise = np.einsum("mp,mp->m", sums.gradient[active], step)
-            worth = (promise > _SETTLED) & (sums.cost[active] - _OPTIMISM * promise < self.limit[active])
+            worth = (promise > settled) & (sums.cost[active] - _OPTIMISM * promise < self.limit[active])
             active, step, promise = active[worth], step[worth], promise[worth]
             if not active.size:
                 break
@@ -224,8 +229,8 @@ class _Problem:
             wins = np.flatnonzero(better)
             state = state.updated(active[wins], _picked(there, wins))
             damping[active] = np.where(better, np.maximum(damping[active] * 0.1, 1e-9), damping[active] * 8)
-            # a step that was taken and promised next to nothing was the last
-            active = active[((promise > _LAST) | ~better) & (damping[active] < 1e5)]
+            # a step that was taken and promised little was the last: the next would promise its square
+            active = active[((promise > 100 * settled) | ~better) & (damping[active] < 1e5)]
         return state
 
     def conclude(self, state: _State) -> Fits:
