@@ -172,12 +172,13 @@ def _modes(cost, n_modes, closes):  # type: ignore[no-untyped-def]
                 if not own < lowest[-1]:
                     continue
                 least = True
-                for ii in range(max(i - 1, 0), min(i + 2, n_d)):
-                    for jj in range(j - 1, j + 2):
-                        if closes:
-                            jj %= n_a
-                        if 0 <= jj < n_a and cost[b, ii, jj] < own:
-                            least = False
+                for bb in range(max(b - 1, 0), min(b + 2, n_b)):
+                    for ii in range(max(i - 1, 0), min(i + 2, n_d)):
+                        for jj in range(j - 1, j + 2):
+                            if closes:
+                                jj %= n_a
+                            if 0 <= jj < n_a and cost[bb, ii, jj] < own:
+                                least = False
                 if not least:
                     continue
                 k = n_modes - 1

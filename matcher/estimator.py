@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -34,6 +35,9 @@ _BESIDE_RAD = math.radians(1.0)
 _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
 _LIKELY = 100.0
 """An explanation whose cost is larger by this has no probability worth telling."""
+_MARGIN = 500.0
+"""A rough fit whose cost is larger by this does not become the best one: a column of pixels on the wrong side of an
+edge costs half as much."""
 _MOST_REFINED = 3
 _FRAMES_AT_ONCE = 256
 
@@ -68,7 +72,7 @@ class MaximumLikelihood:
         on: Quantity = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
-        workers: int = 1,
+        workers: int | None = None,
     ) -> None:
         if on not in ("ranges", "phasors"):
             raise UsageError(f"'on' must be ranges or phasors, got {on!r}")
@@ -93,7 +97,7 @@ class MaximumLikelihood:
         exact = on_grid and on == "ranges" and self.background is None
         self._bank_model = BankModel(bank) if exact else None
         self._scout = BankModel(bank, self._behind, smooth_only=True) if on_grid else None
-        self._rendered = RenderedModel(bank, self.background, workers) if self.auto or not exact else None
+        self._rendered = RenderedModel(bank, self.background, workers or _usual_workers()) if self.auto or not exact else None
         fine = (1, 1) if self.background is not None and "bearing_rad" not in self.free else (2, 3)
         stride = tuple(
             max(1, min(step, (len(grid) - 1) // 4))
@@ -175,11 +179,7 @@ class MaximumLikelihood:
             view = np.concatenate([view, *sides])
         lead = models.scout or models.final
         assert lead is not None
-        fits = refine(lead, evidence, frame, class_index, view, settings, roughly=True)
-        likely = fits.cost < _least_of_frame(fits, len(evidence.weight))[fits.frame] + 2 * _LIKELY
-        better = fits[likely]
-        better = refine(lead, evidence, better.frame, better.class_index, better.view, settings)
-        fits = Fits.joined([better, fits[~likely]])
+        fits = self._modes(lead, evidence, frame, class_index, view, settings)
         fits = Fits.joined([fits, self._other_classes(lead, evidence, fits, settings)])
         if models.scout is None:
             return fits
@@ -200,6 +200,31 @@ class MaximumLikelihood:
         gap = others.cost - least[others.frame]
         others.cost[:] = _least_of_frame(final, len(evidence.weight))[others.frame] + gap
         return Fits.joined([final, others])
+
+    def _modes(
+        self,
+        model: ImageModel,
+        evidence: Evidence,
+        frame: NDArray[np.int64],
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        settings: Settings,
+    ) -> Fits:
+        """Refine the best start of every frame, the others while they can still win, and at last what is likely."""
+        n = len(evidence.weight)
+        first = np.isin(np.arange(len(frame)), np.unique(frame, return_index=True)[1])
+        fits = refine(
+            model, evidence, frame[first], class_index[first], view[first], settings, roughly=True
+        )
+        limit = _least_of_frame(fits, n)[frame[~first]] + _MARGIN
+        more = refine(
+            model, evidence, frame[~first], class_index[~first], view[~first], settings, limit, roughly=True
+        )
+        fits = Fits.joined([fits, more])
+        likely = fits.cost < _least_of_frame(fits, n)[fits.frame] + _MARGIN
+        better = fits[likely]
+        better = refine(model, evidence, better.frame, better.class_index, better.view, settings)
+        return Fits.joined([better, fits[~likely]])
 
     def _other_classes(self, model: ImageModel, evidence: Evidence, fits: Fits, settings: Settings) -> Fits:
         """Let every class but the best explain each frame, from the view of the best."""
@@ -386,6 +411,10 @@ def p_values_of(
         variance = freedom * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
         p = stats.chi2.sf(cost * 2 * mean / variance, 2 * mean**2 / variance)
     return np.where(dof > 0, p, 0.0)
+
+
+def _usual_workers() -> int:
+    return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8)
 
 
 def _behind(bank: Bank, background: Background) -> PhasorImages:

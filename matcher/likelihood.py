@@ -58,7 +58,8 @@ class Evidence:
     weight : float64
         1/variance of the residual (m⁻² on ranges); 0 where there is none.
     seen : Observation
-        The same frames as the coarse search sees them.
+        The same frames as the coarse search sees them. What one frame cannot measure to 0.1 rad is no return there,
+        whether or not the camera dropped it.
     on : {"ranges", "phasors"}
     sensor : Sensor
     """
@@ -79,18 +80,24 @@ class Evidence:
             Phasors are asked of frames without amplitude or intensity.
         """
         sensor = frames.sensor
-        seen = Observation.from_frames(frames, (0, sensor.rows))
-        turn = np.where(seen.returned, np.exp(1j * seen.range_m / sensor.metres_per_radian), 0.0)
+        whole = Observation.from_frames(frames, (0, sensor.rows))
+        measured = whole.returned
+        one_frame_m2 = np.divide(
+            frames.n_effective.reshape(measured.shape), whole.weight, out=np.zeros(measured.shape), where=measured
+        )
+        strong = measured & ~(one_frame_m2 > one_frame_limit_m(sensor) ** 2)
+        seen = Observation(whole.range_m, whole.weight, strong, whole.not_returned | (measured & ~strong))
+        turn = np.where(measured, np.exp(1j * seen.range_m / sensor.metres_per_radian), 0.0)
         if on == "ranges":
-            return cls(turn, seen.weight, seen, on, sensor)
+            return cls(turn, whole.weight, seen, on, sensor)
         if frames.amplitude_e is None or frames.intensity_e is None:
             raise UsageError('on="phasors" needs frames with amplitude and intensity: match on="ranges"')
         shape = seen.range_m.shape
         unit = sensor.contrast * sensor.signal_e
-        amplitude = np.where(seen.returned, frames.amplitude_e.reshape(shape), 0.0) / unit
-        intensity = np.where(seen.returned, frames.intensity_e.reshape(shape), 0.0)
+        amplitude = np.where(measured, frames.amplitude_e.reshape(shape), 0.0) / unit
+        intensity = np.where(measured, frames.intensity_e.reshape(shape), 0.0)
         variance = np.maximum(phase_image_variance(intensity, sensor), 1.0) / (2 * unit**2)
-        weight = np.where(seen.returned, frames.n_effective.reshape(shape) / variance, 0.0)
+        weight = np.where(measured, frames.n_effective.reshape(shape) / variance, 0.0)
         return cls(turn * amplitude, weight, seen, on, sensor)
 
     def __getitem__(self, index: NDArray[np.integer] | slice) -> Evidence:

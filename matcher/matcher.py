@@ -67,8 +67,8 @@ class Matcher:
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool
         Whether "refine" counts residuals beyond 3 σ linearly (Huber); the covariance is then the sandwich.
-    workers : int
-        Threads that render, where "refine" renders; the answer does not depend on it.
+    workers : int, optional
+        Threads that render (None: one for each processor), where "refine" renders; the answer does not depend on it.
 
     Raises
     ------
@@ -94,7 +94,7 @@ class Matcher:
         on: Quantity = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
-        workers: int = 1,
+        workers: int | None = None,
     ) -> None:
         if method not in METHODS:
             raise UsageError(f"unknown method {method!r}: the methods are {', '.join(METHODS)}")

@@ -131,7 +131,7 @@ def refine(
     state = problem.start(view)
     state = problem.descend(state, _ROUGH if roughly else _SETTLED)
     if roughly:
-        return problem.conclude(state)
+        return problem.conclude(state, look_around=False)
     use = problem.pixels_at(state.images, state.theta)
     changed = np.flatnonzero((use != state.use).any(axis=1))
     if changed.size:
@@ -187,15 +187,19 @@ class _Problem:
         )
 
     def start(self, view: NDArray[np.float64]) -> _State:
-        view = self._clipped(view.copy())
-        images = self.model.images(self.class_index, view, self.settings.free)
-        theta = np.column_stack([view, np.ones(len(view))])
+        """Look at the first views: which pixels count, and how bright the landmark is."""
+        theta = np.column_stack([self._clipped(view.copy()), np.ones(len(view))])
+        images = self.model.images(self.class_index, np.ascontiguousarray(theta[:, :4]), self.settings.free)
         if self.with_albedo:
             theta[:, 4] = self._brightness(images)
-        return self.state(theta, self.pixels_at(images, theta))
+        return self._summed(theta, self.pixels_at(images, theta), self._scaled(images, theta))
 
     def state(self, theta: NDArray[np.float64], use: NDArray[np.bool_]) -> _State:
-        images = self._images(theta)
+        """Render and compare."""
+        images = self.model.images(self.class_index, np.ascontiguousarray(theta[:, :4]), self.settings.free)
+        return self._summed(theta, use, self._scaled(images, theta))
+
+    def _summed(self, theta: NDArray[np.float64], use: NDArray[np.bool_], images: ModelImages) -> _State:
         sums = gauss_newton_sums(
             images.phasor, images.slope, self.evidence, self.frame, use & self.settings.pixels, self.settings.huber
         )
@@ -203,9 +207,8 @@ class _Problem:
 
     def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels count at some views, (m, pixels)."""
-        intensity = images.intensity * theta[:, 4:]  # before a background the albedo's part in it is of no account
         trusted = self.model.trusted(self.class_index, theta[:, :4])
-        return counts(images.phasor, intensity, self.evidence.sensor) & trusted
+        return counts(images.phasor, images.intensity, self.evidence.sensor) & trusted
 
     def descend(self, state: _State, settled: float) -> _State:
         """Run Levenberg–Marquardt, each candidate with its own damping."""
@@ -233,7 +236,7 @@ class _Problem:
             active = active[((promise > 100 * settled) | ~better) & (damping[active] < 1e5)]
         return state
 
-    def conclude(self, state: _State) -> Fits:
+    def conclude(self, state: _State, *, look_around: bool = True) -> Fits:
         """Take stock of the solutions."""
         sums, settings, evidence = state.sums, self.settings, self.evidence
         p = len(settings.free)
@@ -251,8 +254,11 @@ class _Problem:
         fitted = state.use & (evidence.weight[self.frame] > 0)
         std = np.sqrt(np.where(np.isfinite(covariance), covariance, 0.0)[:, range(p), range(p)])
         std = np.minimum(std, self.scale[:p])
-        low, high = self.model.reach(self.class_index, state.theta[:, :4], settings.free, std)
-        low, high = np.minimum(low, state.images.coverage), np.maximum(high, state.images.coverage)
+        low, high = state.images.coverage.copy(), state.images.coverage.copy()
+        near = np.flatnonzero((cost <= self.limit) & look_around)  # where it does not matter any more, what is nearby is not looked at
+        if near.size:
+            around = self.model.reach(self.class_index[near], state.theta[near, :4], settings.free, std[near])
+            low[near], high[near] = np.minimum(low[near], around[0]), np.maximum(high[near], around[1])
         returned = evidence.seen.returned[self.frame]
         absent = evidence.seen.not_returned[self.frame]
         if settings.background is None:
@@ -275,8 +281,8 @@ class _Problem:
             information=information,
         )
 
-    def _images(self, theta: NDArray[np.float64]) -> ModelImages:
-        images = self.model.images(self.class_index, np.ascontiguousarray(theta[:, :4]), self.settings.free)
+    def _scaled(self, images: ModelImages, theta: NDArray[np.float64]) -> ModelImages:
+        """Make the landmark as bright as the parameters have it, and append the slope by that."""
         if not self.with_albedo:
             return images
         own = self._landmark_alone(images)
