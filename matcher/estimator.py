@@ -30,6 +30,9 @@ MIN_RETURNS = 3
 ROBUST_FROM = 3.0
 """Where Huber's loss turns linear, in σ: far enough out to cost an honest frame nothing."""
 _MODES, _MODES_BEFORE_BACKGROUND = 2, 4
+_MODES_AGAIN = 8
+_HOPELESS = 1e-4
+"""A p-value at which it is worth looking elsewhere."""
 _BESIDE_RAD = math.radians(1.0)
 """Side peaks of the likelihood before a background are about so far away (PHYSICS section 7)."""
 _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
@@ -117,9 +120,8 @@ class MaximumLikelihood:
     def _match_some(self, frames: FilteredFrames) -> list[Match]:
         evidence = Evidence.from_frames(frames, self.on)
         enough = self._enough(evidence)
-        starts = self._search.starts(_some(evidence.seen, enough), self._n_modes(self.background))
         models = _Models(self._bank_model or self._rendered, None if self._bank_model else self._scout)
-        fits = self._fit(models, evidence, enough, starts, self.background, self._behind)
+        fits = self._searched(models, evidence, evidence.seen, enough, self.background, self._behind)
         bare = bare_cost(evidence.seen, self._behind)
         return self._answers(frames, fits, bare, [self.background] * len(frames))
 
@@ -142,13 +144,32 @@ class MaximumLikelihood:
                 scout = None if self._scout is None else self._scout.before(behind)
                 models = _Models(self._rendered.with_background(background), scout)
                 seen = without_background(seen, around)
-            starts = self._search.starts(_some(seen, enough), self._n_modes(background))
-            fits = self._fit(models, evidence, enough, starts, background, behind)
+            fits = self._searched(models, evidence, seen, enough, background, behind)
             answers.extend(self._answers(one, fits, bare, [background]))
         return answers
 
-    def _n_modes(self, background: Background | None) -> int:
-        return _MODES if background is None else _MODES_BEFORE_BACKGROUND
+    def _searched(
+        self,
+        models: _Models,
+        evidence: Evidence,
+        seen: Observation,
+        enough: NDArray[np.int64],
+        background: Background | None,
+        behind: PhasorImages | None,
+    ) -> Fits:
+        """Search and fit; where nothing fits, search again from many more places."""
+        n_modes = _MODES if background is None else _MODES_BEFORE_BACKGROUND
+        starts = self._search.starts(_some(seen, enough), n_modes)
+        sides = () if background is None else (-_BESIDE_RAD, _BESIDE_RAD)
+        fits = self._fit(models, evidence, enough, starts, sides, behind)
+        best = _best_of_frame(fits)
+        poor = fits.frame[best[fits.cost[best] > stats.chi2.isf(_HOPELESS, np.maximum(fits.dof[best], 1))]]
+        if not poor.size:
+            return fits
+        starts = self._search.starts(_some(seen, poor), _MODES_AGAIN)
+        sides = tuple(side * _BESIDE_RAD for side in (-2.0, -1.0, 1.0, 2.0))
+        again = self._fit(_Models(models.final, None), evidence, poor, starts, sides, behind)
+        return Fits.joined([fits, again])
 
     def _enough(self, evidence: Evidence) -> NDArray[np.int64]:
         """Return which frames have enough returns to place a landmark."""
@@ -160,23 +181,24 @@ class MaximumLikelihood:
         evidence: Evidence,
         enough: NDArray[np.int64],
         starts: Starts,
-        background: Background | None,
+        sides: tuple[float, ...],
         behind: PhasorImages | None,
     ) -> Fits:
         """Refine the modes of every frame, then let the other classes explain it from the best one's view.
 
+        The best start is tried with δ moved to some sides too.
         A scout, where there is one, does this first; of what it finds only the best is refined again.
         """
         settings = Settings(
             self.free, self._used, self._huber, None if behind is None else behind.phasor.reshape(-1)
         )
         frame, class_index, view = enough[starts.frame], starts.class_index, starts.view
-        if background is not None:
+        if sides:
             first = np.flatnonzero(np.diff(starts.frame, prepend=-1))
-            sides = [view[first] + [[0.0, side, 0.0, 0.0]] for side in (-_BESIDE_RAD, _BESIDE_RAD)]
-            frame = np.concatenate([frame, frame[first], frame[first]])
-            class_index = np.concatenate([class_index, class_index[first], class_index[first]])
-            view = np.concatenate([view, *sides])
+            beside = [view[first] + [[0.0, side, 0.0, 0.0]] for side in sides]
+            frame = np.concatenate([frame, np.tile(frame[first], len(sides))])
+            class_index = np.concatenate([class_index, np.tile(class_index[first], len(sides))])
+            view = np.concatenate([view, *beside])
         lead = models.scout or models.final
         assert lead is not None
         fits = self._modes(lead, evidence, frame, class_index, view, settings)

@@ -26,6 +26,8 @@ _MAX_ITERATIONS = 30
 _SETTLED = 1e-4
 """A step that promises to lower the whitened squared residual by less than this is not taken."""
 _ROUGH = 0.1
+_CLOSE = 30.0
+"""Where a step promises less than this, slopes have settled: five σ, over which they hardly change."""
 _OPTIMISM = 3.0
 """A fit gives up where even so many times the promised decrease would not save it."""
 
@@ -194,10 +196,14 @@ class _Problem:
             theta[:, 4] = self._brightness(images)
         return self._summed(theta, self.pixels_at(images, theta), self._scaled(images, theta))
 
-    def state(self, theta: NDArray[np.float64], use: NDArray[np.bool_]) -> _State:
-        """Render and compare."""
-        images = self.model.images(self.class_index, np.ascontiguousarray(theta[:, :4]), self.settings.free)
-        return self._summed(theta, use, self._scaled(images, theta))
+    def state(
+        self, theta: NDArray[np.float64], use: NDArray[np.bool_], slope: NDArray[np.complex128] | None = None
+    ) -> _State:
+        """Render and compare; with known slopes, only the images are new."""
+        free = self.settings.free if slope is None else ()
+        images = self.model.images(self.class_index, np.ascontiguousarray(theta[:, :4]), free)
+        images = self._scaled(images, theta)
+        return self._summed(theta, use, images if slope is None else replace(images, slope=slope))
 
     def _summed(self, theta: NDArray[np.float64], use: NDArray[np.bool_], images: ModelImages) -> _State:
         sums = gauss_newton_sums(
@@ -211,8 +217,12 @@ class _Problem:
         return counts(images.phasor, images.intensity, self.evidence.sensor) & trusted
 
     def descend(self, state: _State, settled: float) -> _State:
-        """Run Levenberg–Marquardt, each candidate with its own damping."""
+        """Run Levenberg–Marquardt, each candidate with its own damping.
+
+        Close to the solution, slopes are those of the step before, until a step with them fails.
+        """
         damping = np.full(len(state.theta), 1e-3)
+        old = np.zeros(len(state.theta), np.bool_)
         active = np.arange(len(state.theta))
         for _ in range(_MAX_ITERATIONS):
             sums = state.sums
@@ -222,18 +232,31 @@ class _Problem:
             active, step, promise = active[worth], step[worth], promise[worth]
             if not active.size:
                 break
-            trial = self.some(active)
             theta = state.theta[active].copy()
             theta[:, self.columns] += step
             theta[:, :4] = self._clipped(theta[:, :4])
             theta[:, 4] = np.maximum(theta[:, 4], 1e-3)
-            there = trial.state(theta, state.use[active])
-            better = there.sums.cost <= sums.cost[active]
-            wins = np.flatnonzero(better)
-            state = state.updated(active[wins], _picked(there, wins))
-            damping[active] = np.where(better, np.maximum(damping[active] * 0.1, 1e-9), damping[active] * 8)
-            # a step that was taken and promised little was the last: the next would promise its square
-            active = active[((promise > 100 * settled) | ~better) & (damping[active] < 1e5)]
+            close = promise < _CLOSE
+            stays = np.ones(len(active), np.bool_)
+            for which, with_slopes in ((np.flatnonzero(~close), True), (np.flatnonzero(close), False)):
+                if not which.size:
+                    continue
+                k = active[which]
+                slope = None if with_slopes else state.images.slope[k]
+                there = self.some(k).state(theta[which], state.use[k], slope)
+                better = there.sums.cost <= state.sums.cost[k]
+                wins = np.flatnonzero(better)
+                # a step that was taken and promised little was the last: the next would promise its square
+                stays[which] = (promise[which] > 100 * settled) | ~better
+                lost = k[~better & old[k]]
+                damping[k] = np.where(better, np.maximum(damping[k] * 0.1, 1e-9), damping[k] * 8)
+                state = state.updated(k[wins], _picked(there, wins))
+                old[k[wins]] = not with_slopes
+                if lost.size:
+                    again = self.some(lost).state(state.theta[lost], state.use[lost])
+                    state = state.updated(lost, again)
+                    old[lost], damping[lost] = False, 1e-3
+            active = active[stays & (damping[active] < 1e5)]
         return state
 
     def conclude(self, state: _State, *, look_around: bool = True) -> Fits:
