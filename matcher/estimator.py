@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -35,6 +35,7 @@ _HOPELESS = 1e-4
 """A p-value at which it is worth looking elsewhere."""
 _BESIDE_RAD = math.radians(1.0)
 """Side peaks of the likelihood before a background are about so far away (PHYSICS section 7)."""
+_BESIDE_AGAIN_RAD = tuple(math.radians(side) for side in (-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0))
 _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
 _LIKELY = 100.0
 """An explanation whose cost is larger by this has no probability worth telling."""
@@ -42,6 +43,8 @@ _MARGIN = 500.0
 """A rough fit whose cost is larger by this does not become the best one: a column of pixels on the wrong side of an
 edge costs half as much."""
 _MOST_REFINED = 3
+_SHORT_STEP = 0.1
+"""Longest step after a scout, in natural units: it comes within about so much."""
 _FRAMES_AT_ONCE = 256
 
 
@@ -167,8 +170,7 @@ class MaximumLikelihood:
         if not poor.size:
             return fits
         starts = self._search.starts(_some(seen, poor), _MODES_AGAIN)
-        sides = tuple(side * _BESIDE_RAD for side in (-2.0, -1.0, 1.0, 2.0))
-        again = self._fit(_Models(models.final, None), evidence, poor, starts, sides, behind)
+        again = self._fit(models, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True)
         return Fits.joined([fits, again])
 
     def _enough(self, evidence: Evidence) -> NDArray[np.int64]:
@@ -183,6 +185,8 @@ class MaximumLikelihood:
         starts: Starts,
         sides: tuple[float, ...],
         behind: PhasorImages | None,
+        *,
+        patient: bool = False,
     ) -> Fits:
         """Refine the modes of every frame, then let the other classes explain it from the best one's view.
 
@@ -201,7 +205,7 @@ class MaximumLikelihood:
             view = np.concatenate([view, *beside])
         lead = models.scout or models.final
         assert lead is not None
-        fits = self._modes(lead, evidence, frame, class_index, view, settings)
+        fits = self._modes(lead, evidence, frame, class_index, view, settings, np.inf if patient else _MARGIN)
         fits = Fits.joined([fits, self._other_classes(lead, evidence, fits, settings)])
         if models.scout is None:
             return fits
@@ -216,7 +220,8 @@ class MaximumLikelihood:
             if len(same) < _MOST_REFINED and len(self._distinct(fits, np.array([*same, k]))) > len(same):
                 chosen.append(int(k))
         again = fits[np.array(chosen, np.int64)]
-        final = refine(models.final, evidence, again.frame, again.class_index, again.view, settings)
+        close = replace(settings, longest_step=_SHORT_STEP)
+        final = refine(models.final, evidence, again.frame, again.class_index, again.view, close)
         rest = np.setdiff1d(order, likely)
         others = fits[rest]
         gap = others.cost - least[others.frame]
@@ -231,6 +236,7 @@ class MaximumLikelihood:
         class_index: NDArray[np.int64],
         view: NDArray[np.float64],
         settings: Settings,
+        margin: float,
     ) -> Fits:
         """Refine the best start of every frame, the others while they can still win, and at last what is likely."""
         n = len(evidence.weight)
@@ -238,12 +244,12 @@ class MaximumLikelihood:
         fits = refine(
             model, evidence, frame[first], class_index[first], view[first], settings, roughly=True
         )
-        limit = _least_of_frame(fits, n)[frame[~first]] + _MARGIN
+        limit = _least_of_frame(fits, n)[frame[~first]] + margin
         more = refine(
             model, evidence, frame[~first], class_index[~first], view[~first], settings, limit, roughly=True
         )
         fits = Fits.joined([fits, more])
-        likely = fits.cost < _least_of_frame(fits, n)[fits.frame] + _MARGIN
+        likely = fits.cost < _least_of_frame(fits, n)[fits.frame] + margin
         better = fits[likely]
         better = refine(model, evidence, better.frame, better.class_index, better.view, settings)
         return Fits.joined([better, fits[~likely]])

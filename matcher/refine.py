@@ -21,7 +21,6 @@ ALBEDO = "albedo"
 """Name of the factor on the landmark's brightness, profiled out on phasors."""
 SCALE = {"distance_m": 0.01, "delta_rad": np.radians(1), "bearing_rad": np.radians(1), "height_m": 0.01, ALBEDO: 0.1}
 """Natural units of the parameters: 1 cm, 1°; what a condition number and the longest step are told in."""
-_LONGEST_STEP = 3.0
 _MAX_ITERATIONS = 30
 _SETTLED = 1e-4
 """A step that promises to lower the whitened squared residual by less than this is not taken."""
@@ -46,12 +45,16 @@ class Settings:
         Residual, in σ, from which the loss grows linearly.
     background : PhasorImages' phasor (pixels,) complex128, optional
         What stands behind, without the landmark; on phasors the albedo does not scale it.
+    longest_step : float
+        No step is longer, in natural units of 1 cm and 1°. Near a solution it should be short: where an edge crosses
+        a pixel's border, slopes jump, and those of one side may lead far away on the other.
     """
 
     free: tuple[str, ...]
     pixels: NDArray[np.bool_]
     huber: float | None = None
     background: NDArray[np.complex128] | None = None
+    longest_step: float = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,14 +336,14 @@ class _Problem:
     def _steps(
         self, information: NDArray[np.float64], gradient: NDArray[np.float64], damping: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return damped steps, (m, p), none longer than three natural units in any parameter."""
+        """Return damped steps, (m, p), none too long in any parameter."""
         scaled = information * np.outer(self.scale, self.scale)
         diagonal = np.einsum("mpp->mp", scaled)
         floor = 1e-12 * diagonal.max(axis=1, initial=0.0) + 1e-300
         held = scaled + np.einsum("mp,pq->mpq", damping[:, None] * diagonal + floor[:, None], np.eye(len(self.scale)))
         step = np.linalg.solve(held, (gradient * self.scale)[:, :, None])[:, :, 0]
         longest = np.abs(step).max(axis=1, keepdims=True)
-        return np.asarray(step * np.minimum(1.0, _LONGEST_STEP / np.maximum(longest, 1e-30)) * self.scale)
+        return np.asarray(step * np.minimum(1.0, self.settings.longest_step / np.maximum(longest, 1e-30)) * self.scale)
 
 
 def _picked(state: _State, which: NDArray[np.integer]) -> _State:
