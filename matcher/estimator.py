@@ -31,7 +31,7 @@ ROBUST_FROM = 3.0
 """Where Huber's loss turns linear, in σ: far enough out to cost an honest frame nothing."""
 _MODES, _MODES_BEFORE_BACKGROUND = 2, 4
 _MODES_AGAIN = 8
-_HOPELESS = 1e-4
+_DOUBTFUL = 0.05
 """A p-value at which it is worth looking elsewhere."""
 _BESIDE_RAD = math.radians(1.0)
 """Side peaks of the likelihood before a background are about so far away (PHYSICS section 7)."""
@@ -166,7 +166,7 @@ class MaximumLikelihood:
         sides = () if background is None else (-_BESIDE_RAD, _BESIDE_RAD)
         fits = self._fit(models, evidence, enough, starts, sides, behind)
         best = _best_of_frame(fits)
-        poor = fits.frame[best[fits.cost[best] > stats.chi2.isf(_HOPELESS, np.maximum(fits.dof[best], 1))]]
+        poor = fits.frame[best[fits.cost[best] > stats.chi2.isf(_DOUBTFUL, np.maximum(fits.dof[best], 1))]]
         if not poor.size:
             return fits
         starts = self._search.starts(_some(seen, poor), _MODES_AGAIN)
@@ -220,6 +220,8 @@ class MaximumLikelihood:
             if len(same) < _MOST_REFINED and len(self._distinct(fits, np.array([*same, k]))) > len(same):
                 chosen.append(int(k))
         again = fits[np.array(chosen, np.int64)]
+        if patient:
+            again = _spread(again)
         close = replace(settings, longest_step=_SHORT_STEP)
         final = refine(models.final, evidence, again.frame, again.class_index, again.view, close)
         rest = np.setdiff1d(order, likely)
@@ -451,6 +453,24 @@ def _behind(bank: Bank, background: Background) -> PhasorImages:
 
 def _some(seen: Observation, index: NDArray[np.int64]) -> Observation:
     return Observation(seen.range_m[index], seen.weight[index], seen.returned[index], seen.not_returned[index])
+
+
+def _spread(fits: Fits) -> Fits:
+    """Surround fits by others, two and four standard deviations away along the axes of their covariance.
+
+    Where an edge has just left a pixel, its slope is none, and nothing leads back.
+    """
+    p = fits.covariance.shape[1]
+    columns = np.arange(p)
+    values, vectors = np.linalg.eigh(np.where(np.isfinite(fits.covariance), fits.covariance, 0.0))
+    axes = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    parts = [fits]
+    for k in range(p):
+        for size in (-4.0, -2.0, 2.0, 4.0):
+            view = fits.view.copy()
+            view[:, columns] += size * axes[:, :, k]
+            parts.append(replace(fits, view=view))
+    return Fits.joined(parts)
 
 
 def _least_of_frame(fits: Fits, n: int) -> NDArray[np.float64]:
