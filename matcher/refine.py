@@ -217,7 +217,11 @@ class _Problem:
     def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels count at some views, (m, pixels)."""
         trusted = self.model.trusted(self.class_index, theta[:, :4])
-        return counts(images.phasor, images.intensity, self.evidence.sensor) & trusted
+        phasor = images.phasor
+        if self.with_albedo and images.slope.shape[1] == len(self.columns):
+            # a landmark made dim must not make its pixels disappear: the bank's albedo decides
+            phasor = phasor - (theta[:, 4:] - 1) * images.slope[:, -1]
+        return counts(phasor, images.intensity, self.evidence.sensor) & trusted
 
     def descend(self, state: _State, settled: float) -> _State:
         """Run Levenberg–Marquardt, each candidate with its own damping.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from phasemark.matcher.bounds import Estimate, cramer_rao, covers, efficiency, mean_of, nees, share
 from phasemark.matcher.filters import FilteredFrames, kalman_filter, phasor_mean
@@ -18,7 +19,7 @@ from phasemark.render import Background, Renderer, Sensor, Views, capture
 
 _VIEWS_AT_ONCE = 250
 OUTLIER_SIGMA = 5.0
-"""An error larger than so many standard deviations of the bound is an outlier, and counted apart."""
+"""An error as improbable as one so many standard deviations away is an outlier, and counted apart."""
 
 MatchFrames = Callable[[FilteredFrames], Matches]
 
@@ -112,11 +113,14 @@ class Trials:
     @property
     def outlier(self) -> NDArray[np.bool_]:
         """Errors beyond 5 σ of the bound or of the matcher's own covariance, or no view at all, (n,)."""
-        limit = OUTLIER_SIGMA**2
-        with np.errstate(invalid="ignore"):
-            far = (self.scaled**2 > limit).any(axis=1)
-            own = self.error**2 > limit * np.einsum("npp->np", self.covariance)
-        return far | own.any(axis=1) | ~self.usable
+        p = len(self.free)
+        limit = stats.chi2.isf(2 * stats.norm.sf(OUTLIER_SIGMA), p)
+        usable = self.usable
+        known = usable & np.isfinite(self.covariance).all(axis=(1, 2))
+        far = ~usable
+        far[usable] |= nees(self.error[usable], self.bound[usable]) > limit
+        far[known] |= nees(self.error[known], self.covariance[known]) > limit
+        return far
 
     @classmethod
     def joined(cls, parts: Sequence[Trials]) -> Trials:
