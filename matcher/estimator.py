@@ -166,12 +166,22 @@ class MaximumLikelihood:
         sides = () if background is None else (-_BESIDE_RAD, _BESIDE_RAD)
         fits = self._fit(models, evidence, enough, starts, sides, behind)
         best = _best_of_frame(fits)
-        poor = fits.frame[best[fits.cost[best] > stats.chi2.isf(_DOUBTFUL, np.maximum(fits.dof[best], 1))]]
+        poor = fits.frame[best[self._is_doubtful(fits, best)]]
         if not poor.size:
             return fits
         starts = self._search.starts(_some(seen, poor), _MODES_AGAIN)
-        again = self._fit(models, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True)
-        return Fits.joined([fits, again])
+        again = [self._fit(models, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True)]
+        if models.scout is not None:
+            best = _best_of_frame(again[0])
+            poor = again[0].frame[best[self._is_doubtful(again[0], best)]]
+            if poor.size:  # too little may be smooth for the scout to see the way
+                starts = self._search.starts(_some(seen, poor), n_modes)
+                direct = _Models(models.final, None)
+                again.append(self._fit(direct, evidence, poor, starts, (-_BESIDE_RAD, _BESIDE_RAD), behind))
+        return Fits.joined([fits, *again])
+
+    def _is_doubtful(self, fits: Fits, which: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return np.asarray(fits.cost[which] > stats.chi2.isf(_DOUBTFUL, np.maximum(fits.dof[which], 1)))
 
     def _enough(self, evidence: Evidence) -> NDArray[np.int64]:
         """Return which frames have enough returns to place a landmark."""
