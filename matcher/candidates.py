@@ -89,6 +89,8 @@ class Search:
             How many of each frame, at most.
         """
         n, n_bearing = len(seen.range_m), len(self._shifts)
+        if not n:
+            return Starts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4)), np.empty(0))
         shape = (len(self._distance), len(self._delta))
         best = np.empty((n, n_bearing, *shape), np.float32)
         classes = np.empty((n, n_bearing, *shape), np.int8)

@@ -122,10 +122,9 @@ class MaximumLikelihood:
 
     def _match_some(self, frames: FilteredFrames) -> list[Match]:
         evidence = Evidence.from_frames(frames, self.on)
-        enough = self._enough(evidence)
-        models = _Models(self._bank_model or self._rendered, None if self._bank_model else self._scout)
-        fits = self._searched(models, evidence, evidence.seen, enough, self.background, self._behind)
         bare = bare_cost(evidence.seen, self._behind)
+        models = _Models(self._bank_model or self._rendered, None if self._bank_model else self._scout)
+        fits = self._searched(models, evidence, evidence.seen, bare, self.background, self._behind)
         return self._answers(frames, fits, bare, [self.background] * len(frames))
 
     def _match_auto(self, frames: FilteredFrames) -> list[Match]:
@@ -135,7 +134,6 @@ class MaximumLikelihood:
             one = frames[k : k + 1]
             evidence = Evidence.from_frames(one, self.on)
             around = estimate_surroundings(one)
-            enough = self._enough(evidence)
             background = around.background
             bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(one, evidence))
             assert self._rendered is not None
@@ -147,7 +145,7 @@ class MaximumLikelihood:
                 scout = None if self._scout is None else self._scout.before(behind)
                 models = _Models(self._rendered.with_background(background), scout)
                 seen = without_background(seen, around)
-            fits = self._searched(models, evidence, seen, enough, background, behind)
+            fits = self._searched(models, evidence, seen, bare, background, behind)
             answers.extend(self._answers(one, fits, bare, [background]))
         return answers
 
@@ -156,36 +154,42 @@ class MaximumLikelihood:
         models: _Models,
         evidence: Evidence,
         seen: Observation,
-        enough: NDArray[np.int64],
+        bare: NDArray[np.float64],
         background: Background | None,
         behind: PhasorImages | None,
     ) -> Fits:
         """Search and fit; where nothing fits, search again from many more places."""
+        enough = self._worth_a_search(evidence, bare)
         n_modes = _MODES if background is None else _MODES_BEFORE_BACKGROUND
         starts = self._search.starts(_some(seen, enough), n_modes)
         sides = () if background is None else (-_BESIDE_RAD, _BESIDE_RAD)
         fits = self._fit(models, evidence, enough, starts, sides, behind)
         best = _best_of_frame(fits)
-        poor = fits.frame[best[self._is_doubtful(fits, best)]]
+        poor = fits.frame[best[self._is_doubtful(fits, best, bare)]]
         if not poor.size:
             return fits
         starts = self._search.starts(_some(seen, poor), _MODES_AGAIN)
         again = [self._fit(models, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True)]
         if models.scout is not None:
             best = _best_of_frame(again[0])
-            poor = again[0].frame[best[self._is_doubtful(again[0], best)]]
+            poor = again[0].frame[best[self._is_doubtful(again[0], best, bare)]]
             if poor.size:  # too little may be smooth for the scout to see the way
                 starts = self._search.starts(_some(seen, poor), n_modes)
                 direct = _Models(models.final, None)
                 again.append(self._fit(direct, evidence, poor, starts, (-_BESIDE_RAD, _BESIDE_RAD), behind))
         return Fits.joined([fits, *again])
 
-    def _is_doubtful(self, fits: Fits, which: NDArray[np.int64]) -> NDArray[np.bool_]:
-        return np.asarray(fits.cost[which] > stats.chi2.isf(_DOUBTFUL, np.maximum(fits.dof[which], 1)))
+    def _is_doubtful(self, fits: Fits, which: NDArray[np.int64], bare: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether fits that are better than a bare scene are worse than good ones are."""
+        doubtful = fits.cost[which] > stats.chi2.isf(_DOUBTFUL, np.maximum(fits.dof[which], 1))
+        return np.asarray(doubtful & (fits.cost[which] < bare[fits.frame[which]]))
 
-    def _enough(self, evidence: Evidence) -> NDArray[np.int64]:
-        """Return which frames have enough returns to place a landmark."""
-        return np.flatnonzero((evidence.seen.returned & self._used).sum(axis=1) >= MIN_RETURNS)
+    def _worth_a_search(self, evidence: Evidence, bare: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return which frames have enough returns to place a landmark, and are not explained without one."""
+        returned = evidence.seen.returned
+        enough = (returned & self._used).sum(axis=1) >= MIN_RETURNS
+        explained = bare <= stats.chi2.isf(self.false_alarm, np.maximum(returned.sum(axis=1), 1))
+        return np.flatnonzero(enough & ~explained)
 
     def _fit(
         self,
