@@ -56,9 +56,7 @@ class ModelImages:
 class ImageModel(Protocol):
     """What the refinement asks of a model."""
 
-    def images(
-        self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
-    ) -> ModelImages:
+    def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Return the images of views (m, 4), columns :data:`VIEW`, of a class each."""
 
     def reach(
@@ -126,9 +124,7 @@ class BankModel:
         m, pixels = len(view), self._sensor.rows * self._sensor.cols
         phasor, slope = np.zeros((m, pixels), np.complex128), np.zeros((m, 2, pixels), np.complex128)
         shade = np.zeros((m, 2, pixels))
-        _interpolate(
-            class_index, view, *self._grid(), self._upper, self._lower, *self._behind, phasor, slope, shade
-        )
+        _interpolate(class_index, view, *self._grid(), self._upper, self._lower, *self._behind, phasor, slope, shade)
         order = [VIEW.index(name) for name in free]
         picked = slope if order == [0, 1] else slope[:, order]
         return ModelImages(phasor, picked, shade[:, 0], shade[:, 1])
@@ -283,9 +279,7 @@ class RenderedModel:
                     low[of], high[of] = np.minimum(low[of], coverage), np.maximum(high[of], coverage)
         return low, high
 
-    def _render(
-        self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None
-    ) -> PhasorImages:
+    def _render(self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None) -> PhasorImages:
         renderer = self._renderers[class_index]
         return renderer.render_views(
             Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows, workers=self.workers
@@ -413,9 +407,7 @@ def _interpolate(  # type: ignore[no-untyped-def]
                 block = lower[cl, i0 + a, (j0 + b) % n_a]
                 _gather(block, wd[a] * wa[b], dwd[a] * wa[b] / step_d, wd[a] * dwa[b] / step_a, cubic, extreme)
                 if dld[a] != 0.0 and dla[b] != 0.0:
-                    _gather_linear(
-                        block, ld[a] * la[b], dld[a] * la[b] / step_d, ld[a] * dla[b] / step_a, straight
-                    )
+                    _gather_linear(block, ld[a] * la[b], dld[a] * la[b] / step_d, ld[a] * dla[b] / step_a, straight)
         _conclude(m, 0, cubic_up, straight_up, extreme_up, behind, behind_intensity, phasor, slope, shade)
         _conclude(m, n_up, cubic, straight, extreme, behind, behind_intensity, phasor, slope, shade)
 

@@ -285,7 +285,9 @@ class _Problem:
         std = np.sqrt(np.where(np.isfinite(covariance), covariance, 0.0)[:, range(p), range(p)])
         std = np.minimum(std, self.scale[:p])
         low, high = state.images.coverage.copy(), state.images.coverage.copy()
-        near = np.flatnonzero((cost <= self.limit) & look_around)  # where it does not matter any more, what is nearby is not looked at
+        near = np.flatnonzero(
+            (cost <= self.limit) & look_around
+        )  # where it does not matter any more, what is nearby is not looked at
         if near.size:
             around = self.model.reach(self.class_index[near], state.theta[near, :4], settings.free, std[near])
             low[near], high[near] = np.minimum(low[near], around[0]), np.maximum(high[near], around[1])
@@ -331,7 +333,8 @@ class _Problem:
         weight = weight * (images.coverage > MUST_RETURN_COVERAGE)
         power = np.sum(weight * np.abs(own) ** 2, axis=1)
         along = np.sum(weight * (own.conj() * (value - (images.phasor - own))).real, axis=1)
-        return np.clip(np.divide(along, power, out=np.ones_like(power), where=power > 0), 0.01, 100.0)
+        factor = np.divide(along, power, out=np.ones_like(power), where=power > 0)
+        return np.asarray(np.clip(factor, 0.01, 100.0))
 
     def _clipped(self, view: NDArray[np.float64]) -> NDArray[np.float64]:
         view[:, 0] = np.clip(view[:, 0], *self.model.limits())
@@ -362,7 +365,7 @@ def _inverse(matrix: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray
     `matrix` is in natural units; the result is scaled back. NaN where a matrix is singular.
     """
     out = np.full(matrix.shape, np.nan)
-    finite = np.isfinite(matrix).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], matrix, 0.0))
     good = finite & (values[:, 0] > 1e-12 * values[:, -1]) & (values[:, 0] > 0)
     v, w = vectors[good], values[good]

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from phasemark.matcher.bounds import Estimate, cramer_rao, covers, efficiency, mean_of, nees, share
+from phasemark.matcher.bounds import Estimate, covers, cramer_rao, efficiency, mean_of, nees, share
 from phasemark.matcher.filters import FilteredFrames, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood import Quantity
 from phasemark.matcher.match import Matches
@@ -103,12 +104,12 @@ class Trials:
     @property
     def scaled(self) -> NDArray[np.float64]:
         """Errors in units of the bound, (n, p)."""
-        return self.error / np.sqrt(np.einsum("npp->np", self.bound))
+        return np.asarray(self.error / np.sqrt(np.einsum("npp->np", self.bound)))
 
     @property
     def usable(self) -> NDArray[np.bool_]:
         """Which trials found a view, and have a bound; (n,)."""
-        return np.isfinite(self.scaled).all(axis=1)
+        return np.asarray(np.isfinite(self.scaled).all(axis=1))
 
     @property
     def outlier(self) -> NDArray[np.bool_]:
@@ -126,7 +127,7 @@ class Trials:
     def joined(cls, parts: Sequence[Trials]) -> Trials:
         """Put runs behind one another."""
         first = parts[0]
-        arrays = {
+        arrays: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in parts])
             for name in ("error", "bound", "covariance", "found", "accepted", "p_value")
         }
