@@ -1,5 +1,15 @@
 """What the robot concludes: filters, matching, and its own position."""
 
+from phasemark.matcher.bounds import (
+    Bound,
+    Estimate,
+    confusion_probability,
+    covers,
+    cramer_rao,
+    efficiency,
+    nees,
+    share,
+)
 from phasemark.matcher.filters import (
     FilteredFrames,
     PixelKalman,
@@ -12,10 +22,15 @@ from phasemark.matcher.filters import (
 from phasemark.matcher.match import Candidate, Match, Matches
 from phasemark.matcher.matcher import Matcher, background_image
 from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
+from phasemark.matcher.surroundings import Surroundings, estimate_surroundings
+from phasemark.matcher.trials import Conditions, Trials, TrialSummary, run_trials
 
 __all__ = [
     "PRIOR_STD",
+    "Bound",
     "Candidate",
+    "Conditions",
+    "Estimate",
     "FilteredFrames",
     "Match",
     "Matcher",
@@ -23,11 +38,22 @@ __all__ = [
     "PixelKalman",
     "PixelState",
     "RobotPose",
+    "Surroundings",
+    "TrialSummary",
+    "Trials",
     "ViewEstimate",
     "background_image",
+    "confusion_probability",
+    "covers",
+    "cramer_rao",
+    "efficiency",
+    "estimate_surroundings",
     "kalman",
     "kalman_filter",
     "kalman_step",
+    "nees",
     "phasor_mean",
     "robot_poses",
+    "run_trials",
+    "share",
 ]

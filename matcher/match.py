@@ -10,6 +10,8 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.render import Background
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -21,12 +23,18 @@ class Candidate:
     distance_m, delta_rad : float
     cost : float
         Whitened squared distance of the frame from the candidate's image.
+    weight : float
+        Its share of the likelihood, among all explanations with the match itself and "none".
+    bearing_rad, height_m : float
     """
 
     class_name: str
     distance_m: float
     delta_rad: float
     cost: float
+    weight: float = 0.0
+    bearing_rad: float = 0.0
+    height_m: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +58,18 @@ class Match:
     class_probability : mapping of str to float
         Of each class and of "none".
     alternatives : tuple of Candidate
-        The best of each other class, best first.
+        The best of each other class, and further modes of the likelihood, best first.
     symmetry : int
         How many turns about its axis leave the class as it is: δ is known modulo 2π / symmetry.
+    condition_number : float
+        Of the information in the free parameters, lengths in units of 1 cm and angles of 1°: how much better the best
+        observed direction is known than the worst, squared. NaN without a covariance, infinite where a direction is
+        not observed at all.
+    weak_direction : mapping of str to float
+        The direction known worst, as the standard deviation along it, by parameter: metres and radians. Empty without
+        a covariance.
+    background : Background or None
+        What the match took to stand behind the landmark; estimated where the matcher was told to.
     """
 
     class_name: str | None
@@ -69,6 +86,9 @@ class Match:
     class_probability: Mapping[str, float] = field(default_factory=lambda: {"none": 1.0})
     alternatives: tuple[Candidate, ...] = ()
     symmetry: int = 1
+    condition_number: float = math.nan
+    weak_direction: Mapping[str, float] = field(default_factory=dict)
+    background: Background | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers and text, angles in degrees too; NaN as None, so that it is valid JSON."""
@@ -94,10 +114,14 @@ class Match:
                     "class": other.class_name,
                     "distance_m": other.distance_m,
                     "delta_deg": math.degrees(other.delta_rad),
-                    "cost": other.cost,
+                    "cost": plain(other.cost),
+                    "weight": other.weight,
                 }
                 for other in self.alternatives
             ],
+            "condition_number": plain(self.condition_number),
+            "weak_direction": dict(self.weak_direction),
+            "wall_m": None if self.background is None else self.background.wall_m,
         }
 
 
@@ -113,8 +137,10 @@ class Matches(Sequence[Match]):
     class_name : (n,) object
         Names, None where there is no landmark.
     accepted : (n,) bool
-    distance_m, delta_rad, bearing_rad, height_m, chi2, p_value : (n,) float64
+    distance_m, delta_rad, bearing_rad, height_m, chi2, p_value, condition_number : (n,) float64
     dof : (n,) int64
+    covariance : (n, p, p) float64, or None
+    class_probability : dict of str to (n,) float64
     """
 
     def __init__(self, matches: Iterable[Match]) -> None:
@@ -179,6 +205,31 @@ class Matches(Sequence[Match]):
     def p_value(self) -> NDArray[np.float64]:
         """Probabilities of a larger χ²; (n,)."""
         return self._floats("p_value")
+
+    @property
+    def condition_number(self) -> NDArray[np.float64]:
+        """Condition of the information in the free parameters; (n,)."""
+        return self._floats("condition_number")
+
+    @property
+    def covariance(self) -> NDArray[np.float64] | None:
+        """Covariances in the order of ``free``, (n, p, p), NaN where there is none; None if no match has one."""
+        known = [match.covariance for match in self if match.covariance is not None]
+        if not known:
+            return None
+        missing = np.full(known[0].shape, np.nan)
+        return np.stack([missing if match.covariance is None else match.covariance for match in self])
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Which parameters of the view were estimated."""
+        return self[0].free if len(self) else ()
+
+    @property
+    def class_probability(self) -> dict[str, NDArray[np.float64]]:
+        """Probability of each class and of "none", by name; (n,) each."""
+        names = dict.fromkeys(name for match in self for name in match.class_probability)
+        return {name: np.array([match.class_probability.get(name, 0.0) for match in self]) for name in names}
 
     def _floats(self, name: str) -> NDArray[np.float64]:
         return np.array([getattr(match, name) for match in self], dtype=np.float64)

@@ -1,27 +1,32 @@
-"""The paper's matcher: the lower pixels give distance and angle, then the upper pixels give the class.
+"""Matching frames against a bank: the paper's nearest image, or maximum likelihood in between.
 
-The minimum-distance classifier of the paper's section 4.2, over every model image of a bank. The answer lies on the
-bank's grid.
+The paper's minimum-distance classifier (its section 4.2) lives here: the lower pixels give distance and angle, then the
+upper pixels give the class, and the answer lies on the bank's grid. Maximum likelihood lives in
+:mod:`phasemark.matcher.estimator`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.data.bank import BankGroup
 from phasemark.matcher.coarse import DISAGREEMENT, Observation, Templates
+from phasemark.matcher.estimator import MaximumLikelihood, Pixels, p_values_of
 from phasemark.matcher.filters import FilteredFrames
+from phasemark.matcher.likelihood import Quantity
 from phasemark.matcher.match import Candidate, Match, Matches
+from phasemark.matcher.models import VIEW
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, wrap_difference_m
 
-METHODS = ("nearest",)
+METHODS = ("nearest", "refine")
 MIN_RETURNS = 3
 """Fewer returns among the pixels that give distance and angle decide nothing: two numbers are sought."""
 _FRAMES_AT_ONCE = 128
@@ -43,25 +48,39 @@ class Matcher:
     Parameters
     ----------
     bank : Bank
-    method : {"nearest"}
+    method : {"nearest", "refine"}
         "nearest" is the paper's minimum-distance classifier: the answer is the nearest model image. In a factored
         bank the lower pixels choose distance and angle, and the upper pixels the class at that distance; in a full
-        bank all pixels choose all three.
-    background : Background, optional
-        What stands behind the landmark. None: nothing is expected to return beside it.
+        bank all pixels choose all three. "refine" is maximum likelihood over a continuous view, with its covariance.
+    free : sequence of str
+        What "refine" estimates: distance_m and delta_rad, and on request bearing_rad and height_m; what is not free
+        is 0.
+    background : Background, "auto" or None
+        What stands behind the landmark. None: nothing is expected to return beside it. "auto", with "refine": wall and
+        floor are estimated from each frame's own far pixels.
     false_alarm : float
         Share of good frames that the test of the fit may refuse.
+    on : {"ranges", "phasors"}
+        What "refine" explains: ranges, or amplitude · exp(iφ) with the landmark's albedo estimated too. Phasors need
+        frames with amplitudes, best from :func:`~phasemark.matcher.phasor_mean`.
+    pixels : {"all", "lower"}
+        Which pixels give "refine" the view. All of them tell the class.
+    robust : bool
+        Whether "refine" counts residuals beyond 3 σ linearly (Huber); the covariance is then the sandwich.
+    workers : int, optional
+        Threads that render (None: one for each processor), where "refine" renders; the answer does not depend on it.
 
     Raises
     ------
     UsageError
-        The method is unknown, or the false-alarm rate is not in (0, 1).
+        The method or an option is unknown, an option does not go with the method, or the false-alarm rate is not in
+        (0, 1).
 
     Notes
     -----
-    `chi2` tests how well the nearest image explains the frame, after the linear change of the ranges within its grid
-    cell is taken out: the frame lies between grid points, and what the interpolation cannot follow (at edges) is added
-    to the variance. Its p-value is therefore approximate.
+    `chi2` of "nearest" tests how well the nearest image explains the frame, after the linear change of the ranges
+    within its grid cell is taken out: the frame lies between grid points, and what the interpolation cannot follow (at
+    edges) is added to the variance. Its p-value is therefore approximate. With "refine" it is that of the fit.
     """
 
     def __init__(
@@ -69,16 +88,39 @@ class Matcher:
         bank: Bank,
         method: str = "nearest",
         *,
-        background: Background | None = None,
+        free: Sequence[str] = VIEW[:2],
+        background: Background | Literal["auto"] | None = None,
         false_alarm: float = 0.01,
+        on: Quantity = "ranges",
+        pixels: Pixels = "all",
+        robust: bool = False,
+        workers: int | None = None,
     ) -> None:
         if method not in METHODS:
             raise UsageError(f"unknown method {method!r}: the methods are {', '.join(METHODS)}")
+        if isinstance(background, str) and background != "auto":
+            raise UsageError(f"'background' must be a Background, \"auto\" or None, got {background!r}")
         if not 0 < false_alarm < 1:
             raise UsageError(f"'false_alarm' must be in (0, 1), got {false_alarm!r}")
         self.bank = bank
-        self.background = background
         self.false_alarm = false_alarm
+        self._likelihood: MaximumLikelihood | None = None
+        if method == "refine":
+            self._likelihood = MaximumLikelihood(
+                bank,
+                free=free,
+                background=background,
+                false_alarm=false_alarm,
+                on=on,
+                pixels=pixels,
+                robust=robust,
+                workers=workers,
+            )
+            return
+        if tuple(free) != VIEW[:2] or on != "ranges" or pixels != "all" or robust or isinstance(background, str):
+            raise UsageError(
+                "'free', 'on', 'pixels', 'robust' and an automatic background belong to method 'refine', not 'nearest'"
+            )
         self._behind = None if background is None else background_image(background, bank.sensor)
         self._symmetry = {name: int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes}
         half = bank.sensor.rows // 2
@@ -114,6 +156,8 @@ class Matcher:
         difference = frames.sensor.optics_difference(self.bank.sensor)
         if difference is not None:
             raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
+        if self._likelihood is not None:
+            return Matches(self._likelihood.match(frames))
         matches: list[Match] = []
         for start in range(0, len(frames), _FRAMES_AT_ONCE):
             matches.extend(self._match_some(frames[start : start + _FRAMES_AT_ONCE]))
@@ -194,7 +238,7 @@ class Matcher:
             return Match(class_name=None, accepted=False, class_probability=self._probabilities([], 0.0))
         best = found[0]
         chi2, dof = self._goodness(pose_seen, class_seen, k, best)
-        p_value = _p_value(chi2, dof, frames, k)
+        p_value = float(p_values_of(np.array([chi2]), np.array([dof]), frames, np.array([k]))[0])
         is_landmark = best.cost < none_cost
         name = self.bank.classes[best.class_index]
         candidates = tuple(
@@ -305,20 +349,3 @@ def background_image(background: Background, sensor: Sensor) -> PhasorImages:
         One image.
     """
     return Renderer(None, sensor).render(distance_m=1.0, background=background)
-
-
-def _p_value(chi2: float, dof: int, frames: FilteredFrames, k: int) -> float:
-    """Return the probability of a larger χ².
-
-    Where the variances were estimated from the scatter of ν + 1 frames, each squared residual follows F(1, ν); their
-    sum is given a scaled χ² of the same mean and variance.
-    """
-    if dof < 1:
-        return 0.0
-    if not frames.std_from_scatter:
-        return float(stats.chi2.sf(chi2, dof))
-    returned = frames.n_effective[k][frames.n_effective[k] > 0]
-    nu = max(float(np.median(returned)) - 1, 5.0)  # the variance of F(1, ν) exists above 4
-    mean: float = dof * nu / (nu - 2)
-    variance: float = dof * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
-    return float(stats.chi2.sf(chi2 * 2 * mean / variance, 2 * mean**2 / variance))

@@ -1,0 +1,498 @@
+"""Maximum likelihood: candidates from the bank, refined, compared, and told with their uncertainty."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from phasemark import UsageError
+from phasemark.data import Bank
+from phasemark.matcher.candidates import Search, Starts
+from phasemark.matcher.coarse import DISAGREEMENT, Observation
+from phasemark.matcher.filters import FilteredFrames
+from phasemark.matcher.likelihood import Evidence, Quantity, counts
+from phasemark.matcher.match import Candidate, Match
+from phasemark.matcher.models import VIEW, BankModel, ImageModel, RenderedModel
+from phasemark.matcher.refine import SCALE, Fits, Settings, refine
+from phasemark.matcher.surroundings import NEAREST_WALL_M, estimate_surroundings, without_background
+from phasemark.render import Background, PhasorImages, Renderer, wrap_difference_m
+
+Pixels = Literal["all", "lower"]
+MIN_RETURNS = 3
+"""Fewer returns decide nothing."""
+ROBUST_FROM = 3.0
+"""Where Huber's loss turns linear, in σ: far enough out to cost an honest frame nothing."""
+_MODES, _MODES_BEFORE_BACKGROUND = 2, 4
+_MODES_AGAIN = 8
+_DOUBTFUL, _HOPELESS = 0.05, 1e-3
+"""p-values at which it is worth looking elsewhere: where the likelihood has side peaks, and where it is smooth."""
+_BESIDE_RAD = math.radians(1.0)
+"""Side peaks of the likelihood before a background are about so far away (PHYSICS section 7)."""
+_BESIDE_AGAIN_RAD = tuple(math.radians(side) for side in (-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0))
+_SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
+_LIKELY = 100.0
+"""An explanation whose cost is larger by this has no probability worth telling."""
+_MARGIN = 500.0
+"""A rough fit whose cost is larger by this does not become the best one: a column of pixels on the wrong side of an
+edge costs half as much."""
+_MOST_REFINED = 3
+_SHORT_STEP = 0.1
+"""Longest step after a scout, in natural units: it comes within about so much."""
+_FRAMES_AT_ONCE = 256
+
+
+def check_free(free: Sequence[str]) -> tuple[str, ...]:
+    """Return names of free parameters in the order of the view.
+
+    Raises
+    ------
+    UsageError
+        A name is unknown or repeated, or distance is not among them.
+    """
+    names = tuple(free)
+    for name in names:
+        if name not in VIEW:
+            raise UsageError(f"'free' must be among {', '.join(VIEW)}, got {name!r}")
+    if len(set(names)) < len(names) or "distance_m" not in names or "delta_rad" not in names:
+        raise UsageError(f"'free' must name distance_m and delta_rad, and others once each, got {names!r}")
+    return tuple(name for name in VIEW if name in names)
+
+
+class MaximumLikelihood:
+    """Estimates class and continuous view of a landmark; see :class:`~phasemark.matcher.Matcher` for the parameters."""
+
+    def __init__(
+        self,
+        bank: Bank,
+        *,
+        free: Sequence[str] = ("distance_m", "delta_rad"),
+        background: Background | Literal["auto"] | None = None,
+        false_alarm: float = 0.01,
+        on: Quantity = "ranges",
+        pixels: Pixels = "all",
+        robust: bool = False,
+        workers: int | None = None,
+    ) -> None:
+        if on not in ("ranges", "phasors"):
+            raise UsageError(f"'on' must be ranges or phasors, got {on!r}")
+        if pixels not in ("all", "lower"):
+            raise UsageError(f"'pixels' must be all or lower, got {pixels!r}")
+        if bank.plan.model != "ray":
+            raise UsageError("the bank was made by the planar generator, which knows no edges: refine needs a ray bank")
+        self.bank = bank
+        self.free = check_free(free)
+        self.on: Quantity = on
+        self.false_alarm = false_alarm
+        self.auto = background == "auto"
+        self.background = background if isinstance(background, Background) else None
+        sensor = bank.sensor
+        used = np.ones((sensor.rows, sensor.cols), np.bool_)
+        if pixels == "lower":
+            used[: sensor.rows // 2] = False
+        self._used = used.ravel()
+        self._huber = ROBUST_FROM if robust else None
+        self._behind = None if self.background is None else _behind(bank, self.background)
+        on_grid = self.free == VIEW[:2] and BankModel.fits(bank)
+        exact = on_grid and on == "ranges" and self.background is None
+        self._bank_model = BankModel(bank) if exact else None
+        self._scout = BankModel(bank, self._behind, smooth_only=True) if on_grid else None
+        self._rendered: RenderedModel | None = None
+        if self.auto or not exact:
+            self._rendered = RenderedModel(bank, self.background, workers or _usual_workers())
+        fine = (1, 1) if self.background is not None and "bearing_rad" not in self.free else (2, 3)
+        stride = tuple(
+            max(1, min(step, (len(grid) - 1) // 4))
+            for step, grid in zip(fine, (bank.distance_m, bank.delta_rad), strict=True)
+        )
+        self._search = Search(bank, self._behind, (stride[0], stride[1]), "bearing_rad" in self.free)
+        self._symmetry = [int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes]
+
+    def match(self, frames: FilteredFrames) -> list[Match]:
+        """Match filtered frames."""
+        answers: list[Match] = []
+        for start in range(0, len(frames), _FRAMES_AT_ONCE):
+            some = frames[start : start + _FRAMES_AT_ONCE]
+            answers.extend(self._match_auto(some) if self.auto else self._match_some(some))
+        return answers
+
+    def _match_some(self, frames: FilteredFrames) -> list[Match]:
+        evidence = Evidence.from_frames(frames, self.on)
+        bare = bare_cost(evidence.seen, self._behind)
+        models = _Models(self._bank_model or self._rendered, None if self._bank_model else self._scout)
+        fits = self._searched(models, evidence, evidence.seen, bare, self.background, self._behind)
+        return self._answers(frames, fits, bare, [self.background] * len(frames))
+
+    def _match_auto(self, frames: FilteredFrames) -> list[Match]:
+        """Match frames one by one, each before what stands behind it."""
+        answers: list[Match] = []
+        for k in range(len(frames)):
+            one = frames[k : k + 1]
+            evidence = Evidence.from_frames(one, self.on)
+            around = estimate_surroundings(one)
+            background = around.background
+            bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(one, evidence))
+            assert self._rendered is not None
+            models = _Models(self._bank_model or self._rendered, None if self._bank_model else self._scout)
+            behind = None
+            seen = evidence.seen
+            if background is not None:
+                behind = _behind(self.bank, background)
+                scout = None if self._scout is None else self._scout.before(behind)
+                models = _Models(self._rendered.with_background(background), scout)
+                seen = without_background(seen, around)
+            fits = self._searched(models, evidence, seen, bare, background, behind)
+            answers.extend(self._answers(one, fits, bare, [background]))
+        return answers
+
+    def _searched(
+        self,
+        models: _Models,
+        evidence: Evidence,
+        seen: Observation,
+        bare: NDArray[np.float64],
+        background: Background | None,
+        behind: PhasorImages | None,
+    ) -> Fits:
+        """Search and fit; where nothing fits, search again from many more places."""
+        enough = self._worth_a_search(evidence, bare)
+        side_peaks = evidence.on == "phasors" or background is not None
+        n_modes = _MODES if background is None else _MODES_BEFORE_BACKGROUND
+        all_classes = evidence.on == "phasors"
+
+        def doubtful(fits: Fits) -> NDArray[np.int64]:
+            """Return the frames whose best fit beats a bare scene, but is worse than good ones are."""
+            best = _best_of_frame(fits)
+            limit = stats.chi2.isf(_DOUBTFUL if side_peaks else _HOPELESS, np.maximum(fits.dof[best], 1))
+            cost, frame = fits.cost[best], fits.frame[best]
+            return np.asarray(frame[(cost > limit) & (cost < bare[frame])])
+
+        starts = self._search.starts(_some(seen, enough), n_modes, all_classes=all_classes)
+        sides = () if background is None else (-_BESIDE_RAD, _BESIDE_RAD)
+        fits = [self._fit(models, evidence, enough, starts, sides, behind)]
+        poor = doubtful(fits[0])
+        if poor.size:
+            starts = self._search.starts(_some(seen, poor), _MODES_AGAIN, all_classes=all_classes)
+            fits.append(self._fit(models, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True))
+            poor = doubtful(fits[-1])
+        if poor.size and models.scout is not None:  # too little may be smooth for the scout to see the way
+            starts = self._search.starts(_some(seen, poor), n_modes, all_classes=all_classes)
+            direct = _Models(models.final, None)
+            fits.append(self._fit(direct, evidence, poor, starts, (-_BESIDE_RAD, _BESIDE_RAD), behind))
+        return Fits.joined(fits)
+
+    def _worth_a_search(self, evidence: Evidence, bare: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return which frames have enough returns to place a landmark, and are not explained without one."""
+        returned = evidence.seen.returned
+        enough = (returned & self._used).sum(axis=1) >= MIN_RETURNS
+        explained = bare <= stats.chi2.isf(self.false_alarm, np.maximum(returned.sum(axis=1), 1))
+        return np.flatnonzero(enough & ~explained)
+
+    def _fit(
+        self,
+        models: _Models,
+        evidence: Evidence,
+        enough: NDArray[np.int64],
+        starts: Starts,
+        sides: tuple[float, ...],
+        behind: PhasorImages | None,
+        *,
+        patient: bool = False,
+    ) -> Fits:
+        """Refine the modes of every frame, then let the other classes explain it from the best one's view.
+
+        The best start is tried with δ moved to some sides too.
+        A scout, where there is one, does this first; of what it finds only the best is refined again.
+        """
+        settings = Settings(self.free, self._used, self._huber, None if behind is None else behind.phasor.reshape(-1))
+        frame, class_index, view = enough[starts.frame], starts.class_index, starts.view
+        if sides:
+            first = np.flatnonzero(np.diff(starts.frame, prepend=-1))
+            beside = [view[first] + [[0.0, side, 0.0, 0.0]] for side in sides]
+            frame = np.concatenate([frame, np.tile(frame[first], len(sides))])
+            class_index = np.concatenate([class_index, np.tile(class_index[first], len(sides))])
+            view = np.concatenate([view, *beside])
+        lead = models.scout or models.final
+        assert lead is not None
+        fits = self._modes(lead, evidence, frame, class_index, view, settings, np.inf if patient else _MARGIN)
+        fits = Fits.joined([fits, self._other_classes(lead, evidence, fits, settings)])
+        if models.scout is None:
+            return fits
+        assert models.final is not None
+        # of what the scout found, the likely ones are refined again; the others keep their distance from the best
+        order = np.lexsort((fits.cost, fits.frame))
+        least = _least_of_frame(fits, len(evidence.weight))
+        likely = [k for k in order if fits.cost[k] < least[fits.frame[k]] + _LIKELY]
+        chosen: list[int] = []
+        for k in likely:
+            same = [j for j in chosen if fits.frame[j] == fits.frame[k]]
+            if len(same) < _MOST_REFINED and len(self._distinct(fits, np.array([*same, k]))) > len(same):
+                chosen.append(int(k))
+        again = fits[np.array(chosen, np.int64)]
+        if patient:
+            again = _spread(again)
+        close = replace(settings, longest_step=_SHORT_STEP)
+        final = refine(models.final, evidence, again.frame, again.class_index, again.view, close)
+        rest = np.setdiff1d(order, likely)
+        others = fits[rest]
+        gap = others.cost - least[others.frame]
+        others.cost[:] = _least_of_frame(final, len(evidence.weight))[others.frame] + gap
+        return Fits.joined([final, others])
+
+    def _modes(
+        self,
+        model: ImageModel,
+        evidence: Evidence,
+        frame: NDArray[np.int64],
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        settings: Settings,
+        margin: float,
+    ) -> Fits:
+        """Refine the best start of every frame, the others while they can still win, and at last what is likely."""
+        n = len(evidence.weight)
+        first = np.isin(np.arange(len(frame)), np.unique(frame, return_index=True)[1])
+        fits = refine(model, evidence, frame[first], class_index[first], view[first], settings, roughly=True)
+        limit = _least_of_frame(fits, n)[frame[~first]] + margin
+        more = refine(model, evidence, frame[~first], class_index[~first], view[~first], settings, limit, roughly=True)
+        fits = Fits.joined([fits, more])
+        likely = fits.cost < _least_of_frame(fits, n)[fits.frame] + margin
+        better = fits[likely]
+        better = refine(model, evidence, better.frame, better.class_index, better.view, settings)
+        return Fits.joined([better, fits[~likely]])
+
+    def _other_classes(self, model: ImageModel, evidence: Evidence, fits: Fits, settings: Settings) -> Fits:
+        """Let every class but the best explain each frame, from the view of the best."""
+        best = _best_of_frame(fits)
+        n_class = len(self.bank.classes)
+        others = np.array([(k, c) for k in best for c in range(n_class) if c != fits.class_index[k]], np.int64)
+        others = others.reshape(-1, 2)
+        source = others[:, 0]
+        return refine(
+            model, evidence, fits.frame[source], others[:, 1], fits.view[source], settings, fits.cost[source] + _LIKELY
+        )
+
+    def _bare_wall_cost(self, one: FilteredFrames, evidence: Evidence) -> NDArray[np.float64]:
+        """Return how badly a wall at its best distance explains all of one frame, (1,)."""
+        seen = evidence.seen
+        forward = self.bank.sensor.axis_cosine().ravel() * seen.range_m[0]
+        returned = seen.returned[0]
+        if returned.sum() < MIN_RETURNS:
+            return np.array([np.inf])
+        wall_m = float(np.average(forward[returned], weights=seen.weight[0, returned]))
+        if wall_m < NEAREST_WALL_M:
+            return np.array([np.inf])
+        return bare_cost(seen, _behind(self.bank, Background(wall_m=wall_m)))
+
+    def _answers(
+        self,
+        frames: FilteredFrames,
+        fits: Fits,
+        bare: NDArray[np.float64],
+        backgrounds: list[Background | None],
+    ) -> list[Match]:
+        p_values = p_values_of(fits.cost, fits.dof, frames, fits.frame)
+        order = np.lexsort((fits.cost, fits.frame))
+        first = np.searchsorted(fits.frame[order], np.arange(len(frames) + 1))
+        doubt = np.asarray(stats.chi2.isf(self.false_alarm, np.maximum(fits.dof, 1)))
+        answers = []
+        for k in range(len(frames)):
+            own = order[first[k] : first[k + 1]]
+            own = own[np.isfinite(fits.cost[own])]
+            answers.append(self._answer(fits, own, p_values, doubt, float(bare[k]), backgrounds[k]))
+        return answers
+
+    def _answer(
+        self,
+        fits: Fits,
+        own: NDArray[np.int64],
+        p_values: NDArray[np.float64],
+        doubt: NDArray[np.float64],
+        bare: float,
+        background: Background | None,
+    ) -> Match:
+        """Turn the fits of one frame, best first, into an answer."""
+        names = self.bank.classes
+        if not len(own):
+            nothing = {**dict.fromkeys(names, 0.0), "none": 1.0}
+            return Match(class_name=None, accepted=False, free=self.free, class_probability=nothing)
+        kept = self._distinct(fits, own)
+        best = kept[0]
+        c = int(fits.class_index[best])
+        is_landmark = bool(fits.cost[best] < bare)
+        covariance = fits.covariance[best]
+        known = bool(np.isfinite(covariance).all())
+        none_cost = min(bare, float(doubt[best]))
+        costs = np.append(fits.cost[kept], none_cost)
+        weight = np.exp(-0.5 * np.minimum(costs - costs.min(), 1400.0))
+        weight /= weight.sum()
+        best_of_class = {names[fits.class_index[k]]: 0.0 for k in kept}
+        for k, w in zip(kept, weight, strict=False):
+            best_of_class[names[fits.class_index[k]]] += float(w)
+        probability = {**dict.fromkeys(names, 0.0), **best_of_class, "none": float(weight[-1])}
+        condition, weak = weak_direction(fits.information[best], self.free)
+        candidates = tuple(
+            Candidate(
+                names[fits.class_index[k]],
+                float(fits.view[k, 0]),
+                self._wrapped(fits.view[k, 1], fits.class_index[k]),
+                float(fits.cost[k]),
+                float(w),
+                float(fits.view[k, 2]),
+                float(fits.view[k, 3]),
+            )
+            for k, w in zip(kept, weight, strict=False)
+        )
+        return Match(
+            class_name=names[c] if is_landmark else None,
+            accepted=is_landmark and known and bool(p_values[best] >= self.false_alarm),
+            distance_m=candidates[0].distance_m,
+            delta_rad=candidates[0].delta_rad,
+            bearing_rad=candidates[0].bearing_rad,
+            height_m=candidates[0].height_m,
+            free=self.free,
+            covariance=covariance.copy() if known else None,
+            chi2=float(fits.cost[best]),
+            dof=int(fits.dof[best]),
+            p_value=float(p_values[best]),
+            class_probability=probability,
+            alternatives=candidates[1:] if is_landmark else candidates,
+            symmetry=self._symmetry[c],
+            condition_number=condition,
+            weak_direction=weak,
+            background=background,
+        )
+
+    def _distinct(self, fits: Fits, own: NDArray[np.int64]) -> list[int]:
+        """Return fits, best first, without those that came to the same place."""
+        kept: list[int] = []
+        for k in own:
+            period = 2 * math.pi / self._symmetry[fits.class_index[k]]
+            for other in kept:
+                turned = math.remainder(fits.view[k, 1] - fits.view[other, 1], period)
+                near = abs(fits.view[k, 0] - fits.view[other, 0]) < _SAME_M and abs(turned) < _SAME_RAD
+                if near and fits.class_index[k] == fits.class_index[other]:
+                    break
+            else:
+                kept.append(int(k))
+        return kept
+
+    def _wrapped(self, delta_rad: float, class_index: int) -> float:
+        return float(delta_rad % (2 * math.pi / self._symmetry[class_index]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Models:
+    """What the answer is taken from, and what finds the way to it where that is slow."""
+
+    final: ImageModel | None
+    scout: ImageModel | None
+
+
+def weak_direction(information: NDArray[np.float64], free: Sequence[str]) -> tuple[float, dict[str, float]]:
+    """Return the condition number of the information, and the direction known worst.
+
+    Parameters
+    ----------
+    information : (p, p) float64
+    free : sequence of str
+        Its parameters; lengths count in centimetres, angles in degrees.
+
+    Returns
+    -------
+    condition : float
+    direction : dict of str to float
+        The standard deviation along the worst direction, by parameter, metres and radians.
+    """
+    if not np.isfinite(information).all():
+        return math.inf, {}
+    scale = np.array([SCALE[name] for name in free])
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    if values[0] <= 0:
+        return math.inf, {}
+    worst = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0]) / math.sqrt(values[0]) * scale
+    return float(values[-1] / values[0]), dict(zip(free, worst.tolist(), strict=True))
+
+
+def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.float64]:
+    """Return the whitened squared distance of frames from a scene without a landmark, (n,)."""
+    if behind is None:
+        return np.asarray(DISAGREEMENT * seen.returned.sum(axis=1), np.float64)
+    sensor = behind.sensor
+    model = behind.range_m.reshape(-1)
+    lit = np.isfinite(model)
+    sure = counts(behind.phasor, behind.intensity, sensor).reshape(-1)
+    residual = wrap_difference_m(np.where(lit & seen.returned, seen.range_m - np.where(lit, model, 0.0), 0.0), sensor)
+    wrong = (seen.returned & ~lit) | (seen.not_returned & sure)
+    return np.asarray((seen.weight * residual**2).sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
+
+
+def p_values_of(
+    cost: NDArray[np.float64], dof: NDArray[np.int64], frames: FilteredFrames, frame: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the probability of a larger χ² for every fit; 0 where nothing is left to test.
+
+    Where the variances were estimated from the scatter of ν + 1 frames, each squared residual follows F(1, ν); their
+    sum is given a scaled χ² of the same mean and variance.
+    """
+    freedom = np.maximum(dof, 1).astype(np.float64)
+    if not frames.std_from_scatter:
+        p = stats.chi2.sf(cost, freedom)
+    else:
+        n = np.where(frames.n_effective > 0, frames.n_effective, np.nan).reshape(len(frames), -1)
+        nu = np.array([np.nanmedian(row) if np.isfinite(row).any() else 0.0 for row in n])[frame] - 1
+        nu = np.maximum(nu, 5.0)  # the variance of F(1, ν) exists above 4
+        mean = freedom * nu / (nu - 2)
+        variance = freedom * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
+        p = stats.chi2.sf(cost * 2 * mean / variance, 2 * mean**2 / variance)
+    return np.where(dof > 0, p, 0.0)
+
+
+def _usual_workers() -> int:
+    return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8)
+
+
+def _behind(bank: Bank, background: Background) -> PhasorImages:
+    return Renderer(None, bank.sensor).render(distance_m=1.0, background=background)
+
+
+def _some(seen: Observation, index: NDArray[np.int64]) -> Observation:
+    return Observation(seen.range_m[index], seen.weight[index], seen.returned[index], seen.not_returned[index])
+
+
+def _spread(fits: Fits) -> Fits:
+    """Surround fits by others, two and four standard deviations away along the axes of their covariance.
+
+    Where an edge has just left a pixel, its slope is none, and nothing leads back.
+    """
+    p = fits.covariance.shape[1]
+    columns = np.arange(p)
+    values, vectors = np.linalg.eigh(np.where(np.isfinite(fits.covariance), fits.covariance, 0.0))
+    axes = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    parts = [fits]
+    for k in range(p):
+        for size in (-4.0, -2.0, 2.0, 4.0):
+            view = fits.view.copy()
+            view[:, columns] += size * axes[:, :, k]
+            parts.append(replace(fits, view=view))
+    return Fits.joined(parts)
+
+
+def _least_of_frame(fits: Fits, n: int) -> NDArray[np.float64]:
+    """Return the lowest cost of every frame, (n,)."""
+    least = np.full(n, np.inf)
+    np.minimum.at(least, fits.frame, fits.cost)
+    return least
+
+
+def _best_of_frame(fits: Fits) -> NDArray[np.int64]:
+    """Return the index of the best fit of every frame that has one."""
+    order = np.lexsort((fits.cost, fits.frame))
+    first = np.r_[True, np.diff(fits.frame[order]) > 0] if len(order) else np.empty(0, np.bool_)
+    return order[first]

@@ -1,0 +1,373 @@
+"""From candidates to the best view: maximum likelihood over continuous parameters, many frames at once.
+
+Levenberg–Marquardt on the sums of :mod:`phasemark.matcher.likelihood`. Which pixels count is decided by the model at
+the start (PHYSICS section 7) and held while the view moves, so that the sum stays comparable; where the solution would
+decide otherwise it is decided again there, once, and the view moves again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.coarse import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE
+from phasemark.matcher.likelihood import Evidence, Sums, counts, gauss_newton_sums
+from phasemark.matcher.models import VIEW, ImageModel, ModelImages
+
+ALBEDO = "albedo"
+"""Name of the factor on the landmark's brightness, profiled out on phasors."""
+SCALE = {"distance_m": 0.01, "delta_rad": np.radians(1), "bearing_rad": np.radians(1), "height_m": 0.01, ALBEDO: 0.1}
+"""Natural units of the parameters: 1 cm, 1°; what a condition number and the longest step are told in."""
+_MAX_ITERATIONS = 30
+_SETTLED = 1e-4
+"""A step that promises to lower the whitened squared residual by less than this is not taken."""
+_ROUGH = 0.1
+_CLOSE = 30.0
+"""Where a step promises less than this, slopes have settled: five σ, over which they hardly change."""
+_OPTIMISM = 3.0
+"""A fit gives up where even so many times the promised decrease would not save it."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is estimated, and from what.
+
+    Parameters
+    ----------
+    free : tuple of str
+        Parameters of the view.
+    pixels : (pixels,) bool
+        Which pixels place the landmark; all of them tell its class.
+    huber : float, optional
+        Residual, in σ, from which the loss grows linearly.
+    background : PhasorImages' phasor (pixels,) complex128, optional
+        What stands behind, without the landmark; on phasors the albedo does not scale it.
+    longest_step : float
+        No step is longer, in natural units of 1 cm and 1°. Near a solution it should be short: where an edge crosses
+        a pixel's border, slopes jump, and those of one side may lead far away on the other.
+    """
+
+    free: tuple[str, ...]
+    pixels: NDArray[np.bool_]
+    huber: float | None = None
+    background: NDArray[np.complex128] | None = None
+    longest_step: float = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Candidates, each at its best view; arrays of one length m.
+
+    Parameters
+    ----------
+    frame, class_index : int64
+    view : (m, 4) float64
+    albedo : float64
+        Factor on the landmark's brightness; 1 on ranges.
+    cost : float64
+        Whitened squared residual of all pixels that count, and :data:`~phasemark.matcher.coarse.DISAGREEMENT` for each
+        pixel whose return or lack of it no view nearby explains.
+    dof : int64
+        Residuals in it, less the parameters fitted.
+    covariance : (m, p, p) float64
+        Of the free parameters of the view, nuisances taken into account; NaN where some direction is not observed.
+    information : (m, p, p) float64
+        Its inverse.
+    """
+
+    frame: NDArray[np.int64]
+    class_index: NDArray[np.int64]
+    view: NDArray[np.float64]
+    albedo: NDArray[np.float64]
+    cost: NDArray[np.float64]
+    dof: NDArray[np.int64]
+    covariance: NDArray[np.float64]
+    information: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, index: NDArray[Any]) -> Fits:
+        return Fits(**{name: values[index] for name, values in vars(self).items()})
+
+    @classmethod
+    def joined(cls, parts: list[Fits]) -> Fits:
+        """Put batches behind one another."""
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+
+
+def refine(
+    model: ImageModel,
+    evidence: Evidence,
+    frame: NDArray[np.int64],
+    class_index: NDArray[np.int64],
+    view: NDArray[np.float64],
+    settings: Settings,
+    give_up_above: NDArray[np.float64] | None = None,
+    *,
+    roughly: bool = False,
+) -> Fits:
+    """Move m candidates to the nearest maximum of the likelihood.
+
+    Parameters
+    ----------
+    model : ImageModel
+    evidence : Evidence
+    frame, class_index : (m,) int64
+        Which frame each candidate explains, and by which class.
+    view : (m, 4) float64
+        Where it starts, columns :data:`~phasemark.matcher.models.VIEW`.
+    settings : Settings
+    give_up_above : (m,) float64, optional
+        Stop where the cost promises to stay above this.
+    roughly : bool
+        Whether to stop within a fraction of a standard deviation, with the pixels that counted at the start.
+
+    Returns
+    -------
+    Fits
+        In the order of the candidates.
+    """
+    limit = np.full(len(frame), np.inf) if give_up_above is None else give_up_above
+    problem = _Problem(model, evidence, frame, class_index, settings, limit)
+    state = problem.start(view)
+    state = problem.descend(state, _ROUGH if roughly else _SETTLED)
+    if roughly:
+        return problem.conclude(state, look_around=False)
+    use = problem.pixels_at(state.images, state.theta)
+    changed = np.flatnonzero((use != state.use).any(axis=1))
+    if changed.size:
+        again = problem.some(changed)
+        moved = again.descend(again.state(state.theta[changed], use[changed]), _SETTLED)
+        state = state.updated(changed, moved)
+    return problem.conclude(state)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Where m candidates are: parameters (view and albedo, (m, 5)), pixels in use, images and sums there."""
+
+    theta: NDArray[np.float64]
+    use: NDArray[np.bool_]
+    images: ModelImages
+    sums: Sums
+
+    def updated(self, where: NDArray[np.integer], news: _State) -> _State:
+        def put(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
+            old[where] = new
+            return old
+
+        for part in ("images", "sums"):
+            for name in vars(getattr(self, part)):
+                put(getattr(getattr(self, part), name), getattr(getattr(news, part), name))
+        return replace(self, theta=put(self.theta, news.theta), use=put(self.use, news.use))
+
+
+class _Problem:
+    """m candidates with their frames."""
+
+    def __init__(
+        self,
+        model: ImageModel,
+        evidence: Evidence,
+        frame: NDArray[np.int64],
+        class_index: NDArray[np.int64],
+        settings: Settings,
+        limit: NDArray[np.float64],
+    ) -> None:
+        self.limit = limit
+        self.model, self.evidence, self.settings = model, evidence, settings
+        self.frame, self.class_index = frame, class_index
+        self.with_albedo = evidence.on == "phasors"
+        names = (*settings.free, ALBEDO) if self.with_albedo else settings.free
+        self.columns = np.array([(*VIEW, ALBEDO).index(name) for name in names])
+        self.scale = np.array([SCALE[name] for name in names])
+
+    def some(self, which: NDArray[np.integer]) -> _Problem:
+        return _Problem(
+            self.model, self.evidence, self.frame[which], self.class_index[which], self.settings, self.limit[which]
+        )
+
+    def start(self, view: NDArray[np.float64]) -> _State:
+        """Look at the first views: which pixels count, and how bright the landmark is."""
+        theta = np.column_stack([self._clipped(view.copy()), np.ones(len(view))])
+        images = self.model.images(self.class_index, np.ascontiguousarray(theta[:, :4]), self.settings.free)
+        if self.with_albedo:
+            theta[:, 4] = self._brightness(images)
+        return self._summed(theta, self.pixels_at(images, theta), self._scaled(images, theta))
+
+    def state(
+        self, theta: NDArray[np.float64], use: NDArray[np.bool_], slope: NDArray[np.complex128] | None = None
+    ) -> _State:
+        """Render and compare; with known slopes, only the images are new."""
+        free = self.settings.free if slope is None else ()
+        images = self.model.images(self.class_index, np.ascontiguousarray(theta[:, :4]), free)
+        images = self._scaled(images, theta)
+        return self._summed(theta, use, images if slope is None else replace(images, slope=slope))
+
+    def _summed(self, theta: NDArray[np.float64], use: NDArray[np.bool_], images: ModelImages) -> _State:
+        sums = gauss_newton_sums(
+            images.phasor, images.slope, self.evidence, self.frame, use & self.settings.pixels, self.settings.huber
+        )
+        return _State(theta, use, images, sums)
+
+    def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which pixels count at some views, (m, pixels)."""
+        trusted = self.model.trusted(self.class_index, theta[:, :4])
+        phasor = images.phasor
+        if self.with_albedo and images.slope.shape[1] == len(self.columns):
+            # a landmark made dim must not make its pixels disappear: the bank's albedo decides
+            phasor = phasor - (theta[:, 4:] - 1) * images.slope[:, -1]
+        return counts(phasor, images.intensity, self.evidence.sensor) & trusted
+
+    def descend(self, state: _State, settled: float) -> _State:
+        """Run Levenberg–Marquardt, each candidate with its own damping.
+
+        Close to the solution, slopes are those of the step before, until a step with them fails.
+        """
+        damping = np.full(len(state.theta), 1e-3)
+        old = np.zeros(len(state.theta), np.bool_)
+        active = np.arange(len(state.theta))
+        for _ in range(_MAX_ITERATIONS):
+            sums = state.sums
+            step = self._steps(sums.information[active], sums.gradient[active], damping[active])
+            promise = np.einsum("mp,mp->m", sums.gradient[active], step)
+            worth = (promise > settled) & (sums.cost[active] - _OPTIMISM * promise < self.limit[active])
+            active, step, promise = active[worth], step[worth], promise[worth]
+            if not active.size:
+                break
+            theta = state.theta[active].copy()
+            theta[:, self.columns] += step
+            theta[:, :4] = self._clipped(theta[:, :4])
+            theta[:, 4] = np.maximum(theta[:, 4], 1e-3)
+            close = promise < _CLOSE
+            stays = np.ones(len(active), np.bool_)
+            for which, with_slopes in ((np.flatnonzero(~close), True), (np.flatnonzero(close), False)):
+                if not which.size:
+                    continue
+                k = active[which]
+                slope = None if with_slopes else state.images.slope[k]
+                there = self.some(k).state(theta[which], state.use[k], slope)
+                better = there.sums.cost <= state.sums.cost[k]
+                wins = np.flatnonzero(better)
+                # a step that was taken and promised little was the last: the next would promise its square
+                stays[which] = (promise[which] > 100 * settled) | ~better
+                lost = k[~better & old[k]]
+                damping[k] = np.where(better, np.maximum(damping[k] * 0.1, 1e-9), damping[k] * 8)
+                state = state.updated(k[wins], _picked(there, wins))
+                old[k[wins]] = not with_slopes
+                if lost.size:
+                    again = self.some(lost).state(state.theta[lost], state.use[lost])
+                    state = state.updated(lost, again)
+                    old[lost], damping[lost] = False, 1e-3
+            active = active[stays & (damping[active] < 1e5)]
+        return state
+
+    def conclude(self, state: _State, *, look_around: bool = True) -> Fits:
+        """Take stock of the solutions."""
+        sums, settings, evidence = state.sums, self.settings, self.evidence
+        p = len(settings.free)
+        covariance = _inverse(sums.information * np.outer(self.scale, self.scale), self.scale)
+        if settings.huber is not None:
+            covariance = covariance @ sums.scatter @ covariance
+        covariance = covariance[:, :p, :p]
+        information = _inverse(covariance / np.outer(self.scale[:p], self.scale[:p]), 1 / self.scale[:p])
+        all_pixels = np.ones_like(settings.pixels)
+        cost = sums.cost
+        if not settings.pixels.all():
+            cost = gauss_newton_sums(
+                state.images.phasor, state.images.slope, evidence, self.frame, state.use & all_pixels, settings.huber
+            ).cost
+        fitted = state.use & (evidence.weight[self.frame] > 0)
+        std = np.sqrt(np.where(np.isfinite(covariance), covariance, 0.0)[:, range(p), range(p)])
+        std = np.minimum(std, self.scale[:p])
+        low, high = state.images.coverage.copy(), state.images.coverage.copy()
+        near = np.flatnonzero(
+            (cost <= self.limit) & look_around
+        )  # where it does not matter any more, what is nearby is not looked at
+        if near.size:
+            around = self.model.reach(self.class_index[near], state.theta[near, :4], settings.free, std[near])
+            low[near], high[near] = np.minimum(low[near], around[0]), np.maximum(high[near], around[1])
+        returned = evidence.seen.returned[self.frame]
+        absent = evidence.seen.not_returned[self.frame]
+        if settings.background is None:
+            lost = returned & (high < MAY_RETURN_COVERAGE)
+            missed = absent & (low > MUST_RETURN_COVERAGE)
+        else:
+            lost = np.zeros_like(returned)
+            missed = absent & state.use
+        # a kink nearby excuses a pixel where it keeps it from being compared
+        wrong = (lost | missed) & ~fitted & self.model.trusted(self.class_index, state.theta[:, :4])
+        n_wrong = wrong.sum(axis=1)
+        return Fits(
+            frame=self.frame,
+            class_index=self.class_index,
+            view=state.theta[:, :4],
+            albedo=state.theta[:, 4],
+            cost=cost + DISAGREEMENT * n_wrong,
+            dof=np.maximum(fitted.sum(axis=1) * evidence.per_pixel + n_wrong - len(self.columns), 0),
+            covariance=covariance,
+            information=information,
+        )
+
+    def _scaled(self, images: ModelImages, theta: NDArray[np.float64]) -> ModelImages:
+        """Make the landmark as bright as the parameters have it, and append the slope by that."""
+        if not self.with_albedo:
+            return images
+        own = self._landmark_alone(images)
+        factor = theta[:, 4:]
+        slope = np.concatenate([images.slope * factor[:, :, None], own[:, None]], axis=1)
+        return replace(images, phasor=images.phasor + (factor - 1) * own, slope=slope)
+
+    def _landmark_alone(self, images: ModelImages) -> NDArray[np.complex128]:
+        behind = self.settings.background
+        return images.phasor if behind is None else images.phasor - (1 - images.coverage) * behind
+
+    def _brightness(self, images: ModelImages) -> NDArray[np.float64]:
+        """Return the factor by which frames are brighter than their models, (m,)."""
+        own = self._landmark_alone(images)
+        value, weight = self.evidence.value[self.frame], self.evidence.weight[self.frame]
+        weight = weight * (images.coverage > MUST_RETURN_COVERAGE)
+        power = np.sum(weight * np.abs(own) ** 2, axis=1)
+        along = np.sum(weight * (own.conj() * (value - (images.phasor - own))).real, axis=1)
+        factor = np.divide(along, power, out=np.ones_like(power), where=power > 0)
+        return np.asarray(np.clip(factor, 0.01, 100.0))
+
+    def _clipped(self, view: NDArray[np.float64]) -> NDArray[np.float64]:
+        view[:, 0] = np.clip(view[:, 0], *self.model.limits())
+        return view
+
+    def _steps(
+        self, information: NDArray[np.float64], gradient: NDArray[np.float64], damping: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return damped steps, (m, p), none too long in any parameter."""
+        scaled = information * np.outer(self.scale, self.scale)
+        diagonal = np.einsum("mpp->mp", scaled)
+        floor = 1e-12 * diagonal.max(axis=1, initial=0.0) + 1e-300
+        held = scaled + np.einsum("mp,pq->mpq", damping[:, None] * diagonal + floor[:, None], np.eye(len(self.scale)))
+        step = np.linalg.solve(held, (gradient * self.scale)[:, :, None])[:, :, 0]
+        longest = np.abs(step).max(axis=1, keepdims=True)
+        return np.asarray(step * np.minimum(1.0, self.settings.longest_step / np.maximum(longest, 1e-30)) * self.scale)
+
+
+def _picked(state: _State, which: NDArray[np.integer]) -> _State:
+    images = ModelImages(**{name: values[which] for name, values in vars(state.images).items()})
+    sums = Sums(**{name: values[which] for name, values in vars(state.sums).items()})
+    return _State(state.theta[which], state.use[which], images, sums)
+
+
+def _inverse(matrix: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the inverses of symmetric matrices that were scaled to be of order one in natural units.
+
+    `matrix` is in natural units; the result is scaled back. NaN where a matrix is singular.
+    """
+    out = np.full(matrix.shape, np.nan)
+    finite = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
+    values, vectors = np.linalg.eigh(np.where(finite[:, None, None], matrix, 0.0))
+    good = finite & (values[:, 0] > 1e-12 * values[:, -1]) & (values[:, 0] > 0)
+    v, w = vectors[good], values[good]
+    out[good] = np.einsum("mij,mj,mkj->mik", v, 1 / w, v)
+    return out * np.outer(scale, scale)

@@ -1,0 +1,132 @@
+"""What stands behind the landmark, estimated from the frame's own far pixels (PHYSICS section 7).
+
+The landmark stands in front, so what is clearly farther than the nearest surface is background. Its pixels are
+explained by a wall, a plane across the line of sight, and below the horizon by a floor; on amplitudes their brightness
+gives the albedo too, relative to the landmark's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.coarse import Observation
+from phasemark.matcher.filters import FilteredFrames, PixelState
+from phasemark.render import Background, Sensor
+
+CLEARLY_BEHIND_M = 0.4
+"""Farther than the nearest surface by more than a landmark is deep."""
+NEAREST_WALL_M = 0.05
+"""Nothing nearer is taken for a wall."""
+_FEWEST = 6
+_USUAL_ALBEDO = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What one frame shows behind the landmark.
+
+    Parameters
+    ----------
+    background : Background or None
+        None: nothing returns from behind.
+    behind : (pixels,) bool
+        Which pixels see background alone, or may see some of it beside the landmark.
+    pure : (pixels,) bool
+        Which see background alone.
+    """
+
+    background: Background | None
+    behind: NDArray[np.bool_]
+    pure: NDArray[np.bool_]
+
+
+def estimate_surroundings(frames: FilteredFrames, index: int = 0, landmark_scale: float = 1.0) -> Surroundings:
+    """Estimate wall and floor behind the landmark of one frame.
+
+    Parameters
+    ----------
+    frames : FilteredFrames
+    index : int
+        Which of them.
+    landmark_scale : float
+        How much brighter the landmark is than its model: albedos count relative to it.
+
+    Returns
+    -------
+    Surroundings
+        Without a background where fewer than six pixels are clearly behind.
+    """
+    sensor = frames.sensor
+    returned = frames.state[index] == PixelState.RETURN
+    ranges = np.where(returned, frames.range_m[index], np.nan)
+    nothing = np.zeros(ranges.size, np.bool_)
+    if returned.sum() < _FEWEST:
+        return Surroundings(None, nothing, nothing)
+    forward = sensor.axis_cosine() * ranges
+    nearest = float(np.nanpercentile(forward, 5))
+    far = returned & (forward > nearest + CLEARLY_BEHIND_M)
+    lonely = far & _inner(far)  # away from the landmark: not mixed
+    pure = lonely if lonely.sum() >= _FEWEST else far
+    if far.sum() < _FEWEST:
+        return Surroundings(None, nothing, nothing)
+    down = -_level_z(sensor)
+    above = pure & (down <= 0)
+    wall_m = _weighted_middle(forward[above] if above.sum() >= 3 else forward[pure])
+    drop = down * ranges
+    short = pure & (down > 0) & (forward < wall_m - 0.1)
+    floor_m = None
+    if short.sum() >= _FEWEST:
+        height = drop[short]
+        middle = float(np.median(height))
+        if np.median(np.abs(height - middle)) < 0.02 * middle:
+            floor_m = middle
+    albedo = _USUAL_ALBEDO
+    if frames.amplitude_e is not None:
+        unit = sensor.contrast * sensor.signal_e
+        lit = pure & ~short
+        # a wall across the axis: |S| = ρ cos θ / r², cos θ that of the ray
+        bright = frames.amplitude_e[index] / unit * ranges**2 / sensor.axis_cosine()
+        if lit.any():
+            albedo = float(np.clip(np.median(bright[lit]) / landmark_scale, 1e-3, 1.0))
+    background = Background(wall_m=wall_m, floor_m=floor_m, wall_albedo=albedo, floor_albedo=albedo)
+    return Surroundings(background, (far | ~_inner(~far) & returned).ravel(), pure.ravel())
+
+
+def without_background(seen: Observation, surroundings: Surroundings) -> Observation:
+    """Return one frame as it would be with nothing behind: far pixels return nothing, those beside them are missing."""
+    nothing = surroundings.pure[None] & seen.returned
+    unclear = surroundings.behind[None] & ~nothing
+    keep = seen.returned & ~nothing & ~unclear
+    return Observation(
+        np.where(keep, seen.range_m, 0.0),
+        np.where(keep, seen.weight, 0.0),
+        keep,
+        (seen.not_returned & ~unclear) | nothing,
+    )
+
+
+def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which pixels have all their neighbours in a mask."""
+    padded = np.pad(mask, 1, constant_values=True)
+    rows, cols = mask.shape
+    return np.asarray(np.logical_and.reduce([padded[i : i + rows, j : j + cols] for i in range(3) for j in range(3)]))
+
+
+def _level_z(sensor: Sensor) -> NDArray[np.float64]:
+    """Return the upward component of the ray of every pixel's centre, (rows, cols)."""
+    tan_h, tan_v = sensor.tan_half_angles
+    u0, v0 = sensor.centre_px
+    v, u = np.mgrid[: sensor.rows, : sensor.cols] + 0.5
+    ray = np.stack([np.ones_like(u), tan_h * 2 * (u0 - u) / sensor.cols, tan_v * 2 * (v0 - v) / sensor.rows])
+    ray /= np.linalg.norm(ray, axis=0)
+    return np.asarray(np.einsum("k,krc->rc", sensor.cam2level[2], ray))
+
+
+def _weighted_middle(values: NDArray[np.float64]) -> float:
+    """Return the mean of what lies within 5 robust σ of the median: as good as a mean, and outliers do not matter."""
+    middle = float(np.median(values))
+    spread = 1.4826 * float(np.median(np.abs(values - middle)))
+    return float(values[np.abs(values - middle) <= 5 * spread + 1e-9].mean())
