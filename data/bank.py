@@ -276,6 +276,12 @@ class Bank:
             metadata={"name": class_name, "symmetry": round(360 / period_deg), "albedo": albedo},
         )
 
+    def identity(self) -> dict[str, Any]:
+        """Return what the bank's bytes depend on: resolved plan, versions, mesh hashes."""
+        with _reading(self.path):
+            hashes = {name: str(self._file[f"meshes/{name}"].attrs["sha256"]) for name in self.classes}
+        return {"plan": self._json("plan"), "versions": self.versions, "mesh_sha256": hashes}
+
     def info(self) -> dict[str, Any]:
         """Return what the bank holds, in plain numbers and text."""
         groups = [group for group in (self.lower, self.upper, self.full) if group is not None]
