@@ -2,9 +2,12 @@
 
 from phasemark.data.bank import Bank, BankGroup, open_bank
 from phasemark.data.build import build_bank
+from phasemark.data.build_frames import build_frames
+from phasemark.data.frame_plan import Distribution, FramePlan
+from phasemark.data.frames import FrameSet, FrameSubset, open_frames
 from phasemark.data.grid import format_grid, parse_grid
 from phasemark.data.measured import read_frames
-from phasemark.data.plan import BankPlan, MeshPlan, load_plan
+from phasemark.data.plan import BankPlan, MeshPlan, load_plan, read_plan
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.store import read_checksum, verify_checksum, write_atomically, write_checksum
 
@@ -12,15 +15,22 @@ __all__ = [
     "Bank",
     "BankGroup",
     "BankPlan",
+    "Distribution",
+    "FramePlan",
+    "FrameSet",
+    "FrameSubset",
     "MeshPlan",
     "build_bank",
+    "build_frames",
     "format_grid",
     "load_plan",
     "mesh_sha256",
     "open_bank",
+    "open_frames",
     "parse_grid",
     "read_checksum",
     "read_frames",
+    "read_plan",
     "verify_checksum",
     "versions",
     "write_atomically",

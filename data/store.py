@@ -243,6 +243,15 @@ def verify_checksum(path: str | os.PathLike[str]) -> str:
     return actual
 
 
+def has_matching_checksum(path: str | os.PathLike[str]) -> bool:
+    """Return whether ``FILE.sha256`` is there and says what the file's SHA-256 is."""
+    try:
+        verify_checksum(path)
+    except InputFileError:
+        return False
+    return True
+
+
 def refuse_unwritable(path: Path, *, force: bool) -> None:
     """Refuse a name in no folder, of a folder or device, or of a file that exists unless `force` allows it."""
     if not path.parent.is_dir():
