@@ -1,4 +1,4 @@
-"""What is kept: plans, banks of model images, measured frames, and files that are whole or not there."""
+"""What is kept: plans, banks of model images, frame sets, measured frames, and files that are whole or not there."""
 
 from phasemark.data.bank import Bank, BankGroup, open_bank
 from phasemark.data.build import build_bank
@@ -6,10 +6,12 @@ from phasemark.data.build_frames import build_frames
 from phasemark.data.frame_plan import Distribution, FramePlan
 from phasemark.data.frames import FrameSet, FrameSubset, open_frames
 from phasemark.data.grid import format_grid, parse_grid
+from phasemark.data.jobs import build_part, estimate, merge_parts, parse_part
 from phasemark.data.measured import read_frames
 from phasemark.data.plan import BankPlan, MeshPlan, load_plan, read_plan
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.store import read_checksum, verify_checksum, write_atomically, write_checksum
+from phasemark.data.verify import verify_bank, verify_frames
 
 __all__ = [
     "Bank",
@@ -22,16 +24,22 @@ __all__ = [
     "MeshPlan",
     "build_bank",
     "build_frames",
+    "build_part",
+    "estimate",
     "format_grid",
     "load_plan",
+    "merge_parts",
     "mesh_sha256",
     "open_bank",
     "open_frames",
     "parse_grid",
+    "parse_part",
     "read_checksum",
     "read_frames",
     "read_plan",
+    "verify_bank",
     "verify_checksum",
+    "verify_frames",
     "versions",
     "write_atomically",
     "write_checksum",

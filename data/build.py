@@ -37,6 +37,7 @@ from phasemark.landmarks import LandmarkSpec, Revolution, build_mesh, read_mesh
 from phasemark.render import PhasorImages, PlanarLandmark, Renderer, Sensor, Views, planar_images
 
 ImagesOf = Callable[[Views], PhasorImages]
+StoredMesh = Callable[[str], trimesh.Trimesh]
 
 
 @dataclass(frozen=True)
@@ -136,16 +137,20 @@ class BankJob:
     Parameters
     ----------
     plan : BankPlan
+    stored_mesh : callable, optional
+        Returns the mesh of a class, in place of the mesh file that the plan names.
     """
 
-    kind = "bank"
-
-    def __init__(self, plan: BankPlan) -> None:
+    def __init__(self, plan: BankPlan, stored_mesh: StoredMesh | None = None) -> None:
         self.plan = plan.resolve()
         _refuse_impossible(self.plan)
         self.sensor = self.plan.build_sensor()
-        self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes)
+        self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
         self._slabs = list(_slabs(self.plan, self.sensor, self.landmarks))
+
+    def spec(self) -> dict[str, Any]:
+        """Return what another process makes the same job from."""
+        return {"kind": "bank", "plan": self.plan.model_dump(mode="json")}
 
     @property
     def items(self) -> list[int]:
@@ -190,6 +195,18 @@ class BankJob:
         stored = _stored(job.images_of(job.views[start:stop]))
         return [stored[field] for field in _FIELDS]
 
+    def read(self, file: h5py.File, slab: int, item: int) -> dict[str, NDArray[Any]]:
+        """Return what a file holds of one image, as :meth:`make` makes it."""
+        at = self._slabs[slab]
+        group = file[at.group]
+        n_dims = len(VIEW_DIMS[at.group])
+        place = np.unravel_index(at.first + item, group["phasor"].shape[:n_dims])
+        return {field: group[field][tuple(int(k) for k in place)] for field in _FIELDS}
+
+    def remake(self, slab: int, item: int) -> dict[str, NDArray[Any]]:
+        """Return the same, rendered again."""
+        return {field: values[0] for field, values in zip(_FIELDS, self.make(slab, item, item + 1), strict=True)}
+
 
 _FIELDS = ("phasor", "intensity", "coverage")
 
@@ -220,20 +237,18 @@ def _refuse_impossible(plan: BankPlan) -> None:
         )
 
 
-def read_landmarks(landmarks: Sequence[LandmarkSpec], meshes: Sequence[MeshPlan]) -> list[Landmark]:
-    """Build the meshes of landmarks, and read those that come from files."""
-    return [
-        *(Landmark(spec.name, build_mesh(spec), spec.symmetry, spec.albedo, spec) for spec in landmarks),
-        *(
-            Landmark(
-                part.name,
-                read_mesh(part.path, unit=part.unit, up=part.up, origin=part.origin),
-                part.symmetry,
-                part.albedo,
-            )
-            for part in meshes
-        ),
-    ]
+def read_landmarks(
+    landmarks: Sequence[LandmarkSpec], meshes: Sequence[MeshPlan], stored_mesh: StoredMesh | None = None
+) -> list[Landmark]:
+    """Build the meshes of landmarks, and read those that come from files (or are stored in one of ours)."""
+    found = [Landmark(spec.name, build_mesh(spec), spec.symmetry, spec.albedo, spec) for spec in landmarks]
+    for part in meshes:
+        if stored_mesh is None:
+            mesh = read_mesh(part.path, unit=part.unit, up=part.up, origin=part.origin)
+        else:
+            mesh = stored_mesh(part.name)
+        found.append(Landmark(part.name, mesh, part.symmetry, part.albedo))
+    return found
 
 
 def _images_of(

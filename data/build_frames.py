@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.data.build import read_landmarks, write_mesh
+from phasemark.data.build import StoredMesh, read_landmarks, write_mesh
 from phasemark.data.frame_plan import FramePlan
 from phasemark.data.frames import (
     FORMAT,
@@ -101,18 +101,22 @@ class FrameJob:
     Parameters
     ----------
     plan : FramePlan
+    stored_mesh : callable, optional
+        Returns the mesh of a class, in place of the mesh file that the plan names.
     """
 
-    kind = "frames"
-
-    def __init__(self, plan: FramePlan) -> None:
+    def __init__(self, plan: FramePlan, stored_mesh: StoredMesh | None = None) -> None:
         self.plan = plan.resolve()
         self.sensor = self.plan.build_sensor()
-        self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes)
+        self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
         self._renderers = [
             Renderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks
         ]
         self._shot_sensor = self.sensor.without_errors(shot_noise=True) if "shot" in self.plan.variants else None
+
+    def spec(self) -> dict[str, Any]:
+        """Return what another process makes the same job from."""
+        return {"kind": "frames", "plan": self.plan.model_dump(mode="json")}
 
     @property
     def items(self) -> list[int]:
@@ -264,6 +268,19 @@ class FrameJob:
             )  # fmt: skip
             stored["range_shot"] = shot.range_m.astype("<f4")
         return [stored[name] for name in self.fields]
+
+    def read(self, file: h5py.File, slab: int, item: int) -> dict[str, NDArray[Any]]:
+        """Return what a file holds of one view, as :meth:`make` makes it."""
+        per = self.plan.frames_per_view
+        return {
+            name: file[name][item * per : (item + 1) * per] if name in FRAME_FIELDS else file[name][item]
+            for name in self.fields
+        }
+
+    def remake(self, slab: int, item: int) -> dict[str, NDArray[Any]]:
+        """Return the same, rendered and captured again."""
+        made = self.make(slab, item, item + 1)
+        return {name: values[0] for name, values in zip(self.fields, made, strict=True)}
 
     def _render(self, truth: dict[str, NDArray[Any]]) -> tuple[PhasorImages, NDArray[np.float64] | None]:
         """Return noise-free images of views, and what their centre rays see; views that share all else go together."""

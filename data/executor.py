@@ -1,4 +1,4 @@
-"""Who does the work: threads of this process, worker processes, or a Dask cluster.
+"""Who does the work: threads here, and what makes shards elsewhere (:mod:`phasemark.data.remote`).
 
 Every shard of a build depends on the job and its range of items alone, so a task may be repeated, done twice or moved to
 another worker, and nothing changes.
@@ -97,8 +97,3 @@ def _wait(answers: queue.SimpleQueue[Any]) -> Any:
         except queue.Empty:
             continue
 
-
-def open_maker(scheduler: str, job: Any) -> Maker | None:
-    if scheduler == "threads":
-        return None
-    raise NotImplementedError

@@ -270,7 +270,8 @@ class FramePlan(ScenePlan):
         names = [name for name in QUANTITIES if (spread := getattr(self, name)) is not None and spread.sobol is not None]
         if not names:
             return {}
-        engine = qmc.Sobol(len(names), scramble=True, bits=32, rng=stream(self.seed, "frames.sobol", 0))
+        seed = int(stream(self.seed, "frames.sobol", 0).integers(2**63))  # SciPy spawns from it, which Philox cannot
+        engine = qmc.Sobol(len(names), scramble=True, bits=32, rng=np.random.default_rng(seed))
         if start:
             engine.fast_forward(start)
         # SciPy warns when the first draw is not a power of two; one point is, and later draws may have any number

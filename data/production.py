@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from phasemark.data.executor import open_maker
+from phasemark.data.remote import open_maker
 from phasemark.data.shards import Job, Progress, build, manifest_path, refuse_difference, refuse_unfinished
 from phasemark.data.store import checksum_path, refuse_unwritable
 

@@ -50,9 +50,8 @@ class Place:
 class Job(Protocol):
     """What a file is made of: slabs of items, each item with the same few fields."""
 
-    @property
-    def kind(self) -> str:
-        """What the file is, "bank" or "frames"."""
+    def spec(self) -> dict[str, Any]:
+        """Return what another process makes the same job from, in plain data (:func:`phasemark.data.jobs.job_of`)."""
 
     @property
     def items(self) -> Sequence[int]:
