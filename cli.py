@@ -602,6 +602,7 @@ def _match(
             flip_h=flip_h,
             flip_v=flip_v,
             rotate=rotate,
+            untrusted=True,
         )
         plots = [] if plot is None else _numbered(plot, len(measured.range_m))
         _refuse_existing(plots, force)

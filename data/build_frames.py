@@ -205,6 +205,8 @@ class FrameJob:
                     dataset.dims[axis].attach_scale(scales[dim])
                 dataset.attrs["long_name"] = long_name
                 dataset.attrs["units"] = units
+                if name in ("range", "range_shot", "range_hard", "range_mixed"):
+                    dataset.attrs["quantity"] = "range"
                 if name == "flags":
                     masks = [1, 2, 4, 8, 16, 32]
                     dataset.attrs["flag_masks"] = np.array(masks, np.uint8)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -110,14 +109,6 @@ def dataset_of(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
     if not isinstance(group.get(name), h5py.Dataset):
         raise InputFileError(f"{path}: the dataset '{f'{group.name}/{name}'.strip('/')}' is missing")
     return group[name]
-
-
-def stored_bytes(dataset: h5py.Dataset, path: str | os.PathLike[str]) -> int | None:
-    """Return where a dataset's values begin if they lie in one piece inside the file, else None."""
-    offset = dataset.id.get_offset()
-    if offset is None or offset + dataset.nbytes > os.path.getsize(path):
-        return None
-    return int(offset)
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:

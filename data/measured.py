@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark.data.guard import EXPANSION, FREE_BYTES
+from phasemark.data.hdf5 import open_hdf5
 from phasemark.render import Frames, Sensor
 
 Unit = Literal["m", "cm", "mm"]
@@ -57,6 +59,7 @@ def read_frames(
     flip_h: bool = False,
     flip_v: bool = False,
     rotate: int = 0,
+    untrusted: bool = False,
 ) -> Frames:
     """Read measured frames; what kind of file it is follows from its content.
 
@@ -89,6 +92,8 @@ def read_frames(
         Whether to mirror left and right, or top and bottom.
     rotate : {0, 90, 180, 270}
         Degrees to turn the image clockwise, after mirroring.
+    untrusted : bool
+        Whether a child process with limits reads an HDF5 file first, unless ``FILE.sha256`` vouches for it.
 
     Returns
     -------
@@ -114,7 +119,7 @@ def read_frames(
     if invalid_means not in ("missing", "no-return"):
         raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
     shape = (sensor.cols, sensor.rows) if rotate in (90, 270) else (sensor.rows, sensor.cols)
-    raw = _read(path, shape)
+    raw = _read(path, shape, untrusted)
     unit_scale = METRES_PER_UNIT[_settled("unit", unit, raw, tuple(METRES_PER_UNIT), path)]
     settled_quantity = _settled("quantity", quantity, raw, QUANTITIES, path)
 
@@ -208,7 +213,7 @@ def _as_frames(values: NDArray[Any], name: str, shape: tuple[int, int], flat: bo
     return values.reshape((1,) * (4 - values.ndim) + values.shape)
 
 
-def _read(path: Path, shape: tuple[int, int]) -> _Raw:
+def _read(path: Path, shape: tuple[int, int], untrusted: bool) -> _Raw:
     try:
         with path.open("rb") as file:
             start = file.read(8)
@@ -219,7 +224,7 @@ def _read(path: Path, shape: tuple[int, int]) -> _Raw:
         if start.startswith(b"PK"):
             return _read_npz(path)
         if start.startswith(b"\x89HDF"):
-            return _read_hdf5(path)
+            return _read_hdf5(path, untrusted)
         return _Raw({"range": _parse_csv(path.read_bytes(), shape, path)}, flat=True)
     except PhasemarkError:
         raise
@@ -233,6 +238,9 @@ def _read(path: Path, shape: tuple[int, int]) -> _Raw:
 def _read_npz(path: Path) -> _Raw:
     # A handle of our own: np.load leaves its file open when the archive is cut off.
     with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        declared = sum(member.file_size for member in archive.zip.infolist())
+        if declared > FREE_BYTES + EXPANSION * path.stat().st_size:
+            raise InputFileError(f"{path}: refused: declares {declared} bytes, far more than its size can hold")
         if "range" not in archive:
             raise InputFileError(f"{path}: must have an array 'range', got {', '.join(archive) or 'nothing'}")
         arrays = {name: np.asarray(archive[name]) for name in _FIELDS if name in archive}
@@ -240,8 +248,8 @@ def _read_npz(path: Path) -> _Raw:
     return _Raw(arrays, stated)
 
 
-def _read_hdf5(path: Path) -> _Raw:
-    with h5py.File(path, "r") as file:
+def _read_hdf5(path: Path, untrusted: bool) -> _Raw:
+    with open_hdf5(path, "file of frames", untrusted=untrusted) as file:
         if not isinstance(file.get("range"), h5py.Dataset):
             kind = file.attrs.get("format")
             raise InputFileError(

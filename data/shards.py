@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from phasemark import OutputExistsError, UsageError
 from phasemark.data.executor import Maker, processors, run_tasks
 from phasemark.data.layout import Layout, place
-from phasemark.data.store import checksum_path, publish, refuse_unwritable, sha256_of, storage_errors, write_checksum
+from phasemark.data.store import checksum_path, finish_publishing, publish, refuse_unwritable, sha256_of, storage_errors
 
 Progress = Callable[[int, int], None]
 
@@ -192,7 +192,7 @@ def _publish_again(job: Job, path: Path) -> bool:
     if manifest is None or manifest.file_sha256 is None or sha256_of(path) != manifest.file_sha256:
         return False
     refuse_difference(path, manifest.identity, job.identity())
-    write_checksum(path, force=True)
+    finish_publishing(path)
     manifest_path(path).unlink(missing_ok=True)
     return True
 

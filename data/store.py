@@ -112,7 +112,7 @@ def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
     OutputExistsError, StorageError
         As :func:`write_atomically`; `part` and what was there before are untouched.
     """
-    checksum_part = part.with_name(f".{checksum_path(path).name}.{secrets.token_hex(4)}.partial")
+    checksum_part, _ = _publishing_names(path)
     try:
         with storage_errors(path):
             _sync(part)
@@ -124,11 +124,24 @@ def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
             checksum_part.unlink(missing_ok=True)
 
 
+def finish_publishing(path: Path) -> None:
+    """Write the checksum of a file that :func:`publish` had just given its name when the process was killed."""
+    write_checksum(path, force=True)
+    for leftover in _publishing_names(path):
+        leftover.unlink(missing_ok=True)
+
+
+def _publishing_names(path: Path) -> tuple[Path, Path]:
+    """Return the temporary names of the new and the old checksum; always the same, so a later run tidies them up."""
+    name = checksum_path(path).name
+    return path.with_name(f".{name}.partial"), path.with_name(f".{name}.old")
+
+
 def _move_into_place(parts: list[Path], targets: list[Path], *, force: bool) -> None:
     """Replace a file, and then its checksum; the old checksum steps aside first and returns if the file cannot go."""
     for target in targets:  # somebody else may have been faster
         refuse_unwritable(target, force=force)
-    aside = targets[-1].with_name(f".{targets[-1].name}.old")
+    _, aside = _publishing_names(targets[0])
     try:
         with storage_errors(targets[0]):
             if len(targets) > 1 and targets[1].exists():
