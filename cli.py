@@ -411,7 +411,9 @@ def _bank_merge(
 def _frames_build(
     plan_file: Annotated[Path, typer.Argument(metavar="PLAN", help="A plan (.toml); options override it.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The frame set to write; its checksum goes beside it.")],
-    seed: Annotated[int | None, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")
+    ] = None,
     views: Annotated[int | None, typer.Option("--views", min=1, help="How many views.")] = None,
     workers: _Workers = None,
     resume: _Resume = False,

@@ -335,9 +335,7 @@ def read_mesh_group(file: h5py.File, class_name: str, path: Path) -> trimesh.Tri
         part = group["part"][...].astype(np.uint8) if "part" in group else None
         period_deg, albedo = float(group.attrs["delta_period_deg"]), float(group.attrs["albedo"])
     if not 1 <= period_deg <= 360:  # as the plan has it: a symmetry of 1 … 360
-        raise InputFileError(
-            f"{path}: 'delta_period_deg' of '{class_name}' must be in [1, 360], got {period_deg:g}"
-        )
+        raise InputFileError(f"{path}: 'delta_period_deg' of '{class_name}' must be in [1, 360], got {period_deg:g}")
     if not (vertices.ndim == faces.ndim == 2 and vertices.shape[1:] == faces.shape[1:] == (3,) and faces.size):
         raise InputFileError(f"{path}: 'meshes/{class_name}' must hold rows of three, of vertices and faces")
     if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
@@ -355,4 +353,3 @@ def read_mesh_group(file: h5py.File, class_name: str, path: Path) -> trimesh.Tri
 
 def _increases(values: NDArray[Any]) -> bool:
     return bool(np.isfinite(values).all() and np.all(np.diff(values) > 0))
-

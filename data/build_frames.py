@@ -109,9 +109,7 @@ class FrameJob:
         self.plan = plan.resolve()
         self.sensor = self.plan.build_sensor()
         self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
-        self._renderers = [
-            Renderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks
-        ]
+        self._renderers = [Renderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks]
         self._shot_sensor = self.sensor.without_errors(shot_noise=True) if "shot" in self.plan.variants else None
 
     def spec(self) -> dict[str, Any]:
@@ -170,7 +168,9 @@ class FrameJob:
                         if background is not None:
                             background.check_behind(vertices, views[one])
                         if inside[np.searchsorted(of_class, view)]:
-                            raise UsageError("the lens is inside the landmark's bounding box: 'distance_m' is too small")
+                            raise UsageError(
+                                "the lens is inside the landmark's bounding box: 'distance_m' is too small"
+                            )
                     except UsageError as error:
                         reason = str(error).replace(" in view 0", "")
                         raise UsageError(f"view {first + int(view)} of the plan cannot be rendered: {reason}") from None

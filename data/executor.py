@@ -96,4 +96,3 @@ def _wait(answers: queue.SimpleQueue[Any]) -> Any:
             return answers.get(timeout=0.5)  # a wait without end would hold back signals on some platforms
         except queue.Empty:
             continue
-

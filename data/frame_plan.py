@@ -267,7 +267,9 @@ class FramePlan(ScenePlan):
         return np.maximum(raw, 2.0**-54)
 
     def _sobol(self, start: int, stop: int) -> dict[str, NDArray[np.float64]]:
-        names = [name for name in QUANTITIES if (spread := getattr(self, name)) is not None and spread.sobol is not None]
+        names = [
+            name for name in QUANTITIES if (spread := getattr(self, name)) is not None and spread.sobol is not None
+        ]
         if not names:
             return {}
         seed = int(stream(self.seed, "frames.sobol", 0).integers(2**63))  # SciPy spawns from it, which Philox cannot

@@ -88,7 +88,9 @@ class FrameSet:
         if (sizes["row"], sizes["col"]) != (self.sensor.rows, self.sensor.cols):
             raise InputFileError(f"{path}: has {sizes['row']} × {sizes['col']} pixels, but its sensor has others")
         if sizes["view"] != self.plan.views or sizes["frame"] != self.plan.views * self.plan.frames_per_view:
-            raise InputFileError(f"{path}: has {sizes['frame']} frames of {sizes['view']} views, its plan says otherwise")
+            raise InputFileError(
+                f"{path}: has {sizes['frame']} frames of {sizes['view']} views, its plan says otherwise"
+            )
         wanted = ["range", "flags", "coverage"] + [name for name in ("amplitude", "intensity", "taps") if name in file]
         wanted += [f"range_{name}" for name in self.plan.variants]
         self._fields = {name: self._field(file, name, sizes) for name in wanted}
@@ -214,7 +216,7 @@ class FrameSet:
                 return np.asarray(file[name][wanted])[back] if len(wanted) else np.empty((0, *shape[1:]), dtype)
         stride = math.prod(shape[1:]) * dtype.itemsize
         out = np.empty((len(numbers), *shape[1:]), dtype)
-        flat = out.reshape(len(numbers), -1)
+        flat = out.reshape(len(numbers), math.prod(shape[1:]))
         descriptor = int(file.id.get_vfd_handle())
         at = 0
         while at < len(numbers):  # runs of neighbours are read at once
@@ -224,7 +226,7 @@ class FrameSet:
             raw = os.pread(descriptor, (stop - at) * stride, offset + int(numbers[at]) * stride)
             if len(raw) != (stop - at) * stride:
                 raise InputFileError(f"{self.path}: cut off in '{name}'")
-            flat[at:stop] = np.frombuffer(raw, dtype).reshape(stop - at, -1)
+            flat[at:stop] = np.frombuffer(raw, dtype).reshape(stop - at, flat.shape[1])
             at = stop
         return out
 

@@ -53,7 +53,9 @@ def open_maker(scheduler: str, job: Job) -> Maker | None:
             raise UsageError(f"--scheduler local:N needs a number of processes, got '{scheduler}'")
         return ProcessMaker(job, int(count))
     if "://" not in scheduler:
-        raise UsageError(f"--scheduler must be threads, local:N or an address such as tcp://HOST:8786, got '{scheduler}'")
+        raise UsageError(
+            f"--scheduler must be threads, local:N or an address such as tcp://HOST:8786, got '{scheduler}'"
+        )
     return DaskMaker(job, scheduler)
 
 
@@ -165,7 +167,9 @@ class _Process:
             if count < 0:  # an error's message
                 kind, message = json.loads(_exactly(self._child.stdout, -count))
                 raise _ERRORS.get(kind, PhasemarkError)(message)
-            return [_exactly(self._child.stdout, _LENGTH.unpack(_exactly(self._child.stdout, 8))[0]) for _ in range(count)]
+            return [
+                _exactly(self._child.stdout, _LENGTH.unpack(_exactly(self._child.stdout, 8))[0]) for _ in range(count)
+            ]
         except PhasemarkError:
             raise
         except (OSError, EOFError, ValueError):

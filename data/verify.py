@@ -124,7 +124,9 @@ def _compare(
         if name == "flags":
             share = float(np.mean(old != new))
             if share > _NOISY_SHARE:
-                raise InputFileError(f"{path}: 'flags' of view {item} differ in {share:.1%} of the pixels when made again")
+                raise InputFileError(
+                    f"{path}: 'flags' of view {item} differ in {share:.1%} of the pixels when made again"
+                )
             continue
         nan_differs = np.isnan(old) != np.isnan(new)
         gap = np.nan_to_num(new.astype(float) - old.astype(float))

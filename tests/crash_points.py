@@ -11,10 +11,11 @@ import signal
 import sys
 from pathlib import Path
 
+from toy_job import ToyJob, check_toy_file
+
 from phasemark import StorageError
 from phasemark.data.shards import build, manifest_path, partial_path
 from phasemark.data.store import checksum_path, verify_checksum
-from toy_job import ToyJob, check_toy_file
 
 CALLS = ("pwrite", "write", "fsync", "replace", "posix_fallocate", "ftruncate")
 
@@ -84,13 +85,17 @@ def main(folder, action):
             path = Path(folder) / f"{action}-{with_old}-{at}"
             if with_old:
                 path.write_bytes(old_job.read_bytes())
-                checksum_path(path).write_bytes(checksum_path(old_job).read_bytes().replace(b"  old", b"  " + path.name.encode()))
+                checksum_path(path).write_bytes(
+                    checksum_path(old_job).read_bytes().replace(b"  old", b"  " + path.name.encode())
+                )
             code = in_fork(fail_at, path, at, action, with_old)
             allowed = [reference.read_bytes()] + ([old_job.read_bytes()] if with_old else [])
             assert path.read_bytes() in allowed if path.exists() else not with_old, f"a partial file after call {at}"
             if action != "kill" and code == 5 and path.exists() and path.read_bytes() == old_job.read_bytes():
                 verify_checksum(path)
-            leftovers = {entry.name for entry in Path(folder).iterdir() if entry.name.startswith((path.name + ".", "."))}
+            leftovers = {
+                entry.name for entry in Path(folder).iterdir() if entry.name.startswith((path.name + ".", "."))
+            }
             expected = {p.name for p in (manifest_path(path), partial_path(path), checksum_path(path))}
             if action != "kill":
                 assert leftovers - expected == set(), f"debris after call {at}: {leftovers - expected}"

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import time
 
 import h5py
 import numpy as np
@@ -129,7 +128,8 @@ def test_refusing_takes_little_memory(trick):
 def test_what_a_cycle_of_groups_holds_is_looked_at_once(tmp_path):
     path = tmp_path / "cycle.h5"
     with h5py.File(path, "w") as file:
-        file.create_group("a/b")["c"] = file["a"]
+        outer = file.create_group("a")
+        outer.create_group("b")["c"] = outer
         file["a/range"] = np.ones((1, 16, 16))
     assert refusal(path) is None
     assert first_reading(path) is None
@@ -177,6 +177,11 @@ def mutate(content, rng):
     return bytes(data)
 
 
+def busy_seconds():
+    """Processor time of this process and its children: other programs' load does not count."""
+    return sum(os.times()[:4])
+
+
 def check_mutants(tmp_path, contents, n, seed):
     """Every reading command ends on every mutant within 5 s, with an answer or exit 3; return how many were refused."""
     rng = np.random.default_rng(seed)
@@ -194,9 +199,9 @@ def check_mutants(tmp_path, contents, n, seed):
             ],
         }[kind]
         command = commands[(k // 2) % 2]
-        begun = time.monotonic()
+        begun = busy_seconds()
         code = main(command)
-        assert time.monotonic() - begun < 5, f"mutant {k} of seed {seed} took too long"
+        assert busy_seconds() - begun < 5, f"mutant {k} of seed {seed} took too long"
         assert code in (0, 3), f"mutant {k} of seed {seed} ended with {code}"
         refused += code == 3
     return refused

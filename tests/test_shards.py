@@ -10,12 +10,11 @@ import time
 from pathlib import Path
 
 import pytest
+from toy_job import ToyJob, check_toy_file
 
 from phasemark import OutputExistsError, StorageError, UsageError
 from phasemark.data.remote import open_maker
 from phasemark.data.shards import build, difference, manifest_path, partial_path
-from phasemark.data.store import verify_checksum
-from toy_job import ToyJob, check_toy_file
 
 HERE = Path(__file__).parent
 
