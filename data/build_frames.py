@@ -1,4 +1,4 @@
-"""Frame sets, as they are built: a job of shards of views, each rendered, captured and placed in the file on its own."""
+"""Frame sets, as they are built: a job of shards of views, each rendered, captured and placed in the file alone."""
 
 from __future__ import annotations
 

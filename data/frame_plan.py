@@ -237,7 +237,7 @@ class FramePlan(ScenePlan):
             The quantities in the plan's units (NaN: no wall, no floor), ``class_index`` and ``split_index``.
         """
         stop = self.views if stop is None else stop
-        landmarks = [*self.landmarks, *self.meshes]
+        landmarks: list[LandmarkSpec | MeshPlan] = [*self.landmarks, *self.meshes]
         truth: dict[str, NDArray[Any]] = {}
         of_class = self._uniform("class", start, stop) * len(landmarks)
         truth["class_index"] = np.minimum(of_class.astype(np.int16), len(landmarks) - 1)

@@ -1,4 +1,4 @@
-"""Plans, as TOML files or in code: frozen, validated, and resolved to the last default. Here: what every plan has, and banks."""
+"""Plans, as TOML files or in code: frozen, validated, resolved to the last default. What every plan has, and banks."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class ScenePlan(PlanModel):
         """
         named = self.classes or (() if self.landmarks or self.meshes else tuple(catalog()))
         specs: list[LandmarkSpec] = [*(_from_catalog(name) for name in named), *self.landmarks]
-        names = [part.name for part in (*specs, *self.meshes)]
+        names = [*(spec.name for spec in specs), *(mesh.name for mesh in self.meshes)]
         for name in names:
             if names.count(name) > 1 or name == "none":
                 problem = "stands for no landmark" if name == "none" else "names two landmarks"

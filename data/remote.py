@@ -1,8 +1,8 @@
 """Shards made elsewhere: by worker processes of this machine, or on a Dask cluster.
 
-A shard travels as raw bytes and is placed in the file here, so workers need no shared disk; only mesh files that a plan
-names must lie at the same path everywhere, and are compared by their hash. A worker that dies is replaced, and its shard
-made again.
+A shard travels as raw bytes and is placed in the file here, so workers need no shared disk; only mesh files that a
+plan names must lie at the same path everywhere, and are compared by their hash. A worker that dies is replaced, and its
+shard made again.
 """
 
 from __future__ import annotations
@@ -147,9 +147,11 @@ class _Process:
 
     def __init__(self, spec: str, identity: str) -> None:
         self._child = subprocess.Popen(
-            [sys.executable, "-c", "from phasemark.data.remote import serve; serve()"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            [sys.executable, "-c", "from phasemark.data.remote import serve; serve()"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C is for the program that asks, which then ends its workers
-        )  # fmt: skip
+        )
         with suppress(OSError):
             self._send({"spec": spec, "identity": identity})
 
@@ -211,7 +213,8 @@ class DaskMaker:
         except ImportError:
             raise UsageError("--scheduler with an address needs Dask: pip install 'phasemark[dask]'") from None
         try:
-            self._client: Any = Client(address, timeout="10s", set_as_default=False)
+            connect: Any = Client
+            self._client: Any = connect(address, timeout="10s", set_as_default=False)
         except (OSError, ValueError) as error:
             raise UsageError(f"no Dask scheduler answers at {address} ({' '.join(str(error).split())})") from None
         self._described = _described(job)
@@ -220,7 +223,7 @@ class DaskMaker:
 
     def concurrency(self) -> int:
         """Return twice the number of the cluster's threads, so that none waits."""
-        return max(2, 2 * sum(self._client.nthreads().values()))
+        return max(2, 2 * int(sum(self._client.nthreads().values())))
 
     def make(self, start: int, stop: int) -> Sequence[NDArray[Any]]:
         """Have the cluster make a shard; again, if its worker dies."""

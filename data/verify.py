@@ -59,7 +59,7 @@ def verify_bank(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0
 
 
 def verify_frames(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0) -> dict[str, Any]:
-    """Check a frame set as :func:`verify_bank` checks a bank; `sample` counts views, all of whose frames are compared."""
+    """Check a frame set as :func:`verify_bank` checks a bank; `sample` counts views, with all frames of each."""
     digest = verify_checksum(path)
     with open_frames(path, untrusted=True) as frames:
         job = FrameJob(frames.plan, frames.mesh)
@@ -91,7 +91,7 @@ def _verify(
 
 
 def _check_values(file: h5py.File, path: Path) -> int:
-    """Refuse values that cannot be: infinities anywhere, NaN but where a range is invalid; return how many there are."""
+    """Refuse infinities, and NaN but where a range is invalid; return how many values there are."""
     count = 0
 
     def check(name: str, item: Any) -> None:

@@ -109,7 +109,7 @@ def main(folder, action):
             left = {entry.name for entry in Path(folder).iterdir() if not entry.name.startswith(("reference", "old"))}
             assert left == {path.name, checksum_path(path).name}, f"debris after resuming from call {at}: {left}"
             tidy(folder)
-    print(points)
+    sys.stdout.write(f"{points}\n")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Large files are built in shards: whole or not there, continued after any end, the same bytes however they are made."""
+"""Large files are built in shards: whole or not there, continued after any end, the same bytes however made."""
 
 import os
 import signal
