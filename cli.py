@@ -471,28 +471,100 @@ def _frames_merge(
     _merge(shards, out, resume, force)
 
 
+@_frames_app.command("export")
+def _frames_export(
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="npz, csv, png16, ply, bop or rosbag.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The file (npz, csv) or folder to write.")],
+    quantity: Annotated[
+        str | None, typer.Option("--quantity", help="range or z, in npz, csv and png16; BOP and ROS have z.")
+    ] = None,
+    force: _Force = False,
+) -> None:
+    """Write a frame set for other programs."""
+    from phasemark.data import export_frames, open_frames
+
+    with open_frames(frames, untrusted=True) as opened:
+        typer.echo(export_frames(opened, out, to, quantity=quantity, force=force))  # type: ignore[arg-type]
+
+
+@_frames_app.command("import")
+def _frames_import(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV, NPY, NPZ, HDF5, PNG; a folder of PNG, a bag.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The measured frames as .npz, range along the ray, metres.")],
+    sensor: _SensorOption = "pmd-16x16",
+    unit: Annotated[str | None, typer.Option("--unit", help="m, cm or mm, if the file does not say.")] = None,
+    quantity: Annotated[str | None, typer.Option("--quantity", help="range or z, if the file does not say.")] = None,
+    invalid_means: Annotated[str, typer.Option("--invalid-means", help="missing or no-return.")] = "missing",
+    valid_status: Annotated[list[int] | None, typer.Option("--valid-status", help="Repeatable.")] = None,
+    flip_h: Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")] = False,
+    flip_v: Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")] = False,
+    rotate: Annotated[int, typer.Option("--rotate", help="Turn clockwise by 90, 180 or 270 degrees.")] = 0,
+    topic: Annotated[str | None, typer.Option("--topic", help="Which images of a ROS bag.")] = None,
+    force: _Force = False,
+) -> None:
+    """Bring measured frames into one form: range along the ray, in metres, upright."""
+    from phasemark.data import read_frames, write_measured
+
+    if out.suffix.lower() != ".npz":
+        raise UsageError(f"the output must be a .npz file, got '{out}'")
+    _refuse_existing([out], force)
+    frames = read_frames(
+        file,
+        sensor=_load_sensor(sensor),
+        unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
+        quantity=quantity,  # type: ignore[arg-type]
+        invalid_means=invalid_means,  # type: ignore[arg-type]
+        valid_status=valid_status,
+        flip_h=flip_h,
+        flip_v=flip_v,
+        rotate=rotate,
+        untrusted=True,
+        topic=topic,
+    )
+    typer.echo(write_measured(frames, out, force=force))
+
+
 @_frames_app.command("show")
 def _frames_show(
-    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, or measured frames.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png.")],
     index: Annotated[int, typer.Option("--index", min=0, help="Number of the frame.")] = 0,
+    sensor: _SensorOption = "pmd-16x16",
+    unit: Annotated[str | None, typer.Option("--unit", help="m, cm or mm, of measured frames.")] = None,
+    quantity: Annotated[str | None, typer.Option("--quantity", help="range or z, of measured frames.")] = None,
     force: _Force = False,
 ) -> None:
     """Draw one frame."""
     import io as bytes_io
 
-    from phasemark.data import open_frames, write_atomically
+    from phasemark.data import is_frame_set, open_frames, read_frames, write_atomically
 
     if out.suffix.lower() != ".png":
         raise UsageError(f"the picture must be a .png file, got '{out}'")
     _refuse_existing([out], force)
-    with open_frames(frames, untrusted=True) as opened:
-        if index >= len(opened):
-            raise UsageError(f"--index must be below {len(opened)}, the number of frames, got {index}")
-        figure = opened.frames([index]).plot()
-        picture = bytes_io.BytesIO()
-        figure.savefig(picture, format="png", dpi=120)
+    if is_frame_set(frames):
+        with open_frames(frames, untrusted=True) as opened:
+            _refuse_index(index, len(opened))
+            figure = opened.frames([index]).plot()
+    else:
+        measured = read_frames(
+            frames,
+            sensor=_load_sensor(sensor),
+            unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
+            quantity=quantity,  # type: ignore[arg-type]
+            untrusted=True,
+        )
+        _refuse_index(index, len(measured) * measured.n_frames)
+        figure = measured.plot(*divmod(index, measured.n_frames))
+    picture = bytes_io.BytesIO()
+    figure.savefig(picture, format="png", dpi=120)
     typer.echo(write_atomically(out, picture.getvalue(), force=force))
+
+
+def _refuse_index(index: int, n: int) -> None:
+    if index >= n:
+        raise UsageError(f"--index must be below {n}, the number of frames, got {index}")
 
 
 def _build(

@@ -3,11 +3,12 @@
 from phasemark.data.bank import Bank, BankGroup, open_bank
 from phasemark.data.build import build_bank
 from phasemark.data.build_frames import build_frames
+from phasemark.data.export import export_frames
 from phasemark.data.frame_plan import Distribution, FramePlan
-from phasemark.data.frames import FrameSet, FrameSubset, open_frames
+from phasemark.data.frames import FrameSet, FrameSubset, is_frame_set, open_frames
 from phasemark.data.grid import format_grid, parse_grid
 from phasemark.data.jobs import build_part, estimate, merge_parts, parse_part
-from phasemark.data.measured import read_frames
+from phasemark.data.measured import read_frames, write_measured
 from phasemark.data.plan import BankPlan, MeshPlan, load_plan, read_plan
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.store import read_checksum, verify_checksum, write_atomically, write_checksum
@@ -26,7 +27,9 @@ __all__ = [
     "build_frames",
     "build_part",
     "estimate",
+    "export_frames",
     "format_grid",
+    "is_frame_set",
     "load_plan",
     "merge_parts",
     "mesh_sha256",
@@ -43,4 +46,5 @@ __all__ = [
     "versions",
     "write_atomically",
     "write_checksum",
+    "write_measured",
 ]

@@ -387,3 +387,14 @@ def open_frames(path: str | os.PathLike[str], *, untrusted: bool = False) -> Fra
     except BaseException:
         file.close()
         raise
+
+
+def is_frame_set(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file says that it is a frame set; what it says of itself is all that is looked at."""
+    try:
+        with open(path, "rb") as file:
+            if file.read(8) != b"\x89HDF\r\n\x1a\n":
+                return False
+            return FORMAT.encode() in file.read(1 << 16)
+    except OSError:
+        return False

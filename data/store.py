@@ -6,6 +6,7 @@ import hashlib
 import os
 import re
 import secrets
+import shutil
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -91,6 +92,42 @@ def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bo
         for leftover in parts:
             with suppress(OSError):
                 leftover.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_folder(path: Path, *, force: bool = False) -> Iterator[Path]:
+    """Hand out an empty folder beside `path` and give it that name when the block ends well, as :func:`replacing`.
+
+    Raises
+    ------
+    OutputExistsError
+        Something has the name and `force` is not set, or what has it is not a folder.
+    UsageError, StorageError
+        As :func:`write_atomically`.
+    """
+    if not path.name or not path.parent.is_dir():
+        raise UsageError(f"{path}: the folder '{path.parent}' does not exist: make it first")
+    if path.exists() and not path.is_dir():
+        raise UsageError(f"{path}: is a file, give the name of a folder")
+    if path.exists() and not force:
+        raise OutputExistsError(f"{path}: exists; use --force to replace it")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    aside = temporary.with_suffix(".old")
+    try:
+        with storage_errors(path):
+            temporary.mkdir()
+            yield temporary
+            if path.exists():
+                os.replace(path, aside)
+            os.replace(temporary, path)
+            _sync(path.parent)
+    except BaseException:
+        if aside.exists() and not path.exists():
+            os.replace(aside, path)
+        raise
+    finally:
+        for leftover in (temporary, aside):
+            shutil.rmtree(leftover, ignore_errors=True)
 
 
 def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
