@@ -59,10 +59,12 @@ _landmark_app = typer.Typer(help="The landmarks: the catalogue and mesh files.")
 _sensor_app = typer.Typer(help="The cameras: shipped presets and sensor files.")
 _bank_app = typer.Typer(help="Banks of model images.")
 _frames_app = typer.Typer(help="Sets of noisy frames with their truth.")
+_plan_app = typer.Typer(help="Plans: what banks and frame sets are built from.")
 app.add_typer(_landmark_app, name="landmark")
 app.add_typer(_sensor_app, name="sensor")
 app.add_typer(_bank_app, name="bank")
 app.add_typer(_frames_app, name="frames")
+app.add_typer(_plan_app, name="plan")
 
 _Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 _Force = Annotated[bool, typer.Option("--force", help="Replace an output that exists.")]
@@ -609,6 +611,38 @@ def _merge(shards: Sequence[Path], out: Path, resume: bool, force: bool) -> None
     with _Progress("merging") as progress:
         merge_parts(shards, out, resume=resume, force=force, progress=progress)
     typer.echo(out)
+
+
+@_plan_app.command("example")
+def _plan_example(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank or frames.")]) -> None:
+    """Print a plan with comments; it can be used as it is."""
+    from phasemark.data import plan_example
+
+    typer.echo(plan_example(kind), nl=False)
+
+
+@_plan_app.command("schema")
+def _plan_schema(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank or frames.")]) -> None:
+    """Print the JSON Schema of a kind of plan, for editors and other programs."""
+    from phasemark.data import plan_schema
+
+    _echo_json(plan_schema(kind))
+
+
+@_plan_app.command("check")
+def _plan_check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A plan (.toml).")],
+    kind: Annotated[str | None, typer.Option("--kind", help="bank or frames, if the plan leaves it open.")] = None,
+    as_json: _Json = False,
+) -> None:
+    """Check a plan and say what it is; with --json print it with every default made explicit."""
+    from phasemark.data import check_plan
+
+    found, plan = check_plan(file, kind)
+    if as_json:
+        _echo_json({"kind": found, "plan": plan.model_dump(mode="json")})
+    else:
+        typer.echo(f"{file}: a plan of kind '{found}', complete and valid")
 
 
 @app.command("match")

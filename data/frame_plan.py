@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, model_validator
+from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, WithJsonSchema, model_validator
 from scipy import special
 from scipy.stats import qmc
 
@@ -117,8 +117,24 @@ def _to_plain(value: Distribution | None) -> Any:
     return {k: list(v) for k in (*KINDS, "within") if (v := getattr(value, k)) is not None}
 
 
-_Spread = Annotated[Distribution, BeforeValidator(_to_distribution), PlainSerializer(_to_plain)]
-_MaybeSpread = Annotated[Distribution | None, BeforeValidator(_to_distribution), PlainSerializer(_to_plain)]
+_PAIR_SCHEMA = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
+_SPREAD_SCHEMA = {
+    "description": "a number, or how the quantity is spread over the views",
+    "anyOf": [
+        {"type": "number"},
+        {
+            "type": "object",
+            "additionalProperties": False,
+            "properties": {
+                "fixed": {"type": "number"},
+                **dict.fromkeys(("uniform", "normal", "sobol", "within"), _PAIR_SCHEMA),
+            },
+        },
+    ],
+}
+_FORM = (BeforeValidator(_to_distribution), PlainSerializer(_to_plain), WithJsonSchema(_SPREAD_SCHEMA))
+_Spread = Annotated[Distribution, *_FORM]
+_MaybeSpread = Annotated[Distribution | None, *_FORM]
 _Share = Annotated[float, Field(ge=0, le=1)]
 
 QUANTITIES = ("distance_m", "delta_deg", "bearing_deg", "height_m", "albedo", "wall_m", "floor_m")
@@ -198,7 +214,7 @@ class FramePlan(ScenePlan):
             raise UsageError(f"'variants' must not repeat, got {list(self.variants)}")
         return self
 
-    def resolve(self) -> FramePlan:
+    def resolve(self) -> Self:
         """Return the plan with every default made explicit; resolving again changes nothing.
 
         Raises

@@ -19,6 +19,7 @@ from pydantic import (
     PlainSerializer,
     ValidationError,
     ValidationInfo,
+    WithJsonSchema,
     model_validator,
 )
 
@@ -44,7 +45,16 @@ def _positive(values: tuple[float, ...], info: ValidationInfo) -> tuple[float, .
     return values
 
 
-_Grid = Annotated[tuple[float, ...], BeforeValidator(_to_grid), PlainSerializer(format_grid, return_type=str)]
+_GRID_SCHEMA = {
+    "description": "START:STOP:STEP, V1,V2,… or V",
+    "anyOf": [{"type": "string"}, {"type": "number"}, {"type": "array", "items": {"type": "number"}}],
+}
+_Grid = Annotated[
+    tuple[float, ...],
+    BeforeValidator(_to_grid),
+    PlainSerializer(format_grid, return_type=str),
+    WithJsonSchema(_GRID_SCHEMA),
+]
 
 
 class PlanModel(BaseModel):
@@ -111,6 +121,10 @@ class ScenePlan(PlanModel):
     meshes: tuple[MeshPlan, ...] = ()
     sensor: str = "pmd-16x16"
     sensor_overrides: dict[str, Any] = Field(default_factory=dict)
+
+    def resolve(self) -> Self:
+        """Return the plan with every default made explicit."""
+        raise NotImplementedError
 
     def build_sensor(self) -> Sensor:
         """Return the sensor, overrides applied.
@@ -196,7 +210,7 @@ class BankPlan(ScenePlan):
             raise UsageError(f"'harmonics' must increase from order to order, got {list(self.harmonics)}")
         return self
 
-    def resolve(self) -> BankPlan:
+    def resolve(self) -> Self:
         """Return the plan with every default made explicit: landmarks, the sensor's fields, both grids, albedo.
 
         Resolving again changes nothing, and the result no longer depends on the catalogue or the presets.
@@ -215,7 +229,7 @@ class BankPlan(ScenePlan):
         parts: list[LandmarkSpec | MeshPlan] = [*specs, *meshes]
         period_deg = 360 / math.gcd(*(part.symmetry for part in parts))
         delta_deg = parse_grid(self.delta_deg or f"0:{period_deg!r}:{DEFAULT_DELTA_STEP_DEG}", "delta_deg")
-        return BankPlan(
+        return type(self)(
             landmarks=tuple(specs),
             meshes=tuple(meshes),
             sensor=self.sensor,

@@ -69,7 +69,7 @@ def test_range_and_z_are_told_apart(frames, tmp_path):
     np.testing.assert_allclose(of_z["range"], of_range["range"] * SENSOR.axis_cosine(), rtol=1e-6)
     with pytest.raises(UsageError, match="--quantity must be z for bop, got 'range'"):
         exported(frames, tmp_path, "bop", "range")
-    with pytest.raises(UsageError, match="contradicts|but .* says z"):
+    with pytest.raises(UsageError, match=r"but .* says z"):
         read_frames(tmp_path / "z", sensor=SENSOR, quantity="range")
 
 
