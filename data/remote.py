@@ -28,6 +28,9 @@ from phasemark.data.shards import Job, difference, make_shard
 ATTEMPTS = 20
 """How often a shard is tried again when workers die under it."""
 
+CONNECT_SECONDS = 10
+"""How long a Dask scheduler may take to answer."""
+
 _LENGTH = struct.Struct("<q")
 
 
@@ -214,7 +217,7 @@ class DaskMaker:
             raise UsageError("--scheduler with an address needs Dask: pip install 'phasemark[dask]'") from None
         try:
             connect: Any = Client
-            self._client: Any = connect(address, timeout="10s", set_as_default=False)
+            self._client: Any = connect(address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
             raise UsageError(f"no Dask scheduler answers at {address} ({' '.join(str(error).split())})") from None
         self._described = _described(job)

@@ -42,5 +42,7 @@ if __name__ == "__main__":
     for name, (phasor, coverage) in render_catalogue().items():
         arrays[f"{name}_phasor"], arrays[f"{name}_coverage"] = phasor, coverage
     np.savez_compressed(CATALOGUE, **arrays)
-    build_bank(BANK_PLAN, BANK, force=True).close()
-    build_frames(FRAMES_PLAN, FRAMES, force=True).close()
+    if not BANK.exists():  # files of a released version are never written again
+        build_bank(BANK_PLAN, BANK).close()
+    if not FRAMES.exists():
+        build_frames(FRAMES_PLAN, FRAMES).close()
