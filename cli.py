@@ -77,7 +77,6 @@ _SensorOption = Annotated[
 ]
 _Wall = Annotated[float | None, typer.Option("--wall", metavar="M", help="Distance of a wall behind the landmark.")]
 _Floor = Annotated[float | None, typer.Option("--floor", metavar="M", help="How far a floor lies below the lens.")]
-<<<<<<< HEAD
 _FramesUnit = Annotated[str | None, typer.Option("--unit", help="Unit of the frames: m, cm or mm.")]
 _Quantity = Annotated[
     str | None, typer.Option("--quantity", help="range (along the ray) or z (along the optical axis).")
@@ -88,7 +87,6 @@ _ValidStatus = Annotated[
 _FlipH = Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")]
 _FlipV = Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")]
 _Rotate = Annotated[int, typer.Option("--rotate", help="Turn the image clockwise by 0, 90, 180 or 270 degrees.")]
-=======
 _Resume = Annotated[bool, typer.Option("--resume", help="Continue an unfinished run of the same plan.")]
 _DryRun = Annotated[bool, typer.Option("--dry-run", help="Say how large it would be and how long it would take.")]
 _Scheduler = Annotated[
@@ -99,7 +97,6 @@ _ShardItems = Annotated[
     int | None, typer.Option("--shard-size", min=1, help="Images or views per shard; the result does not depend on it.")
 ]
 _Sample = Annotated[int, typer.Option("--sample", min=0, help="How many random items to render again.")]
->>>>>>> 0bd3127a42b0addacf70885a47ac7581f662898e
 _Seed = Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")]
 _Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; the result does not depend on it.")]
 
@@ -830,7 +827,6 @@ def _match(
     if plot is not None and plot.suffix.lower() != ".png":
         raise UsageError(f"the picture must be a .png file, got '{plot}'")
     background = _background(wall, floor)
-<<<<<<< HEAD
     if auto_background and background is not None:
         raise UsageError("--auto-background estimates wall and floor: leave --wall and --floor out")
     parameters = ["distance_m", "delta_rad"]
@@ -838,10 +834,7 @@ def _match(
         if name not in _FREE:
             raise UsageError(f"--free must be {' or '.join(_FREE)}, got '{name}'")
         parameters.append(_FREE[name])
-    with open_bank(bank) as opened:
-=======
     with open_bank(bank, untrusted=True) as opened:
->>>>>>> 0bd3127a42b0addacf70885a47ac7581f662898e
         measured = read_frames(
             frames,
             sensor=opened.sensor,
