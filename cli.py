@@ -502,14 +502,21 @@ def _bank_info(
 @_bank_app.command("verify")
 def _bank_verify(
     bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank, its checksum beside it.")],
+    population: Annotated[
+        int | None, typer.Option("--population", min=1, help="Match so many random views against the bank.")
+    ] = None,
     sample: _Sample = 16,
     seed: _Seed = 0,
     as_json: _Json = False,
 ) -> None:
-    """Check a bank: checksum, schema, values, and random images rendered again."""
-    from phasemark.data import verify_bank
+    """Check a bank: checksum, schema, values, random images rendered again; and what its grid's spacing costs."""
+    from phasemark.data import grid_loss, open_bank, verify_bank
 
     report = verify_bank(bank, sample=sample, seed=seed)
+    if population is not None:
+        with open_bank(bank, untrusted=True) as opened:
+            loss = grid_loss(opened, population, seed=seed)
+        report |= {key: float(f"{value:.3g}") if isinstance(value, float) else value for key, value in loss.items()}
     _echo_json(report) if as_json else _echo_facts(report)
 
 

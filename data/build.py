@@ -157,6 +157,10 @@ class BankJob:
         """Images of each slab."""
         return [len(slab.views) for slab in self._slabs]
 
+    def angled_images(self) -> list[ImagesOf]:
+        """Return what makes images that depend on the angle: of each class of a full bank, or of the lower parts."""
+        return [slab.images_of for slab in self._slabs if "delta" in VIEW_DIMS[slab.group]]
+
     def identity(self) -> dict[str, Any]:
         """Return all that the bank's bytes depend on."""
         return {

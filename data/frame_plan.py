@@ -144,11 +144,20 @@ QUANTITIES = ("distance_m", "delta_deg", "bearing_deg", "height_m", "albedo", "w
 class FramePlan(ScenePlan):
     """A frame set: noisy frames of many views, with their truth.
 
-    Landmarks and camera are given as in a bank's plan (:class:`phasemark.data.BankPlan`): `classes`, `landmarks`,
-    `meshes`, `sensor`, `sensor_overrides`. Each view shows one of them, drawn with equal chances.
+    Each view shows one of the landmarks, drawn with equal chances.
 
     Parameters
     ----------
+    classes : sequence of str
+        Names from the catalogue. Without classes, landmarks and meshes: the whole catalogue.
+    landmarks : sequence of LandmarkSpec
+        Further boxes with a solid of revolution, spelled out.
+    meshes : sequence of MeshPlan
+        Landmarks from mesh files.
+    sensor : str
+        A preset's name, or a sensor file (with a ``/`` or ending in ``.toml``).
+    sensor_overrides : mapping
+        Fields of the sensor that replace those of `sensor`.
     views : int
         How many views.
     frames_per_view : int

@@ -390,7 +390,17 @@ def open_frames(path: str | os.PathLike[str], *, untrusted: bool = False) -> Fra
 
 
 def is_frame_set(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file says that it is a frame set; what it says of itself is all that is looked at."""
+    """Return whether a file says that it is a frame set; what it says of itself is all that is looked at.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    bool
+        False also if the file cannot be read.
+    """
     try:
         with open(path, "rb") as file:
             if file.read(8) != b"\x89HDF\r\n\x1a\n":

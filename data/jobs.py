@@ -49,6 +49,14 @@ def job_of(spec: dict[str, Any]) -> Job:
 def parse_part(text: str) -> tuple[int, int]:
     """Read ``i/n``, part i of n, counted from 1.
 
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    i, n : int
+
     Raises
     ------
     UsageError

@@ -346,7 +346,7 @@ def _parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> NDArray[np
     except UnicodeDecodeError:
         text = "\0"
     if "\0" in text:
-        raise InputFileError(f"{path}: is not CSV, NPY, NPZ or HDF5")
+        raise InputFileError(f"{path}: is not CSV, NPY, NPZ, HDF5 or PNG")
     expected = math.prod(shape)
     lines = [
         (number, line)

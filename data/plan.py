@@ -274,7 +274,26 @@ def load_plan(path: str | os.PathLike[str]) -> BankPlan:
 
 
 def read_plan(path: str | os.PathLike[str], model: type[P]) -> P:
-    """Read a plan of any kind from a TOML file, as :func:`load_plan` reads that of a bank."""
+    """Read a plan of any kind from a TOML file; files it names are relative to its folder.
+
+    Parameters
+    ----------
+    path : path-like
+    model : type
+        :class:`BankPlan` or :class:`phasemark.data.FramePlan`.
+
+    Returns
+    -------
+    ScenePlan
+        Of the type `model`.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read or is not TOML.
+    UsageError
+        With one line that names the file, the key, the value and what would be right.
+    """
     path = Path(path)
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))

@@ -17,6 +17,14 @@ PLAN_KINDS: dict[str, type[ScenePlan]] = {"bank": BankPlan, "frames": FramePlan}
 def plan_example(kind: str) -> str:
     """Return a plan of a kind, with comments, as TOML.
 
+    Parameters
+    ----------
+    kind : {"bank", "frames"}
+
+    Returns
+    -------
+    str
+
     Raises
     ------
     UsageError
@@ -28,6 +36,14 @@ def plan_example(kind: str) -> str:
 
 def plan_schema(kind: str) -> dict[str, Any]:
     """Return the JSON Schema of a kind of plan.
+
+    Parameters
+    ----------
+    kind : {"bank", "frames"}
+
+    Returns
+    -------
+    dict
 
     Raises
     ------
@@ -46,6 +62,12 @@ def check_plan(path: str | os.PathLike[str], kind: str | None = None) -> tuple[s
     path : path-like
     kind : str, optional
         What it should be; without it, a plan with ``views`` is one of a frame set, any other one of a bank.
+
+    Returns
+    -------
+    kind : str
+    plan : BankPlan or FramePlan
+        The resolved plan.
 
     Raises
     ------

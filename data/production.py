@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from phasemark import UsageError
 from phasemark.data.remote import open_maker
 from phasemark.data.shards import Job, Progress, build, manifest_path, refuse_difference, refuse_unfinished
 from phasemark.data.store import checksum_path, refuse_unwritable
@@ -21,6 +22,8 @@ def refuse_unwritable_output(path: Path, *, force: bool, resume: bool) -> None:
     OutputExistsError, UsageError
         As :func:`phasemark.data.shards.build`.
     """
+    if not path.name:
+        raise UsageError(f"'{path}' is not a file name")
     for target in (path, checksum_path(path)):
         refuse_unwritable(target, force=force or resume)
     if manifest_path(path).exists() and not (force or resume):

@@ -59,7 +59,27 @@ def verify_bank(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0
 
 
 def verify_frames(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0) -> dict[str, Any]:
-    """Check a frame set as :func:`verify_bank` checks a bank; `sample` counts views, with all frames of each."""
+    """Check a frame set as :func:`verify_bank` checks a bank, with views rendered and captured again.
+
+    Parameters
+    ----------
+    path : path-like
+        The frame set, with ``FILE.sha256`` beside it.
+    sample : int
+        How many random views to make again, with all frames of each.
+    seed : int
+        Which.
+
+    Returns
+    -------
+    dict
+        What was checked, in plain numbers and text.
+
+    Raises
+    ------
+    InputFileError
+        Naming the first thing that is wrong.
+    """
     digest = verify_checksum(path)
     with open_frames(path, untrusted=True) as frames:
         job = FrameJob(frames.plan, frames.mesh)
