@@ -167,11 +167,12 @@ class MaximumLikelihood:
         all_classes = evidence.on == "phasors"
 
         def doubtful(fits: Fits) -> NDArray[np.int64]:
-            """Return the frames whose best fit beats a bare scene, but is worse than good ones are."""
+            """Return the frames whose best fit is worse than good ones are; on ranges, if it beats a bare scene."""
             best = _best_of_frame(fits)
             limit = stats.chi2.isf(_DOUBTFUL if side_peaks else _HOPELESS, np.maximum(fits.dof[best], 1))
             cost, frame = fits.cost[best], fits.frame[best]
-            return np.asarray(frame[(cost > limit) & (cost < bare[frame])])
+            hope = cost < bare[frame] if evidence.on == "ranges" else True
+            return np.asarray(frame[(cost > limit) & hope])
 
         starts = self._search.starts(_some(seen, enough), n_modes, all_classes=all_classes)
         sides = () if background is None else (-_BESIDE_RAD, _BESIDE_RAD)
