@@ -121,11 +121,13 @@ class BankModel:
         return other
 
     @staticmethod
-    def fits(bank: Bank) -> bool:
-        """Whether a bank's grid can be interpolated."""
+    def fits(bank: Bank, step_m: float, step_rad: float) -> bool:
+        """Whether a bank's grid is regular, and no wider than some steps."""
         return all(
-            len(grid) >= 4 and np.allclose(np.diff(grid), (grid[-1] - grid[0]) / (len(grid) - 1), rtol=1e-6)
-            for grid in (bank.distance_m, bank.delta_rad)
+            len(grid) >= 4
+            and grid[-1] - grid[0] <= (len(grid) - 1) * step * (1 + 1e-6)
+            and np.allclose(np.diff(grid), (grid[-1] - grid[0]) / (len(grid) - 1), rtol=1e-6)
+            for grid, step in ((bank.distance_m, step_m), (bank.delta_rad, step_rad))
         )
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
