@@ -36,6 +36,8 @@ _DOUBTFUL, _HOPELESS = 0.05, 1e-3
 _BESIDE_RAD = math.radians(1.0)
 """Side peaks of the likelihood before a background are about so far away (PHYSICS section 7)."""
 _BESIDE_AGAIN_RAD = tuple(math.radians(side) for side in (-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0))
+_FINE, _COARSE = (0.011, math.radians(1.1)), (0.022, math.radians(2.2))
+"""Widest grids, metres and radians, on which interpolation is at the bound, and on which it shows the way."""
 _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
 _LIKELY = 100.0
 """An explanation whose cost is larger by this has no probability worth telling."""
@@ -99,10 +101,11 @@ class MaximumLikelihood:
         self._used = used.ravel()
         self._huber = ROBUST_FROM if robust else None
         self._behind = None if self.background is None else _behind(bank, self.background)
-        on_grid = self.free == VIEW[:2] and BankModel.fits(bank)
-        exact = on_grid and on == "ranges" and self.background is None
+        on_grid = self.free == VIEW[:2]
+        exact = on_grid and on == "ranges" and self.background is None and BankModel.fits(bank, *_FINE)
+        scouts = on_grid and BankModel.fits(bank, *_COARSE)
         self._bank_model = BankModel(bank) if exact else None
-        self._scout = BankModel(bank, self._behind, smooth_only=True) if on_grid else None
+        self._scout = BankModel(bank, self._behind, smooth_only=True) if scouts else None
         self._rendered: RenderedModel | None = None
         if self.auto or not exact:
             self._rendered = RenderedModel(bank, self.background, workers or _usual_workers())
@@ -167,11 +170,12 @@ class MaximumLikelihood:
         all_classes = evidence.on == "phasors"
 
         def doubtful(fits: Fits) -> NDArray[np.int64]:
-            """Return the frames whose best fit beats a bare scene, but is worse than good ones are."""
+            """Return the frames whose best fit is worse than good ones are; on ranges, if it beats a bare scene."""
             best = _best_of_frame(fits)
             limit = stats.chi2.isf(_DOUBTFUL if side_peaks else _HOPELESS, np.maximum(fits.dof[best], 1))
             cost, frame = fits.cost[best], fits.frame[best]
-            return np.asarray(frame[(cost > limit) & (cost < bare[frame])])
+            hope = cost < bare[frame] if evidence.on == "ranges" else True
+            return np.asarray(frame[(cost > limit) & hope])
 
         starts = self._search.starts(_some(seen, enough), n_modes, all_classes=all_classes)
         sides = () if background is None else (-_BESIDE_RAD, _BESIDE_RAD)

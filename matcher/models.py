@@ -68,6 +68,15 @@ class ImageModel(Protocol):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the least and the greatest coverage nearby, (m, pixels) each: within three `std` (m, p) at least."""
 
+    def wide_slopes(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        step: NDArray[np.float64],
+    ) -> NDArray[np.complex128] | None:
+        """Return slopes from differences over `step` (m, p) to either side; None if they differ little from others."""
+
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels of its images may be relied on, (m, pixels)."""
 
@@ -112,11 +121,13 @@ class BankModel:
         return other
 
     @staticmethod
-    def fits(bank: Bank) -> bool:
-        """Whether a bank's grid can be interpolated."""
+    def fits(bank: Bank, step_m: float, step_rad: float) -> bool:
+        """Whether a bank's grid is regular, and no wider than some steps."""
         return all(
-            len(grid) >= 4 and np.allclose(np.diff(grid), (grid[-1] - grid[0]) / (len(grid) - 1), rtol=1e-6)
-            for grid in (bank.distance_m, bank.delta_rad)
+            len(grid) >= 4
+            and grid[-1] - grid[0] <= (len(grid) - 1) * step * (1 + 1e-6)
+            and np.allclose(np.diff(grid), (grid[-1] - grid[0]) / (len(grid) - 1), rtol=1e-6)
+            for grid, step in ((bank.distance_m, step_m), (bank.delta_rad, step_rad))
         )
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
@@ -141,6 +152,15 @@ class BankModel:
         low, high = np.empty((m, pixels)), np.empty((m, pixels))
         _extremes(class_index, view, *self._grid(), self._upper, self._lower, low, high)
         return low, high
+
+    def wide_slopes(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        step: NDArray[np.float64],
+    ) -> None:
+        """Return None: what is interpolated is smooth."""
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels are smooth enough."""
@@ -234,7 +254,6 @@ class RenderedModel:
         m, pixels, p = len(view), self.sensor.rows * self.sensor.cols, len(free)
         phasor, slope = np.empty((m, pixels), np.complex128), np.zeros((m, p, pixels), np.complex128)
         intensity, coverage = np.empty((m, pixels)), np.empty((m, pixels))
-        half = self.sensor.rows // 2 * self.sensor.cols
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
             image = self._render(c, view[of])
@@ -246,13 +265,44 @@ class RenderedModel:
                 moved = view[of]
                 moved[:, axis] += STEP
                 width = (moved - view[of])[:, axis]
-                # a body of revolution looks the same from every side
-                only_lower = self._factored and name == "delta_rad" and not view[of, 3].any()
-                first = half if only_lower else 0
-                rows = (self.sensor.rows // 2, self.sensor.rows) if only_lower else None
+                rows, first = self._changing_rows(name, view[of])
                 there = self._render(c, moved, rows).phasor.reshape(len(of), -1)
                 slope[of, k, first:] = (there - phasor[of, first:]) / width[:, None]
         return ModelImages(phasor, slope, intensity, coverage)
+
+    def wide_slopes(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        step: NDArray[np.float64],
+    ) -> NDArray[np.complex128]:
+        """Render both ends."""
+        slope = np.zeros((len(view), len(free), self.sensor.rows * self.sensor.cols), np.complex128)
+        for c in np.unique(class_index):
+            of = np.flatnonzero(class_index == c)
+            for k, name in enumerate(free):
+                rows, first = self._changing_rows(name, view[of])
+                axis = VIEW.index(name)
+                ends = []
+                for side in (1.0, -1.0):
+                    moved = view[of]
+                    moved[:, axis] += side * np.maximum(step[of, k], STEP)
+                    moved[:, 0] = np.clip(moved[:, 0], *self._limits)
+                    ends.append((moved[:, axis], self._render(c, moved, rows).phasor.reshape(len(of), -1)))
+                width = np.maximum(ends[0][0] - ends[1][0], STEP)
+                slope[of, k, first:] = (ends[0][1] - ends[1][1]) / width[:, None]
+        return slope
+
+    def _changing_rows(self, name: str, view: NDArray[np.float64]) -> tuple[tuple[int, int] | None, int]:
+        """Return the rows that a parameter changes, None for all, and their first pixel.
+
+        A body of revolution looks the same from every side.
+        """
+        half = self.sensor.rows // 2
+        if self._factored and name == "delta_rad" and not view[:, 3].any():
+            return (half, self.sensor.rows), half * self.sensor.cols
+        return None, 0
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return that every pixel may be relied on."""

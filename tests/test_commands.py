@@ -115,6 +115,26 @@ def test_a_hard_render_has_no_mixed_pixel(run, tmp_path):
         assert set(np.unique(data["coverage"])) == {0.0, 1.0}
 
 
+def test_refinement_tells_standard_deviations_and_frees_the_bearing(run, folder):
+    code, out, _ = run("match", folder / "bank.h5", folder / "frames.csv", *MATCH, "--method", "refine", "--json")
+    assert code == 0
+    (match,) = json.loads(out)["matches"]
+    assert match["class"] == "cone"
+    assert match["distance_m"] == pytest.approx(1.0, abs=1e-3)  # ten standard deviations before a wall
+    assert match["delta_deg"] == pytest.approx(40.0, abs=0.5)
+    assert np.array(match["covariance"]).shape == (2, 2)
+    code, out, _ = run(
+        "match", folder / "bank.h5", folder / "frames.csv", *MATCH, "--method", "refine", "--free", "bearing", "--json"
+    )
+    (match,) = json.loads(out)["matches"]
+    assert match["free"] == ["distance_m", "delta_rad", "bearing_rad"]
+    assert match["bearing_deg"] == pytest.approx(0.0, abs=0.3)
+    auto = ["--unit", "m", "--quantity", "range", "--auto-background", "--method", "refine"]
+    code, out, _ = run("match", folder / "bank.h5", folder / "frames.csv", *auto)
+    assert code == 0
+    assert "±" in out
+
+
 def test_what_render_writes_match_reads(run, folder, tmp_path):
     run("render", "--class", "cone", "--distance", 1.0, "--delta", 40, "--wall", 3, "-o", tmp_path / "f.png")
     code, out, _ = run("match", folder / "bank.h5", tmp_path / "f.npz", "--wall", 3, "--json")
@@ -186,6 +206,9 @@ def _case(code, *arguments, contains):
 
 
 MISTAKES = [
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--auto-background", contains="leave --wall"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--free", "yaw", contains="bearing or height"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--free", "bearing", contains="belong to method 'refine'"),
     _case(3, "match", "none.h5", "frames.csv", *MATCH, contains="none.h5"),
     _case(3, "match", "frames.csv", "frames.csv", *MATCH, contains="not a bank"),
     _case(3, "match", "cut.h5", "frames.csv", *MATCH, contains="cut.h5"),
