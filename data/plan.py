@@ -47,7 +47,9 @@ def _positive(values: tuple[float, ...], info: ValidationInfo) -> tuple[float, .
 _Grid = Annotated[tuple[float, ...], BeforeValidator(_to_grid), PlainSerializer(format_grid, return_type=str)]
 
 
-class _PlanModel(BaseModel):
+class PlanModel(BaseModel):
+    """A frozen table of a plan; what is wrong with it is a UsageError of one line."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     def __init__(self, **data: Any) -> None:
@@ -57,7 +59,7 @@ class _PlanModel(BaseModel):
             raise _as_usage_error(error) from None
 
 
-class MeshPlan(_PlanModel):
+class MeshPlan(PlanModel):
     """A landmark from a mesh file.
 
     Parameters
@@ -87,7 +89,7 @@ class MeshPlan(_PlanModel):
     albedo: _Albedo = 0.8
 
 
-class BankPlan(_PlanModel):
+class BankPlan(PlanModel):
     """A bank of model images (PHYSICS sections 5 and 7).
 
     Parameters
@@ -224,12 +226,7 @@ def load_plan(path: str | os.PathLike[str]) -> BankPlan:
         With one line that names the file, the key, the value and what would be right.
     """
     path = Path(path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:  # the last: nested without end
-        raise InputFileError(f"{path}: not a TOML file ({error})") from None
+    table = read_toml(path)
     try:
         plan = BankPlan(**table)
     except UsageError as error:
@@ -239,6 +236,23 @@ def load_plan(path: str | os.PathLike[str]) -> BankPlan:
     return plan.model_copy(
         update={"meshes": tuple(meshes), "sensor": str(path.parent / plan.sensor) if is_file else plan.sensor}
     )
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read or is not TOML.
+    """
+    path = Path(path)
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:  # the last: nested without end
+        raise InputFileError(f"{path}: not a TOML file ({error})") from None
 
 
 def factored_refusal(plan: BankPlan) -> str | None:

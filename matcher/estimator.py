@@ -133,7 +133,7 @@ class MaximumLikelihood:
         for k in range(len(frames)):
             one = frames[k : k + 1]
             evidence = Evidence.from_frames(one, self.on)
-            around = estimate_surroundings(one)
+            around = estimate_surroundings(one, bearing_known="bearing_rad" not in self.free)
             background = around.background
             bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(one, evidence))
             assert self._rendered is not None
