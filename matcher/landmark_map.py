@@ -1,4 +1,4 @@
-"""Where the landmarks stand: a map in TOML, and every pose of the robot that a match allows on it (PHYSICS section 8)."""
+"""Where the landmarks stand: a map in TOML, and the poses of the robot that a match allows on it (PHYSICS section 8)."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class LandmarkMap(PlanModel):
         share = np.clip(np.sum(to * along, axis=1) / np.sum(along**2, axis=1), 0, 1)
         return float(np.linalg.norm(to - share[:, None] * along, axis=1).min())
 
-    def wall_distance_m(self, xy_m: Sequence[float], heading_rad: float) -> float | None:
+    def wall_distance_m(self, xy_m: Sequence[float] | NDArray[np.float64], heading_rad: float) -> float | None:
         """Return how far the room's wall is from a point in a direction; None where there is none.
 
         Parameters

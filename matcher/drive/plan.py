@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import tomllib
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Self
@@ -12,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from phasemark import InputFileError, UsageError
+from phasemark import UsageError
 from phasemark.data.plan import PlanModel, read_toml
-from phasemark.matcher.landmark_map import Coordinate, LandmarkMap, Point, Std, load_map
+from phasemark.matcher.landmark_map import LandmarkMap, Point, Std, load_map
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Share = Annotated[float, Field(gt=0, lt=1)]
@@ -219,7 +220,9 @@ def load_drive_plan(path: str | os.PathLike[str]) -> DrivePlan:
 
 def example_drive() -> str:
     """Return the text of the shipped plan: a tour of 20 m past four landmarks."""
-    try:
-        return (files("phasemark.matcher") / "plans" / "drive.toml").read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputFileError(f"the shipped plan cannot be read ({error.strerror})") from None
+    return (files("phasemark.matcher") / "plans" / "drive.toml").read_text(encoding="utf-8")
+
+
+def default_drive() -> DrivePlan:
+    """Return the shipped plan."""
+    return DrivePlan(**tomllib.loads(example_drive()))

@@ -174,9 +174,9 @@ def _bank(plan: DrivePlan, names: Sequence[str], workers: int | None) -> Bank:
     low, high = plan.stop.distance_m
     low = max(low - _BANK_MARGIN_M, 0.5)
     steps = math.ceil((high + _BANK_MARGIN_M - low) / _BANK_STEP_M)
-    distance = [low + k * _BANK_STEP_M for k in range(steps + 1)]
-    grid = [k * _BANK_STEP_DEG for k in range(round(180 / _BANK_STEP_DEG))]
-    bank = BankPlan(classes=tuple(names), sensor=plan.camera.sensor, distance_m=distance, delta_deg=grid)
+    distance = tuple(low + k * _BANK_STEP_M for k in range(steps + 1))
+    delta = tuple(k * _BANK_STEP_DEG for k in range(round(180 / _BANK_STEP_DEG)))
+    bank = BankPlan(classes=tuple(names), sensor=plan.camera.sensor, distance_m=distance, delta_deg=delta)
     return build_bank(bank, None, workers=workers)
 
 
@@ -258,9 +258,7 @@ class _Driver:
                     " 'path.turn_limit_deg_s' room for its corners, or let it see a landmark earlier"
                 )
         time_s, way_m, true, dead, corrected, covariance = (np.stack(column) for column in zip(*self.log, strict=True))
-        return Drive(
-            plan, self.seed, time_s, way_m, true, dead, corrected, covariance, tuple(self.stops)
-        )
+        return Drive(plan, self.seed, time_s, way_m, true, dead, corrected, covariance, tuple(self.stops))
 
     def _step(self) -> None:
         plan = self.plan.path
@@ -342,7 +340,7 @@ class _Driver:
             placements = plan.map.poses(
                 match,
                 pan,
-                prior=before,
+                prior=before.tolist(),
                 prior_covariance=covariance_before,
                 pan_offset_xy_m=camera.pan_offset_m,
                 lens_offset_xy_m=camera.lens_offset_m,
@@ -385,7 +383,7 @@ class _Driver:
     def _wall(self, lens_m: NDArray[np.float64], landmark_m: Sequence[float]) -> Background | None:
         """Return the room's wall behind a landmark."""
         heading = math.atan2(landmark_m[1] - lens_m[1], landmark_m[0] - lens_m[0])
-        wall = self.plan.map.wall_distance_m(lens_m.tolist(), heading)
+        wall = self.plan.map.wall_distance_m(lens_m, heading)
         return None if wall is None else Background(wall_m=wall, wall_albedo=self.plan.camera.wall_albedo)
 
 
