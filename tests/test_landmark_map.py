@@ -1,0 +1,113 @@
+"""The map of landmarks: what it refuses, its walls, and the poses that a match allows on it."""
+
+import math
+
+import numpy as np
+import pytest
+
+from phasemark import InputFileError, UsageError
+from phasemark.matcher import LandmarkMap, Match, load_map, robot_poses
+
+DOOR = {"name": "door", "class": "cone", "x_m": 2.0, "y_m": 1.0, "yaw_deg": 30.0}
+ROOM = [(0, 0), (4, 0), (4, 3), (1, 3), (1, 2), (0, 2)]  # an L
+
+
+def map_file(folder, text):
+    path = folder / "map.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def landmark_text(**changes):
+    fields = {**DOOR, **changes}
+    lines = [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value}" for key, value in fields.items()]
+    return "\n".join(["[[landmark]]", *lines, ""])
+
+
+def test_a_map_file_says_where_each_landmark_stands_and_how_well_that_is_known(tmp_path):
+    text = landmark_text(xy_std_m=0.01, yaw_std_deg=2.0)
+    (landmark,) = load_map(map_file(tmp_path, text)).landmark
+    assert (landmark.name, landmark.class_name, landmark.xy_m) == ("door", "cone", (2.0, 1.0))
+    assert landmark.yaw_rad == pytest.approx(math.pi / 6)
+    np.testing.assert_allclose(landmark.covariance, np.diag([1e-4, 1e-4, math.radians(2) ** 2]))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "'landmark' is missing"),
+        ("landmark = []", r"'landmark' Tuple should have at least 1 item|'landmark' must"),
+        (landmark_text(x_m="here"), r"landmark\.0: 'x_m' must be a valid number.*got 'here'"),
+        (landmark_text(x_m=math.nan), r"landmark\.0: 'x_m' must be a finite number, got nan"),
+        (landmark_text(xy_std_m=-0.1), r"landmark\.0: 'xy_std_m' must be greater than or equal to 0, got -0.1"),
+        (landmark_text(z_m=1.0), r"landmark\.0: unknown key 'z_m'"),
+        (landmark_text() + landmark_text(), r"'landmark\.1\.name' must be a name of its own, got 'door' twice"),
+        ("room_m = [[0, 0], [1, 0]]\n" + landmark_text(), "'room_m' must have at least 3 corners, got 2"),
+        ("room_m = [[0, 0], [1, 0], [0, 1]]\n" + landmark_text(), r"'landmark\.0' must stand inside 'room_m'"),
+    ],
+)
+def test_a_wrong_map_is_refused_with_file_key_value_and_what_would_be_right(tmp_path, text, message):
+    path = map_file(tmp_path, text)
+    with pytest.raises(UsageError, match=message) as caught:
+        load_map(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_no_map_is_an_input_error(tmp_path):
+    with pytest.raises(InputFileError, match="cannot be read"):
+        load_map(tmp_path / "absent.toml")
+    with pytest.raises(InputFileError, match="not a TOML file"):
+        load_map(map_file(tmp_path, "[["))
+
+
+def test_the_wall_behind_is_the_first_one_that_a_ray_meets():
+    room = LandmarkMap(landmark=[DOOR], room_m=ROOM)
+    at = (2.0, 1.5)
+    for heading_deg, expected in ((0, 2.0), (90, 1.5), (180, 2.0), (-90, 1.5), (45, 1.5 * math.sqrt(2))):
+        assert room.wall_distance_m(at, math.radians(heading_deg)) == pytest.approx(expected, abs=1e-12)
+    # into the notch of the L: its wall x = 1 at y = 2.5
+    assert room.wall_distance_m((3.0, 2.5), math.pi) == pytest.approx(2.0, abs=1e-12)
+    assert LandmarkMap(landmark=[DOOR]).wall_distance_m(at, 0.0) is None
+
+
+def test_inside_and_clearance_follow_the_corners():
+    room = LandmarkMap(landmark=[DOOR], room_m=ROOM)
+    points = {(0.5, 1.0): True, (0.5, 2.5): False, (2.0, 2.5): True, (5.0, 1.0): False, (-1.0, 1.0): False}
+    assert {point: room.is_inside(point) for point in points} == points
+    assert room.wall_clearance_m((0.7, 1.6)) == pytest.approx(0.4)
+    assert room.wall_clearance_m((1.3, 1.8)) == pytest.approx(math.hypot(0.3, 0.2))  # to the corner that juts in
+    assert LandmarkMap(landmark=[DOOR]).wall_clearance_m((0.0, 0.0)) == math.inf
+
+
+def test_the_prior_chooses_among_landmarks_of_the_class_and_their_symmetric_poses():
+    others = [
+        {**DOOR, "name": "window", "x_m": 6.0, "yaw_deg": -40.0},
+        {**DOOR, "name": "lamp", "class": "post"},
+    ]
+    room = LandmarkMap(landmark=[DOOR, *others])
+    match = Match("cone", True, 1.2, 0.4, covariance=np.diag([1e-6, 1e-5]), symmetry=2)
+    everywhere = room.poses(match)
+    assert [placement.landmark.name for placement in everywhere] == ["door", "door", "window", "window"]
+    for wanted in everywhere:
+        pose = wanted.pose
+        near = (pose.x_m + 0.1, pose.y_m - 0.1, pose.heading_rad + 0.1)
+        found = room.poses(match, prior=near, prior_covariance=np.diag([0.04, 0.04, 0.04]))
+        assert found[0].landmark.name == wanted.landmark.name
+        assert (found[0].pose.x_m, found[0].pose.y_m) == (pose.x_m, pose.y_m)
+        assert len(found) == 4
+    assert room.poses(Match("sphere", True, 1.2, 0.4)) == []
+    assert room.poses(Match(None, False)) == []
+
+
+def test_the_survey_s_uncertainty_is_in_the_pose():
+    match = Match("cone", True, 1.2, 0.4, covariance=np.diag([1e-6, 1e-5]), symmetry=1)
+    (exact,) = LandmarkMap(landmark=[DOOR]).poses(match)
+    surveyed = LandmarkMap(landmark=[{**DOOR, "xy_std_m": 0.01, "yaw_std_deg": 1.0}])
+    (loose,) = surveyed.poses(match)
+    expected = robot_poses(
+        match, (2.0, 1.0), math.radians(30), landmark_covariance=np.diag([1e-4, 1e-4, math.radians(1) ** 2])
+    )
+    np.testing.assert_array_equal(loose.pose.covariance, expected[0].covariance)
+    # the landmark's own x, y and heading add to the heading's variance that heading alone
+    assert loose.pose.covariance[2, 2] - exact.pose.covariance[2, 2] == pytest.approx(math.radians(1) ** 2)
