@@ -289,6 +289,7 @@ def _from_catalog(name: str) -> LandmarkSpec:
 def _as_usage_error(error: ValidationError) -> UsageError:
     first = error.errors()[0]
     own = first.get("ctx", {}).get("error")
-    if isinstance(own, UsageError) and len(first["loc"]) <= 1:
-        return own  # it names key and value already
+    if isinstance(own, UsageError):
+        key = ".".join(map(str, first["loc"]))
+        return own if f"'{key}'" in str(own) or not key else UsageError(f"{key}: {own}")
     return UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"])
