@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import math
-import tempfile
-from pathlib import Path
 
 import numpy as np
-from matplotlib.animation import PillowWriter
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse, Polygon
 from numpy.typing import NDArray
+from PIL import Image
 from scipy import stats
 
 from phasemark.landmarks import catalog
@@ -22,8 +23,8 @@ _TRUE, _DEAD, _CORRECTED, _MARK = "#1a1a1a", "#c8553d", "#2a6fbb", "#5b8c5a"
 _ENLARGED = 10.0
 """Ellipses of centimetres would be lost in a room of metres."""
 _LEVEL = 0.95
-_FRAMES_PER_S = 8
-_MOVING_FRAMES, _STANDING_FRAMES = 56, 3
+_MOVING_FRAMES, _MOVING_MS, _STANDING_MS = 100, 80, 1500
+_COLOURS = 64
 
 
 def drive_picture(drive: Drive) -> Figure:
@@ -68,6 +69,7 @@ def drive_animation(drive: Drive) -> bytes:
     drive : Drive
     """
     figure = Figure(figsize=(9.0, 4.8), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
     room, frame = figure.subplots(1, 2, width_ratios=(2.2, 1))
     _draw_room(room, drive)
     lines = [
@@ -78,29 +80,37 @@ def drive_animation(drive: Drive) -> bytes:
             (_CORRECTED, 1.2, "--", "corrected"),
         )
     ]
-    robot = room.add_patch(Polygon(_outline(drive.true[0]), closed=True, fc=_TRUE, ec="none", zorder=5))
-    sight = room.plot([], [], color=_MARK, lw=1.0, zorder=4)[0]
+    robot = Polygon(_outline(drive.true[0]), closed=True, fc=_TRUE, ec="none", zorder=5)
+    room.add_patch(robot)
     room.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, fontsize=7, frameon=False)
     _no_frame(frame)
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # nothing moves any more, and laying out costs more than drawing
-    paths = (drive.true, drive.dead_reckoned, drive.corrected)
-    writer = PillowWriter(fps=_FRAMES_PER_S)
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "drive.gif"
-        with writer.saving(figure, str(target), dpi=80):
-            for index, stop in _moments(drive):
-                for line, path in zip(lines, paths, strict=True):
-                    line.set_data(*path[: index + 1, :2].T)
-                robot.set_xy(_outline(drive.true[index]))
-                sight.set_data([], [])
-                if stop is not None:
-                    sight.set_data([stop.true[0], stop.landmark.x_m], [stop.true[1], stop.landmark.y_m])
-                    _draw_stop(room, stop)
-                    _draw_frame(frame, stop)
-                for _ in range(1 if stop is None else _STANDING_FRAMES):
-                    writer.grab_frame()
-        return target.read_bytes()
+    canvas.draw()
+    figure.set_layout_engine("none")  # nothing moves any more
+    moving: list[Artist] = [*lines, robot]
+    for artist in moving:
+        artist.set_animated(True)  # drawn over what stands still, which is drawn anew at stops alone
+    still = None
+    images, durations = [], []
+    for index, stop in _moments(drive):
+        if stop is not None:
+            _draw_stop(room, stop)
+            _draw_frame(frame, stop)
+        if stop is not None or still is None:
+            canvas.draw()
+            still = canvas.copy_from_bbox(figure.bbox)
+        canvas.restore_region(still)
+        for line, path in zip(lines, (drive.true, drive.dead_reckoned, drive.corrected), strict=True):
+            line.set_data(*path[: index + 1, :2].T)
+        robot.set_xy(_outline(drive.true[index]))
+        for artist in moving:
+            room.draw_artist(artist)
+        images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
+        durations.append(_MOVING_MS if stop is None else _STANDING_MS)
+    palette = images[-1].quantize(_COLOURS)  # the last image has every colour, the first ones hardly any red
+    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    buffer = io.BytesIO()
+    images[0].save(buffer, "GIF", save_all=True, append_images=images[1:], duration=durations, loop=0)
+    return buffer.getvalue()
 
 
 def _moments(drive: Drive) -> list[tuple[int, Stop | None]]:
