@@ -13,6 +13,7 @@ from phasemark.data import write_atomically
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh, catalog, mesh_picture
 from phasemark.matcher import kalman_filter
+from phasemark.matcher.drive import default_drive, drive_picture, run_drive
 from phasemark.render import Background, Renderer, capture, preset
 from phasemark.render.plot import draw_range
 
@@ -39,10 +40,12 @@ def demo_figure() -> Figure:
 
 def main() -> None:
     """Write every picture."""
-    buffer = io.BytesIO()
-    demo_figure().savefig(buffer, format="png", dpi=90)
     IMAGES.mkdir(exist_ok=True)
-    write_atomically(IMAGES / "demo.png", buffer.getvalue(), force=True)
+    figures = {"demo.png": demo_figure(), "drive.png": drive_picture(run_drive(default_drive()))}
+    for name, figure in figures.items():
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=90)
+        write_atomically(IMAGES / name, buffer.getvalue(), force=True)
 
 
 if __name__ == "__main__":
