@@ -385,8 +385,25 @@ def _match(
     rotate: Annotated[int, typer.Option("--rotate", help="Turn the image clockwise by 0, 90, 180 or 270 degrees.")] = 0,
     filter_name: Annotated[str, typer.Option("--filter", help="kalman or phasor-mean.")] = "kalman",
     method: Annotated[
-        str, typer.Option("--method", help="nearest: the paper's minimum-distance classifier.")
+        str,
+        typer.Option(
+            "--method",
+            help="nearest: the paper's minimum-distance classifier. refine: maximum likelihood, with covariance.",
+        ),
     ] = "nearest",
+    free: Annotated[
+        list[str] | None,
+        typer.Option("--free", help="With refine, estimate this too: bearing or height; repeatable."),
+    ] = None,
+    on: Annotated[str, typer.Option("--on", help="With refine: ranges, or phasors with the albedo free.")] = "ranges",
+    pixels: Annotated[str, typer.Option("--pixels", help="With refine, what gives the view: all or lower.")] = "all",
+    robust: Annotated[bool, typer.Option("--robust", help="With refine, count residuals beyond 3 σ less.")] = False,
+    false_alarm: Annotated[
+        float, typer.Option("--false-alarm", help="Share of good frames that the test of the fit may refuse.")
+    ] = 0.01,
+    auto_background: Annotated[
+        bool, typer.Option("--auto-background", help="With refine, estimate wall and floor from each frame.")
+    ] = False,
     wall: _Wall = None,
     floor: _Floor = None,
     landmark_xy: Annotated[
@@ -437,6 +454,13 @@ def _match(
     if plot is not None and plot.suffix.lower() != ".png":
         raise UsageError(f"the picture must be a .png file, got '{plot}'")
     background = _background(wall, floor)
+    if auto_background and background is not None:
+        raise UsageError("--auto-background estimates wall and floor: leave --wall and --floor out")
+    parameters = ["distance_m", "delta_rad"]
+    for name in free or ():
+        if name not in _FREE:
+            raise UsageError(f"--free must be {' or '.join(_FREE)}, got '{name}'")
+        parameters.append(_FREE[name])
     with open_bank(bank) as opened:
         measured = read_frames(
             frames,
@@ -452,7 +476,16 @@ def _match(
         plots = [] if plot is None else _numbered(plot, len(measured.range_m))
         _refuse_existing(plots, force)
         filtered = filters[filter_name](measured)
-        matches = Matcher(opened, method, background=background).match(filtered)
+        matches = Matcher(
+            opened,
+            method,
+            free=parameters,
+            background="auto" if auto_background else background,
+            false_alarm=false_alarm,
+            on=on,  # type: ignore[arg-type]  # Matcher says what is right
+            pixels=pixels,  # type: ignore[arg-type]
+            robust=robust,
+        ).match(filtered)
         _save_match_pictures(plots, filtered, matches, opened, background, force)
     answers = []
     for match in matches:
@@ -641,6 +674,17 @@ def _pose_text(pose: Mapping[str, Any]) -> str:
     )
 
 
+_FREE = {"bearing": "bearing_rad", "height": "height_m"}
+
+
+def _plus_minus(answer: dict[str, Any], name: str, scale: float, digits: int) -> str:
+    """Return the standard deviation of one parameter of a match as text; nothing if there is none."""
+    if answer["covariance"] is None:
+        return ""
+    k = answer["free"].index(name)
+    return f" ± {scale * math.sqrt(answer['covariance'][k][k]):.{digits}f}"
+
+
 def _echo_matches(answers: Sequence[dict[str, Any]]) -> None:
     """Print one line a match, and one a pose."""
     rows = []
@@ -650,8 +694,8 @@ def _echo_matches(answers: Sequence[dict[str, Any]]) -> None:
             (
                 str(k),
                 answer["class"] or "no landmark",
-                f"{answer['distance_m']:.3f}" if found else "",
-                f"{answer['delta_deg']:.2f}" if found else "",
+                f"{answer['distance_m']:.3f}{_plus_minus(answer, 'distance_m', 1.0, 4)}" if found else "",
+                f"{answer['delta_deg']:.2f}{_plus_minus(answer, 'delta_rad', 180 / math.pi, 3)}" if found else "",
                 "yes" if answer["accepted"] else "no",
                 "" if answer["p_value"] is None else f"{answer['p_value']:.3g}",
                 "  or  ".join(_pose_text(pose) for pose in answer.get("poses", ())),

@@ -1,5 +1,15 @@
 """What the robot concludes: filters, matching, and its own position."""
 
+from phasemark.matcher.bounds import (
+    Bound,
+    Estimate,
+    confusion_probability,
+    covers,
+    cramer_rao,
+    efficiency,
+    nees,
+    share,
+)
 from phasemark.matcher.filters import (
     FilteredFrames,
     PixelKalman,
@@ -13,10 +23,15 @@ from phasemark.matcher.landmark_map import LandmarkMap, MappedLandmark, Placemen
 from phasemark.matcher.match import Candidate, Match, Matches
 from phasemark.matcher.matcher import Matcher, background_image
 from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
+from phasemark.matcher.surroundings import Surroundings, estimate_surroundings
+from phasemark.matcher.trials import Conditions, Trials, TrialSummary, run_trials
 
 __all__ = [
     "PRIOR_STD",
+    "Bound",
     "Candidate",
+    "Conditions",
+    "Estimate",
     "FilteredFrames",
     "LandmarkMap",
     "MappedLandmark",
@@ -27,12 +42,23 @@ __all__ = [
     "PixelState",
     "Placement",
     "RobotPose",
+    "Surroundings",
+    "TrialSummary",
+    "Trials",
     "ViewEstimate",
     "background_image",
+    "confusion_probability",
+    "covers",
+    "cramer_rao",
+    "efficiency",
+    "estimate_surroundings",
     "kalman",
     "kalman_filter",
     "kalman_step",
     "load_map",
+    "nees",
     "phasor_mean",
     "robot_poses",
+    "run_trials",
+    "share",
 ]

@@ -1,7 +1,7 @@
 """What can be known at best: Fisher information, Cramér–Rao bounds, class confusion, and tests of a covariance.
 
-All bounds are those of PHYSICS section 7, for Gaussian residuals with the variance of the noise law: say of every number
-which pixels count, whether ranges or phasors are measured, what is free, and what stands behind the landmark.
+All bounds are those of PHYSICS section 7, for Gaussian residuals with the variance of the noise law: say of every
+number which pixels count, whether ranges or phasors are measured, what is free, and what stands behind the landmark.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numba import njit
@@ -19,6 +20,13 @@ from phasemark.data.bank import BankGroup, group_rows
 from phasemark.matcher.coarse import DISAGREEMENT, Observation, Templates
 from phasemark.matcher.models import closing_period
 from phasemark.render import PhasorImages
+
+_T = TypeVar("_T", bound=np.generic)
+
+_UNDECIDED, _SHARE = 50.0, 0.5
+"""Other classes start too where their cost is larger by no more than this, and this share of the best: between the
+grid's points none of them fits."""
+
 
 @dataclass(frozen=True, eq=False)
 class Starts:
@@ -78,7 +86,7 @@ class Search:
         )
         self._parts.append((templates, rows, group.name == "upper"))
 
-    def starts(self, seen: Observation, n_modes: int) -> Starts:
+    def starts(self, seen: Observation, n_modes: int, *, all_classes: bool = False) -> Starts:
         """Return the best modes of every frame.
 
         Parameters
@@ -87,25 +95,32 @@ class Search:
             Whole frames.
         n_modes : int
             How many of each frame, at most.
+        all_classes : bool
+            Whether classes that are hardly worse than the best one of a mode start there too.
         """
         n, n_bearing = len(seen.range_m), len(self._shifts)
         if not n:
             return Starts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4)), np.empty(0))
         shape = (len(self._distance), len(self._delta))
         best = np.empty((n, n_bearing, *shape), np.float32)
-        classes = np.empty((n, n_bearing, *shape), np.int8)
+        by_class = []
         for k, shift in enumerate(self._shifts):
-            best[:, k], classes[:, k] = self._costs(self._shifted(seen, shift), seen)
+            best[:, k], above = self._costs(self._shifted(seen, shift), seen)
+            by_class.append(above)
         frame, class_index, views, cost = [], [], [], []
         for f in range(n):
-            found = _modes(best[f], n_modes, self._closes)
-            for b, i, j in found:
+            for b, i, j in _modes(best[f], n_modes, self._closes):
                 if b < 0:
                     break
-                frame.append(f)
-                class_index.append(classes[f, b, i, j])
-                views.append((self._distance[i], self._delta[j], self._bearing(b), 0.0))
-                cost.append(best[f, b, i, j])
+                least = float(best[f, b, i, j])
+                above = by_class[b][f, :, i, min(j, by_class[b].shape[-1] - 1)]
+                for c in np.argsort(above, kind="stable")[: None if all_classes else 1]:
+                    if above[c] > _UNDECIDED + _SHARE * least:
+                        break
+                    frame.append(f)
+                    class_index.append(c)
+                    views.append((self._distance[i], self._delta[j], self._bearing(b), 0.0))
+                    cost.append(least + float(above[c]))
         return Starts(
             np.array(frame, np.int64),
             np.array(class_index, np.int64),
@@ -123,7 +138,7 @@ class Search:
             return seen
         rows, cols = self._bank.sensor.rows, self._bank.sensor.cols
 
-        def move(values: NDArray[np.generic]) -> NDArray[np.generic]:
+        def move(values: NDArray[_T]) -> NDArray[_T]:
             grid = values.reshape(-1, rows, cols)
             out = np.zeros_like(grid)
             if shift > 0:
@@ -132,10 +147,13 @@ class Search:
                 out[:, :, -shift:] = grid[:, :, :shift]
             return out.reshape(values.shape)
 
-        return Observation(*(move(a) for a in (seen.range_m, seen.weight, seen.returned, seen.not_returned)))
+        return Observation(move(seen.range_m), move(seen.weight), move(seen.returned), move(seen.not_returned))
 
-    def _costs(self, moved: Observation, seen: Observation) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
-        """Return the cost of the best class at every view of the grid, (n, D, δ), and which class that is."""
+    def _costs(self, moved: Observation, seen: Observation) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the cost of the best class at every view of the grid, (n, D, δ), and how far above it each class is.
+
+        The latter is (n, class, D, δ), or (n, class, D, 1) where it does not depend on δ.
+        """
         n, cols = len(moved.range_m), self._bank.sensor.cols
         n_class, shape = len(self._bank.classes), (len(self._distance), len(self._delta))
         out = DISAGREEMENT * (seen.returned.sum(axis=1) - moved.returned.sum(axis=1)).astype(np.float32)
@@ -154,11 +172,10 @@ class Search:
                 pose = costs.reshape(n, -1, *shape)
         assert pose is not None
         if upper is None:
-            kinds = pose.argmin(axis=1)
-            return pose.min(axis=1) + out[:, None, None], kinds.astype(np.int8)
-        kinds = upper.argmin(axis=1)
-        total = pose[:, 0] + upper.min(axis=1)[:, :, None] + out[:, None, None]
-        return total, np.broadcast_to(kinds[:, :, None], total.shape).astype(np.int8)
+            least = pose.min(axis=1)
+            return least + out[:, None, None], pose - least[:, None]
+        least = upper.min(axis=1)
+        return pose[:, 0] + least[:, :, None] + out[:, None, None], (upper - least[:, None])[..., None]
 
 
 @njit(cache=True, nogil=True)

@@ -21,7 +21,7 @@ from phasemark.matcher.likelihood import Evidence, Quantity, counts
 from phasemark.matcher.match import Candidate, Match
 from phasemark.matcher.models import VIEW, BankModel, ImageModel, RenderedModel
 from phasemark.matcher.refine import SCALE, Fits, Settings, refine
-from phasemark.matcher.surroundings import estimate_surroundings, without_background
+from phasemark.matcher.surroundings import NEAREST_WALL_M, estimate_surroundings, without_background
 from phasemark.render import Background, PhasorImages, Renderer, wrap_difference_m
 
 Pixels = Literal["all", "lower"]
@@ -31,8 +31,8 @@ ROBUST_FROM = 3.0
 """Where Huber's loss turns linear, in σ: far enough out to cost an honest frame nothing."""
 _MODES, _MODES_BEFORE_BACKGROUND = 2, 4
 _MODES_AGAIN = 8
-_DOUBTFUL = 0.05
-"""A p-value at which it is worth looking elsewhere."""
+_DOUBTFUL, _HOPELESS = 0.05, 1e-3
+"""p-values at which it is worth looking elsewhere: where the likelihood has side peaks, and where it is smooth."""
 _BESIDE_RAD = math.radians(1.0)
 """Side peaks of the likelihood before a background are about so far away (PHYSICS section 7)."""
 _BESIDE_AGAIN_RAD = tuple(math.radians(side) for side in (-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0))
@@ -103,7 +103,9 @@ class MaximumLikelihood:
         exact = on_grid and on == "ranges" and self.background is None
         self._bank_model = BankModel(bank) if exact else None
         self._scout = BankModel(bank, self._behind, smooth_only=True) if on_grid else None
-        self._rendered = RenderedModel(bank, self.background, workers or _usual_workers()) if self.auto or not exact else None
+        self._rendered: RenderedModel | None = None
+        if self.auto or not exact:
+            self._rendered = RenderedModel(bank, self.background, workers or _usual_workers())
         fine = (1, 1) if self.background is not None and "bearing_rad" not in self.free else (2, 3)
         stride = tuple(
             max(1, min(step, (len(grid) - 1) // 4))
@@ -160,29 +162,31 @@ class MaximumLikelihood:
     ) -> Fits:
         """Search and fit; where nothing fits, search again from many more places."""
         enough = self._worth_a_search(evidence, bare)
+        side_peaks = evidence.on == "phasors" or background is not None
         n_modes = _MODES if background is None else _MODES_BEFORE_BACKGROUND
-        starts = self._search.starts(_some(seen, enough), n_modes)
-        sides = () if background is None else (-_BESIDE_RAD, _BESIDE_RAD)
-        fits = self._fit(models, evidence, enough, starts, sides, behind)
-        best = _best_of_frame(fits)
-        poor = fits.frame[best[self._is_doubtful(fits, best, bare)]]
-        if not poor.size:
-            return fits
-        starts = self._search.starts(_some(seen, poor), _MODES_AGAIN)
-        again = [self._fit(models, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True)]
-        if models.scout is not None:
-            best = _best_of_frame(again[0])
-            poor = again[0].frame[best[self._is_doubtful(again[0], best, bare)]]
-            if poor.size:  # too little may be smooth for the scout to see the way
-                starts = self._search.starts(_some(seen, poor), n_modes)
-                direct = _Models(models.final, None)
-                again.append(self._fit(direct, evidence, poor, starts, (-_BESIDE_RAD, _BESIDE_RAD), behind))
-        return Fits.joined([fits, *again])
+        all_classes = evidence.on == "phasors"
 
-    def _is_doubtful(self, fits: Fits, which: NDArray[np.int64], bare: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether fits that are better than a bare scene are worse than good ones are."""
-        doubtful = fits.cost[which] > stats.chi2.isf(_DOUBTFUL, np.maximum(fits.dof[which], 1))
-        return np.asarray(doubtful & (fits.cost[which] < bare[fits.frame[which]]))
+        def doubtful(fits: Fits) -> NDArray[np.int64]:
+            """Return the frames whose best fit is worse than good ones are; on ranges, if it beats a bare scene."""
+            best = _best_of_frame(fits)
+            limit = stats.chi2.isf(_DOUBTFUL if side_peaks else _HOPELESS, np.maximum(fits.dof[best], 1))
+            cost, frame = fits.cost[best], fits.frame[best]
+            hope = cost < bare[frame] if evidence.on == "ranges" else True
+            return np.asarray(frame[(cost > limit) & hope])
+
+        starts = self._search.starts(_some(seen, enough), n_modes, all_classes=all_classes)
+        sides = () if background is None else (-_BESIDE_RAD, _BESIDE_RAD)
+        fits = [self._fit(models, evidence, enough, starts, sides, behind)]
+        poor = doubtful(fits[0])
+        if poor.size:
+            starts = self._search.starts(_some(seen, poor), _MODES_AGAIN, all_classes=all_classes)
+            fits.append(self._fit(models, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True))
+            poor = doubtful(fits[-1])
+        if poor.size and models.scout is not None:  # too little may be smooth for the scout to see the way
+            starts = self._search.starts(_some(seen, poor), n_modes, all_classes=all_classes)
+            direct = _Models(models.final, None)
+            fits.append(self._fit(direct, evidence, poor, starts, (-_BESIDE_RAD, _BESIDE_RAD), behind))
+        return Fits.joined(fits)
 
     def _worth_a_search(self, evidence: Evidence, bare: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return which frames have enough returns to place a landmark, and are not explained without one."""
@@ -207,9 +211,7 @@ class MaximumLikelihood:
         The best start is tried with δ moved to some sides too.
         A scout, where there is one, does this first; of what it finds only the best is refined again.
         """
-        settings = Settings(
-            self.free, self._used, self._huber, None if behind is None else behind.phasor.reshape(-1)
-        )
+        settings = Settings(self.free, self._used, self._huber, None if behind is None else behind.phasor.reshape(-1))
         frame, class_index, view = enough[starts.frame], starts.class_index, starts.view
         if sides:
             first = np.flatnonzero(np.diff(starts.frame, prepend=-1))
@@ -257,13 +259,9 @@ class MaximumLikelihood:
         """Refine the best start of every frame, the others while they can still win, and at last what is likely."""
         n = len(evidence.weight)
         first = np.isin(np.arange(len(frame)), np.unique(frame, return_index=True)[1])
-        fits = refine(
-            model, evidence, frame[first], class_index[first], view[first], settings, roughly=True
-        )
+        fits = refine(model, evidence, frame[first], class_index[first], view[first], settings, roughly=True)
         limit = _least_of_frame(fits, n)[frame[~first]] + margin
-        more = refine(
-            model, evidence, frame[~first], class_index[~first], view[~first], settings, limit, roughly=True
-        )
+        more = refine(model, evidence, frame[~first], class_index[~first], view[~first], settings, limit, roughly=True)
         fits = Fits.joined([fits, more])
         likely = fits.cost < _least_of_frame(fits, n)[fits.frame] + margin
         better = fits[likely]
@@ -289,7 +287,7 @@ class MaximumLikelihood:
         if returned.sum() < MIN_RETURNS:
             return np.array([np.inf])
         wall_m = float(np.average(forward[returned], weights=seen.weight[0, returned]))
-        if wall_m <= 0:
+        if wall_m < NEAREST_WALL_M:
             return np.array([np.inf])
         return bare_cost(seen, _behind(self.bank, Background(wall_m=wall_m)))
 
@@ -303,7 +301,7 @@ class MaximumLikelihood:
         p_values = p_values_of(fits.cost, fits.dof, frames, fits.frame)
         order = np.lexsort((fits.cost, fits.frame))
         first = np.searchsorted(fits.frame[order], np.arange(len(frames) + 1))
-        doubt = stats.chi2.isf(self.false_alarm, np.maximum(fits.dof, 1))
+        doubt = np.asarray(stats.chi2.isf(self.false_alarm, np.maximum(fits.dof, 1)))
         answers = []
         for k in range(len(frames)):
             own = order[first[k] : first[k + 1]]

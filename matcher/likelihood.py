@@ -87,7 +87,7 @@ class Evidence:
         )
         strong = measured & ~(one_frame_m2 > one_frame_limit_m(sensor) ** 2)
         seen = Observation(whole.range_m, whole.weight, strong, whole.not_returned | (measured & ~strong))
-        turn = np.where(measured, np.exp(1j * seen.range_m / sensor.metres_per_radian), 0.0)
+        turn = np.asarray(np.where(measured, np.exp(1j * seen.range_m / sensor.metres_per_radian), 0.0), np.complex128)
         if on == "ranges":
             return cls(turn, whole.weight, seen, on, sensor)
         if frames.amplitude_e is None or frames.intensity_e is None:
@@ -102,9 +102,7 @@ class Evidence:
 
     def __getitem__(self, index: NDArray[np.integer] | slice) -> Evidence:
         seen = self.seen
-        part = Observation(
-            seen.range_m[index], seen.weight[index], seen.returned[index], seen.not_returned[index]
-        )
+        part = Observation(seen.range_m[index], seen.weight[index], seen.returned[index], seen.not_returned[index])
         return Evidence(self.value[index], self.weight[index], part, self.on, self.sensor)
 
     @property

@@ -56,9 +56,7 @@ class ModelImages:
 class ImageModel(Protocol):
     """What the refinement asks of a model."""
 
-    def images(
-        self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
-    ) -> ModelImages:
+    def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Return the images of views (m, 4), columns :data:`VIEW`, of a class each."""
 
     def reach(
@@ -69,6 +67,15 @@ class ImageModel(Protocol):
         std: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the least and the greatest coverage nearby, (m, pixels) each: within three `std` (m, p) at least."""
+
+    def wide_slopes(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        step: NDArray[np.float64],
+    ) -> NDArray[np.complex128] | None:
+        """Return slopes from differences over `step` (m, p) to either side; None if they differ little from others."""
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels of its images may be relied on, (m, pixels)."""
@@ -126,9 +133,7 @@ class BankModel:
         m, pixels = len(view), self._sensor.rows * self._sensor.cols
         phasor, slope = np.zeros((m, pixels), np.complex128), np.zeros((m, 2, pixels), np.complex128)
         shade = np.zeros((m, 2, pixels))
-        _interpolate(
-            class_index, view, *self._grid(), self._upper, self._lower, *self._behind, phasor, slope, shade
-        )
+        _interpolate(class_index, view, *self._grid(), self._upper, self._lower, *self._behind, phasor, slope, shade)
         order = [VIEW.index(name) for name in free]
         picked = slope if order == [0, 1] else slope[:, order]
         return ModelImages(phasor, picked, shade[:, 0], shade[:, 1])
@@ -145,6 +150,15 @@ class BankModel:
         low, high = np.empty((m, pixels)), np.empty((m, pixels))
         _extremes(class_index, view, *self._grid(), self._upper, self._lower, low, high)
         return low, high
+
+    def wide_slopes(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        step: NDArray[np.float64],
+    ) -> None:
+        """Return None: what is interpolated is smooth."""
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels are smooth enough."""
@@ -238,7 +252,6 @@ class RenderedModel:
         m, pixels, p = len(view), self.sensor.rows * self.sensor.cols, len(free)
         phasor, slope = np.empty((m, pixels), np.complex128), np.zeros((m, p, pixels), np.complex128)
         intensity, coverage = np.empty((m, pixels)), np.empty((m, pixels))
-        half = self.sensor.rows // 2 * self.sensor.cols
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
             image = self._render(c, view[of])
@@ -250,13 +263,44 @@ class RenderedModel:
                 moved = view[of]
                 moved[:, axis] += STEP
                 width = (moved - view[of])[:, axis]
-                # a body of revolution looks the same from every side
-                only_lower = self._factored and name == "delta_rad" and not view[of, 3].any()
-                first = half if only_lower else 0
-                rows = (self.sensor.rows // 2, self.sensor.rows) if only_lower else None
+                rows, first = self._changing_rows(name, view[of])
                 there = self._render(c, moved, rows).phasor.reshape(len(of), -1)
                 slope[of, k, first:] = (there - phasor[of, first:]) / width[:, None]
         return ModelImages(phasor, slope, intensity, coverage)
+
+    def wide_slopes(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        step: NDArray[np.float64],
+    ) -> NDArray[np.complex128]:
+        """Render both ends."""
+        slope = np.zeros((len(view), len(free), self.sensor.rows * self.sensor.cols), np.complex128)
+        for c in np.unique(class_index):
+            of = np.flatnonzero(class_index == c)
+            for k, name in enumerate(free):
+                rows, first = self._changing_rows(name, view[of])
+                axis = VIEW.index(name)
+                ends = []
+                for side in (1.0, -1.0):
+                    moved = view[of]
+                    moved[:, axis] += side * np.maximum(step[of, k], STEP)
+                    moved[:, 0] = np.clip(moved[:, 0], *self._limits)
+                    ends.append((moved[:, axis], self._render(c, moved, rows).phasor.reshape(len(of), -1)))
+                width = np.maximum(ends[0][0] - ends[1][0], STEP)
+                slope[of, k, first:] = (ends[0][1] - ends[1][1]) / width[:, None]
+        return slope
+
+    def _changing_rows(self, name: str, view: NDArray[np.float64]) -> tuple[tuple[int, int] | None, int]:
+        """Return the rows that a parameter changes, None for all, and their first pixel.
+
+        A body of revolution looks the same from every side.
+        """
+        half = self.sensor.rows // 2
+        if self._factored and name == "delta_rad" and not view[:, 3].any():
+            return (half, self.sensor.rows), half * self.sensor.cols
+        return None, 0
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return that every pixel may be relied on."""
@@ -283,9 +327,7 @@ class RenderedModel:
                     low[of], high[of] = np.minimum(low[of], coverage), np.maximum(high[of], coverage)
         return low, high
 
-    def _render(
-        self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None
-    ) -> PhasorImages:
+    def _render(self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None) -> PhasorImages:
         renderer = self._renderers[class_index]
         return renderer.render_views(
             Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows, workers=self.workers
@@ -413,9 +455,7 @@ def _interpolate(  # type: ignore[no-untyped-def]
                 block = lower[cl, i0 + a, (j0 + b) % n_a]
                 _gather(block, wd[a] * wa[b], dwd[a] * wa[b] / step_d, wd[a] * dwa[b] / step_a, cubic, extreme)
                 if dld[a] != 0.0 and dla[b] != 0.0:
-                    _gather_linear(
-                        block, ld[a] * la[b], dld[a] * la[b] / step_d, ld[a] * dla[b] / step_a, straight
-                    )
+                    _gather_linear(block, ld[a] * la[b], dld[a] * la[b] / step_d, ld[a] * dla[b] / step_a, straight)
         _conclude(m, 0, cubic_up, straight_up, extreme_up, behind, behind_intensity, phasor, slope, shade)
         _conclude(m, n_up, cubic, straight, extreme, behind, behind_intensity, phasor, slope, shade)
 

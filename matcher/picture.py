@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.matcher.filters import FilteredFrames
+from phasemark.matcher.likelihood import counts
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import background_image
-from phasemark.render import Background, phasor_to_range_m, predicted_range_std, wrap_difference_m
+from phasemark.render import Background, Renderer, phasor_to_range_m, predicted_range_std, wrap_difference_m
 from phasemark.render.plot import draw_difference, draw_range
 
 
@@ -23,11 +24,22 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
     ----------
     bank : Bank
     match : Match
-        Its view is rounded to the bank's grid.
+        Where it has no covariance, its view is one of the bank's grid.
     background : Background, optional
         What the model is composed with, as in the matcher.
     """
     name = match.class_name or match.alternatives[0].class_name
+    if match.covariance is not None:
+        mesh = bank.mesh(name)
+        rendered = Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"])).render(
+            match.distance_m,
+            match.delta_rad,
+            match.bearing_rad,
+            match.height_m,
+            background=match.background or background,
+        )
+        counted = counts(rendered.phasor[0], rendered.intensity[0], bank.sensor)
+        return np.where(counted, rendered.range_m[0], np.nan)
     i = int(np.abs(bank.distance_m - match.distance_m).argmin())
     period = 2 * math.pi / match.symmetry
     turned = np.abs(bank.delta_rad - match.delta_rad)

@@ -268,26 +268,32 @@ class _Problem:
 
     def conclude(self, state: _State, *, look_around: bool = True) -> Fits:
         """Take stock of the solutions."""
-        sums, settings, evidence = state.sums, self.settings, self.evidence
+        settings, evidence = self.settings, self.evidence
         p = len(settings.free)
-        covariance = _inverse(sums.information * np.outer(self.scale, self.scale), self.scale)
-        if settings.huber is not None:
-            covariance = covariance @ sums.scatter @ covariance
-        covariance = covariance[:, :p, :p]
+        covariance = self._covariance(state.sums)
+        # where it does not matter any more, what is nearby is not looked at
+        near = np.flatnonzero((state.sums.cost <= self.limit) & look_around)
+        if near.size:
+            there = self.some(near)
+            slope = there.slopes_around(state, near, self._std(covariance[near]))
+            if slope is not None:
+                sums = gauss_newton_sums(
+                    state.images.phasor[near], slope, evidence, self.frame[near],
+                    state.use[near] & settings.pixels, settings.huber,
+                )  # fmt: skip
+                covariance[near] = self._covariance(sums)
         information = _inverse(covariance / np.outer(self.scale[:p], self.scale[:p]), 1 / self.scale[:p])
         all_pixels = np.ones_like(settings.pixels)
-        cost = sums.cost
+        cost = state.sums.cost
         if not settings.pixels.all():
             cost = gauss_newton_sums(
                 state.images.phasor, state.images.slope, evidence, self.frame, state.use & all_pixels, settings.huber
             ).cost
         fitted = state.use & (evidence.weight[self.frame] > 0)
-        std = np.sqrt(np.where(np.isfinite(covariance), covariance, 0.0)[:, range(p), range(p)])
-        std = np.minimum(std, self.scale[:p])
         low, high = state.images.coverage.copy(), state.images.coverage.copy()
-        near = np.flatnonzero((cost <= self.limit) & look_around)  # where it does not matter any more, what is nearby is not looked at
-        if near.size:
-            around = self.model.reach(self.class_index[near], state.theta[near, :4], settings.free, std[near])
+        if near.size and settings.background is None:
+            std = self._std(covariance[near])
+            around = self.model.reach(self.class_index[near], state.theta[near, :4], settings.free, std)
             low[near], high[near] = np.minimum(low[near], around[0]), np.maximum(high[near], around[1])
         returned = evidence.seen.returned[self.frame]
         absent = evidence.seen.not_returned[self.frame]
@@ -300,16 +306,48 @@ class _Problem:
         # a kink nearby excuses a pixel where it keeps it from being compared
         wrong = (lost | missed) & ~fitted & self.model.trusted(self.class_index, state.theta[:, :4])
         n_wrong = wrong.sum(axis=1)
+        # a return that is neither compared nor wrong costs what a pixel costs on average: a model that counts fewer
+        # pixels is not better for it
+        n_open = (returned & ~fitted & ~wrong).sum(axis=1)
+        n_residuals = fitted.sum(axis=1) * evidence.per_pixel + n_wrong + n_open
         return Fits(
             frame=self.frame,
             class_index=self.class_index,
             view=state.theta[:, :4],
             albedo=state.theta[:, 4],
-            cost=cost + DISAGREEMENT * n_wrong,
-            dof=np.maximum(fitted.sum(axis=1) * evidence.per_pixel + n_wrong - len(self.columns), 0),
+            cost=cost + DISAGREEMENT * n_wrong + n_open,
+            dof=np.maximum(n_residuals - len(self.columns), 0),
             covariance=covariance,
             information=information,
         )
+
+    def _covariance(self, sums: Sums) -> NDArray[np.float64]:
+        """Return the covariance of the view, (m, p, p): inverse information, or the sandwich."""
+        p = len(self.settings.free)
+        covariance = _inverse(sums.information * np.outer(self.scale, self.scale), self.scale)
+        if self.settings.huber is not None:
+            covariance = covariance @ sums.scatter @ covariance
+        return np.ascontiguousarray(covariance[:, :p, :p])
+
+    def _std(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return standard deviations, (m, p), one natural unit where they are larger or unknown."""
+        p = covariance.shape[1]
+        variance = np.einsum("mpp->mp", covariance)
+        std = np.sqrt(np.where(np.isfinite(variance), variance, np.inf))
+        return np.asarray(np.minimum(std, self.scale[:p]))
+
+    def slopes_around(
+        self, state: _State, which: NDArray[np.integer], std: NDArray[np.float64]
+    ) -> NDArray[np.complex128] | None:
+        """Return slopes over half a standard deviation to either side, (m, p, pixels): what a kink nearby averages to.
+
+        None where the model is smooth.
+        """
+        view = np.ascontiguousarray(state.theta[which, :4])
+        slope = self.model.wide_slopes(self.class_index, view, self.settings.free, 0.5 * std)
+        if slope is None or not self.with_albedo:
+            return slope
+        return np.concatenate([slope * state.theta[which, 4:, None], state.images.slope[which, -1:]], axis=1)
 
     def _scaled(self, images: ModelImages, theta: NDArray[np.float64]) -> ModelImages:
         """Make the landmark as bright as the parameters have it, and append the slope by that."""
@@ -331,7 +369,8 @@ class _Problem:
         weight = weight * (images.coverage > MUST_RETURN_COVERAGE)
         power = np.sum(weight * np.abs(own) ** 2, axis=1)
         along = np.sum(weight * (own.conj() * (value - (images.phasor - own))).real, axis=1)
-        return np.clip(np.divide(along, power, out=np.ones_like(power), where=power > 0), 0.01, 100.0)
+        factor = np.divide(along, power, out=np.ones_like(power), where=power > 0)
+        return np.asarray(np.clip(factor, 0.01, 100.0))
 
     def _clipped(self, view: NDArray[np.float64]) -> NDArray[np.float64]:
         view[:, 0] = np.clip(view[:, 0], *self.model.limits())
@@ -362,7 +401,7 @@ def _inverse(matrix: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray
     `matrix` is in natural units; the result is scaled back. NaN where a matrix is singular.
     """
     out = np.full(matrix.shape, np.nan)
-    finite = np.isfinite(matrix).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], matrix, 0.0))
     good = finite & (values[:, 0] > 1e-12 * values[:, -1]) & (values[:, 0] > 0)
     v, w = vectors[good], values[good]

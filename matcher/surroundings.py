@@ -18,6 +18,8 @@ from phasemark.render import Background, Sensor
 
 CLEARLY_BEHIND_M = 0.4
 """Farther than the nearest surface by more than a landmark is deep."""
+NEAREST_WALL_M = 0.05
+"""Nothing nearer is taken for a wall."""
 _FEWEST = 6
 _USUAL_ALBEDO = 0.5
 
@@ -119,7 +121,7 @@ def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which pixels have all their neighbours in a mask."""
     padded = np.pad(mask, 1, constant_values=True)
     rows, cols = mask.shape
-    return np.logical_and.reduce([padded[i : i + rows, j : j + cols] for i in range(3) for j in range(3)])
+    return np.asarray(np.logical_and.reduce([padded[i : i + rows, j : j + cols] for i in range(3) for j in range(3)]))
 
 
 def _level_rays(sensor: Sensor) -> NDArray[np.float64]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
-from phasemark.matcher.bounds import Estimate, cramer_rao, covers, efficiency, mean_of, nees, share
+from phasemark.matcher.bounds import Estimate, covers, cramer_rao, efficiency, mean_of, nees, share
 from phasemark.matcher.filters import FilteredFrames, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood import Quantity
 from phasemark.matcher.match import Matches
@@ -19,7 +19,7 @@ from phasemark.render import Background, Renderer, Sensor, Views, capture
 
 _VIEWS_AT_ONCE = 250
 OUTLIER_SIGMA = 5.0
-"""An error as improbable as one so many standard deviations away is an outlier, and counted apart."""
+"""An error of so many standard deviations in any parameter is an outlier, and counted apart."""
 
 MatchFrames = Callable[[FilteredFrames], Matches]
 
@@ -103,30 +103,26 @@ class Trials:
     @property
     def scaled(self) -> NDArray[np.float64]:
         """Errors in units of the bound, (n, p)."""
-        return self.error / np.sqrt(np.einsum("npp->np", self.bound))
+        return np.asarray(self.error / np.sqrt(np.einsum("npp->np", self.bound)))
 
     @property
     def usable(self) -> NDArray[np.bool_]:
         """Which trials found a view, and have a bound; (n,)."""
-        return np.isfinite(self.scaled).all(axis=1)
+        return np.asarray(np.isfinite(self.scaled).all(axis=1))
 
     @property
     def outlier(self) -> NDArray[np.bool_]:
         """Errors beyond 5 σ of the bound or of the matcher's own covariance, or no view at all, (n,)."""
-        p = len(self.free)
-        limit = stats.chi2.isf(2 * stats.norm.sf(OUTLIER_SIGMA), p)
-        usable = self.usable
-        known = usable & np.isfinite(self.covariance).all(axis=(1, 2))
-        far = ~usable
-        far[usable] |= nees(self.error[usable], self.bound[usable]) > limit
-        far[known] |= nees(self.error[known], self.covariance[known]) > limit
-        return far
+        with np.errstate(invalid="ignore"):
+            far = np.abs(self.scaled) > OUTLIER_SIGMA
+            own = np.abs(self.error) > OUTLIER_SIGMA * np.sqrt(np.einsum("npp->np", self.covariance))
+        return np.asarray((far | own).any(axis=1) | ~self.usable)
 
     @classmethod
     def joined(cls, parts: Sequence[Trials]) -> Trials:
         """Put runs behind one another."""
         first = parts[0]
-        arrays = {
+        arrays: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in parts])
             for name in ("error", "bound", "covariance", "found", "accepted", "p_value")
         }
