@@ -150,7 +150,7 @@ class MaximumLikelihood:
                 seen = without_background(seen, around)
             fits = self._searched(models, evidence, seen, bare, background, behind)
             if background is not None and self._is_doubtful(fits):
-                # of what was taken for background, or lay beside it, some may be landmark: search with both in the images
+                # what was taken for background, or lies beside it, may be landmark: search with both in the images
                 assert behind is not None
                 search = Search(self.bank, behind, self._stride, "bearing_rad" in self.free)
                 again = self._searched(models, evidence, evidence.seen, bare, background, behind, search)
