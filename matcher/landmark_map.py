@@ -28,8 +28,8 @@ class MappedLandmark(PlanModel):
     ----------
     name : str
         Of this one landmark.
-    class : str
-        Its class, as the matcher's bank calls it; ``class_name`` in Python.
+    class_name : str
+        Its class, as the matcher's bank calls it; ``class`` in a file.
     x_m, y_m : float
         Where its axis stands.
     yaw_deg : float

@@ -1,12 +1,16 @@
 """The map of landmarks: what it refuses, its walls, and the poses that a match allows on it."""
 
+import json
 import math
 
 import numpy as np
 import pytest
 
 from phasemark import InputFileError, UsageError
+from phasemark.cli import _plain_pose, _pose_text, main
+from phasemark.data import BankPlan, build_bank
 from phasemark.matcher import LandmarkMap, Match, load_map, robot_poses
+from phasemark.render import Renderer, capture
 
 DOOR = {"name": "door", "class": "cone", "x_m": 2.0, "y_m": 1.0, "yaw_deg": 30.0}
 ROOM = [(0, 0), (4, 0), (4, 3), (1, 3), (1, 2), (0, 2)]  # an L
@@ -111,3 +115,61 @@ def test_the_survey_s_uncertainty_is_in_the_pose():
     np.testing.assert_array_equal(loose.pose.covariance, expected[0].covariance)
     # the landmark's own x, y and heading add to the heading's variance that heading alone
     assert loose.pose.covariance[2, 2] - exact.pose.covariance[2, 2] == pytest.approx(math.radians(1) ** 2)
+
+
+@pytest.fixture(scope="module")
+def bank_and_frames(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("match")
+    plan = BankPlan(classes=("cone",), distance_m="0.9:1.1:0.05", delta_deg="0:180:15")
+    with build_bank(plan, folder / "bank.h5") as bank:
+        image = Renderer(bank.mesh("cone"), bank.sensor, albedo=0.8).render(1.0, math.radians(30))
+        frames = capture(image, bank.sensor, rng=np.random.default_rng(1), n_frames=20)
+    np.savetxt(folder / "frames.csv", frames.range_m.reshape(20, -1), delimiter=",")
+    return str(folder / "bank.h5"), str(folder / "frames.csv")
+
+
+def run_match(bank_and_frames, *options):
+    return main(["match", *bank_and_frames, "--unit", "m", "--quantity", "range", *options])
+
+
+def test_the_command_places_the_robot_on_a_map_by_a_prior(tmp_path, capsys, bank_and_frames):
+    path = map_file(tmp_path, landmark_text(yaw_deg=0.0) + landmark_text(name="far", x_m=9.0))
+    near = (2.0 - math.cos(math.radians(30)), 1.0 - 0.5, 30.0)  # lens of the view at 1 m, 30°
+    prior = ["--prior", *(f"{value:.3f}" for value in near), "--prior-std", "0.2", "5"]
+    assert run_match(bank_and_frames, "--map", str(path), *prior, "--json") == 0
+    (match,) = json.loads(capsys.readouterr().out)["matches"]
+    assert len(match["poses"]) == 4
+    best = match["poses"][0]
+    assert best["landmark"] == "door"
+    # half a step of the bank in D, and half of 15° at 1 m
+    assert math.hypot(best["x_m"] - near[0], best["y_m"] - near[1]) < 0.025 + math.radians(7.5)
+    assert best["mahalanobis"] < 3 < match["poses"][1]["mahalanobis"]
+    assert run_match(bank_and_frames, "--map", str(path)) == 0
+    assert "door: (" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        (["--map", "absent.toml"], 3, "absent.toml: cannot be read"),
+        (["--map", "a.toml", "--landmark-xy", "1", "2"], 2, "give one of them"),
+        (["--prior", "0", "0", "0"], 2, "--prior needs --landmark-xy or --map"),
+        (["--landmark-xy", "1", "2", "--prior-std", "1", "1"], 2, "--prior-std needs --prior"),
+        (
+            ["--landmark-xy", "1", "2", "--prior", "0", "0", "0", "--prior-std", "0", "1"],
+            2,
+            "--prior-std must be two positive numbers, got 0 1",
+        ),
+    ],
+)
+def test_options_that_make_no_sense_are_one_line(capsys, bank_and_frames, options, code, message):
+    assert run_match(bank_and_frames, *options) == code
+    assert message in capsys.readouterr().err
+
+
+def test_a_pose_with_covariance_is_printed_with_its_standard_deviations():
+    match = Match("cone", True, 1.2, 0.4, covariance=np.diag([1e-6, 1e-4]), symmetry=1)
+    (placement,) = LandmarkMap(landmark=[DOOR]).poses(match)
+    pose = _plain_pose(placement.pose)
+    assert pose["std"]["heading_deg"] == pytest.approx(math.degrees(0.01))
+    assert f"heading {pose['heading_deg']:.2f} ± 0.57°" in _pose_text(pose)
