@@ -19,6 +19,7 @@ from phasemark.matcher.filters import (
     kalman_step,
     phasor_mean,
 )
+from phasemark.matcher.landmark_map import LandmarkMap, MappedLandmark, Placement, load_map
 from phasemark.matcher.match import Candidate, Match, Matches
 from phasemark.matcher.matcher import Matcher, background_image
 from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
@@ -32,11 +33,14 @@ __all__ = [
     "Conditions",
     "Estimate",
     "FilteredFrames",
+    "LandmarkMap",
+    "MappedLandmark",
     "Match",
     "Matcher",
     "Matches",
     "PixelKalman",
     "PixelState",
+    "Placement",
     "RobotPose",
     "Surroundings",
     "TrialSummary",
@@ -51,6 +55,7 @@ __all__ = [
     "kalman",
     "kalman_filter",
     "kalman_step",
+    "load_map",
     "nees",
     "phasor_mean",
     "robot_poses",
