@@ -1019,6 +1019,10 @@ def _one_landmark(xy: tuple[float, float], yaw_deg: float) -> LandmarkMap:
     """Return the map of a landmark of any class."""
     from phasemark.matcher import LandmarkMap, MappedLandmark
 
+    if not all(map(math.isfinite, (*xy, yaw_deg))):
+        raise UsageError(
+            f"--landmark-xy and --landmark-yaw must be finite numbers, got {xy[0]:g} {xy[1]:g} and {yaw_deg:g}"
+        )
     only = MappedLandmark(name="landmark", class_name="any", x_m=xy[0], y_m=xy[1], yaw_deg=yaw_deg)
     return LandmarkMap(landmark=(only,))
 
