@@ -36,6 +36,8 @@ _DOUBTFUL, _HOPELESS = 0.05, 1e-3
 _BESIDE_RAD = math.radians(1.0)
 """Side peaks of the likelihood before a background are about so far away (PHYSICS section 7)."""
 _BESIDE_AGAIN_RAD = tuple(math.radians(side) for side in (-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0))
+_CLOSE_BY_RAD = tuple(math.radians(side) for side in (-0.7, -0.28, -0.12, 0.12, 0.28, 0.7))
+"""And others, of narrower edges, so far."""
 _FINE, _COARSE = (0.011, math.radians(1.1)), (0.022, math.radians(2.2))
 """Widest grids, metres and radians, on which interpolation is at the bound, and on which it shows the way."""
 _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
@@ -257,7 +259,8 @@ class MaximumLikelihood:
         again = fits[np.array(chosen, np.int64)]
         if patient:
             again = _spread(again)
-        close = replace(settings, longest_step=_SHORT_STEP)
+        side_peaks = evidence.on == "phasors" or behind is not None
+        close = replace(settings, longest_step=_SHORT_STEP, look_beside_rad=_CLOSE_BY_RAD if side_peaks else ())
         final = refine(models.final, evidence, again.frame, again.class_index, again.view, close)
         rest = np.setdiff1d(order, likely)
         others = fits[rest]

@@ -27,6 +27,10 @@ _SETTLED = 1e-4
 _ROUGH = 0.1
 _CLOSE = 30.0
 """Where a step promises less than this, slopes have settled: five σ, over which they hardly change."""
+_PROMISING = 20.0
+"""What a view beside a solution may cost more, and still lead to a better one."""
+_KINK = 0.05
+"""Slopes at one point may be those of a kink narrower than this, in natural units, which says nothing of the rest."""
 _OPTIMISM = 3.0
 """A fit gives up where even so many times the promised decrease would not save it."""
 
@@ -45,6 +49,8 @@ class Settings:
         Residual, in σ, from which the loss grows linearly.
     background : PhasorImages' phasor (pixels,) complex128, optional
         What stands behind, without the landmark; on phasors the albedo does not scale it.
+    look_beside_rad : tuple of float
+        How far to either side of a solution δ is tried once more; there may be a lower minimum behind a kink.
     longest_step : float
         No step is longer, in natural units of 1 cm and 1°. Near a solution it should be short: where an edge crosses
         a pixel's border, slopes jump, and those of one side may lead far away on the other.
@@ -54,6 +60,7 @@ class Settings:
     pixels: NDArray[np.bool_]
     huber: float | None = None
     background: NDArray[np.complex128] | None = None
+    look_beside_rad: tuple[float, ...] = ()
     longest_step: float = 3.0
 
 
@@ -137,6 +144,8 @@ def refine(
     state = problem.descend(state, _ROUGH if roughly else _SETTLED)
     if roughly:
         return problem.conclude(state, look_around=False)
+    if settings.look_beside_rad:
+        state = problem.look_beside(state)
     use = problem.pixels_at(state.images, state.theta)
     changed = np.flatnonzero((use != state.use).any(axis=1))
     if changed.size:
@@ -266,6 +275,35 @@ class _Problem:
             active = active[stays & (damping[active] < 1e5)]
         return state
 
+    def look_beside(self, state: _State) -> _State:
+        """Try δ a little to either side, the other parameters following, and descend from where that is promising."""
+        sides = np.array(self.settings.look_beside_rad)
+        near = np.flatnonzero(state.sums.cost <= self.limit)
+        source = np.repeat(near, len(sides))
+        if not source.size:
+            return state
+        theta = state.theta[source]
+        theta[:, VIEW.index("delta_rad")] += np.tile(sides, len(near))
+        there = self.some(source).state(theta, state.use[source], state.images.slope[source])
+        others = np.flatnonzero(self.columns != VIEW.index("delta_rad"))
+        unit = self.scale[others]
+        information = there.sums.information[:, others[:, None], others] * np.outer(unit, unit)
+        gradient = there.sums.gradient[:, others] * unit
+        step = np.einsum("mpq,mq->mp", np.linalg.pinv(information, hermitian=True), gradient)
+        cost = (there.sums.cost - np.einsum("mp,mp->m", gradient, step)).reshape(len(near), -1)
+        best = cost.argmin(axis=1)
+        chosen = np.flatnonzero(cost.min(axis=1) < state.sums.cost[near] + _PROMISING)
+        if not chosen.size:
+            return state
+        which, at = near[chosen], chosen * len(sides) + best[chosen]
+        theta = theta[at]
+        theta[:, self.columns[others]] += step[at] * unit
+        theta[:, :4] = self._clipped(theta[:, :4])
+        some = self.some(which)
+        found = some.descend(some.state(theta, state.use[which]), _SETTLED)
+        better = np.flatnonzero(found.sums.cost < state.sums.cost[which])
+        return state.updated(which[better], _picked(found, better))
+
     def conclude(self, state: _State, *, look_around: bool = True) -> Fits:
         """Take stock of the solutions."""
         settings, evidence = self.settings, self.evidence
@@ -344,7 +382,8 @@ class _Problem:
         None where the model is smooth.
         """
         view = np.ascontiguousarray(state.theta[which, :4])
-        slope = self.model.wide_slopes(self.class_index, view, self.settings.free, 0.5 * std)
+        step = np.maximum(0.5 * std, _KINK * self.scale[: std.shape[1]])
+        slope = self.model.wide_slopes(self.class_index, view, self.settings.free, step)
         if slope is None or not self.with_albedo:
             return slope
         return np.concatenate([slope * state.theta[which, 4:, None], state.images.slope[which, -1:]], axis=1)

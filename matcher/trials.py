@@ -114,9 +114,15 @@ class Trials:
     def outlier(self) -> NDArray[np.bool_]:
         """Errors beyond 5 σ of the bound or of the matcher's own covariance, or no view at all, (n,)."""
         with np.errstate(invalid="ignore"):
-            far = np.abs(self.scaled) > OUTLIER_SIGMA
             own = np.abs(self.error) > OUTLIER_SIGMA * np.sqrt(np.einsum("npp->np", self.covariance))
-        return np.asarray((far | own).any(axis=1) | ~self.usable)
+        return np.asarray(self.astray | own.any(axis=1))
+
+    @property
+    def astray(self) -> NDArray[np.bool_]:
+        """Errors beyond 5 σ of the bound, or no view at all, (n,)."""
+        with np.errstate(invalid="ignore"):
+            far = np.abs(self.scaled) > OUTLIER_SIGMA
+        return np.asarray(far.any(axis=1) | ~self.usable)
 
     @classmethod
     def joined(cls, parts: Sequence[Trials]) -> Trials:
@@ -145,6 +151,7 @@ class Trials:
             nees=mean_of(nees(self.error[known], self.covariance[known]) / len(self.free)),
             coverage=share(int(covers(self.error[known], self.covariance[known]).sum()), int(known.sum())),
             outliers=share(int((~inner).sum()), len(self)),
+            astray=share(int(self.astray.sum()), len(self)),
             class_errors=share(int((self.found != self.class_name).sum()), len(self)),
             accepted=share(int(self.accepted.sum()), len(self)),
         )
@@ -189,7 +196,8 @@ class TrialSummary:
         Mean eᵀP⁻¹e over the number of parameters.
     coverage : Estimate
         Share of errors inside the 95 % ellipsoid.
-    outliers, class_errors, accepted : Estimate
+    outliers, astray, class_errors, accepted : Estimate
+        Shares; outliers are beyond 5 σ of the bound or of the match's own covariance, astray beyond those of the bound.
     """
 
     n: int
@@ -199,6 +207,7 @@ class TrialSummary:
     nees: Estimate
     coverage: Estimate
     outliers: Estimate
+    astray: Estimate
     class_errors: Estimate
     accepted: Estimate
 
@@ -212,6 +221,7 @@ class TrialSummary:
             ("NEES / p", str(self.nees)),
             ("95 % coverage", str(self.coverage)),
             ("outliers", str(self.outliers)),
+            ("beyond 5 σ of the bound", str(self.astray)),
             ("class errors", str(self.class_errors)),
             ("accepted", str(self.accepted)),
         ]
