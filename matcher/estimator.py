@@ -22,7 +22,7 @@ from phasemark.matcher.match import Candidate, Match
 from phasemark.matcher.models import VIEW, BankModel, ImageModel, RenderedModel
 from phasemark.matcher.refine import SCALE, Fits, Settings, refine
 from phasemark.matcher.surroundings import NEAREST_WALL_M, estimate_surroundings, without_background
-from phasemark.render import Background, PhasorImages, Renderer, wrap_difference_m
+from phasemark.render import Background, PhasorImages, Renderer, phasor_to_range_m, wrap_difference_m
 
 Pixels = Literal["all", "lower"]
 MIN_RETURNS = 3
@@ -50,6 +50,8 @@ _MOST_REFINED = 3
 _SHORT_STEP = 0.1
 """Longest step after a scout, in natural units: it comes within about so much."""
 _FRAMES_AT_ONCE = 256
+_TRIMMINGS, _ODD, _ODD_SIGMA = 3, 3.0, 5.0
+"""How often a robust search starts again without the returns that fit worst, and which: by the median, and in σ."""
 
 
 def check_free(free: Sequence[str]) -> tuple[str, ...]:
@@ -180,12 +182,12 @@ class MaximumLikelihood:
         n_modes = _MODES if background is None else _MODES_BEFORE_BACKGROUND
         all_classes = evidence.on == "phasors"
 
-        def doubtful(fits: Fits) -> NDArray[np.int64]:
+        def doubtful(fits: Fits, *, hopeless: bool = False) -> NDArray[np.int64]:
             """Return the frames whose best fit is worse than good ones are; on ranges, if it beats a bare scene."""
             best = _best_of_frame(fits)
             limit = stats.chi2.isf(_DOUBTFUL if side_peaks else _HOPELESS, np.maximum(fits.dof[best], 1))
             cost, frame = fits.cost[best], fits.frame[best]
-            hope = cost < bare[frame] if evidence.on == "ranges" else True
+            hope = cost < bare[frame] if evidence.on == "ranges" and not hopeless else True
             return np.asarray(frame[(cost > limit) & hope])
 
         starts = search.starts(_some(seen, enough), n_modes, all_classes=all_classes)
@@ -200,7 +202,32 @@ class MaximumLikelihood:
             starts = search.starts(_some(seen, poor), n_modes, all_classes=all_classes)
             direct = _Models(models.final, None)
             fits.append(self._fit(direct, evidence, poor, starts, (-_BESIDE_RAD, _BESIDE_RAD), behind))
+        if self._huber is not None:
+            for _ in range(_TRIMMINGS):
+                poor = doubtful(Fits.joined(fits), hopeless=True)
+                if not poor.size:
+                    break
+                assert models.final is not None
+                kept = self._trimmed(models.final, evidence, Fits.joined(fits), poor, seen)
+                starts = search.starts(kept, n_modes, all_classes=all_classes)
+                fits.append(self._fit(models, evidence, poor, starts, sides, behind))
         return Fits.joined(fits)
+
+    def _trimmed(
+        self, model: ImageModel, evidence: Evidence, fits: Fits, which: NDArray[np.int64], seen: Observation
+    ) -> Observation:
+        """Return some frames without the returns that are farthest from their best fits, and from the bulk of them."""
+        best = _best_of_frame(fits)
+        best = best[np.searchsorted(fits.frame[best], which)]
+        phasor = model.images(fits.class_index[best], np.ascontiguousarray(fits.view[best]), ()).phasor
+        few = _some(seen, which)
+        size = np.sqrt(few.weight) * np.abs(
+            wrap_difference_m(few.range_m - phasor_to_range_m(phasor, evidence.sensor), evidence.sensor)
+        )
+        compared = few.returned & np.isfinite(size)
+        middle = np.nanmedian(np.where(compared, size, np.nan), axis=1, keepdims=True)
+        odd = compared & (size > np.maximum(_ODD * middle, _ODD_SIGMA))
+        return Observation(few.range_m, np.where(odd, 0.0, few.weight), few.returned & ~odd, few.not_returned & ~odd)
 
     def _is_doubtful(self, fits: Fits) -> bool:
         """Return whether the best fit of one frame is worse than good ones are."""
@@ -348,7 +375,7 @@ class MaximumLikelihood:
         kept = self._distinct(fits, own)
         best = kept[0]
         c = int(fits.class_index[best])
-        is_landmark = bool(fits.cost[best] < bare)
+        is_landmark = bool(fits.capped[best] < bare)
         covariance = fits.covariance[best]
         known = bool(np.isfinite(covariance).all())
         none_cost = min(bare, float(doubt[best]))
@@ -453,7 +480,8 @@ def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.floa
     sure = counts(behind.phasor, behind.intensity, sensor).reshape(-1)
     residual = wrap_difference_m(np.where(lit & seen.returned, seen.range_m - np.where(lit, model, 0.0), 0.0), sensor)
     wrong = (seen.returned & ~lit) | (seen.not_returned & sure)
-    return np.asarray((seen.weight * residual**2).sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
+    squared = np.minimum(seen.weight * residual**2, DISAGREEMENT)
+    return np.asarray(squared.sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
 
 
 def p_values_of(

@@ -46,7 +46,7 @@ class Settings:
     pixels : (pixels,) bool
         Which pixels place the landmark; all of them tell its class.
     huber : float, optional
-        Residual, in σ, from which the loss grows linearly.
+        Residual, in σ, from which the loss grows linearly, and soon no more.
     background : PhasorImages' phasor (pixels,) complex128, optional
         What stands behind, without the landmark; on phasors the albedo does not scale it.
     look_beside_rad : tuple of float
@@ -77,6 +77,8 @@ class Fits:
     cost : float64
         Whitened squared residual of all pixels that count, and :data:`~phasemark.matcher.coarse.DISAGREEMENT` for each
         pixel whose return or lack of it no view nearby explains.
+    capped : float64
+        The same with no residual adding more than that: what to compare with a scene that explains nothing.
     dof : int64
         Residuals in it, less the parameters fitted.
     covariance : (m, p, p) float64
@@ -90,6 +92,7 @@ class Fits:
     view: NDArray[np.float64]
     albedo: NDArray[np.float64]
     cost: NDArray[np.float64]
+    capped: NDArray[np.float64]
     dof: NDArray[np.int64]
     covariance: NDArray[np.float64]
     information: NDArray[np.float64]
@@ -322,11 +325,11 @@ class _Problem:
                 covariance[near] = self._covariance(sums)
         information = _inverse(covariance / np.outer(self.scale[:p], self.scale[:p]), 1 / self.scale[:p])
         all_pixels = np.ones_like(settings.pixels)
-        cost = state.sums.cost
+        sums = state.sums
         if not settings.pixels.all():
-            cost = gauss_newton_sums(
+            sums = gauss_newton_sums(
                 state.images.phasor, state.images.slope, evidence, self.frame, state.use & all_pixels, settings.huber
-            ).cost
+            )
         fitted = state.use & (evidence.weight[self.frame] > 0)
         low, high = state.images.coverage.copy(), state.images.coverage.copy()
         if near.size and settings.background is None:
@@ -353,7 +356,8 @@ class _Problem:
             class_index=self.class_index,
             view=state.theta[:, :4],
             albedo=state.theta[:, 4],
-            cost=cost + DISAGREEMENT * n_wrong + n_open,
+            cost=sums.cost + DISAGREEMENT * n_wrong + n_open,
+            capped=sums.capped + DISAGREEMENT * n_wrong + n_open,
             dof=np.maximum(n_residuals - len(self.columns), 0),
             covariance=covariance,
             information=information,
