@@ -313,7 +313,7 @@ class MaximumLikelihood:
         more = refine(model, evidence, frame[~first], class_index[~first], view[~first], settings, limit, roughly=True)
         fits = Fits.joined([fits, more])
         likely = fits.cost < _least_of_frame(fits, n)[fits.frame] + margin
-        better = fits[likely]
+        better = fits[self._distinct_of_frames(fits, np.flatnonzero(likely))]
         better = refine(model, evidence, better.frame, better.class_index, better.view, settings)
         return Fits.joined([better, fits[~likely]])
 
@@ -418,6 +418,12 @@ class MaximumLikelihood:
             weak_direction=weak,
             background=background,
         )
+
+    def _distinct_of_frames(self, fits: Fits, which: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return those of some fits that came to places of their own, the best at each."""
+        which = which[np.lexsort((fits.cost[which], fits.frame[which]))]
+        borders = np.flatnonzero(np.diff(fits.frame[which])) + 1
+        return np.array([k for own in np.split(which, borders) for k in self._distinct(fits, own)], np.int64)
 
     def _distinct(self, fits: Fits, own: NDArray[np.int64]) -> list[int]:
         """Return fits, best first, without those that came to the same place."""
