@@ -187,7 +187,7 @@ class MaximumLikelihood:
             best = _best_of_frame(fits)
             limit = stats.chi2.isf(_DOUBTFUL if side_peaks else _HOPELESS, np.maximum(fits.dof[best], 1))
             cost, frame = fits.cost[best], fits.frame[best]
-            hope = cost < bare[frame] if evidence.on == "ranges" and not hopeless else True
+            hope = fits.capped[best] < bare[frame] if evidence.on == "ranges" and not hopeless else True
             return np.asarray(frame[(cost > limit) & hope])
 
         starts = search.starts(_some(seen, enough), n_modes, all_classes=all_classes)
@@ -324,8 +324,9 @@ class MaximumLikelihood:
         others = np.array([(k, c) for k in best for c in range(n_class) if c != fits.class_index[k]], np.int64)
         others = others.reshape(-1, 2)
         source = others[:, 0]
+        limit = fits.cost[source] + _LIKELY
         return refine(
-            model, evidence, fits.frame[source], others[:, 1], fits.view[source], settings, fits.cost[source] + _LIKELY
+            model, evidence, fits.frame[source], others[:, 1], fits.view[source], settings, limit, at_first_sight=True
         )
 
     def _bare_wall_cost(self, one: FilteredFrames, evidence: Evidence) -> NDArray[np.float64]:

@@ -125,6 +125,7 @@ def refine(
     give_up_above: NDArray[np.float64] | None = None,
     *,
     roughly: bool = False,
+    at_first_sight: bool = False,
 ) -> Fits:
     """Move m candidates to the nearest maximum of the likelihood.
 
@@ -141,6 +142,8 @@ def refine(
         Stop where the cost promises to stay above this.
     roughly : bool
         Whether to stop within a fraction of a standard deviation, with the pixels that counted at the start.
+    at_first_sight : bool
+        Whether to give up at the start already, where its cost is far above the limit: for starts that are good.
 
     Returns
     -------
@@ -149,7 +152,7 @@ def refine(
     """
     limit = np.full(len(frame), np.inf) if give_up_above is None else give_up_above
     problem = _Problem(model, evidence, frame, class_index, settings, limit)
-    state = problem.start(view)
+    state = problem.start(view, at_first_sight)
     state = problem.descend(state, _ROUGH if roughly else _SETTLED)
     if roughly:
         return problem.conclude(state, look_around=False)
@@ -209,19 +212,21 @@ class _Problem:
             self.model, self.evidence, self.frame[which], self.class_index[which], self.settings, self.limit[which]
         )
 
-    def start(self, view: NDArray[np.float64]) -> _State:
+    def start(self, view: NDArray[np.float64], at_first_sight: bool) -> _State:
         """Look at the first views: which pixels count, and how bright the landmark is."""
         theta = np.column_stack([self._clipped(view.copy()), np.ones(len(view))])
-        images = self._images(theta)
+        view, free = np.ascontiguousarray(theta[:, :4]), self.settings.free
+        if at_first_sight and not self.with_albedo and not self.model.slopes_are_free:
+            images = self._images_at_first_sight(theta)
+        else:
+            images = self.model.images(self.class_index, view, free)
         if self.with_albedo:
             theta[:, 4] = self._brightness(images)
         return self._summed(theta, self.pixels_at(images, theta), self._scaled(images, theta))
 
-    def _images(self, theta: NDArray[np.float64]) -> ModelImages:
+    def _images_at_first_sight(self, theta: NDArray[np.float64]) -> ModelImages:
         """Return first images; slopes are 0 where no step is likely to lead below the limit."""
         view, free = np.ascontiguousarray(theta[:, :4]), self.settings.free
-        if not np.isfinite(self.limit).any() or self.with_albedo or self.model.slopes_are_free:
-            return self.model.images(self.class_index, view, free)
         images = self.model.images(self.class_index, view, ())
         images = replace(images, slope=np.zeros((len(view), len(free), images.phasor.shape[1]), np.complex128))
         cost = self._summed(theta, self.pixels_at(images, theta), images).sums.cost
