@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from rich.progress import Progress
     from trimesh import Trimesh
 
-    from phasemark.data import Bank
+    from phasemark.data import Bank, BankPlan, FramePlan
     from phasemark.landmarks import LandmarkSpec
     from phasemark.matcher import FilteredFrames, Match, Matches
-    from phasemark.render import Background, Sensor
+    from phasemark.render import Background, Estimate, Sensor
 
 __all__ = ["app", "main"]
 
@@ -46,6 +46,7 @@ Start with
   phasemark render --class cylinder --distance 1.0 --delta 30 --wall 4 -o frame.png
   phasemark bank build -o bank.h5   a bank of model images to match your frames against
   phasemark match bank.h5 measured.csv --unit m --quantity range
+  phasemark sensor fit frames.npz --distance 1.0 -o mycam.toml    a camera of your own, from frames of a flat board
   phasemark --help                  all commands; COMMAND --help explains one
 """
 
@@ -58,9 +59,13 @@ app = typer.Typer(
 _landmark_app = typer.Typer(help="The landmarks: the catalogue and mesh files.")
 _sensor_app = typer.Typer(help="The cameras: shipped presets and sensor files.")
 _bank_app = typer.Typer(help="Banks of model images.")
+_frames_app = typer.Typer(help="Sets of noisy frames with their truth.")
+_plan_app = typer.Typer(help="Plans: what banks and frame sets are built from.")
 app.add_typer(_landmark_app, name="landmark")
 app.add_typer(_sensor_app, name="sensor")
 app.add_typer(_bank_app, name="bank")
+app.add_typer(_frames_app, name="frames")
+app.add_typer(_plan_app, name="plan")
 
 _Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 _Force = Annotated[bool, typer.Option("--force", help="Replace an output that exists.")]
@@ -72,6 +77,27 @@ _SensorOption = Annotated[
 ]
 _Wall = Annotated[float | None, typer.Option("--wall", metavar="M", help="Distance of a wall behind the landmark.")]
 _Floor = Annotated[float | None, typer.Option("--floor", metavar="M", help="How far a floor lies below the lens.")]
+_FramesUnit = Annotated[str | None, typer.Option("--unit", help="Unit of the frames: m, cm or mm.")]
+_Quantity = Annotated[
+    str | None, typer.Option("--quantity", help="range (along the ray) or z (along the optical axis).")
+]
+_ValidStatus = Annotated[
+    list[int] | None, typer.Option("--valid-status", help="Value of 'status' that marks a valid pixel; repeatable.")
+]
+_FlipH = Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")]
+_FlipV = Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")]
+_Rotate = Annotated[int, typer.Option("--rotate", help="Turn the image clockwise by 0, 90, 180 or 270 degrees.")]
+_Resume = Annotated[bool, typer.Option("--resume", help="Continue an unfinished run of the same plan.")]
+_DryRun = Annotated[bool, typer.Option("--dry-run", help="Say how large it would be and how long it would take.")]
+_Scheduler = Annotated[
+    str, typer.Option("--scheduler", metavar="WHERE", help="threads, local:N processes, or a Dask scheduler's address.")
+]
+_Shard = Annotated[str | None, typer.Option("--shard", metavar="I/N", help="Build only part I of N, to be merged.")]
+_ShardItems = Annotated[
+    int | None, typer.Option("--shard-size", min=1, help="Images or views per shard; the result does not depend on it.")
+]
+_Sample = Annotated[int, typer.Option("--sample", min=0, help="How many random items to render again.")]
+_Seed = Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")]
 _Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; the result does not depend on it.")]
 
 
@@ -139,6 +165,110 @@ def _sensor_show(
         for name in names:
             value = fields[name]
             typer.echo(f"# {name} is not set" if value is None else f"{name} = {json.dumps(value)}")
+
+
+@_sensor_app.command("characterise")
+def _sensor_characterise(
+    name_or_file: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, its pictures and numbers.")],
+    n_frames: Annotated[
+        int | None, typer.Option("--frames", min=2, help="Frames at each point; by default 51200 readings a point.")
+    ] = None,
+    seed: _Seed = 2005,
+    as_json: _Json = False,
+    force: _Force = False,
+) -> None:
+    """Measure a sensor before flat fields, as EMVA 1288 would, and compare it with what its numbers predict."""
+    from phasemark.data import summary_sentences, write_characterisation
+    from phasemark.data.characterisation import NAMES
+    from phasemark.data.seeds import stream
+    from phasemark.render import characterise
+
+    sensor = _load_sensor(name_or_file)
+    _refuse_existing([out / name for name in NAMES], force)
+    _make_folder(out)
+    found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
+    report = write_characterisation(found, name_or_file, out, seed=seed, force=force)[0]
+    if as_json:
+        facts = found.as_dict()
+        _echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
+        return
+    for sentence in (*summary_sentences(found, name_or_file), *found.notes):
+        typer.echo(sentence)
+    typer.echo(report)
+
+
+@_sensor_app.command("fit")
+def _sensor_fit(
+    frames: Annotated[
+        list[Path], typer.Argument(metavar="FRAMES...", help="Frames of a flat board: CSV, NPY, NPZ or HDF5.")
+    ],
+    distance: Annotated[
+        list[float],
+        typer.Option("--distance", metavar="M", help="Distance of the board; once for each FRAMES, in order."),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
+    albedo: Annotated[
+        list[float] | None,
+        typer.Option("--albedo", help="Albedo of the board, one for all or one for each; 0.8 is assumed."),
+    ] = None,
+    sensor: _SensorOption = "pmd-16x16",
+    amplitude_unit: Annotated[
+        str, typer.Option("--amplitude-unit", help="Unit of amplitude and intensity: electrons or arbitrary.")
+    ] = "electrons",
+    unit: _FramesUnit = None,
+    quantity: _Quantity = None,
+    valid_status: _ValidStatus = None,
+    flip_h: _FlipH = False,
+    flip_v: _FlipV = False,
+    rotate: _Rotate = 0,
+    as_json: _Json = False,
+    force: _Force = False,
+) -> None:
+    """Fit a sensor to measured frames of a flat board that fills the image, square to the camera.
+
+    Give the board's distance for each file, in order: FRAMES FRAMES --distance 1.0 --distance 2.0. Geometry and
+    whatever the frames do not tell come from --sensor; the file says of each number whether it is measured or assumed.
+    """
+    from phasemark.data import read_frames, write_atomically
+    from phasemark.render import fit_sensor
+
+    if out.suffix.lower() != ".toml":
+        raise UsageError(f"the sensor must be a .toml file, got '{out}'")
+    _refuse_existing([out], force)
+    base = _load_sensor(sensor)
+    measured = [
+        read_frames(
+            path,
+            sensor=base,
+            unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
+            quantity=quantity,  # type: ignore[arg-type]
+            valid_status=valid_status,
+            flip_h=flip_h,
+            flip_v=flip_v,
+            rotate=rotate,
+        )
+        for path in frames
+    ]
+    fit = fit_sensor(
+        [one[k : k + 1] for one in measured for k in range(len(one))],  # every position of a file has its distance
+        distance,
+        base=base,
+        albedo=albedo or None,
+        amplitude_unit=amplitude_unit,  # type: ignore[arg-type]  # fit_sensor says what is right
+    )
+    write_atomically(out, fit.to_toml(base_name=sensor).encode(), force=force)
+    if as_json:
+        _echo_json({"file": str(out), **fit.as_dict()})
+        return
+    fields = fit.sensor.model_dump(mode="json")
+    _echo_table(
+        ("field", "value", "std error", "from"),
+        ((name, _short(fields[name]), _error_of(one), one.note) for name, one in fit.estimates.items()),
+    )
+    for note in fit.notes:
+        typer.echo(note)
+    typer.echo(out)
 
 
 @_landmark_app.command("list")
@@ -317,6 +447,12 @@ def _bank_build(
     model: Annotated[str | None, typer.Option("--model", help="ray, or planar: the paper's own generator.")] = None,
     full: Annotated[bool, typer.Option("--full", help="Every class at every D and δ; a must for meshes.")] = False,
     workers: _Workers = None,
+    resume: _Resume = False,
+    dry_run: _DryRun = False,
+    shard: _Shard = None,
+    shard_size: _ShardItems = None,
+    scheduler: _Scheduler = "threads",
+    as_json: _Json = False,
     force: _Force = False,
 ) -> None:
     """Build a bank of noise-free model images."""
@@ -344,9 +480,7 @@ def _bank_build(
     if full or meshes:
         changes["layout"] = "full"
     plan = BankPlan(**{**plan.model_dump(), **changes})
-    with _Progress("rendering") as progress, build_bank(plan, out, force=force, workers=workers, progress=progress):
-        pass
-    typer.echo(out)
+    _build(build_bank, plan, out, shard, dry_run, as_json, workers, resume, force, shard_size, scheduler)
 
 
 @_bank_app.command("info")
@@ -357,7 +491,7 @@ def _bank_info(
     """Say what a bank holds."""
     from phasemark.data import open_bank
 
-    with open_bank(bank) as opened:
+    with open_bank(bank, untrusted=True) as opened:
         info = opened.info()
     if as_json:
         _echo_json(info)
@@ -365,23 +499,287 @@ def _bank_info(
         _echo_facts(info)
 
 
+@_bank_app.command("verify")
+def _bank_verify(
+    bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank, its checksum beside it.")],
+    population: Annotated[
+        int | None, typer.Option("--population", min=1, help="Match so many random views against the bank.")
+    ] = None,
+    sample: _Sample = 16,
+    seed: _Seed = 0,
+    as_json: _Json = False,
+) -> None:
+    """Check a bank: checksum, schema, values, random images rendered again; and what its grid's spacing costs."""
+    from phasemark.data import grid_loss, open_bank, verify_bank
+
+    report = verify_bank(bank, sample=sample, seed=seed)
+    if population is not None:
+        with open_bank(bank, untrusted=True) as opened:
+            loss = grid_loss(opened, population, seed=seed)
+        report |= {key: float(f"{value:.3g}") if isinstance(value, float) else value for key, value in loss.items()}
+    _echo_json(report) if as_json else _echo_facts(report)
+
+
+@_bank_app.command("merge")
+def _bank_merge(
+    shards: Annotated[list[Path], typer.Argument(metavar="SHARD...", help="All parts that --shard has built.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The bank to write.")],
+    resume: _Resume = False,
+    force: _Force = False,
+) -> None:
+    """Put the parts of a bank together."""
+    _merge(shards, out, resume, force)
+
+
+@_frames_app.command("build")
+def _frames_build(
+    plan_file: Annotated[Path, typer.Argument(metavar="PLAN", help="A plan (.toml); options override it.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The frame set to write; its checksum goes beside it.")],
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")
+    ] = None,
+    views: Annotated[int | None, typer.Option("--views", min=1, help="How many views.")] = None,
+    workers: _Workers = None,
+    resume: _Resume = False,
+    dry_run: _DryRun = False,
+    shard: _Shard = None,
+    shard_size: _ShardItems = None,
+    scheduler: _Scheduler = "threads",
+    as_json: _Json = False,
+    force: _Force = False,
+) -> None:
+    """Build a set of noisy frames with their truth."""
+    from phasemark.data import FramePlan, build_frames, read_plan
+
+    plan = read_plan(plan_file, FramePlan)
+    changes = {key: value for key, value in (("seed", seed), ("views", views)) if value is not None}
+    plan = plan.model_copy(update=changes)
+    _build(build_frames, plan, out, shard, dry_run, as_json, workers, resume, force, shard_size, scheduler)
+
+
+@_frames_app.command("info")
+def _frames_info(
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
+    as_json: _Json = False,
+) -> None:
+    """Say what a frame set holds."""
+    from phasemark.data import open_frames
+
+    with open_frames(frames, untrusted=True) as opened:
+        info = opened.info()
+    _echo_json(info) if as_json else _echo_facts(info)
+
+
+@_frames_app.command("verify")
+def _frames_verify(
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, its checksum beside it.")],
+    sample: _Sample = 16,
+    seed: _Seed = 0,
+    as_json: _Json = False,
+) -> None:
+    """Check a frame set: checksum, schema, values, and random views rendered and captured again."""
+    from phasemark.data import verify_frames
+
+    report = verify_frames(frames, sample=sample, seed=seed)
+    _echo_json(report) if as_json else _echo_facts(report)
+
+
+@_frames_app.command("merge")
+def _frames_merge(
+    shards: Annotated[list[Path], typer.Argument(metavar="SHARD...", help="All parts that --shard has built.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The frame set to write.")],
+    resume: _Resume = False,
+    force: _Force = False,
+) -> None:
+    """Put the parts of a frame set together; the bytes are those of a single run."""
+    _merge(shards, out, resume, force)
+
+
+@_frames_app.command("export")
+def _frames_export(
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="npz, csv, png16, ply, bop or rosbag.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The file (npz, csv) or folder to write.")],
+    quantity: Annotated[
+        str | None, typer.Option("--quantity", help="range or z, in npz, csv and png16; BOP and ROS have z.")
+    ] = None,
+    force: _Force = False,
+) -> None:
+    """Write a frame set for other programs."""
+    from phasemark.data import export_frames, open_frames
+
+    with open_frames(frames, untrusted=True) as opened:
+        typer.echo(export_frames(opened, out, to, quantity=quantity, force=force))  # type: ignore[arg-type]
+
+
+@_frames_app.command("import")
+def _frames_import(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV, NPY, NPZ, HDF5, PNG; a folder of PNG, a bag.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The measured frames as .npz, range along the ray, metres.")],
+    sensor: _SensorOption = "pmd-16x16",
+    unit: Annotated[str | None, typer.Option("--unit", help="m, cm or mm, if the file does not say.")] = None,
+    quantity: Annotated[str | None, typer.Option("--quantity", help="range or z, if the file does not say.")] = None,
+    invalid_means: Annotated[str, typer.Option("--invalid-means", help="missing or no-return.")] = "missing",
+    valid_status: Annotated[list[int] | None, typer.Option("--valid-status", help="Repeatable.")] = None,
+    flip_h: Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")] = False,
+    flip_v: Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")] = False,
+    rotate: Annotated[int, typer.Option("--rotate", help="Turn clockwise by 90, 180 or 270 degrees.")] = 0,
+    topic: Annotated[str | None, typer.Option("--topic", help="Which images of a ROS bag.")] = None,
+    force: _Force = False,
+) -> None:
+    """Bring measured frames into one form: range along the ray, in metres, upright."""
+    from phasemark.data import read_frames, write_measured
+
+    if out.suffix.lower() != ".npz":
+        raise UsageError(f"the output must be a .npz file, got '{out}'")
+    _refuse_existing([out], force)
+    frames = read_frames(
+        file,
+        sensor=_load_sensor(sensor),
+        unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
+        quantity=quantity,  # type: ignore[arg-type]
+        invalid_means=invalid_means,  # type: ignore[arg-type]
+        valid_status=valid_status,
+        flip_h=flip_h,
+        flip_v=flip_v,
+        rotate=rotate,
+        untrusted=True,
+        topic=topic,
+    )
+    typer.echo(write_measured(frames, out, force=force))
+
+
+@_frames_app.command("show")
+def _frames_show(
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, or measured frames.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png.")],
+    index: Annotated[int, typer.Option("--index", min=0, help="Number of the frame.")] = 0,
+    sensor: _SensorOption = "pmd-16x16",
+    unit: Annotated[str | None, typer.Option("--unit", help="m, cm or mm, of measured frames.")] = None,
+    quantity: Annotated[str | None, typer.Option("--quantity", help="range or z, of measured frames.")] = None,
+    force: _Force = False,
+) -> None:
+    """Draw one frame."""
+    import io as bytes_io
+
+    from phasemark.data import is_frame_set, open_frames, read_frames, write_atomically
+
+    if out.suffix.lower() != ".png":
+        raise UsageError(f"the picture must be a .png file, got '{out}'")
+    _refuse_existing([out], force)
+    if is_frame_set(frames):
+        with open_frames(frames, untrusted=True) as opened:
+            _refuse_index(index, len(opened))
+            figure = opened.frames([index]).plot()
+    else:
+        measured = read_frames(
+            frames,
+            sensor=_load_sensor(sensor),
+            unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
+            quantity=quantity,  # type: ignore[arg-type]
+            untrusted=True,
+        )
+        _refuse_index(index, len(measured) * measured.n_frames)
+        figure = measured.plot(*divmod(index, measured.n_frames))
+    picture = bytes_io.BytesIO()
+    figure.savefig(picture, format="png", dpi=120)
+    typer.echo(write_atomically(out, picture.getvalue(), force=force))
+
+
+def _refuse_index(index: int, n: int) -> None:
+    if index >= n:
+        raise UsageError(f"--index must be below {n}, the number of frames, got {index}")
+
+
+def _build(
+    build: Callable[..., Any],
+    plan: BankPlan | FramePlan,
+    out: Path,
+    shard: str | None,
+    dry_run: bool,
+    as_json: bool,
+    workers: int | None,
+    resume: bool,
+    force: bool,
+    shard_size: int | None,
+    scheduler: str,
+) -> None:
+    """Build a bank or frame set, whole or in part; or say what that would take."""
+    from phasemark.data import build_part, estimate, parse_part
+    from phasemark.data.executor import processors
+
+    if dry_run:
+        facts = estimate(plan, workers=workers or processors())
+        _echo_json(facts) if as_json else _echo_facts({**facts, "seconds": f"about {facts['seconds']:.3g}"})
+        return
+    with _Progress("rendering") as progress:
+        options: dict[str, Any] = {
+            "workers": workers, "resume": resume, "force": force, "shard_items": shard_size, "scheduler": scheduler,
+            "progress": progress,
+        }  # fmt: skip
+        if shard is not None:
+            build_part(plan, parse_part(shard), out, **options)
+        else:
+            build(plan, out, **options).close()
+    if as_json:
+        _echo_json({"path": str(out)})
+    else:
+        typer.echo(out)
+
+
+def _merge(shards: Sequence[Path], out: Path, resume: bool, force: bool) -> None:
+    from phasemark.data import merge_parts
+
+    with _Progress("merging") as progress:
+        merge_parts(shards, out, resume=resume, force=force, progress=progress)
+    typer.echo(out)
+
+
+@_plan_app.command("example")
+def _plan_example(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank or frames.")]) -> None:
+    """Print a plan with comments; it can be used as it is."""
+    from phasemark.data import plan_example
+
+    typer.echo(plan_example(kind), nl=False)
+
+
+@_plan_app.command("schema")
+def _plan_schema(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank or frames.")]) -> None:
+    """Print the JSON Schema of a kind of plan, for editors and other programs."""
+    from phasemark.data import plan_schema
+
+    _echo_json(plan_schema(kind))
+
+
+@_plan_app.command("check")
+def _plan_check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A plan (.toml).")],
+    kind: Annotated[str | None, typer.Option("--kind", help="bank or frames, if the plan leaves it open.")] = None,
+    as_json: _Json = False,
+) -> None:
+    """Check a plan and say what it is; with --json print it with every default made explicit."""
+    from phasemark.data import check_plan
+
+    found, plan = check_plan(file, kind)
+    if as_json:
+        _echo_json({"kind": found, "plan": plan.model_dump(mode="json")})
+    else:
+        typer.echo(f"{file}: a plan of kind '{found}', complete and valid")
+
+
 @app.command("match")
 def _match(
     bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank.")],
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Measured frames: CSV, NPY, NPZ or HDF5.")],
-    unit: Annotated[str | None, typer.Option("--unit", help="Unit of the frames: m, cm or mm.")] = None,
-    quantity: Annotated[
-        str | None, typer.Option("--quantity", help="range (along the ray) or z (along the optical axis).")
-    ] = None,
+    unit: _FramesUnit = None,
+    quantity: _Quantity = None,
     invalid_means: Annotated[
         str, typer.Option("--invalid-means", help="What an invalid pixel stands for: missing or no-return.")
     ] = "missing",
-    valid_status: Annotated[
-        list[int] | None, typer.Option("--valid-status", help="Value of 'status' that marks a valid pixel; repeatable.")
-    ] = None,
-    flip_h: Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")] = False,
-    flip_v: Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")] = False,
-    rotate: Annotated[int, typer.Option("--rotate", help="Turn the image clockwise by 0, 90, 180 or 270 degrees.")] = 0,
+    valid_status: _ValidStatus = None,
+    flip_h: _FlipH = False,
+    flip_v: _FlipV = False,
+    rotate: _Rotate = 0,
     filter_name: Annotated[str, typer.Option("--filter", help="kalman or phasor-mean.")] = "kalman",
     method: Annotated[
         str,
@@ -443,7 +841,7 @@ def _match(
         if name not in _FREE:
             raise UsageError(f"--free must be {' or '.join(_FREE)}, got '{name}'")
         parameters.append(_FREE[name])
-    with open_bank(bank) as opened:
+    with open_bank(bank, untrusted=True) as opened:
         measured = read_frames(
             frames,
             sensor=opened.sensor,
@@ -454,6 +852,7 @@ def _match(
             flip_h=flip_h,
             flip_v=flip_v,
             rotate=rotate,
+            untrusted=True,
         )
         plots = [] if plot is None else _numbered(plot, len(measured.range_m))
         _refuse_existing(plots, force)
@@ -488,7 +887,7 @@ def _demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, the tables and the bank.")] = Path(
         "out/demo"
     ),
-    seed: Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")] = 2005,
+    seed: _Seed = 2005,
     workers: _Workers = None,
     as_json: _Json = False,
     force: _Force = False,
@@ -725,6 +1124,20 @@ def _sensor_facts(sensor: Sensor) -> dict[str, Any]:
     return {**sensor.model_dump(mode="json"), "unambiguous_range_m": sensor.unambiguous_range_m}
 
 
+def _error_of(estimate: Estimate) -> str:
+    """Write the standard error of an estimate; pixels are counted and have none."""
+    if estimate.std_error is None:
+        return "assumed"
+    return f"{estimate.std_error:.2g}" if estimate.std_error > 0 else ""
+
+
+def _short(value: object) -> str:
+    """Write a field's value for a table; a list of pixels as their number."""
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    return f"{len(value)} in all" if isinstance(value, list) else str(value)
+
+
 def _plain(value: str | int | float) -> str | int | float | None:
     """Return None for a number that JSON does not have."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -790,6 +1203,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Python prints its traceback and exits with 1.
     """
     signal.signal(signal.SIGTERM, _terminate)
+    os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")  # before HDF5 is loaded: no file makes it load code
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without '×' or 'σ' is no reason to fail
     try:

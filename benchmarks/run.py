@@ -275,7 +275,7 @@ def plain_capture(image: PhasorImages, sensor: Sensor, rng: np.random.Generator,
 
 
 def peer() -> Table:
-    """Compare with jittered supersampling on Open3D's RaycastingScene, at the same error."""
+    """Compare with supersampling on Open3D's RaycastingScene, on a grid and jittered, at the same error."""
     try:
         import open3d
     except (ImportError, OSError) as error:
@@ -300,34 +300,38 @@ def peer_on(k: int, scene: Any) -> list[dict[str, Any]]:
     background = Background(wall_m=case.get("wall_m"), floor_m=case.get("floor_m"))
     ours = seconds_per_view(renderer, views, 2, background)
     measured = []
-    for density in (16, 32, 64, 128, 256):
-        times, errors = [], []
-        for run in range(1 if density == 256 else 3):
-            started = time.perf_counter()
-            image = jittered(scene, case, density, np.random.default_rng([SEED, run]))
-            times.append(time.perf_counter() - started)
-            errors.append(np.abs(image - truth).max() / brightest)
-        measured.append((f"jitter {density}² (Open3D, 2 threads)", statistics.median(times), statistics.median(errors)))
-    slope, offset = np.polyfit(np.log([m[2] for m in measured]), np.log([m[1] for m in measured]), 1)
+    for method in ("grid", "jitter"):
+        for density in (16, 32, 64, 128, 256):
+            times, errors = [], []
+            for run in range(1 if density == 256 else 3):
+                rng = np.random.default_rng([SEED, run]) if method == "jitter" else None
+                started = time.perf_counter()
+                image = supersampled(scene, case, density, rng)
+                times.append(time.perf_counter() - started)
+                errors.append(np.abs(image - truth).max() / brightest)
+            measured.append((method, density, statistics.median(times), statistics.median(errors)))
+    jitter = np.array([row[2:] for row in measured if row[0] == "jitter"])
+    slope, offset = np.polyfit(np.log(jitter[:, 1]), np.log(jitter[:, 0]), 1)
     needed = math.exp(offset + slope * math.log(our_error))
     return [
         {
             "frame": k,
             "method": method,
+            "rays a pixel": rays,
             "seconds/frame": float(f"{seconds:.3g}"),
             "ε": float(f"{error:.2g}"),
             "time over ours": round(seconds / ours),
         }
-        for method, seconds, error in (
-            *measured,
-            ("jitter, extrapolated to our ε", needed, our_error),
-            ("phasemark, 2 threads", ours, our_error),
+        for method, rays, seconds, error in (
+            *((f"{method} (Open3D, 2 threads)", f"{density}²", *rest) for method, density, *rest in measured),
+            ("jitter, extrapolated to our ε", "", needed, our_error),
+            ("phasemark, 2 threads", "7 on average", ours, our_error),
         )
     ]
 
 
-def jittered(scene: Any, case: dict[str, Any], density: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the phasors of one frame from density² jittered rays a pixel, cast row by row by Open3D."""
+def supersampled(scene: Any, case: dict[str, Any], density: int, rng: np.random.Generator | None) -> np.ndarray:
+    """Return the phasors of one frame from density² rays a pixel, cast row by row by Open3D; no `rng`: on a grid."""
     views = Views.broadcast(
         case["distance_m"], case["delta_rad"], case.get("bearing_rad", 0.0), case.get("height_m", 0.0)
     )
@@ -341,8 +345,9 @@ def jittered(scene: Any, case: dict[str, Any], density: int, rng: np.random.Gene
     rays = np.empty((density, n, 6), np.float32)
     rays[..., :3] = lens
     for row in range(16):
-        u = (cell + rng.random((density, n), np.float32)) / density
-        v = row + (cell[:density, None] + rng.random((density, n), np.float32)) / density
+        place_u, place_v = (0.5, 0.5) if rng is None else rng.random((2, density, n), np.float32)
+        u = (cell + place_u) / density
+        v = row + (cell[:density, None] + place_v) / density
         direction = np.empty((density, n, 3), np.float32)
         direction[..., 0] = 1.0
         direction[..., 1] = tan_h * (1 - u / 8)
@@ -377,7 +382,7 @@ def jittered(scene: Any, case: dict[str, Any], density: int, rng: np.random.Gene
 SECTIONS: dict[str, tuple[str, Callable[[], Table]]] = {
     "accuracy": ("Error against frames integrated from the true solids", accuracy),
     "rendering": ("Rendering", rendering),
-    "peer": ("Against jittered supersampling", peer),
+    "peer": ("Against supersampling", peer),
     "banks": ("Banks", banks),
     "capture": ("Capturing noisy frames", capturing),
     "chain": ("Capture, filters, matching", chain),

@@ -1,28 +1,60 @@
-"""What is kept: plans, banks of model images, measured frames, and files that are whole or not there."""
+"""What is kept: plans, banks of model images, frame sets, measured frames, and files that are whole or not there."""
 
 from phasemark.data.bank import Bank, BankGroup, open_bank
 from phasemark.data.build import build_bank
+from phasemark.data.build_frames import build_frames
+from phasemark.data.characterisation import summary_sentences, write_characterisation
+from phasemark.data.export import export_frames
+from phasemark.data.frame_plan import Distribution, FramePlan
+from phasemark.data.frames import FrameSet, FrameSubset, is_frame_set, open_frames
 from phasemark.data.grid import format_grid, parse_grid
-from phasemark.data.measured import read_frames
-from phasemark.data.plan import BankPlan, MeshPlan, load_plan
+from phasemark.data.jobs import build_part, estimate, merge_parts, parse_part
+from phasemark.data.measured import read_frames, write_measured
+from phasemark.data.plan import BankPlan, MeshPlan, load_plan, read_plan
+from phasemark.data.plan_kinds import PLAN_KINDS, check_plan, plan_example, plan_schema
+from phasemark.data.population import grid_loss
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.store import read_checksum, verify_checksum, write_atomically, write_checksum
+from phasemark.data.verify import verify_bank, verify_frames
 
 __all__ = [
+    "PLAN_KINDS",
     "Bank",
     "BankGroup",
     "BankPlan",
+    "Distribution",
+    "FramePlan",
+    "FrameSet",
+    "FrameSubset",
     "MeshPlan",
     "build_bank",
+    "build_frames",
+    "build_part",
+    "check_plan",
+    "estimate",
+    "export_frames",
     "format_grid",
+    "grid_loss",
+    "is_frame_set",
     "load_plan",
+    "merge_parts",
     "mesh_sha256",
     "open_bank",
+    "open_frames",
     "parse_grid",
+    "parse_part",
+    "plan_example",
+    "plan_schema",
     "read_checksum",
     "read_frames",
+    "read_plan",
+    "summary_sentences",
+    "verify_bank",
     "verify_checksum",
+    "verify_frames",
     "versions",
     "write_atomically",
+    "write_characterisation",
     "write_checksum",
+    "write_measured",
 ]

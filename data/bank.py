@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -16,8 +13,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark import InputFileError, UsageError
 from phasemark.data.grid import format_grid
+from phasemark.data.hdf5 import check_format, dataset_of, frozen, group_of, json_attribute, open_hdf5, reading
 from phasemark.data.plan import BankPlan
 from phasemark.render import PhasorImages, Sensor, Views
 
@@ -76,18 +74,18 @@ class BankGroup:
         coordinates = {dim: self._coordinate(dim) for dim in (*view_dims, *PHASOR_DIMS)}
         sizes = {dim: len(values) for dim, values in coordinates.items()}
         for field, dims in (("phasor", PHASOR_DIMS), ("intensity", IMAGE_DIMS), ("coverage", IMAGE_DIMS)):
-            dataset = _dataset(group, field, self._path)
+            dataset = dataset_of(group, field, self._path)
             expected = tuple(sizes[dim] for dim in (*view_dims, *dims))
             if dataset.shape != expected or dataset.dtype.kind != "f":
                 raise InputFileError(
                     f"{path}: '{name}/{field}' must be floats of shape {expected},"
                     f" got {dataset.dtype} of shape {dataset.shape}"
                 )
-        self.distance_m: NDArray[np.float64] = _frozen(coordinates["distance"])
-        self.delta_rad: NDArray[np.float64] = _frozen(np.deg2rad(coordinates.get("delta", np.empty(0))))
-        self.row: NDArray[np.int64] = _frozen(coordinates["row"].astype(np.int64))
-        self.col: NDArray[np.int64] = _frozen(coordinates["col"].astype(np.int64))
-        self.order: NDArray[np.int64] = _frozen(np.rint(coordinates["frequency"] / sensor.modulation_hz).astype(int))
+        self.distance_m: NDArray[np.float64] = frozen(coordinates["distance"])
+        self.delta_rad: NDArray[np.float64] = frozen(np.deg2rad(coordinates.get("delta", np.empty(0))))
+        self.row: NDArray[np.int64] = frozen(coordinates["row"].astype(np.int64))
+        self.col: NDArray[np.int64] = frozen(coordinates["col"].astype(np.int64))
+        self.order: NDArray[np.int64] = frozen(np.rint(coordinates["frequency"] / sensor.modulation_hz).astype(int))
         self.classes: tuple[str, ...] = tuple(coordinates.get("landmark_class", np.empty(0)).tolist())
         self._check_coordinates(sensor)
 
@@ -112,7 +110,7 @@ class BankGroup:
     @cached_property
     def intensity(self) -> NDArray[np.float32]:
         """Mean amplitude, (views, row, col)."""
-        return _frozen(self._read("intensity"))
+        return frozen(self._read("intensity"))
 
     @cached_property
     def coverage(self) -> NDArray[np.float32]:
@@ -121,21 +119,21 @@ class BankGroup:
         outside = coverage[(coverage < -_COVERAGE_SLACK) | (coverage > 1 + _COVERAGE_SLACK)]
         if outside.size:
             raise InputFileError(f"{self._path}: '{self.name}/coverage' must be in 0 … 1, got {outside.flat[0]:g}")
-        return _frozen(coverage)
+        return frozen(coverage)
 
     @cached_property
     def _phasors(self) -> NDArray[np.complex64]:
-        return _frozen(self._read("phasor").view(np.complex64)[..., 0])
+        return frozen(self._read("phasor").view(np.complex64)[..., 0])
 
     def _read(self, name: str) -> NDArray[np.float32]:
-        with _reading(self._path):
+        with reading(self._path):
             values = np.ascontiguousarray(self._group[name][...], dtype=np.float32)
         if not np.isfinite(values).all():
             raise InputFileError(f"{self._path}: '{self.name}/{name}' must be finite, got NaN or infinity")
         return values
 
     def _coordinate(self, name: str) -> NDArray[Any]:
-        dataset = _dataset(self._group, name, self._path)
+        dataset = dataset_of(self._group, name, self._path)
         is_text = name in ("landmark_class", "iq")
         if dataset.ndim != 1 or not dataset.size or (dataset.dtype.kind == "O") != is_text:
             raise InputFileError(
@@ -189,13 +187,13 @@ class Bank:
     def __init__(self, file: h5py.File, path: Path) -> None:
         self._file = file
         self.path = path
-        _check_format(file, path)
-        self.sensor = Sensor(**self._json("sensor"))
-        self.plan = BankPlan(**self._json("plan"))
-        self.versions: dict[str, str] = self._json("versions")
+        check_format(file, path, "bank", FORMAT, SCHEMA_VERSION)
+        self.sensor = Sensor(**json_attribute(file, path, "sensor"))
+        self.plan = BankPlan(**json_attribute(file, path, "plan"))
+        self.versions: dict[str, str] = json_attribute(file, path, "versions")
         self.layout = self.plan.layout
         groups: dict[str, BankGroup] = {
-            name: BankGroup(name, _group(file, name, path), path, self.sensor) for name in LAYOUT_GROUPS[self.layout]
+            name: BankGroup(name, group_of(file, name, path), path, self.sensor) for name in LAYOUT_GROUPS[self.layout]
         }
         self.lower, self.upper, self.full = groups.get("lower"), groups.get("upper"), groups.get("full")
         classed = self.full or self.upper
@@ -207,7 +205,7 @@ class Bank:
         if not np.array_equal(classed.distance_m, angled.distance_m):
             raise InputFileError(f"{path}: 'lower/distance' and 'upper/distance' must agree")
         for name in self.classes:
-            _group(file, f"meshes/{name}", path)
+            group_of(file, f"meshes/{name}", path)
 
     def __enter__(self) -> Self:
         return self
@@ -252,35 +250,19 @@ class Bank:
             The mesh in the file is damaged.
         """
         self._class_index(class_name)
-        group = _group(self._file, f"meshes/{class_name}", self.path)
-        with _reading(self.path):
-            vertices = group["vertices"][...].astype(np.float64)
-            faces = group["faces"][...].astype(np.int64)
-            part = group["part"][...].astype(np.uint8) if "part" in group else None
-            period_deg, albedo = float(group.attrs["delta_period_deg"]), float(group.attrs["albedo"])
-        if not 1 <= period_deg <= 360:  # as the plan has it: a symmetry of 1 … 360
-            raise InputFileError(
-                f"{self.path}: 'delta_period_deg' of '{class_name}' must be in [1, 360], got {period_deg:g}"
-            )
-        if not (vertices.ndim == faces.ndim == 2 and vertices.shape[1:] == faces.shape[1:] == (3,) and faces.size):
-            raise InputFileError(f"{self.path}: 'meshes/{class_name}' must hold rows of three, of vertices and faces")
-        if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
-            raise InputFileError(f"{self.path}: 'meshes/{class_name}' has vertices that are not finite or not there")
-        if part is not None and part.shape != faces.shape[:1]:
-            raise InputFileError(f"{self.path}: 'meshes/{class_name}/part' must have one value for each face")
-        return trimesh.Trimesh(
-            vertices,
-            faces,
-            process=False,
-            face_attributes=None if part is None else {"part": part},
-            metadata={"name": class_name, "symmetry": round(360 / period_deg), "albedo": albedo},
-        )
+        return read_mesh_group(self._file, class_name, self.path)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what the bank's bytes depend on: resolved plan, versions, mesh hashes."""
+        with reading(self.path):
+            hashes = {name: str(self._file[f"meshes/{name}"].attrs["sha256"]) for name in self.classes}
+        return {"plan": json_attribute(self._file, self.path, "plan"), "versions": self.versions, "mesh_sha256": hashes}
 
     def info(self) -> dict[str, Any]:
         """Return what the bank holds, in plain numbers and text."""
         groups = [group for group in (self.lower, self.upper, self.full) if group is not None]
         views = {group.name: int(np.prod(self._file[group.name]["phasor"].shape[:-4])) for group in groups}
-        with _reading(self.path):
+        with reading(self.path):
             hashes = {name: str(self._file[f"meshes/{name}"].attrs["sha256"]) for name in self.classes}
         return {
             "path": str(self.path),
@@ -314,20 +296,15 @@ class Bank:
             raise UsageError(f"unknown class {class_name!r}: {self.path} has {', '.join(self.classes)}")
         return self.classes.index(class_name)
 
-    def _json(self, name: str) -> dict[str, Any]:
-        with _reading(self.path):
-            value = json.loads(self._file.attrs[name])
-        if not isinstance(value, dict):
-            raise InputFileError(f"{self.path}: the attribute '{name}' must be a JSON object, got {value!r}")
-        return value
 
-
-def open_bank(path: str | os.PathLike[str]) -> Bank:
+def open_bank(path: str | os.PathLike[str], *, untrusted: bool = False) -> Bank:
     """Open a bank.
 
     Parameters
     ----------
     path : path-like
+    untrusted : bool
+        Whether a child process with limits reads the file first, unless ``FILE.sha256`` vouches for it.
 
     Returns
     -------
@@ -340,65 +317,39 @@ def open_bank(path: str | os.PathLike[str]) -> Bank:
         The file cannot be read, is not a bank, was made by a newer version, or is damaged.
     """
     path = Path(path)
+    file = open_hdf5(path, "bank", untrusted=untrusted)
     try:
-        with path.open("rb") as plain:
-            signature = plain.read(8)
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
-    if signature != b"\x89HDF\r\n\x1a\n":
-        raise InputFileError(f"{path}: not a bank (not an HDF5 file)")
-    try:
-        file = h5py.File(path, "r")
-    except OSError:
-        raise InputFileError(f"{path}: damaged or cut off: HDF5 cannot open it") from None
-    try:
-        with _reading(path):
+        with reading(path):
             return Bank(file, path)
     except BaseException:
         file.close()
         raise
 
 
-def _check_format(file: h5py.File, path: Path) -> None:
-    found = file.attrs.get("format")
-    if found != FORMAT:
-        raise InputFileError(f"{path}: not a bank (its format is {found!r}, must be '{FORMAT}')")
-    version = int(file.attrs["schema_version"])
-    if version != SCHEMA_VERSION:
-        advice = "update phasemark" if version > SCHEMA_VERSION else "build it again"
-        raise InputFileError(f"{path}: has schema version {version}, this phasemark reads {SCHEMA_VERSION}: {advice}")
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Turn whatever a damaged file makes h5py, json or pydantic say into one line."""
-    try:
-        yield
-    except UsageError as error:
-        raise InputFileError(f"{path}: damaged ({error})") from None
-    except PhasemarkError:
-        raise
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputFileError(f"{path}: damaged ({reason})") from None
-
-
-def _group(file: h5py.File, name: str, path: Path) -> h5py.Group:
-    if not isinstance(file.get(name), h5py.Group):
-        raise InputFileError(f"{path}: the group '{name}' is missing")
-    return file[name]
-
-
-def _dataset(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
-    if not isinstance(group.get(name), h5py.Dataset):
-        raise InputFileError(f"{path}: the dataset '{group.name.strip('/')}/{name}' is missing")
-    return group[name]
+def read_mesh_group(file: h5py.File, class_name: str, path: Path) -> trimesh.Trimesh:
+    """Return the mesh of a class as a bank or a frame set holds it, checked."""
+    group = group_of(file, f"meshes/{class_name}", path)
+    with reading(path):
+        vertices = group["vertices"][...].astype(np.float64)
+        faces = group["faces"][...].astype(np.int64)
+        part = group["part"][...].astype(np.uint8) if "part" in group else None
+        period_deg, albedo = float(group.attrs["delta_period_deg"]), float(group.attrs["albedo"])
+    if not 1 <= period_deg <= 360:  # as the plan has it: a symmetry of 1 … 360
+        raise InputFileError(f"{path}: 'delta_period_deg' of '{class_name}' must be in [1, 360], got {period_deg:g}")
+    if not (vertices.ndim == faces.ndim == 2 and vertices.shape[1:] == faces.shape[1:] == (3,) and faces.size):
+        raise InputFileError(f"{path}: 'meshes/{class_name}' must hold rows of three, of vertices and faces")
+    if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputFileError(f"{path}: 'meshes/{class_name}' has vertices that are not finite or not there")
+    if part is not None and part.shape != faces.shape[:1]:
+        raise InputFileError(f"{path}: 'meshes/{class_name}/part' must have one value for each face")
+    return trimesh.Trimesh(
+        vertices,
+        faces,
+        process=False,
+        face_attributes=None if part is None else {"part": part},
+        metadata={"name": class_name, "symmetry": round(360 / period_deg), "albedo": albedo},
+    )
 
 
 def _increases(values: NDArray[Any]) -> bool:
     return bool(np.isfinite(values).all() and np.all(np.diff(values) > 0))
-
-
-def _frozen(array: NDArray[Any]) -> NDArray[Any]:
-    array.flags.writeable = False
-    return array

@@ -1,10 +1,10 @@
-"""Banks of model images, as they are built: rendered in batches, each written to its place in the file."""
+"""Banks of model images, as they are built: a job of shards, each rendered and placed in the file on its own."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,18 +28,16 @@ from phasemark.data.bank import (
     group_rows,
     open_bank,
 )
-from phasemark.data.layout import Layout, place
-from phasemark.data.plan import BankPlan, factored_refusal
+from phasemark.data.layout import Layout
+from phasemark.data.plan import BankPlan, MeshPlan, factored_refusal
+from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.provenance import mesh_sha256, versions
-from phasemark.data.store import replacing
+from phasemark.data.shards import Place, Progress
 from phasemark.landmarks import LandmarkSpec, Revolution, build_mesh, read_mesh
 from phasemark.render import PhasorImages, PlanarLandmark, Renderer, Sensor, Views, planar_images
 
-BATCH_PIXELS = 1 << 19
-"""Pixels rendered at a time: 2048 images of 16 × 16, some 20 MB."""
-
-Progress = Callable[[int, int], None]
 ImagesOf = Callable[[Views], PhasorImages]
+StoredMesh = Callable[[str], trimesh.Trimesh]
 
 
 @dataclass(frozen=True)
@@ -58,12 +56,16 @@ def build_bank(
     path: str | os.PathLike[str] | None = None,
     *,
     force: bool = False,
+    resume: bool = False,
     workers: int | None = None,
+    shard_items: int | None = None,
+    scheduler: str = "threads",
     progress: Progress | None = None,
 ) -> Bank:
     """Render a bank of noise-free model images and write it with its checksum.
 
-    The same plan gives the same bytes, whatever the number of workers. Memory does not grow with the bank.
+    The same plan gives the same bytes, whatever the number of workers. Memory does not grow with the bank. A run that
+    was ended early leaves ``FILE.partial`` and ``FILE.manifest`` beside the file if anything was finished.
 
     Parameters
     ----------
@@ -71,11 +73,17 @@ def build_bank(
     path : path-like, optional
         The file to write; ``FILE.sha256`` goes beside it. None: a temporary file, gone once the bank is closed.
     force : bool
-        Whether an existing file may be replaced.
+        Whether an existing file may be replaced, and an unfinished run of it thrown away.
+    resume : bool
+        Whether to continue an unfinished run; a finished bank of the same plan is opened as it is.
     workers : int, optional
         Threads that render. None: one for each processor this process may use.
+    shard_items : int, optional
+        Images rendered at a time; the result does not depend on it.
+    scheduler : str
+        ``threads``, ``local:N`` for N worker processes, or the address of a Dask scheduler.
     progress : callable (done, total), optional
-        Called from this thread after each batch with the number of images rendered so far and in all.
+        Called from this thread with the number of images rendered so far and in all.
 
     Returns
     -------
@@ -88,8 +96,10 @@ def build_bank(
         The plan cannot be built, with the reason.
     InputFileError
         A mesh or sensor file cannot be read.
-    OutputExistsError, StorageError
-        As in :func:`phasemark.data.write_atomically`.
+    OutputExistsError
+        The bank exists, another run is writing it, or an unfinished run had another plan.
+    StorageError
+        The disk is full or fails.
     """
     if workers is not None and workers < 1:
         raise UsageError(f"'workers' must be at least 1, got {workers}")
@@ -97,19 +107,18 @@ def build_bank(
         with TemporaryDirectory(prefix="phasemark-") as folder:
             # The open file outlives its name.
             return build_bank(plan, Path(folder) / "bank.h5", workers=workers, progress=progress)
-    plan = plan.resolve()
-    _refuse_impossible(plan)
-    with replacing(path, force=force, checksum=True) as temporary:
-        sensor = plan.build_sensor()
-        landmarks = _landmarks(plan)
-        slabs = list(_slabs(plan, sensor, landmarks, workers or _processors()))
-        places = _write_header(temporary, plan, sensor, landmarks)
-        descriptor = os.open(temporary, os.O_WRONLY)
-        try:
-            _render_all(slabs, places, descriptor, max(1, BATCH_PIXELS // (sensor.rows * sensor.cols)), progress)
-        finally:
-            os.close(descriptor)
+    refuse_unwritable_output(Path(path), force=force, resume=resume)
+    job = BankJob(plan)
+    produce(
+        job, path, finished=_finished_identity, force=force, resume=resume, workers=workers, shard_items=shard_items,
+        scheduler=scheduler, progress=progress,
+    )  # fmt: skip
     return open_bank(path)
+
+
+def _finished_identity(path: Path) -> dict[str, Any]:
+    with open_bank(path) as bank:
+        return bank.identity()
 
 
 @dataclass(frozen=True)
@@ -117,17 +126,109 @@ class _Slab:
     """Images that lie one behind the other in a group: those of one class, or of all."""
 
     group: GroupName
-    start: int
+    first: int
     views: Views
     images_of: ImagesOf
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where a dataset's images begin in the file, and how many bytes each takes."""
+class BankJob:
+    """A bank to be built (:class:`phasemark.data.shards.Job`): one slab of images for each class or part.
 
-    offset: int
-    stride: int
+    Parameters
+    ----------
+    plan : BankPlan
+    stored_mesh : callable, optional
+        Returns the mesh of a class, in place of the mesh file that the plan names.
+    """
+
+    def __init__(self, plan: BankPlan, stored_mesh: StoredMesh | None = None) -> None:
+        self.plan = plan.resolve()
+        _refuse_impossible(self.plan)
+        self.sensor = self.plan.build_sensor()
+        self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
+        self._slabs = list(_slabs(self.plan, self.sensor, self.landmarks))
+
+    def spec(self) -> dict[str, Any]:
+        """Return what another process makes the same job from."""
+        return {"kind": "bank", "plan": self.plan.model_dump(mode="json")}
+
+    @property
+    def items(self) -> list[int]:
+        """Images of each slab."""
+        return [len(slab.views) for slab in self._slabs]
+
+    def angled_images(self) -> list[ImagesOf]:
+        """Return what makes images that depend on the angle: of each class of a full bank, or of the lower parts."""
+        return [slab.images_of for slab in self._slabs if "delta" in VIEW_DIMS[slab.group]]
+
+    def identity(self) -> dict[str, Any]:
+        """Return all that the bank's bytes depend on."""
+        return {
+            "plan": self.plan.model_dump(mode="json"),
+            "versions": versions(),
+            "mesh_sha256": {landmark.name: mesh_sha256(landmark.mesh) for landmark in self.landmarks},
+        }
+
+    def lay_out(self) -> tuple[Layout, list[list[Place]]]:
+        """Return all but the images, and for each slab where phasor, intensity and coverage go."""
+        plan = self.plan
+        places: dict[tuple[GroupName, str], Place] = {}
+        with Layout() as layout:
+            file = layout.file
+            file.attrs["format"] = FORMAT
+            file.attrs["schema_version"] = SCHEMA_VERSION
+            file.attrs["layout"] = plan.layout
+            file.attrs["model"] = plan.model
+            file.attrs["plan"] = plan.model_dump_json()
+            file.attrs["sensor"] = self.sensor.model_dump_json()
+            file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
+            for name in LAYOUT_GROUPS[plan.layout]:
+                names = [landmark.name for landmark in self.landmarks]
+                places |= _lay_out_group(layout, name, plan, self.sensor, names)
+            for landmark in self.landmarks:
+                write_mesh(file.create_group(f"meshes/{landmark.name}"), landmark)
+        by_slab = []
+        for slab in self._slabs:
+            found = [places[slab.group, field] for field in _FIELDS]
+            by_slab.append([Place(at.offset + slab.first * at.stride, at.stride) for at in found])
+        return layout, by_slab
+
+    def make(self, slab: int, start: int, stop: int) -> list[NDArray[Any]]:
+        """Render some images of a slab."""
+        job = self._slabs[slab]
+        stored = _stored(job.images_of(job.views[start:stop]))
+        return [stored[field] for field in _FIELDS]
+
+    def read(self, file: h5py.File, slab: int, item: int) -> dict[str, NDArray[Any]]:
+        """Return what a file holds of one image, as :meth:`make` makes it."""
+        at = self._slabs[slab]
+        group = file[at.group]
+        n_dims = len(VIEW_DIMS[at.group])
+        place = np.unravel_index(at.first + item, group["phasor"].shape[:n_dims])
+        return {field: group[field][tuple(int(k) for k in place)] for field in _FIELDS}
+
+    def remake(self, slab: int, item: int) -> dict[str, NDArray[Any]]:
+        """Return the same, rendered again."""
+        return {field: values[0] for field, values in zip(_FIELDS, self.make(slab, item, item + 1), strict=True)}
+
+
+_FIELDS = ("phasor", "intensity", "coverage")
+
+
+def _slabs(plan: BankPlan, sensor: Sensor, landmarks: list[Landmark]) -> Iterator[_Slab]:
+    distance_m, delta_rad = np.array(plan.distance_m), plan.delta_rad
+    by_angle = Views.broadcast(distance_m[:, None], delta_rad)
+    facing = Views.broadcast(distance_m)  # a solid of revolution looks the same from every side
+    jobs: list[tuple[GroupName, Literal["both", "lower", "upper"], Views, list[Landmark]]] = [
+        ("full", "both", by_angle, landmarks),
+        ("lower", "lower", by_angle, landmarks[:1]),
+        ("upper", "upper", facing, landmarks),
+    ]
+    for group, part, views, shown in jobs:
+        if group in LAYOUT_GROUPS[plan.layout]:
+            for k, landmark in enumerate(shown):
+                images_of = _images_of(plan, sensor, landmark, part, group_rows(group, sensor))
+                yield _Slab(group, k * len(views), views, images_of)
 
 
 def _refuse_impossible(plan: BankPlan) -> None:
@@ -140,19 +241,18 @@ def _refuse_impossible(plan: BankPlan) -> None:
         )
 
 
-def _landmarks(plan: BankPlan) -> list[Landmark]:
-    return [
-        *(Landmark(spec.name, build_mesh(spec), spec.symmetry, spec.albedo, spec) for spec in plan.landmarks),
-        *(
-            Landmark(
-                part.name,
-                read_mesh(part.path, unit=part.unit, up=part.up, origin=part.origin),
-                part.symmetry,
-                part.albedo,
-            )
-            for part in plan.meshes
-        ),
-    ]
+def read_landmarks(
+    landmarks: Sequence[LandmarkSpec], meshes: Sequence[MeshPlan], stored_mesh: StoredMesh | None = None
+) -> list[Landmark]:
+    """Build the meshes of landmarks, and read those that come from files (or are stored in one of ours)."""
+    found = [Landmark(spec.name, build_mesh(spec), spec.symmetry, spec.albedo, spec) for spec in landmarks]
+    for part in meshes:
+        if stored_mesh is None:
+            mesh = read_mesh(part.path, unit=part.unit, up=part.up, origin=part.origin)
+        else:
+            mesh = stored_mesh(part.name)
+        found.append(Landmark(part.name, mesh, part.symmetry, part.albedo))
+    return found
 
 
 def _images_of(
@@ -161,7 +261,6 @@ def _images_of(
     landmark: Landmark,
     part: Literal["both", "lower", "upper"],
     rows: tuple[int, int],
-    workers: int,
 ) -> ImagesOf:
     """Return the function that makes the model images of a landmark, or of one of its parts, on some rows."""
     if plan.model == "planar":
@@ -172,7 +271,7 @@ def _images_of(
         )
     mesh = landmark.mesh if landmark.spec is None else build_mesh(landmark.spec, part=part)
     renderer = Renderer(mesh, sensor, albedo=landmark.albedo, harmonics=plan.harmonics)
-    return lambda views: renderer.render_views(views, rows=rows, workers=workers)
+    return lambda views: renderer.render_views(views, rows=rows)
 
 
 def _top_view(spec: LandmarkSpec) -> PlanarLandmark:
@@ -182,46 +281,6 @@ def _top_view(spec: LandmarkSpec) -> PlanarLandmark:
         return PlanarLandmark(spec.box.length_m, spec.box.width_m)
     profile = upper.profile_m if isinstance(upper, Revolution) else upper.radius_at_m
     return PlanarLandmark(spec.box.length_m, spec.box.width_m, profile)
-
-
-def _slabs(plan: BankPlan, sensor: Sensor, landmarks: list[Landmark], workers: int) -> Iterator[_Slab]:
-    distance_m, delta_rad = np.array(plan.distance_m), plan.delta_rad
-    by_angle = Views.broadcast(distance_m[:, None], delta_rad)
-    facing = Views.broadcast(distance_m)  # a solid of revolution looks the same from every side
-    jobs: list[tuple[GroupName, Literal["both", "lower", "upper"], Views, list[Landmark]]] = [
-        ("full", "both", by_angle, landmarks),
-        ("lower", "lower", by_angle, landmarks[:1]),
-        ("upper", "upper", facing, landmarks),
-    ]
-    for group, part, views, shown in jobs:
-        if group in LAYOUT_GROUPS[plan.layout]:
-            for k, landmark in enumerate(shown):
-                images_of = _images_of(plan, sensor, landmark, part, group_rows(group, sensor), workers)
-                yield _Slab(group, k * len(views), views, images_of)
-
-
-def _processors() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _render_all(
-    slabs: list[_Slab],
-    places: dict[tuple[GroupName, str], _Place],
-    descriptor: int,
-    batch: int,
-    progress: Progress | None,
-) -> None:
-    """Render batch after batch of views, and write each before the next."""
-    done, total = 0, sum(len(slab.views) for slab in slabs)
-    for slab in slabs:
-        for at in range(0, len(slab.views), batch):
-            views = slab.views[at : at + batch]
-            for name, values in _stored(slab.images_of(views)).items():
-                where = places[slab.group, name]
-                place(descriptor, where.offset + (slab.start + at) * where.stride, values)
-            done += len(views)
-            if progress is not None:
-                progress(done, total)
 
 
 def _stored(images: PhasorImages) -> dict[str, NDArray[np.float32]]:
@@ -239,35 +298,9 @@ def _stored(images: PhasorImages) -> dict[str, NDArray[np.float32]]:
     return stored
 
 
-def _write_header(
-    temporary: Path, plan: BankPlan, sensor: Sensor, landmarks: list[Landmark]
-) -> dict[tuple[GroupName, str], _Place]:
-    """Write everything but the images, with room for them, and return where they go."""
-    places: dict[tuple[GroupName, str], _Place] = {}
-    with Layout() as layout:
-        file = layout.file
-        file.attrs["format"] = FORMAT
-        file.attrs["schema_version"] = SCHEMA_VERSION
-        file.attrs["layout"] = plan.layout
-        file.attrs["model"] = plan.model
-        file.attrs["plan"] = plan.model_dump_json()
-        file.attrs["sensor"] = sensor.model_dump_json()
-        file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
-        for name in LAYOUT_GROUPS[plan.layout]:
-            places |= _lay_out_group(layout, name, plan, sensor, [landmark.name for landmark in landmarks])
-        for landmark in landmarks:
-            _write_mesh(file.create_group(f"meshes/{landmark.name}"), landmark)
-    descriptor = os.open(temporary, os.O_WRONLY)
-    try:
-        layout.write_to(descriptor)
-    finally:
-        os.close(descriptor)
-    return places
-
-
 def _lay_out_group(
     layout: Layout, name: GroupName, plan: BankPlan, sensor: Sensor, classes: list[str]
-) -> dict[tuple[GroupName, str], _Place]:
+) -> dict[tuple[GroupName, str], Place]:
     group = layout.file.create_group(name)
     coordinates = _coordinates(name, plan, sensor, classes)
     scales = {}
@@ -279,7 +312,7 @@ def _lay_out_group(
         scales[dim].attrs["long_name"] = long_name
         if units:
             scales[dim].attrs["units"] = units
-    places: dict[tuple[GroupName, str], _Place] = {}
+    places: dict[tuple[GroupName, str], Place] = {}
     for field, dims, long_name in (
         ("phasor", PHASOR_DIMS, "phasor S_k of the landmark alone"),
         ("intensity", IMAGE_DIMS, "mean amplitude of the landmark alone"),
@@ -292,7 +325,7 @@ def _lay_out_group(
         dataset.attrs["long_name"] = long_name
         dataset.attrs["units"] = "1"
         stride = int(np.prod(shape[len(VIEW_DIMS[name]) :])) * 4
-        places[name, field] = _Place(offset, stride)
+        places[name, field] = Place(offset, stride)
     return places
 
 
@@ -316,7 +349,8 @@ def _coordinates(
     }
 
 
-def _write_mesh(group: h5py.Group, landmark: Landmark) -> None:
+def write_mesh(group: h5py.Group, landmark: Landmark) -> None:
+    """Write the mesh of a class into its group."""
     vertices = group.create_dataset("vertices", data=np.asarray(landmark.mesh.vertices, dtype="<f8"))
     vertices.attrs["units"] = "m"
     vertices.attrs["long_name"] = "vertices x', y', z' in the landmark frame"

@@ -7,6 +7,7 @@ sparse memory, with room for the large arrays but not their content, and every b
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
 from collections.abc import Sequence
@@ -120,6 +121,19 @@ class Layout:
         kind = h5py.h5t.py_create(np.dtype(dtype))
         dataset = h5py.h5d.create(group.id, name.encode(), kind, space, creation)
         return h5py.Dataset(dataset), int(dataset.get_offset())
+
+    @property
+    def size(self) -> int:
+        """Bytes of the whole file, once it is closed."""
+        return len(self._memory)
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of all but the reserved arrays, once the file is closed."""
+        digest = hashlib.sha256()
+        for offset, page in self._memory.pages():
+            digest.update(offset.to_bytes(8, "little"))
+            digest.update(page)
+        return digest.hexdigest()
 
     def write_to(self, descriptor: int) -> None:
         """Claim the whole file's space on disk and write all but the reserved arrays, once the file is closed.

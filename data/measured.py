@@ -1,4 +1,4 @@
-"""Frames that somebody else's camera measured, from CSV, NPY, NPZ and HDF5 files."""
+"""Frames that somebody else's camera measured, from CSV, NPY, NPZ, HDF5 and PNG files and ROS bags."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import os
 import tokenize
 import warnings
 import zipfile
+import zlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +18,13 @@ from typing import Any, Literal
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark.data.bags import read_rosbag
+from phasemark.data.guard import EXPANSION, FREE_BYTES
+from phasemark.data.hdf5 import open_hdf5
+from phasemark.data.store import write_atomically
 from phasemark.render import Frames, Sensor
 
 Unit = Literal["m", "cm", "mm"]
@@ -29,10 +35,11 @@ METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 QUANTITIES = ("range", "z")
 
 _FIELDS = ("range", "amplitude", "intensity", "status", "valid")
+_MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
 _NOT_A_NUMBER = ("", "nan")
 _UNREADABLE = (
-    OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile, csv.Error,
+    OSError, EOFError, ValueError, KeyError, RuntimeError, SyntaxError, zipfile.BadZipFile, csv.Error, zlib.error,
     tokenize.TokenError,  # NumPy tokenizes the header of an NPY file
 )  # fmt: skip
 
@@ -57,6 +64,8 @@ def read_frames(
     flip_h: bool = False,
     flip_v: bool = False,
     rotate: int = 0,
+    untrusted: bool = False,
+    topic: str | None = None,
 ) -> Frames:
     """Read measured frames; what kind of file it is follows from its content.
 
@@ -65,8 +74,10 @@ def read_frames(
     is a header; empty lines and those that start with ``#`` are skipped; an empty cell and ``nan`` are invalid pixels.
     *NPY*: the ranges. *NPZ*: ``range`` and optionally ``amplitude``, ``intensity`` (electrons per phase image),
     ``status``, ``valid`` (0: invalid), ``unit`` and ``quantity``. *HDF5*: the same arrays as datasets, with the
-    attributes ``units`` and ``quantity`` on ``range``. Arrays are (frames, rows, cols), (n, frames, rows, cols), or
-    (rows, cols) for a single frame.
+    attributes ``units`` and ``quantity`` on ``range``. *PNG*, one or a folder of them in the order of their names: 16
+    bits, grey, 0 is invalid; codes are in the stated unit, or scaled by the text chunk ``metres_per_unit``. *ROS 2
+    bag* (its folder): images of 32FC1, metres, or 16UC1, millimetres; 0 is invalid. Arrays are (frames, rows, cols),
+    (n, frames, rows, cols), or (rows, cols) for a single frame.
 
     A range that is not finite is invalid. So is one that no such camera can measure, zero or negative or beyond c / 2f,
     and a warning tells how many there are; if it is most of them, unit or sensor are wrong, which is an error.
@@ -89,6 +100,10 @@ def read_frames(
         Whether to mirror left and right, or top and bottom.
     rotate : {0, 90, 180, 270}
         Degrees to turn the image clockwise, after mirroring.
+    untrusted : bool
+        Whether a child process with limits reads an HDF5 file first, unless ``FILE.sha256`` vouches for it.
+    topic : str, optional
+        Which images of a ROS bag, if it has several that are not ours.
 
     Returns
     -------
@@ -114,7 +129,7 @@ def read_frames(
     if invalid_means not in ("missing", "no-return"):
         raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
     shape = (sensor.cols, sensor.rows) if rotate in (90, 270) else (sensor.rows, sensor.cols)
-    raw = _read(path, shape)
+    raw = _read(path, shape, untrusted, topic)
     unit_scale = METRES_PER_UNIT[_settled("unit", unit, raw, tuple(METRES_PER_UNIT), path)]
     settled_quantity = _settled("quantity", quantity, raw, QUANTITIES, path)
 
@@ -208,8 +223,39 @@ def _as_frames(values: NDArray[Any], name: str, shape: tuple[int, int], flat: bo
     return values.reshape((1,) * (4 - values.ndim) + values.shape)
 
 
-def _read(path: Path, shape: tuple[int, int]) -> _Raw:
+def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+    """Write measured frames as an NPZ file: range along the ray in metres, which :func:`read_frames` reads untold.
+
+    Parameters
+    ----------
+    frames : Frames
+    path : path-like
+    force : bool
+        Whether an existing file may be replaced.
+
+    Returns
+    -------
+    Path
+        `path`.
+
+    Raises
+    ------
+    OutputExistsError, StorageError
+        As :func:`phasemark.data.write_atomically`.
+    """
+    arrays: dict[str, Any] = {"range": frames.range_m, "valid": frames.valid, "flags": frames.flags}
+    for name, values in (("amplitude", frames.amplitude_e), ("intensity", frames.intensity_e)):
+        if values is not None:
+            arrays[name] = values
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays, unit="m", quantity="range")
+    return write_atomically(path, buffer.getvalue(), force=force)
+
+
+def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None) -> _Raw:
     try:
+        if path.is_dir():
+            return _Raw(*read_rosbag(path, topic)) if (path / "metadata.yaml").exists() else _read_pngs(path)
         with path.open("rb") as file:
             start = file.read(8)
         if not start:
@@ -218,8 +264,10 @@ def _read(path: Path, shape: tuple[int, int]) -> _Raw:
             return _Raw({"range": np.asarray(np.load(path, allow_pickle=False))})
         if start.startswith(b"PK"):
             return _read_npz(path)
+        if start == b"\x89PNG\r\n\x1a\n":
+            return _read_pngs(path)
         if start.startswith(b"\x89HDF"):
-            return _read_hdf5(path)
+            return _read_hdf5(path, untrusted)
         return _Raw({"range": _parse_csv(path.read_bytes(), shape, path)}, flat=True)
     except PhasemarkError:
         raise
@@ -230,9 +278,38 @@ def _read(path: Path, shape: tuple[int, int]) -> _Raw:
         raise InputFileError(f"{path}: cannot be read ({reason})") from None
 
 
+def _read_pngs(path: Path) -> _Raw:
+    """Read a 16-bit grey image, or a folder of them."""
+    files = sorted(path.glob("*.png")) if path.is_dir() else [path]
+    if not files:
+        raise InputFileError(f"{path}: is a folder without PNG images, and no ROS bag")
+    images, told = [], set()
+    for file in files:
+        if file.stat().st_size > FREE_BYTES:
+            raise InputFileError(f"{file}: refused: is far too large for a frame")
+        with Image.open(file, formats=("PNG",)) as image:
+            if image.width * image.height > _MOST_PIXELS or not image.mode.startswith("I"):
+                raise InputFileError(f"{file}: must be a 16-bit grey image of at most {_MOST_PIXELS} pixels")
+            images.append(np.asarray(image, dtype=np.float64))
+            text = getattr(image, "text", {})  # read with the image
+            told.add((text.get("metres_per_unit"), text.get("quantity")))
+    if len(told) > 1 or len({image.shape for image in images}) > 1:
+        raise InputFileError(f"{path}: its images must all have one size, scale and quantity")
+    scale, quantity = told.pop()
+    codes = np.stack(images)
+    stated = {} if quantity is None else {"quantity": quantity}
+    if scale is not None:
+        codes = codes * float(scale)
+        stated["unit"] = "m"
+    return _Raw({"range": np.where(codes == 0, np.nan, codes)}, stated)
+
+
 def _read_npz(path: Path) -> _Raw:
     # A handle of our own: np.load leaves its file open when the archive is cut off.
     with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        declared = sum(member.file_size for member in archive.zip.infolist())
+        if declared > FREE_BYTES + EXPANSION * path.stat().st_size:
+            raise InputFileError(f"{path}: refused: declares {declared} bytes, far more than its size can hold")
         if "range" not in archive:
             raise InputFileError(f"{path}: must have an array 'range', got {', '.join(archive) or 'nothing'}")
         arrays = {name: np.asarray(archive[name]) for name in _FIELDS if name in archive}
@@ -240,8 +317,8 @@ def _read_npz(path: Path) -> _Raw:
     return _Raw(arrays, stated)
 
 
-def _read_hdf5(path: Path) -> _Raw:
-    with h5py.File(path, "r") as file:
+def _read_hdf5(path: Path, untrusted: bool) -> _Raw:
+    with open_hdf5(path, "file of frames", untrusted=untrusted) as file:
         if not isinstance(file.get("range"), h5py.Dataset):
             kind = file.attrs.get("format")
             raise InputFileError(
@@ -269,7 +346,7 @@ def _parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> NDArray[np
     except UnicodeDecodeError:
         text = "\0"
     if "\0" in text:
-        raise InputFileError(f"{path}: is not CSV, NPY, NPZ or HDF5")
+        raise InputFileError(f"{path}: is not CSV, NPY, NPZ, HDF5 or PNG")
     expected = math.prod(shape)
     lines = [
         (number, line)

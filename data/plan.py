@@ -1,4 +1,4 @@
-"""What a bank is made of, as a TOML file or in code: frozen, validated, and resolved to the last default."""
+"""Plans, as TOML files or in code: frozen, validated, resolved to the last default. What every plan has, and banks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import os
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from pydantic import (
     PlainSerializer,
     ValidationError,
     ValidationInfo,
+    WithJsonSchema,
     model_validator,
 )
 
@@ -44,10 +45,21 @@ def _positive(values: tuple[float, ...], info: ValidationInfo) -> tuple[float, .
     return values
 
 
-_Grid = Annotated[tuple[float, ...], BeforeValidator(_to_grid), PlainSerializer(format_grid, return_type=str)]
+_GRID_SCHEMA = {
+    "description": "START:STOP:STEP, V1,V2,… or V",
+    "anyOf": [{"type": "string"}, {"type": "number"}, {"type": "array", "items": {"type": "number"}}],
+}
+_Grid = Annotated[
+    tuple[float, ...],
+    BeforeValidator(_to_grid),
+    PlainSerializer(format_grid, return_type=str),
+    WithJsonSchema(_GRID_SCHEMA),
+]
 
 
-class _PlanModel(BaseModel):
+class PlanModel(BaseModel):
+    """A frozen table of a plan; what is wrong with it is a UsageError of one line."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     def __init__(self, **data: Any) -> None:
@@ -57,7 +69,7 @@ class _PlanModel(BaseModel):
             raise _as_usage_error(error) from None
 
 
-class MeshPlan(_PlanModel):
+class MeshPlan(PlanModel):
     """A landmark from a mesh file.
 
     Parameters
@@ -87,7 +99,67 @@ class MeshPlan(_PlanModel):
     albedo: _Albedo = 0.8
 
 
-class BankPlan(_PlanModel):
+class ScenePlan(PlanModel):
+    """What a plan says of the landmarks and the camera.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Names from the catalogue. Without classes, landmarks and meshes: the whole catalogue.
+    landmarks : sequence of LandmarkSpec
+        Further boxes with a solid of revolution, spelled out.
+    meshes : sequence of MeshPlan
+        Landmarks from mesh files.
+    sensor : str
+        A preset's name, or a sensor file (with a ``/`` or ending in ``.toml``).
+    sensor_overrides : mapping
+        Fields of the sensor that replace those of `sensor`.
+    """
+
+    classes: tuple[str, ...] = ()
+    landmarks: tuple[LandmarkSpec, ...] = ()
+    meshes: tuple[MeshPlan, ...] = ()
+    sensor: str = "pmd-16x16"
+    sensor_overrides: dict[str, Any] = Field(default_factory=dict)
+
+    def resolve(self) -> Self:
+        """Return the plan with every default made explicit."""
+        raise NotImplementedError
+
+    def build_sensor(self) -> Sensor:
+        """Return the sensor, overrides applied.
+
+        Raises
+        ------
+        UsageError
+            The preset is unknown, or a field or its value is wrong.
+        InputFileError
+            The sensor file cannot be read.
+        """
+        if set(self.sensor_overrides) >= set(Sensor.model_fields):  # a resolved plan needs no preset and no file
+            return Sensor(**self.sensor_overrides)
+        base = Sensor.from_toml(self.sensor) if _is_file(self.sensor) else preset(self.sensor)
+        return base.with_(**self.sensor_overrides)
+
+    def resolve_landmarks(self) -> tuple[list[LandmarkSpec], list[MeshPlan]]:
+        """Return the landmarks, those of the catalogue spelled out, and those from mesh files.
+
+        Raises
+        ------
+        UsageError
+            A class is unknown, or two landmarks have one name.
+        """
+        named = self.classes or (() if self.landmarks or self.meshes else tuple(catalog()))
+        specs: list[LandmarkSpec] = [*(_from_catalog(name) for name in named), *self.landmarks]
+        names = [*(spec.name for spec in specs), *(mesh.name for mesh in self.meshes)]
+        for name in names:
+            if names.count(name) > 1 or name == "none":
+                problem = "stands for no landmark" if name == "none" else "names two landmarks"
+                raise UsageError(f"the class name {name!r} {problem}: give each landmark a name of its own")
+        return specs, list(self.meshes)
+
+
+class BankPlan(ScenePlan):
     """A bank of model images (PHYSICS sections 5 and 7).
 
     Parameters
@@ -125,11 +197,6 @@ class BankPlan(_PlanModel):
     (0.8, 1.0, 1.2)
     """
 
-    classes: tuple[str, ...] = ()
-    landmarks: tuple[LandmarkSpec, ...] = ()
-    meshes: tuple[MeshPlan, ...] = ()
-    sensor: str = "pmd-16x16"
-    sensor_overrides: dict[str, Any] = Field(default_factory=dict)
     distance_m: Annotated[_Grid, AfterValidator(_positive)] = Field(default=DEFAULT_DISTANCE_M, validate_default=True)
     delta_deg: _Grid | None = None
     model: Literal["ray", "planar"] = "ray"
@@ -143,7 +210,7 @@ class BankPlan(_PlanModel):
             raise UsageError(f"'harmonics' must increase from order to order, got {list(self.harmonics)}")
         return self
 
-    def resolve(self) -> BankPlan:
+    def resolve(self) -> Self:
         """Return the plan with every default made explicit: landmarks, the sensor's fields, both grids, albedo.
 
         Resolving again changes nothing, and the result no longer depends on the catalogue or the presets.
@@ -155,21 +222,14 @@ class BankPlan(_PlanModel):
         InputFileError
             The sensor file cannot be read.
         """
-        named = self.classes or (() if self.landmarks or self.meshes else tuple(catalog()))
-        specs: list[LandmarkSpec] = [*(_from_catalog(name) for name in named), *self.landmarks]
-        meshes: list[MeshPlan] = list(self.meshes)
+        specs, meshes = self.resolve_landmarks()
         if self.albedo is not None:
             specs = [LandmarkSpec(**{**spec.model_dump(), "albedo": self.albedo}) for spec in specs]
             meshes = [MeshPlan(**{**mesh.model_dump(), "albedo": self.albedo}) for mesh in meshes]
         parts: list[LandmarkSpec | MeshPlan] = [*specs, *meshes]
-        names = [part.name for part in parts]
-        for name in names:
-            if names.count(name) > 1 or name == "none":
-                problem = "stands for no landmark" if name == "none" else "names two landmarks"
-                raise UsageError(f"the class name {name!r} {problem}: give each landmark a name of its own")
         period_deg = 360 / math.gcd(*(part.symmetry for part in parts))
         delta_deg = parse_grid(self.delta_deg or f"0:{period_deg!r}:{DEFAULT_DELTA_STEP_DEG}", "delta_deg")
-        return BankPlan(
+        return type(self)(
             landmarks=tuple(specs),
             meshes=tuple(meshes),
             sensor=self.sensor,
@@ -181,28 +241,15 @@ class BankPlan(_PlanModel):
             harmonics=self.harmonics,
         )
 
-    def build_sensor(self) -> Sensor:
-        """Return the sensor, overrides applied.
-
-        Raises
-        ------
-        UsageError
-            The preset is unknown, or a field or its value is wrong.
-        InputFileError
-            The sensor file cannot be read.
-        """
-        if set(self.sensor_overrides) >= set(Sensor.model_fields):  # a resolved plan needs no preset and no file
-            return Sensor(**self.sensor_overrides)
-        is_file = self.sensor.endswith(".toml") or "/" in self.sensor
-        base = Sensor.from_toml(self.sensor) if is_file else preset(self.sensor)
-        return base.with_(**self.sensor_overrides)
-
     @property
     def delta_rad(self) -> NDArray[np.float64]:
         """The grid of angles of a resolved plan, radians."""
         if self.delta_deg is None:
             raise UsageError("'delta_deg' follows from the landmarks' symmetry: resolve the plan first")
         return np.deg2rad(self.delta_deg)
+
+
+P = TypeVar("P", bound=ScenePlan)
 
 
 def load_plan(path: str | os.PathLike[str]) -> BankPlan:
@@ -223,6 +270,30 @@ def load_plan(path: str | os.PathLike[str]) -> BankPlan:
     UsageError
         With one line that names the file, the key, the value and what would be right.
     """
+    return read_plan(path, BankPlan)
+
+
+def read_plan(path: str | os.PathLike[str], model: type[P]) -> P:
+    """Read a plan of any kind from a TOML file; files it names are relative to its folder.
+
+    Parameters
+    ----------
+    path : path-like
+    model : type
+        :class:`BankPlan` or :class:`phasemark.data.FramePlan`.
+
+    Returns
+    -------
+    ScenePlan
+        Of the type `model`.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read or is not TOML.
+    UsageError
+        With one line that names the file, the key, the value and what would be right.
+    """
     path = Path(path)
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -231,14 +302,16 @@ def load_plan(path: str | os.PathLike[str]) -> BankPlan:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:  # the last: nested without end
         raise InputFileError(f"{path}: not a TOML file ({error})") from None
     try:
-        plan = BankPlan(**table)
+        plan = model(**table)
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from None
     meshes = [MeshPlan(**{**mesh.model_dump(), "path": str(path.parent / mesh.path)}) for mesh in plan.meshes]
-    is_file = plan.sensor.endswith(".toml") or "/" in plan.sensor
-    return plan.model_copy(
-        update={"meshes": tuple(meshes), "sensor": str(path.parent / plan.sensor) if is_file else plan.sensor}
-    )
+    sensor = str(path.parent / plan.sensor) if _is_file(plan.sensor) else plan.sensor
+    return plan.model_copy(update={"meshes": tuple(meshes), "sensor": sensor})
+
+
+def _is_file(sensor: str) -> bool:
+    return sensor.endswith(".toml") or "/" in sensor
 
 
 def factored_refusal(plan: BankPlan) -> str | None:

@@ -6,6 +6,7 @@ import hashlib
 import os
 import re
 import secrets
+import shutil
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -76,34 +77,124 @@ def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bo
         raise UsageError(f"'{path}' is not a file name")
     targets = [path, checksum_path(path)] if checksum else [path]
     for target in targets:
-        _refuse_unwritable(target, force=force)
+        refuse_unwritable(target, force=force)
     parts = [target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial") for target in targets]
-    aside = parts[-1].with_suffix(".old")
     try:
-        with _storage_errors(path):
+        with storage_errors(path):
             _create(parts[0])
             yield parts[0]
             _sync(parts[0])
             if checksum:
                 parts[1].write_bytes(_checksum_line(sha256_of(parts[0]), path.name))
                 _sync(parts[1])
-        for target in targets:  # somebody else may have been faster
-            _refuse_unwritable(target, force=force)
-        with _storage_errors(path):
-            if checksum and targets[1].exists():
+        _move_into_place(parts, targets, force=force)
+    finally:
+        for leftover in parts:
+            with suppress(OSError):
+                leftover.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_folder(path: Path, *, force: bool = False) -> Iterator[Path]:
+    """Hand out an empty folder beside `path` and give it that name when the block ends well, as :func:`replacing`.
+
+    Raises
+    ------
+    OutputExistsError
+        Something has the name and `force` is not set, or what has it is not a folder.
+    UsageError, StorageError
+        As :func:`write_atomically`.
+    """
+    if not path.name or not path.parent.is_dir():
+        raise UsageError(f"{path}: the folder '{path.parent}' does not exist: make it first")
+    if path.exists() and not path.is_dir():
+        raise UsageError(f"{path}: is a file, give the name of a folder")
+    if path.exists() and not force:
+        raise OutputExistsError(f"{path}: exists; use --force to replace it")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    aside = temporary.with_suffix(".old")
+    try:
+        with storage_errors(path):
+            temporary.mkdir()
+            yield temporary
+            if path.exists():
+                os.replace(path, aside)
+            os.replace(temporary, path)
+            _sync(path.parent)
+    except BaseException:
+        if aside.exists() and not path.exists():
+            os.replace(aside, path)
+        raise
+    finally:
+        for leftover in (temporary, aside):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
+def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
+    """Give a finished file its name, and the checksum file that goes with it, as :func:`replacing` does.
+
+    Parameters
+    ----------
+    part : Path
+        The finished file, in the folder of `path`.
+    path : Path
+        The name it gets.
+    digest : str
+        Its SHA-256.
+    force : bool
+        Whether existing files may be replaced.
+
+    Raises
+    ------
+    OutputExistsError, StorageError
+        As :func:`write_atomically`; `part` and what was there before are untouched.
+    """
+    checksum_part, _ = _publishing_names(path)
+    try:
+        with storage_errors(path):
+            _sync(part)
+            checksum_part.write_bytes(_checksum_line(digest, path.name))
+            _sync(checksum_part)
+        _move_into_place([part, checksum_part], [path, checksum_path(path)], force=force)
+    finally:
+        with suppress(OSError):
+            checksum_part.unlink(missing_ok=True)
+
+
+def finish_publishing(path: Path) -> None:
+    """Write the checksum of a file that :func:`publish` had just given its name when the process was killed."""
+    write_checksum(path, force=True)
+    for leftover in _publishing_names(path):
+        leftover.unlink(missing_ok=True)
+
+
+def _publishing_names(path: Path) -> tuple[Path, Path]:
+    """Return the temporary names of the new and the old checksum; always the same, so a later run tidies them up."""
+    name = checksum_path(path).name
+    return path.with_name(f".{name}.partial"), path.with_name(f".{name}.old")
+
+
+def _move_into_place(parts: list[Path], targets: list[Path], *, force: bool) -> None:
+    """Replace a file, and then its checksum; the old checksum steps aside first and returns if the file cannot go."""
+    for target in targets:  # somebody else may have been faster
+        refuse_unwritable(target, force=force)
+    _, aside = _publishing_names(targets[0])
+    try:
+        with storage_errors(targets[0]):
+            if len(targets) > 1 and targets[1].exists():
                 os.replace(targets[1], aside)
             for part, target in zip(parts, targets, strict=True):
                 os.replace(part, target)
-            _sync(path.parent)
+            _sync(targets[0].parent)
     except BaseException:
-        if aside.exists() and parts[0].exists():  # `path` is still the old file: give it its checksum back
+        if aside.exists() and parts[0].exists():  # the file is still the old one: give it its checksum back
             with suppress(OSError):
                 os.replace(aside, targets[1])
         raise
     finally:
-        for leftover in (*parts, aside):
+        if not parts[0].exists():
             with suppress(OSError):
-                leftover.unlink(missing_ok=True)
+                aside.unlink(missing_ok=True)
 
 
 def checksum_path(path: str | os.PathLike[str]) -> Path:
@@ -160,11 +251,6 @@ def read_checksum(path: str | os.PathLike[str]) -> str:
     str
         Lower-case hexadecimal.
 
-    Parameters
-    ----------
-    path : path-like
-        The file, not its checksum.
-
     Raises
     ------
     InputFileError
@@ -207,7 +293,17 @@ def verify_checksum(path: str | os.PathLike[str]) -> str:
     return actual
 
 
-def _refuse_unwritable(path: Path, *, force: bool) -> None:
+def has_matching_checksum(path: str | os.PathLike[str]) -> bool:
+    """Return whether ``FILE.sha256`` is there and says what the file's SHA-256 is."""
+    try:
+        verify_checksum(path)
+    except InputFileError:
+        return False
+    return True
+
+
+def refuse_unwritable(path: Path, *, force: bool) -> None:
+    """Refuse a name in no folder, of a folder or device, or of a file that exists unless `force` allows it."""
     if not path.parent.is_dir():
         raise UsageError(f"{path}: the folder '{path.parent}' does not exist: make it first")
     try:
@@ -223,7 +319,8 @@ def _refuse_unwritable(path: Path, *, force: bool) -> None:
 
 
 @contextmanager
-def _storage_errors(path: Path) -> Iterator[None]:
+def storage_errors(path: Path) -> Iterator[None]:
+    """Turn an OSError of the block into a StorageError that names `path`."""
     try:
         yield
     except OSError as error:

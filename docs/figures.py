@@ -1,9 +1,14 @@
-"""Draw the pictures of the documentation into docs/images: ``python docs/figures.py``."""
+"""Draw the pictures of the documentation into docs/images: ``python docs/figures.py``.
+
+That of accuracy against cost shows the numbers of the last ``make bench``, in out/bench.json.
+"""
 
 from __future__ import annotations
 
 import io
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -37,12 +42,59 @@ def demo_figure() -> Figure:
     return figure
 
 
+def cost_figure(rows: list[dict[str, Any]]) -> Figure:
+    """Draw the error of a frame against the time it takes, for each method, on each frame measured."""
+    figure = Figure(figsize=(9.0, 3.9), layout="constrained")
+    frames = sorted({row["frame"] for row in rows})
+    for k, (axes, frame) in enumerate(
+        zip(figure.subplots(1, len(frames), sharey=True, squeeze=False)[0], frames, strict=True)
+    ):
+        for method, style in (("grid", "s:"), ("jitter", "o--"), ("phasemark", "*")):
+            points = [row for row in rows if row["frame"] == frame and row["method"].startswith(method)]
+            measured = [row for row in points if "extrapolated" not in row["method"]]
+            (line,) = axes.loglog(
+                [row["seconds/frame"] for row in measured],
+                [row["ε"] for row in measured],
+                style,
+                markersize=11 if method == "phasemark" else 5,
+                label={"grid": "point grid (Open3D)", "jitter": "jittered (Open3D)"}.get(method, method),
+            )
+            for row in measured if method != "phasemark" else ():
+                axes.annotate(
+                    row["rays a pixel"], (row["seconds/frame"], row["ε"]), (3, 4), textcoords="offset points", size=7
+                )
+            for row in points:
+                if "extrapolated" in row["method"]:
+                    last = measured[-1]
+                    axes.loglog(
+                        [last["seconds/frame"], row["seconds/frame"]], [last["ε"], row["ε"]],
+                        "--", color=line.get_color(), alpha=0.4,
+                    )  # fmt: skip
+                    axes.loglog(row["seconds/frame"], row["ε"], "o", color=line.get_color(), fillstyle="none")
+        axes.axhline(1e-4, color="0.6", lw=0.8)
+        axes.set_title(f"reference frame {frame}", size=10)
+        axes.set_xlabel("time of a frame (s), two threads")
+        if k == 0:
+            axes.set_ylabel("ε: largest error / brightest pixel")
+            axes.legend(frameon=False, fontsize=8)
+        axes.grid(alpha=0.3)
+    return figure
+
+
+def write(figure: Figure, name: str) -> None:
+    """Write a picture."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=90)
+    IMAGES.mkdir(exist_ok=True)
+    write_atomically(IMAGES / name, buffer.getvalue(), force=True)
+
+
 def main() -> None:
     """Write every picture."""
-    buffer = io.BytesIO()
-    demo_figure().savefig(buffer, format="png", dpi=90)
-    IMAGES.mkdir(exist_ok=True)
-    write_atomically(IMAGES / "demo.png", buffer.getvalue(), force=True)
+    write(demo_figure(), "demo.png")
+    bench = Path(__file__).parent.parent / "out" / "bench.json"
+    if bench.exists():
+        write(cost_figure(json.loads(bench.read_text(encoding="utf-8"))["peer"]["rows"]), "cost.png")
 
 
 if __name__ == "__main__":

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from phasemark.data import versions
+from phasemark.data.page import embedded_png, figure_png, page_template, short_number
 from phasemark.landmarks import mesh_picture
 from phasemark.matcher.demo import LANDMARK_XY_M, SHIFT_STEPS, WALL_M, CellResult, DemoResult, cell_rows
 from phasemark.matcher.picture import describe, match_picture
@@ -35,10 +33,6 @@ def demo_report(result: DemoResult) -> str:
     -------
     str
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("phasemark.matcher", "."), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    environment.filters["number"] = _number
     on_grid, shifted = result.select(shifted=False), result.select(shifted=True)
     halves = [
         {"name": "On the bank's grid: the paper's cells", "results": on_grid},
@@ -46,7 +40,7 @@ def demo_report(result: DemoResult) -> str:
     ]
     for half in halves:
         half["rows"] = cell_rows(half["results"])  # type: ignore[arg-type]
-    return environment.get_template("demo.html.j2").render(
+    return page_template("phasemark.matcher", "demo.html.j2").render(
         summary=_summary(result),
         gallery=_gallery(result),
         matches=_matches(result),
@@ -80,7 +74,7 @@ def _summary(result: DemoResult) -> list[str]:
         delta_deg = np.degrees(np.concatenate([np.abs(r.delta_error_rad) for r in results]))
         position_mm = np.concatenate([r.position_error_m for r in results]) * 1e3
         (distance, distance_worst), (delta, delta_worst), (position, position_worst) = (
-            (_number(float(np.nanmedian(errors))), _number(float(np.nanmax(errors))))
+            (short_number(float(np.nanmedian(errors))), short_number(float(np.nanmax(errors))))
             for errors in (distance_mm, delta_deg, position_mm)
         )
         sentences.append(
@@ -115,13 +109,12 @@ def _gallery(result: DemoResult) -> list[dict[str, Any]]:
         picked = own[len(own) // 2]
         figure = Figure(figsize=(3.9, 3.3), layout="constrained")
         draw_range(figure.add_subplot(), picked.filtered.range_m[0])
-        mesh = base64.b64encode(mesh_picture(result.bank.mesh(name))).decode()
         shown.append(
             {
                 "name": name,
                 "view": f"D = {100 * picked.cell.distance_m:g} cm, δ = {math.degrees(picked.cell.delta_rad):g}°",
                 "frame": _image(figure, f"Filtered range image of the {name}"),
-                "mesh": Markup('<img alt="{}" src="data:image/png;base64,{}">').format(f"The {name}", mesh),
+                "mesh": embedded_png(mesh_picture(result.bank.mesh(name)), f"The {name}"),
             }
         )
     return shown
@@ -218,17 +211,7 @@ def _run_time(result: DemoResult) -> list[tuple[str, float]]:
 
 
 def _image(figure: Figure, alternative: str) -> Markup:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    data = base64.b64encode(buffer.getvalue()).decode()
-    return Markup('<img alt="{}" src="data:image/png;base64,{}">').format(alternative, data)
-
-
-def _number(value: float) -> str:
-    """Write a number with as many digits as it deserves in a table."""
-    if not math.isfinite(value):
-        return "–"
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
+    return embedded_png(figure_png(figure), alternative)
 
 
 def summary_rows(results: Sequence[CellResult]) -> list[tuple[str, ...]]:
@@ -246,7 +229,7 @@ def summary_rows(results: Sequence[CellResult]) -> list[tuple[str, ...]]:
                 f"{100 * distance:.2f}",
                 f"{math.degrees(delta):.2f}",
                 f"{sum(int(r.class_right.sum()) for r in own)}/{sum(len(r.matches) for r in own)}",
-                *(_number(float(statistic(error))) for error in errors for statistic in (np.nanmedian, np.nanmax)),
+                *(short_number(float(statistic(error))) for error in errors for statistic in (np.nanmedian, np.nanmax)),
             )
         )
     return rows

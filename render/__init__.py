@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING
 from phasemark.render.ablation import Ablation, ablate
 from phasemark.render.background import Background
 from phasemark.render.capture import capture, capture_moving
+from phasemark.render.characterise import Characterisation, Comparison, Quantity, characterise
 from phasemark.render.correlation import Harmonic, pulse_harmonics, square_harmonics
+from phasemark.render.fit import Estimate, SensorFit, fit_sensor
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.motion import Motion, render_moving
 from phasemark.render.noise import measured_range_std, predicted_range_std
@@ -24,19 +26,26 @@ __all__ = [
     "Ablation",
     "Background",
     "CameraUnit",
+    "Characterisation",
+    "Comparison",
+    "Estimate",
     "Flag",
     "Frames",
     "Harmonic",
     "Motion",
     "PhasorImages",
     "PlanarLandmark",
+    "Quantity",
     "Renderer",
     "Sensor",
+    "SensorFit",
     "Views",
     "ablate",
     "camera_unit",
     "capture",
     "capture_moving",
+    "characterise",
+    "fit_sensor",
     "measured_range_std",
     "phasor_to_range_m",
     "planar_images",

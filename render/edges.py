@@ -35,7 +35,10 @@ class MeshTopology(NamedTuple):
     faces : (f, 3) int32
     planes : (f, 4) float64
         Unit normal and offset of each face: n · p = offset on it.
-    corner_normals : (f, 3, 3) float64
+    corner_shares : (f, 2, 4) float32
+        The barycentric coordinates of a point on a face that belong to its second and third corner: the products of
+        the rows with (x, y, z, 1).
+    corner_normals : (f, 3, 3) float32
         Shading normal at each corner of each face; zero at an apex, where there is none.
     flat : (f,) bool
         Whether the three corner normals are the face's own.
@@ -52,13 +55,13 @@ class MeshTopology(NamedTuple):
         regions, which matter where they are silhouettes. An edge runs along the winding of its first face.
     face_folds : (f, 3) int32
         The folds whose first face this is, −1: fewer than three.
-    fold_reach : (f,) float64
-        How far the normal turns, |n − n'|, over the face's folds at most; −1 if it has none.
     smooth_faces : (g,) int32
         Faces with folds, neighbours near one another; each :data:`CLUSTER` of them are a cluster.
+    smooth_planes : (g, 5) float64
+        Their planes, and their reach: how far the normal turns, |n − n'|, over the face's folds at most.
     clusters : (c, 10) float64
         Per cluster a point, a mean normal, its offset from the point's plane, how far the faces' normals and offsets
-        differ from those at most, and the largest fold_reach.
+        differ from those at most, and the largest reach.
     radius_m : float
         Distance of the farthest vertex from the origin.
     closed : bool
@@ -68,7 +71,8 @@ class MeshTopology(NamedTuple):
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
     planes: NDArray[np.float64]
-    corner_normals: NDArray[np.float64]
+    corner_shares: NDArray[np.float32]
+    corner_normals: NDArray[np.float32]
     flat: NDArray[np.bool_]
     plain: NDArray[np.bool_]
     patch: NDArray[np.int32]
@@ -77,8 +81,8 @@ class MeshTopology(NamedTuple):
     concave: NDArray[np.bool_]
     folds: NDArray[np.int32]
     face_folds: NDArray[np.int32]
-    fold_reach: NDArray[np.float64]
     smooth_faces: NDArray[np.int32]
+    smooth_planes: NDArray[np.float64]
     clusters: NDArray[np.float64]
     radius_m: float
     closed: bool
@@ -129,7 +133,8 @@ class MeshTopology(NamedTuple):
             vertices=np.ascontiguousarray(vertices),
             faces=np.ascontiguousarray(faces, dtype=np.int32),
             planes=np.ascontiguousarray(planes),
-            corner_normals=np.ascontiguousarray(corners),
+            corner_shares=_corner_shares(vertices[faces]),
+            corner_normals=np.ascontiguousarray(corners, dtype=np.float32),
             flat=np.ascontiguousarray(flat),
             plain=np.bincount(patch, ~flat)[patch] == 0,
             patch=patch,
@@ -138,8 +143,8 @@ class MeshTopology(NamedTuple):
             concave=np.ascontiguousarray(concave[crease]),
             folds=np.ascontiguousarray(edges[fold], dtype=np.int32),
             face_folds=face_folds,
-            fold_reach=fold_reach,
             smooth_faces=smooth_faces,
+            smooth_planes=np.ascontiguousarray(np.column_stack([planes, fold_reach])[smooth_faces]),
             clusters=clusters,
             radius_m=float(np.linalg.norm(vertices, axis=1).max()),
             closed=bool(regular.all() and (six_volumes > 0).all()),
@@ -152,7 +157,8 @@ class MeshTopology(NamedTuple):
             vertices=np.zeros((0, 3)),
             faces=np.zeros((0, 3), np.int32),
             planes=np.zeros((0, 4)),
-            corner_normals=np.zeros((0, 3, 3)),
+            corner_shares=np.zeros((0, 2, 4), np.float32),
+            corner_normals=np.zeros((0, 3, 3), np.float32),
             flat=np.zeros(0, np.bool_),
             plain=np.zeros(0, np.bool_),
             patch=np.zeros(0, np.int32),
@@ -161,8 +167,8 @@ class MeshTopology(NamedTuple):
             concave=np.zeros(0, np.bool_),
             folds=np.zeros((0, 4), np.int32),
             face_folds=np.zeros((0, 3), np.int32),
-            fold_reach=np.zeros(0),
             smooth_faces=np.zeros(0, np.int32),
+            smooth_planes=np.zeros((0, 5)),
             clusters=np.zeros((0, 10)),
             radius_m=0.0,
             closed=True,
@@ -206,7 +212,7 @@ def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool
 def _folds_of_faces(
     folds: NDArray[np.int64], normals: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Return the folds that each face comes first in, (f, 3), and how far its normal turns over all of its folds."""
+    """Return the folds that each face comes first in, (f, 3), and its reach (−1: it has no fold)."""
     table = np.full((len(normals), 3), -1, np.int32)
     reach = np.full(len(normals), -1.0)
     order = np.argsort(folds[:, 2], kind="stable")
@@ -259,6 +265,22 @@ def _components(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int32]:
 
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
+
+
+def _corner_shares(corners: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return ``corner_shares`` of faces, given their corners (f, 3, 3)."""
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    d11, d12, d22 = (np.einsum("ij,ij->i", x, y) for x, y in ((first, first), (first, second), (second, second)))
+    determinant = (d11 * d22 - d12 * d12)[:, None]
+    gradient = np.stack(
+        [
+            (d22[:, None] * first - d12[:, None] * second) / determinant,
+            (d11[:, None] * second - d12[:, None] * first) / determinant,
+        ],
+        axis=1,
+    )
+    constant = -np.einsum("fkx,fx->fk", gradient, corners[:, 0])
+    return np.ascontiguousarray(np.concatenate([gradient, constant[..., None]], axis=2), dtype=np.float32)
 
 
 def _corner_normals(
@@ -339,9 +361,8 @@ def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  #
         How many segments were written.
     """
     vertices, planes, creases, concave, folds = mesh.vertices, mesh.planes, mesh.creases, mesh.concave, mesh.folds
-    face_folds, fold_reach, smooth_faces, clusters = (
-        mesh.face_folds, mesh.fold_reach, mesh.smooth_faces, mesh.clusters
-    )  # fmt: skip
+    face_folds, smooth_faces, smooth_planes = mesh.face_folds, mesh.smooth_faces, mesh.smooth_planes
+    clusters = mesh.clusters
     n = 0
     for e in range(len(creases)):
         start, end, face, other = creases[e, 0], creases[e, 1], creases[e, 2], creases[e, 3]
@@ -350,7 +371,7 @@ def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  #
             before, before_other = _height(planes, face, lens) > 0.0, _height(planes, other, lens) > 0.0
             if not (before or before_other) or (concave[e] and not (before and before_other)):
                 continue
-        if _project(vertices, start, end, matrix, offset, scale, centre, segments[n]):
+        if _project(vertices, start, end, matrix, offset, scale, centre, segments, n):
             limb[n] = 0
             n += 1
     farthest = mesh.radius_m + math.sqrt(lens[0] * lens[0] + lens[1] * lens[1] + lens[2] * lens[2])
@@ -361,11 +382,10 @@ def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  #
         if abs(nx * dx + ny * dy + nz * dz - d) > turn * away + slack + reach * farthest:
             continue
         for i in range(c * CLUSTER, min((c + 1) * CLUSTER, len(smooth_faces))):
-            f = smooth_faces[i]
-            height = _height(planes, f, lens)
-            if abs(height) > fold_reach[f] * farthest:
+            height = _height(smooth_planes, i, lens)
+            if abs(height) > smooth_planes[i, 4] * farthest:
                 continue
-            before = height > 0.0
+            f, before = smooth_faces[i], height > 0.0
             for k in range(3):
                 e = face_folds[f, k]
                 if e < 0:
@@ -373,7 +393,7 @@ def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  #
                 if before == (_height(planes, folds[e, 3], lens) > 0.0):
                     continue
                 a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
-                if _project(vertices, a, b, matrix, offset, scale, centre, segments[n]):
+                if _project(vertices, a, b, matrix, offset, scale, centre, segments, n):
                     limb[n] = 1
                     n += 1
     return n
@@ -386,7 +406,7 @@ def _height(planes, f, lens):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _project(vertices, a, b, matrix, offset, scale, centre, out):  # type: ignore[no-untyped-def]
+def _project(vertices, a, b, matrix, offset, scale, centre, segments, n):  # type: ignore[no-untyped-def]
     ax = matrix[0, 0] * vertices[a, 0] + matrix[0, 1] * vertices[a, 1] + matrix[0, 2] * vertices[a, 2] + offset[0]
     bx = matrix[0, 0] * vertices[b, 0] + matrix[0, 1] * vertices[b, 1] + matrix[0, 2] * vertices[b, 2] + offset[0]
     if ax < _NEAR_M and bx < _NEAR_M:
@@ -401,8 +421,8 @@ def _project(vertices, a, b, matrix, offset, scale, centre, out):  # type: ignor
     elif bx < _NEAR_M:
         w = (_NEAR_M - bx) / (ax - bx)
         bx, by, bz = _NEAR_M, by + w * (ay - by), bz + w * (az - bz)
-    out[0] = centre[0] - scale[0] * ay / ax
-    out[1] = centre[1] - scale[1] * az / ax
-    out[2] = centre[0] - scale[0] * by / bx
-    out[3] = centre[1] - scale[1] * bz / bx
+    segments[n, 0] = centre[0] - scale[0] * ay / ax
+    segments[n, 1] = centre[1] - scale[1] * az / ax
+    segments[n, 2] = centre[0] - scale[0] * by / bx
+    segments[n, 3] = centre[1] - scale[1] * bz / bx
     return 1

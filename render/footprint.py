@@ -33,6 +33,8 @@ _THIN = 0.15
 """Intervals narrower than this (pixels) get one Gauss point."""
 _WIDE = 0.3
 """Intervals wider than this (pixels) get three Gauss points on a curved surface, the others two."""
+_BESIDE_LIMB = (0.1, 0.6)
+"""Intervals beside a limb get two Gauss points, or three, or four where they are wider than this (pixels)."""
 _NARROW = 0.04
 """Strips narrower than this (pixels) get one line."""
 _TRIFLE = 4e-5
@@ -60,8 +62,14 @@ class Scratch(NamedTuple):
 
     Parameters
     ----------
+    boxes : (4 * _MAX_DEPTH + 4, 5) float64
+        Parts of the pixel still to be split: u, v of two corners, level.
+    clipped : (MAX_SEGMENTS, 6) float64
+        The edges of a box as they come.
+    order : (MAX_SEGMENTS,) int64
+        Their order.
     edges : (MAX_SEGMENTS, 6) float64
-        The pixel's edges: s, x of both ends (s rising), side of the surface where the edge is a limb, slope dx/ds.
+        The same in order: s, x of both ends (s rising), side of the surface where the edge is a limb, slope dx/ds.
     events : (_MAX_EVENTS,) float64
         Where slabs begin and end.
     active : (MAX_SEGMENTS,) int64
@@ -75,6 +83,9 @@ class Scratch(NamedTuple):
     n_limbs : (2,) int64
     """
 
+    boxes: NDArray[np.float64]
+    clipped: NDArray[np.float64]
+    order: NDArray[np.int64]
     edges: NDArray[np.float64]
     events: NDArray[np.float64]
     active: NDArray[np.int64]
@@ -87,6 +98,9 @@ class Scratch(NamedTuple):
     def empty(cls) -> Scratch:
         """Return scratch for one thread."""
         return cls(
+            boxes=np.empty((4 * _MAX_DEPTH + 4, 5)),
+            clipped=np.empty((MAX_SEGMENTS, 6)),
+            order=np.empty(MAX_SEGMENTS, np.int64),
             edges=np.empty((MAX_SEGMENTS, 6)),
             events=np.empty(_MAX_EVENTS),
             active=np.empty(MAX_SEGMENTS, np.int64),
@@ -169,7 +183,7 @@ def _has_limb(entry, link, owner, limb):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def sample_pixel(  # type: ignore[no-untyped-def]
-    r, c, bent, width, height, segments, limb, head, link, owner, scratch, points, weights, regions, n, region
+    r, c, bent, width, height, splits, segments, limb, head, link, owner, scratch, points, weights, regions, n, region
 ):
     """Place the samples of one pixel.
 
@@ -181,6 +195,8 @@ def sample_pixel(  # type: ignore[no-untyped-def]
         Whether the pixel may see the inside of a curved surface, which takes more points than a flat one.
     width, height : float
         Fill factor.
+    splits : int
+        Boxes a side that the active area is cut into before anything else.
     segments, limb, head, link, owner
         As :func:`project_edges` and :func:`bin_segments` left them.
     scratch : Scratch
@@ -204,33 +220,39 @@ def sample_pixel(  # type: ignore[no-untyped-def]
     upright = _has_limb(head[i - 1, j], link, owner, limb) or _has_limb(head[i + 1, j], link, owner, limb)
     if head[i, j] < 0 and not sideways and not upright:
         count = 3 if bent else 2
-        if n + count * count > len(weights):
+        if n + (splits * count) ** 2 > len(weights):
             return -1, region, True
-        for a in range(count):
-            for b in range(count):
-                points[n, 0] = u0 + width * (_G3X[b] if bent else _G2X[b])
-                points[n, 1] = v0 + height * (_G3X[a] if bent else _G2X[a])
-                weights[n] = _G3W[a] * _G3W[b] if bent else 0.25
-                regions[n] = region
-                n += 1
-        return n, region + 1, True
+        for box in range(splits * splits):
+            row, col = divmod(box, splits)
+            for a in range(count):
+                for b in range(count):
+                    points[n, 0] = u0 + width / splits * (col + (_G3X[b] if bent else _G2X[b]))
+                    points[n, 1] = v0 + height / splits * (row + (_G3X[a] if bent else _G2X[a]))
+                    weights[n] = (_G3W[a] * _G3W[b] if bent else 0.25) / (splits * splits)
+                    regions[n] = region
+                    n += 1
+            region += 1
+        return n, region, True
     # sweep along the limb if there is one, else along where one is near, else along most of the edges
-    along = np.zeros(4)
+    crease_u, crease_v, limb_u, limb_v = 0.0, 0.0, 0.0, 0.0
     entry = head[i, j]
     while entry >= 0:
         k = owner[entry]
         ua, va, ub, vb = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
         lo, hi = _clip(ua, va, ub, vb, c, r, c + 1, r + 1)
-        along[2 * limb[k]] += max(hi - lo, 0.0) * abs(ub - ua)
-        along[2 * limb[k] + 1] += max(hi - lo, 0.0) * abs(vb - va)
+        du, dv = max(hi - lo, 0.0) * abs(ub - ua), max(hi - lo, 0.0) * abs(vb - va)
+        if limb[k]:
+            limb_u, limb_v = limb_u + du, limb_v + dv
+        else:
+            crease_u, crease_v = crease_u + du, crease_v + dv
         entry = link[entry]
-    has_limb = along[2] > 0.0 or along[3] > 0.0
+    has_limb = limb_u > 0.0 or limb_v > 0.0
     if has_limb:
-        sweep_v = along[3] >= along[2]
+        sweep_v = limb_v >= limb_u
     elif sideways != upright:
         sweep_v = sideways
     else:
-        sweep_v = along[1] >= along[0]
+        sweep_v = crease_v >= crease_u
     curved = sideways or upright or has_limb
     scratch.n_limbs[:] = 0
     if curved:
@@ -238,14 +260,22 @@ def sample_pixel(  # type: ignore[no-untyped-def]
         before, after = (head[i, j - 1], head[i, j + 1]) if sweep_v else (head[i - 1, j], head[i + 1, j])
         for near in (head[i, j], before, after):
             _collect_limbs(near, link, owner, segments, limb, sweep_v, scratch.limbs, scratch.n_limbs)
-    stack = np.empty((4 * _MAX_DEPTH + 4, 5))
-    stack[0] = (u0, v0, u0 + width, v0 + height, 0.0)
-    depth = 1
-    trusted = True
-    while depth > 0:
+    stack = scratch.boxes
+    box, depth, trusted = 0, 0, True
+    while depth > 0 or box < splits * splits:
+        if depth == 0:
+            row, col = divmod(box, splits)
+            stack[0] = (
+                u0 + width * col / splits,
+                v0 + height * row / splits,
+                u0 + width * (col + 1) / splits,
+                v0 + height * (row + 1) / splits,
+                0.0,
+            )
+            box, depth = box + 1, 1
         depth -= 1
         bu0, bv0, bu1, bv1, level = stack[depth]
-        m = _clip_to_box(head[i, j], link, owner, segments, limb, bu0, bv0, bu1, bv1, sweep_v, scratch.edges)
+        m = _clip_to_box(head[i, j], link, owner, segments, limb, bu0, bv0, bu1, bv1, sweep_v, scratch)
         s0, s1, x0, x1 = (bv0, bv1, bu0, bu1) if sweep_v else (bu0, bu1, bv0, bv1)
         n_events = _events(s0, s1, scratch.edges, m, scratch.events) if m >= 0 else -1
         if n_events < 0 and level < _MAX_DEPTH:
@@ -284,13 +314,14 @@ def _clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, edges):  # type: ignore[no-untyped-def]
-    """Clip a pixel's segments to a box.
+def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore[no-untyped-def]
+    """Clip a pixel's segments to a box, into ``scratch.edges``.
 
-    Rows of `edges` are s, x of both ends (s rising), the limb's side and the slope, sorted by where they begin. The
+    Its rows are s, x of both ends (s rising), the limb's side and the slope, sorted by where they begin. The
     side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number, or
     −1 if there are too many.
     """
+    edges, order = scratch.clipped, scratch.order
     m = 0
     while entry >= 0:
         k = owner[entry]
@@ -315,9 +346,15 @@ def _clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, ed
         edges[m, 4] = side if limb[k] else 0.0
         length = edges[m, 2] - edges[m, 0]
         edges[m, 5] = (edges[m, 3] - edges[m, 1]) / length if length > 0.0 else 0.0
+        begin, place = edges[m, 0], m
+        while place > 0 and edges[order[place - 1], 0] > begin:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = m
         m += 1
-    if m > 1:
-        edges[:m] = edges[np.argsort(edges[:m, 0])]
+    for i in range(m):
+        for j in range(6):
+            scratch.edges[i, j] = edges[order[i], j]
     return m
 
 
@@ -327,12 +364,14 @@ def _events(s0, s1, edges, m, events):  # type: ignore[no-untyped-def]
 
     Returns their number, or −1 if there are too many.
     """
-    n = 2
-    events[0], events[1] = s0, s1
+    events[0] = s0
+    n = 1
     for i in range(m):
         events[n] = edges[i, 0]
         events[n + 1] = edges[i, 2]
         n += 2
+    events[n] = s1
+    n += 1
     for i in range(m):
         for j in range(i + 1, m):
             if edges[j, 0] >= edges[i, 2]:
@@ -351,13 +390,19 @@ def _events(s0, s1, edges, m, events):  # type: ignore[no-untyped-def]
                     return -1
                 events[n] = lo + (hi - lo) * gap_lo / (gap_lo - gap_hi)
                 n += 1
-    events[:n].sort()
+    # a chain's links follow one another, so that little is out of order
+    for i in range(1, n):
+        event, place = events[i], i
+        while place > 0 and events[place - 1] > event:
+            events[place] = events[place - 1]
+            place -= 1
+        events[place] = event
     return n
 
 
 @njit(cache=True, nogil=True)
 def _collect_limbs(entry, link, owner, segments, limb, sweep_v, limbs, count):  # type: ignore[no-untyped-def]
-    """Append a pixel's limbs: rows of s, x at the low end, s, x at the high end.
+    """Append a pixel's limbs: rows of s, x at the low end, s at the high end, slope dx/ds.
 
     Those whose surface lies towards larger x go to ``limbs[0]``, the others to ``limbs[1]``; `count` has their numbers.
     What no longer fits is left out.
@@ -378,24 +423,28 @@ def _collect_limbs(entry, link, owner, segments, limb, sweep_v, limbs, count):  
             continue
         if sa > sb:
             sa, xa, sb, xb = sb, xb, sa, xa
-        limbs[which, n, 0], limbs[which, n, 1], limbs[which, n, 2], limbs[which, n, 3] = sa, xa, sb, xb
+        limbs[which, n, 0], limbs[which, n, 1], limbs[which, n, 2] = sa, xa, sb
+        limbs[which, n, 3] = (xb - xa) / (sb - sa)
         count[which] += 1
 
 
 @njit(cache=True, nogil=True)
-def _nearest_limb(limbs, n, s, side, bound):  # type: ignore[no-untyped-def]
+def _nearest_limb(limbs, n_limbs, s, side, bound):  # type: ignore[no-untyped-def]
     """Find, of limbs with their surface on our side, the one nearest to `bound` and beyond it, on or near a line.
 
     A limb that ends before it reaches the line (at a rim, say) still shapes the surface beside its end.
     """
+    which = 0 if side > 0 else 1
     best = -np.inf if side > 0 else np.inf
     closest = _REACH
-    for i in range(n):
-        gap = max(limbs[i, 0] - s, s - limbs[i, 2], 0.0)
+    for i in range(n_limbs[which]):
+        gap = max(limbs[which, i, 0] - s, s - limbs[which, i, 2], 0.0)
         if gap > closest:
             continue
-        t = min(max((s - limbs[i, 0]) / (limbs[i, 2] - limbs[i, 0]), 0.0), 1.0)
-        x = limbs[i, 1] + t * (limbs[i, 3] - limbs[i, 1])
+        x = (
+            limbs[which, i, 1]
+            + (min(max(s, limbs[which, i, 0]), limbs[which, i, 2]) - limbs[which, i, 0]) * limbs[which, i, 3]
+        )
         if (side > 0 and x > bound) or (side < 0 and x < bound):
             continue
         if gap < closest or (side > 0 and x > best) or (side < 0 and x < best):
@@ -439,14 +488,15 @@ def _edge_at(edges, i, s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _continues(edges, m, first, before, after, n, stop, lo):  # type: ignore[no-untyped-def]
+def _continues(edges, m, links, last, after, n, stop, lo):  # type: ignore[no-untyped-def]
     """Tell whether the edges of two neighbouring slabs are the same, or links of the same smooth curves.
 
     Not so where edges cross, begin or end alone, where one lies along the border between the slabs, where a link stands
-    at a noticeable angle to the one before, or where the curve has turned far since its `first` link.
+    at a noticeable angle to the one before, or where the curve has turned far since the strip's first slab. The last
+    slab's edges stand in `links` from `last` on.
     """
     for i in range(n):
-        old, new = before[i], after[i]
+        old, new = links[last + i], after[i]
         if old == new:
             continue
         if edges[old, 4] != edges[new, 4] or abs(edges[old, 2] - stop) > _EMPTY or abs(edges[new, 0] - lo) > _EMPTY:
@@ -459,7 +509,8 @@ def _continues(edges, m, first, before, after, n, stop, lo):  # type: ignore[no-
         kink = old_ds * dx - old_dx * ds
         if kink * kink > _KINK * _KINK * max(length, old_ds * old_ds + old_dx * old_dx):
             return False
-        first_ds, first_dx = edges[first[i], 2] - edges[first[i], 0], edges[first[i], 3] - edges[first[i], 1]
+        first = links[i]
+        first_ds, first_dx = edges[first, 2] - edges[first, 0], edges[first, 3] - edges[first, 1]
         turn = first_ds * dx - first_dx * ds
         if turn * turn > _TURN * _TURN * length * (first_ds * first_ds + first_dx * first_dx):
             return False
@@ -489,10 +540,9 @@ def _sweep_box(  # type: ignore[no-untyped-def]
         started, n_active = _activate(lo, hi, edges, m, started, active, n_active)
         if n_slabs > 0:
             stop = slabs[n_slabs - 1, 1]
-            last = links[(n_slabs - 1) * k : n_slabs * k]
             full = n_slabs == len(slabs) or (n_slabs + 1) * k > len(links)
             joined = not full and n_active == k and lo - stop <= _EMPTY
-            if not (joined and _continues(edges, m, links[:k], last, active, k, stop, lo)):
+            if not (joined and _continues(edges, m, links, (n_slabs - 1) * k, active, k, stop, lo)):
                 n, region = _sample_strip(
                     n_slabs, k, x0, x1, sweep_v, scratch, curved, bent, scale, points, weights, regions, n, region
                 )
@@ -501,7 +551,8 @@ def _sweep_box(  # type: ignore[no-untyped-def]
                 n_slabs = 0
         k = n_active
         slabs[n_slabs, 0], slabs[n_slabs, 1] = lo, hi
-        links[n_slabs * k : (n_slabs + 1) * k] = active[:k]
+        for i in range(k):
+            links[n_slabs * k + i] = active[i]
         n_slabs += 1
     if n_slabs > 0:
         n, region = _sample_strip(
@@ -519,19 +570,26 @@ def _sample_strip(  # type: ignore[no-untyped-def]
     An interval's light is ∫ width(s) · mean over x of f(s, x) ds. The width is known exactly; its moments give the
     two-point Gauss rule for it as a weight, exact wherever the mean is cubic in s, and the area always.
     """
-    slabs = scratch.slabs
+    edges, slabs, links = scratch.edges, scratch.slabs, scratch.links
+    limbs, n_limbs = scratch.limbs, scratch.n_limbs
     start, stop = slabs[0, 0], slabs[n_slabs - 1, 1]
     for i in range(k + 1):
-        a, b, left, right = _interval(0.5 * (start + stop), n_slabs, i, k, x0, x1, scratch, curved, curved)
+        a, b, left, right = _interval(
+            0.5 * (start + stop), n_slabs, i, k, x0, x1, edges, slabs, links, limbs, n_limbs, curved, curved
+        )
         near_left, near_right = a - left < _FELT, right - b < _FELT
         limb, width = near_left or near_right, b - a
-        a_low, b_low = _bounds(start, 0, i, k, x0, x1, scratch)
-        a_high, b_high = _bounds(stop, n_slabs - 1, i, k, x0, x1, scratch)
+        a_low, b_low = _bounds(start, 0, i, k, x0, x1, edges, links)
+        a_high, b_high = _bounds(stop, n_slabs - 1, i, k, x0, x1, edges, links)
         extent = max(stop - start, abs(a_high - a_low), abs(b_high - b_low))
         steep = False
         if limb:
-            _, _, left_low, right_low = _interval(start, n_slabs, i, k, x0, x1, scratch, near_left, near_right)
-            _, _, left_high, right_high = _interval(stop, n_slabs, i, k, x0, x1, scratch, near_left, near_right)
+            _, _, left_low, right_low = _interval(
+                start, n_slabs, i, k, x0, x1, edges, slabs, links, limbs, n_limbs, near_left, near_right
+            )
+            _, _, left_high, right_high = _interval(
+                stop, n_slabs, i, k, x0, x1, edges, slabs, links, limbs, n_limbs, near_left, near_right
+            )
             for near, at_low, at_high in ((near_left, left_low, left_high), (near_right, right_low, right_high)):
                 moved = max(abs(at_high - at_low - a_high + a_low), abs(at_high - at_low - b_high + b_low))
                 steep = steep or (near and not moved < _PARALLEL)
@@ -542,11 +600,13 @@ def _sample_strip(  # type: ignore[no-untyped-def]
         for piece in range(pieces):
             lo = start + (stop - start) * _cut(piece / pieces, low, width, high)
             hi = start + (stop - start) * _cut((piece + 1) / pieces, low, width, high)
-            nodes, area, s_a, s_b, share = _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, scratch)
+            nodes, area, s_a, s_b, share = _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, edges, slabs, links)
             for g in range(nodes):
                 s = s_a if g == 0 else s_b
                 weight = area * (share if g == 0 else 1.0 - share)
-                a, b, left, right = _interval(s, n_slabs, i, k, x0, x1, scratch, near_left, near_right)
+                a, b, left, right = _interval(
+                    s, n_slabs, i, k, x0, x1, edges, slabs, links, limbs, n_limbs, near_left, near_right
+                )
                 if n + 5 > len(weights):
                     return -1, region
                 placed = _place(a, b, left, right, bent, points[n:], weights[n:])
@@ -579,7 +639,7 @@ def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, scratch):  # type: ignore[no-untyped-def]
+def _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, edges, slabs, links):  # type: ignore[no-untyped-def]
     """Return the Gauss rule for the width of an interval from `lo` to `hi` as weight.
 
     Returns
@@ -592,7 +652,6 @@ def _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, scratch):  # type: ignore[no-unty
     share : float
         Of the first node in the area.
     """
-    slabs = scratch.slabs
     origin = 0.5 * (lo + hi)
     m0, m1, m2, m3 = 0.0, 0.0, 0.0, 0.0
     first_a, first_b, last_a, last_b, met = 0.0, 0.0, 0.0, 0.0, False
@@ -600,8 +659,8 @@ def _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, scratch):  # type: ignore[no-unty
         begin, end = max(slabs[slab, 0], lo), min(slabs[slab, 1], hi)
         if end <= begin:
             continue
-        a, b = _bounds(begin, slab, i, k, x0, x1, scratch)
-        last_a, last_b = _bounds(end, slab, i, k, x0, x1, scratch)
+        a, b = _bounds(begin, slab, i, k, x0, x1, edges, links)
+        last_a, last_b = _bounds(end, slab, i, k, x0, x1, edges, links)
         if not met:
             first_a, first_b, met = a, b, True
         low, high = max(b - a, 0.0), max(last_b - last_a, 0.0)
@@ -628,21 +687,21 @@ def _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, scratch):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _bounds(s, slab, i, k, x0, x1, scratch):  # type: ignore[no-untyped-def]
+def _bounds(s, slab, i, k, x0, x1, edges, links):  # type: ignore[no-untyped-def]
     """Return the ends of interval i on the line at s, which lies in a slab."""
-    links, edges = scratch.links, scratch.edges
     a = x0 if i == 0 else _edge_at(edges, links[slab * k + i - 1], s)
     b = x1 if i == k else _edge_at(edges, links[slab * k + i], s)
     return a, b
 
 
 @njit(cache=True, nogil=True)
-def _interval(s, n_slabs, i, k, x0, x1, scratch, seek_left, seek_right):  # type: ignore[no-untyped-def]
+def _interval(  # type: ignore[no-untyped-def]
+    s, n_slabs, i, k, x0, x1, edges, slabs, links, limbs, n_limbs, seek_left, seek_right
+):
     """Return the ends of interval i on the line at s, and where its surface's limbs are, ∓inf where there is none.
 
     Limbs beyond the strip are looked for where `seek_left` and `seek_right` say so.
     """
-    slabs, links, edges = scratch.slabs, scratch.links, scratch.edges
     low, high = 0, n_slabs - 1
     while low < high:
         middle = (low + high) // 2
@@ -651,7 +710,7 @@ def _interval(s, n_slabs, i, k, x0, x1, scratch, seek_left, seek_right):  # type
         else:
             high = middle
     row = low * k
-    a, b = _bounds(s, low, i, k, x0, x1, scratch)
+    a, b = _bounds(s, low, i, k, x0, x1, edges, links)
     left, right = -np.inf, np.inf
     behind_limb = False
     for j in range(i - 1, -1, -1):
@@ -671,9 +730,9 @@ def _interval(s, n_slabs, i, k, x0, x1, scratch, seek_left, seek_right):  # type
             break
     if not behind_limb:
         if seek_left and left == -np.inf and not before_limb:
-            left = _nearest_limb(scratch.limbs[0], scratch.n_limbs[0], s, 1.0, a)
+            left = _nearest_limb(limbs, n_limbs, s, 1.0, a)
         if seek_right and alone:
-            right = _nearest_limb(scratch.limbs[1], scratch.n_limbs[1], s, -1.0, b)
+            right = _nearest_limb(limbs, n_limbs, s, -1.0, b)
     return a, b, left, right
 
 
@@ -685,15 +744,16 @@ def _place(a, b, left, right, bent, points, weights):  # type: ignore[no-untyped
     """
     near_left, near_right = a - left < _FELT, right - b < _FELT
     middle, half = 0.0, 0.0
+    count = 2 + (b - a > _BESIDE_LIMB[0]) + (b - a > _BESIDE_LIMB[1])
     if near_left and near_right:
         middle, half = 0.5 * (left + right), 0.5 * (right - left)
         t0 = math.asin(min(max((a - middle) / half, -1.0), 1.0))
         t1 = math.asin(max(min((b - middle) / half, 1.0), -1.0))
         count = 5
     elif near_left:
-        t0, t1, count = math.sqrt(max(a - left, 0.0)), math.sqrt(max(b - left, 0.0)), 4
+        t0, t1 = math.sqrt(max(a - left, 0.0)), math.sqrt(max(b - left, 0.0))
     elif near_right:
-        t0, t1, count = math.sqrt(max(right - a, 0.0)), math.sqrt(max(right - b, 0.0)), 4
+        t0, t1 = math.sqrt(max(right - a, 0.0)), math.sqrt(max(right - b, 0.0))
     else:
         count = 1 if b - a < _THIN else (3 if bent and b - a > _WIDE else 2)
         t0, t1 = a, b

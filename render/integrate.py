@@ -29,7 +29,7 @@ UNTRUSTED = 2
 
 @njit(cache=True, nogil=True)
 def plan_rays(  # type: ignore[no-untyped-def]
-    first, mesh, lens, matrix, offset, bearing, camera, level, row_range, background,
+    first, mesh, lens, matrix, offset, bearing, camera, level, row_range, splits, background,
     segments, limb, head, link, owner, scratch, points, weights, regions, pixel, state,
 ):  # fmt: skip
     """Place the samples of as many views as fit into the buffers, from view `first` on.
@@ -46,6 +46,8 @@ def plan_rays(  # type: ignore[no-untyped-def]
         Tilted to level camera frame.
     row_range : (2,) int64
         First and last-but-one image row to render.
+    splits : int
+        Boxes a side that every pixel is cut into.
     background : (4,) float64
     segments, limb, head, link, owner, scratch
         Scratch, see :func:`project_edges`, :func:`bin_segments` and :func:`sample_pixel`.
@@ -94,7 +96,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
                 before = n
                 bent = c < bent_high_u and c + 1 > bent_low_u and r < bent_high_v and r + 1 > bent_low_v
                 n, region, trusted = sample_pixel(
-                    r, c, bent, camera[6], camera[7], segments, limb, head, link, owner, scratch,
+                    r, c, bent, camera[6], camera[7], splits, segments, limb, head, link, owner, scratch,
                     points, weights, regions, n, region,
                 )  # fmt: skip
                 if n < 0:
@@ -190,9 +192,9 @@ def sum_samples(  # type: ignore[no-untyped-def]
     intensity, coverage, upper : (pixels,) float64, added to
         `upper` is the coverage by the landmark's upper part.
     """
-    normal = np.empty(3)
     # arrays taken out of the tuple once: inside the loop each use of it would count references
-    vertices, faces, planes, corner_normals = mesh.vertices, mesh.faces, mesh.planes, mesh.corner_normals
+    vertices, faces, planes = mesh.vertices, mesh.faces, mesh.planes
+    corner_shares, corner_normals = mesh.corner_shares, mesh.corner_normals
     flat, part = mesh.flat, mesh.part
     for k in range(n):
         index = pixel[k]
@@ -213,7 +215,7 @@ def sum_samples(  # type: ignore[no-untyped-def]
             cos_theta = abs(facing)
             if not (flat[f] and t > 0.0):
                 t, cos_theta = _hit_curved(
-                    ox, oy, oz, dx, dy, dz, t, facing, f, vertices, faces, corner_normals, normal
+                    ox, oy, oz, dx, dy, dz, t, facing, f, vertices, faces, corner_shares[f], corner_normals[f]
                 )
             cos_theta /= length
             distance = t * length
@@ -240,37 +242,30 @@ def sum_samples(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _hit_curved(ox, oy, oz, dx, dy, dz, t, facing, f, vertices, faces, corner_normals, normal):  # type: ignore[no-untyped-def]
+def _hit_curved(ox, oy, oz, dx, dy, dz, t, facing, f, vertices, faces, shares, normals):  # type: ignore[no-untyped-def]
     """Return the multiple of the ray at its hit, and |cos θ| of the shading normal times the ray's length.
 
-    `t` is the multiple at the face's plane, `facing` the product of the face's normal with the ray.
+    `t` is the multiple at the face's plane, `facing` the product of the face's normal with the ray; `shares` and
+    `normals` are the face's rows of ``corner_shares`` and ``corner_normals``.
     """
-    a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
     px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
     # barycentric coordinates in the plane of the face
-    e1x, e1y, e1z = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
-    e2x, e2y, e2z = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
-    qx, qy, qz = px - vertices[a, 0], py - vertices[a, 1], pz - vertices[a, 2]
-    d11 = e1x * e1x + e1y * e1y + e1z * e1z
-    d12 = e1x * e2x + e1y * e2y + e1z * e2z
-    d22 = e2x * e2x + e2y * e2y + e2z * e2z
-    q1 = qx * e1x + qy * e1y + qz * e1z
-    q2 = qx * e2x + qy * e2y + qz * e2z
-    determinant = d11 * d22 - d12 * d12
-    v = min(max((d22 * q1 - d12 * q2) / determinant, 0.0), 1.0)
-    w = min(max((d11 * q2 - d12 * q1) / determinant, 0.0), 1.0 - v)
+    v = min(max(shares[0, 0] * px + shares[0, 1] * py + shares[0, 2] * pz + shares[0, 3], 0.0), 1.0)
+    w = min(max(shares[1, 0] * px + shares[1, 1] * py + shares[1, 2] * pz + shares[1, 3], 0.0), 1.0 - v)
     u = 1.0 - v - w
     # a face seen edge-on leaves the plane's intersection ill-conditioned: take the nearest point of the face instead
     if abs(facing) < 1e-6 * math.sqrt(dx * dx + dy * dy + dz * dz):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         px = u * vertices[a, 0] + v * vertices[b, 0] + w * vertices[c, 0]
         py = u * vertices[a, 1] + v * vertices[b, 1] + w * vertices[c, 1]
         pz = u * vertices[a, 2] + v * vertices[b, 2] + w * vertices[c, 2]
         along = (px - ox) * dx + (py - oy) * dy + (pz - oz) * dz
         t = along / (dx * dx + dy * dy + dz * dz)
-    for k in range(3):
-        normal[k] = u * corner_normals[f, 0, k] + v * corner_normals[f, 1, k] + w * corner_normals[f, 2, k]
-    towards = normal[0] * dx + normal[1] * dy + normal[2] * dz
-    size = math.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
+    nx = u * normals[0, 0] + v * normals[1, 0] + w * normals[2, 0]
+    ny = u * normals[0, 1] + v * normals[1, 1] + w * normals[2, 1]
+    nz = u * normals[0, 2] + v * normals[1, 2] + w * normals[2, 2]
+    towards = nx * dx + ny * dy + nz * dz
+    size = math.sqrt(nx * nx + ny * ny + nz * nz)
     if size == 0.0:  # at the very apex
         return t, abs(facing)
     # the interpolated normal may lean past the ray at the very limb, where nothing comes back

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
 from phasemark.render.sensor import Sensor
+
+_HOPELESS_STD_RAD = 100.0  # π²/3 of phase variance to one part in 1e2; no law describes a signal so low
 
 
 def predicted_range_std(amplitude: ArrayLike, intensity: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
@@ -85,3 +89,54 @@ def phase_image_variance(intensity_e: ArrayLike, sensor: Sensor) -> NDArray[np.f
     """
     shot = np.maximum(np.asarray(intensity_e, dtype=np.float64), 0.0) if sensor.shot_noise else 0.0
     return np.asarray(shot + np.zeros(np.shape(intensity_e)) + sensor.read_variance_e2)
+
+
+def phase_density(phase_error_rad: ArrayLike, s: float) -> NDArray[np.float64]:
+    """Return the exact density of the phase error of a phasor in Gaussian noise (PHYSICS section 4).
+
+    p(ψ) = e^{−s}/2π · [1 + √(πs) cos ψ · e^{s cos²ψ} (1 + erf(√s cos ψ))]
+
+    Parameters
+    ----------
+    phase_error_rad : array_like
+        ψ, in −π … π.
+    s : float
+        amplitude_e² over the variance of one phase image, 1 / (2 · law's phase std²).
+    """
+    root = math.sqrt(s) * np.cos(np.asarray(phase_error_rad, dtype=np.float64))
+    hill = math.sqrt(math.pi) * root * np.exp(root**2 - s) * (1 + special.erf(root))
+    return np.asarray((math.exp(-s) + hill) / (2 * math.pi))
+
+
+def exact_phase_moments(law_std_rad: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return variance and kurtosis of the phase error where the noise law, its limit of high signal, is not exact.
+
+    Parameters
+    ----------
+    law_std_rad : array_like
+        Standard deviation of the phase by the law, radians.
+
+    Returns
+    -------
+    variance_rad2, kurtosis : ndarray
+        Second moment of :func:`phase_density`; fourth moment over its square, 3 for high signal.
+    """
+    std = np.asarray(law_std_rad, dtype=np.float64)
+    log_std, ratio, kurtosis = _moment_table()
+    std = np.minimum(std, _HOPELESS_STD_RAD)  # where every phase is equally probable
+    at = np.log(np.maximum(std, np.exp(log_std[0])))
+    return std**2 * np.interp(at, log_std, ratio), np.interp(at, log_std, kurtosis)
+
+
+@lru_cache(maxsize=1)
+def _moment_table() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return log of the law's std, exact variance over the law's, and kurtosis: steps of 2 % from 0.003 rad on."""
+    stds = np.geomspace(0.003, _HOPELESS_STD_RAD, 530)
+    ratio, kurtosis = np.empty_like(stds), np.empty_like(stds)
+    for i, std in enumerate(stds):
+        psi = np.linspace(-1, 1, 2001) * min(math.pi, 20 * std)
+        weight = phase_density(psi, 1 / (2 * std**2))
+        weight /= np.trapezoid(weight, psi)
+        second, fourth = np.trapezoid(psi**2 * weight, psi), np.trapezoid(psi**4 * weight, psi)
+        ratio[i], kurtosis[i] = second / std**2, fourth / second**2
+    return np.log(stds), ratio, kurtosis

@@ -138,8 +138,10 @@ def plot_phasor_image(images: PhasorImages, index: int = 0) -> Figure:
     left, middle, right = figure.subplots(1, 3)
     left.set_title("range")
     draw_range(left, images.range_m[index])
-    _panel(middle, images.amplitude[index], "amplitude", "amplitude |S| (1: albedo 1 at 1 m)", cmap="gray", vmin=0.0)
-    _panel(right, images.coverage[index], "coverage", "share of the pixel on the landmark", cmap="gray", vmin=0, vmax=1)
+    draw_map(middle, images.amplitude[index], "amplitude", "amplitude |S| (1: albedo 1 at 1 m)", cmap="gray", vmin=0.0)
+    draw_map(
+        right, images.coverage[index], "coverage", "share of the pixel on the landmark", cmap="gray", vmin=0, vmax=1
+    )
     views = images.views
     figure.suptitle(
         f"view {index}: D = {views.distance_m[index]:.3f} m, δ = {math.degrees(views.delta_rad[index]):.2f}°, "
@@ -171,7 +173,7 @@ def plot_frame(frames: Frames, index: int = 0, frame: int = 0) -> Figure:
     panels[0].set_title("range")
     draw_range(panels[0], frames.range_m[index, frame])
     if frames.amplitude_e is not None:
-        _panel(panels[1], frames.amplitude_e[index, frame], "amplitude", "amplitude (e-)", cmap="gray", vmin=0.0)
+        draw_map(panels[1], frames.amplitude_e[index, frame], "amplitude", "amplitude (e-)", cmap="gray", vmin=0.0)
     _draw_flags(panels[-1], frames.flags[index, frame])
     figure.suptitle(f"position {index}, frame {frame}")
     return figure
@@ -252,7 +254,8 @@ def _draw_pixels(axes: Axes, values: NDArray[np.generic], **how: object) -> Axes
     return image
 
 
-def _panel(axes: Axes, values: NDArray[np.float64], title: str, label: str, **how: object) -> None:
+def draw_map(axes: Axes, values: NDArray[np.float64], title: str, label: str, **how: object) -> None:
+    """Draw one number of every pixel into axes, with a title and a colour bar; `how` goes to ``imshow``."""
     axes.set_title(title)
     _colour_bar(axes, _draw_pixels(axes, values, **how), label)
 

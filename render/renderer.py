@@ -37,6 +37,7 @@ Variant = Literal["exact", "hard"]
 
 _SAMPLES = 1 << 17
 _VIEWS_PER_TASK = 64
+_MAX_SPLITS = 4
 
 
 @dataclass
@@ -89,6 +90,9 @@ class Renderer:
         Harmonic orders k > 1 wanted beside the signal; None: those that the sensor's taps need.
     intersector : {"auto", "embree", "float64"}
         What finds the face a ray meets; "auto" is Embree where the package embreex is installed.
+    splits : int
+        Every pixel is first cut into splits × splits boxes, at most 4 × 4. 1 is enough where surfaces are smooth over
+        a pixel, as those of landmarks are; bumps finer than a pixel take 2.
 
     Raises
     ------
@@ -113,14 +117,18 @@ class Renderer:
         albedo: float = 0.8,
         harmonics: Sequence[int] | None = None,
         intersector: str = "auto",
+        splits: int = 1,
     ) -> None:
         if not 0 < albedo <= 1:
             raise UsageError(f"'albedo' must be in (0, 1], got {albedo!r}")
+        if splits != int(splits) or not 1 <= splits <= _MAX_SPLITS:
+            raise UsageError(f"'splits' must be a whole number from 1 to {_MAX_SPLITS}, got {splits!r}")
         harmonics = sensor.harmonic_orders if harmonics is None else harmonics
         if any(order < 2 or order != int(order) for order in harmonics):
             raise UsageError(f"'harmonics' must be whole orders of 2 or more, got {tuple(harmonics)!r}")
         self.sensor = sensor
         self.albedo = float(albedo)
+        self.splits = int(splits)
         self.topology = MeshTopology.empty() if mesh is None else MeshTopology.from_mesh(unite_shells(mesh))
         self._orders = np.array([1, *harmonics], dtype=np.int64)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
@@ -312,8 +320,8 @@ class Renderer:
             while view < len(part):
                 b = buffers
                 reached, n = plan_rays(
-                    view, mesh, lens, matrix, offset, part.bearing_rad, self._camera, level, row_range, behind,
-                    b.segments, b.limb, b.head, b.link, b.owner, b.scratch,
+                    view, mesh, lens, matrix, offset, part.bearing_rad, self._camera, level, row_range, self.splits,
+                    behind, b.segments, b.limb, b.head, b.link, b.owner, b.scratch,
                     b.points, b.weights, b.regions, b.pixel, state,
                 )  # fmt: skip
                 if reached == -1:

@@ -4,10 +4,15 @@ import numpy as np
 import trimesh
 
 
-def bowl():
+def bowl(rings=128):
     """Half a spherical shell without thickness, open at the top."""
-    angle = np.linspace(-np.pi / 2, 0, 32)
-    return trimesh.creation.revolve(0.12 * np.c_[np.cos(angle), np.sin(angle)].round(15), sections=128)
+    angle = np.linspace(-np.pi / 2, 0, rings)
+    return trimesh.creation.revolve(0.12 * np.c_[np.cos(angle), np.sin(angle)].round(15), sections=4 * rings)
+
+
+def coarse_bowl():
+    """A bowl with facets a quarter of a pixel wide."""
+    return bowl(rings=32)
 
 
 def star_prism():
@@ -48,15 +53,35 @@ def blob():
     return trimesh.Trimesh(ball.vertices * radius[:, None], ball.faces, process=False)
 
 
-ODD = {"bowl": bowl, "star prism": star_prism, "L bracket": l_bracket, "hidden box": hidden_box, "blob": blob}
+def _bumpy(unit, noise_m):
+    """Return a lump of 10 cm with bumps of a few centimetres, from the vertices and faces of a unit ball."""
+    x, y, z = unit.vertices.T
+    bumps = 0.08 * np.sin(3 * x + 1) * np.cos(2 * y) + 0.04 * np.sin(5 * z) * np.cos(4 * x)
+    noise = noise_m * np.random.default_rng(4).normal(size=len(x))
+    return unit.vertices * (0.1 * (1 + bumps) + noise)[:, None]
+
+
+def lump(subdivisions=7):
+    """A bumpy ball of 330 000 faces, its bumps finer than a pixel from 2 m away."""
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return trimesh.Trimesh(_bumpy(ball, 0.0), ball.faces, process=False)
 
 
 def scan():
     """Return what a laser scanner makes of a lump: 200 000 faces, noise on every vertex, and no floor."""
     ball = trimesh.creation.uv_sphere(radius=1.0, count=(256, 256))
-    x, y, z = ball.vertices.T
-    bumps = 0.08 * np.sin(3 * x + 1) * np.cos(2 * y) + 0.04 * np.sin(5 * z) * np.cos(4 * x)
-    noise = 2e-6 * np.random.default_rng(4).normal(size=len(x))
-    vertices = ball.vertices * (0.1 * (1 + bumps) + noise)[:, None]
+    vertices = _bumpy(ball, 2e-6)
     kept = vertices[ball.faces][..., 2].min(axis=1) > -0.085
     return trimesh.Trimesh(vertices, ball.faces[kept], process=False)
+
+
+ODD = {
+    "bowl": bowl,
+    "coarse bowl": coarse_bowl,
+    "star prism": star_prism,
+    "L bracket": l_bracket,
+    "hidden box": hidden_box,
+    "blob": blob,
+    "lump": lump,
+    "scan": scan,
+}

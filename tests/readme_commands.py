@@ -146,4 +146,23 @@ def _write_measured(path: Path) -> None:
     np.savetxt(path, frames.range_m.reshape(50, -1), delimiter=",", fmt="%.6f")
 
 
-GIVEN: dict[str, Callable[[Path], None]] = {"measured.csv": _write_measured, "my_part.stl": _write_part}
+def _write_board(path: Path) -> None:
+    """Write 50 frames of a flat board; its distance stands in the file's name."""
+    import numpy as np
+
+    from phasemark.render import Background, Renderer, capture, preset
+
+    sensor, distance_m = preset("pmd-16x16"), float(path.stem.removeprefix("board_").removesuffix("m"))
+    board = Renderer(None, sensor).render(0.5, background=Background(wall_m=distance_m, wall_albedo=0.8))
+    frames = capture(board, sensor, rng=np.random.default_rng(1), n_frames=50)
+    arrays = {"range": frames.range_m, "amplitude": frames.amplitude_e, "intensity": frames.intensity_e}
+    np.savez(path, **arrays, unit="m", quantity="range")
+
+
+GIVEN: dict[str, Callable[[Path], None]] = {
+    "board_1m.npz": _write_board,
+    "board_2m.npz": _write_board,
+    "board_3m.npz": _write_board,
+    "measured.csv": _write_measured,
+    "my_part.stl": _write_part,
+}

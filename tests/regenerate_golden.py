@@ -1,15 +1,31 @@
-"""Write tests/golden/catalogue.npz anew: ``python tests/regenerate_golden.py`` from the root of the repository."""
+"""Write the golden files that our own code makes: ``python tests/regenerate_golden.py`` from the repository's root."""
 
 from pathlib import Path
 
 import numpy as np
 
+from phasemark.data import BankPlan, FramePlan, build_bank, build_frames
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, preset
 
 CATALOGUE = Path(__file__).parent / "golden" / "catalogue.npz"
 VIEW = {"distance_m": 0.9, "delta_rad": 0.5, "bearing_rad": 0.02, "height_m": -0.01}
 BACKGROUND = Background(wall_m=3.0, floor_m=0.3)
+
+TINY_CAMERA = {"rows": 4, "cols": 4}
+BANK = Path(__file__).parent / "golden" / "bank-v1.h5"
+BANK_PLAN = BankPlan(
+    classes=["cone"], sensor_overrides=TINY_CAMERA, distance_m="0.9,1", delta_deg="0,45", model="planar"
+)
+FRAMES = Path(__file__).parent / "golden" / "frames-v1.h5"
+FRAMES_PLAN = FramePlan(
+    landmarks=[{"name": "block", "box": {"length_m": 0.2, "width_m": 0.1, "height_m": 0.1}, "upper": None}],
+    sensor_overrides=TINY_CAMERA,
+    views=3,
+    frames_per_view=2,
+    seed=7,
+    wall_m=3.0,
+)
 
 
 def render_catalogue():
@@ -26,3 +42,7 @@ if __name__ == "__main__":
     for name, (phasor, coverage) in render_catalogue().items():
         arrays[f"{name}_phasor"], arrays[f"{name}_coverage"] = phasor, coverage
     np.savez_compressed(CATALOGUE, **arrays)
+    if not BANK.exists():  # files of a released version are never written again
+        build_bank(BANK_PLAN, BANK).close()
+    if not FRAMES.exists():
+        build_frames(FRAMES_PLAN, FRAMES).close()

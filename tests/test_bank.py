@@ -32,7 +32,7 @@ class Painter:
     def __init__(self, mesh, sensor, *, albedo, harmonics=()):
         self.sensor, self.harmonics, self.mark = sensor, harmonics, mesh_mark(mesh)
 
-    def render_views(self, views, *, rows, workers):
+    def render_views(self, views, *, rows):
         row, col = np.mgrid[rows[0] : rows[1], : self.sensor.cols]
         shape = (len(views), *row.shape)
         intensity = np.broadcast_to(paint(views.distance_m, views.delta_rad, row, col, self.mark), shape)
@@ -84,10 +84,9 @@ def expected_images(class_name, layout):
     return np.concatenate([upper[:, :, :8], lower[:, :, 8:]], axis=2)
 
 
-@pytest.mark.parametrize("batch_pixels", [1, 5 * 256, 1 << 19])
+@pytest.mark.parametrize("shard_items", [1, 5, None])
 @pytest.mark.parametrize("plan", [PLAN, FULL], ids=["factored", "full"])
-def test_every_image_lies_where_its_coordinates_say(painted, tmp_path, monkeypatch, plan, batch_pixels):
-    monkeypatch.setattr(build, "BATCH_PIXELS", batch_pixels)
+def test_every_image_lies_where_its_coordinates_say(painted, tmp_path, plan, shard_items):
     with build_bank(plan, tmp_path / "bank.h5") as bank:
         assert bank.classes == ("cone", "post")
         assert bank.distance_m.tolist() == [0.8, 1.0, 1.2]
@@ -287,11 +286,14 @@ def test_a_bank_without_a_path_leaves_no_file(painted, tmp_path, monkeypatch):
         assert bank.phasor("cone", 0, 0).shape == (16, 16)
 
 
-def test_progress_counts_images(painted, tmp_path, monkeypatch):
-    monkeypatch.setattr(build, "BATCH_PIXELS", 5 * 256)
+def test_progress_counts_images(painted, tmp_path):
     seen = []
-    build_bank(PLAN, tmp_path / "bank.h5", progress=lambda done, total: seen.append((done, total))).close()
-    assert seen == [(5, 18), (10, 18), (12, 18), (15, 18), (18, 18)]
+
+    def note(done, total):
+        seen.append((done, total))
+
+    build_bank(PLAN, tmp_path / "bank.h5", workers=1, shard_items=5, progress=note).close()
+    assert seen == [(5, 18), (10, 18), (15, 18), (18, 18)]
 
 
 def test_an_existing_bank_needs_force_and_is_asked_about_before_rendering(bank_file, monkeypatch):
@@ -305,16 +307,21 @@ def test_an_existing_bank_needs_force_and_is_asked_about_before_rendering(bank_f
     verify_checksum(bank_file)
 
 
-def test_an_interrupted_build_leaves_the_old_bank(bank_file):
+def test_an_interrupted_build_leaves_the_old_bank_and_can_be_resumed(bank_file, tmp_path):
     before = bank_file.read_bytes()
 
     def interrupt(done, total):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        build_bank(FULL, bank_file, force=True, progress=interrupt)
+        build_bank(FULL, bank_file, force=True, shard_items=5, progress=interrupt)
     assert bank_file.read_bytes() == before
-    assert names(bank_file.parent) == ["bank.h5", "bank.h5.sha256"]
+    verify_checksum(bank_file)
+    assert names(bank_file.parent) == ["bank.h5", "bank.h5.manifest", "bank.h5.partial", "bank.h5.sha256"]
+    build_bank(FULL, bank_file, force=True, resume=True).close()
+    build_bank(FULL, tmp_path / "again.h5").close()
+    assert bank_file.read_bytes() == (tmp_path / "again.h5").read_bytes()
+    assert names(bank_file.parent) == ["again.h5", "again.h5.sha256", "bank.h5", "bank.h5.sha256"]
 
 
 @pytest.mark.parametrize("call", ["posix_fallocate", "pwrite", "fsync"])

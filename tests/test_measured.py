@@ -257,9 +257,9 @@ def plain(tmp_path, content):
     ("make", "reason"),
     [
         (lambda t: t / "absent.csv", "No such file"),
-        (lambda t: t, "Is a directory"),
-        (lambda t: plain(t, b"\x00\x01\x02"), "is not CSV, NPY, NPZ or HDF5"),
-        (lambda t: plain(t, b"\xff\xfe\xfd"), "is not CSV, NPY, NPZ or HDF5"),
+        (lambda t: t, "is a folder without PNG images, and no ROS bag"),
+        (lambda t: plain(t, b"\x00\x01\x02"), "is not CSV, NPY, NPZ, HDF5 or PNG"),
+        (lambda t: plain(t, b"\xff\xfe\xfd"), "is not CSV, NPY, NPZ, HDF5 or PNG"),
         (lambda t: npy(t, np.ones((3, 8, 8))), "8 × 8 pixels, but the sensor's have 2 × 3"),
         (lambda t: npy(t, np.ones((3, 6))), "3 × 6 pixels"),
         (lambda t: npy(t, np.ones(6)), r"must have shape .*got \(6,\)"),
@@ -279,7 +279,7 @@ def plain(tmp_path, content):
             lambda t: hdf5_file(t, {"range": IMAGE, "amplitude": IMAGE}, {"amplitude": {"units": "mV"}}),
             "'amplitude' must be in electrons",
         ),
-        (lambda t: cut(hdf5_file(t, {"range": IMAGE}), 600), "cannot be read"),
+        (lambda t: cut(hdf5_file(t, {"range": IMAGE}), 600), "damaged or cut off"),
     ],
 )
 def test_a_bad_file_is_an_input_error_of_one_line(tmp_path, make, reason):

@@ -448,7 +448,7 @@ def mixed_and_brightest(image, n=6):
     return [tuple(pixel) for pixel in mixed[:: max(1, len(mixed) // n)]] + [brightest]
 
 
-@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize("name", ["bowl", "coarse bowl", "star prism", "L bracket", "hidden box", "blob"])
 @pytest.mark.parametrize("wall_m", [None, 2.0])
 def test_odd_meshes_agree_with_dense_sampling(name, wall_m):
     view = {"distance_m": 1.0, "delta_rad": 0.4, "bearing_rad": 0.01, "height_m": -0.1}

@@ -20,8 +20,10 @@ PMD = preset("pmd-16x16")
 TAN = math.tan(math.radians(11))
 BAR = 1e-6
 """Largest deviation from a quadratic over 1e-5 m or rad, as a share of the brightest pixel."""
-ROUGH_SHARE = 0.15
+ROUGH_SHARE = 0.1
 """Share of the windows that may miss the bar: where the limb of a sphere gains a facet, a rule changes its nodes."""
+ROUGHEST = 2e-5
+"""Largest deviation in any window, for that reason."""
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +101,7 @@ def assert_smooth(scene, views, **background):
         assert len(residual) > len(views) / 2
         assert np.mean(residual > BAR) <= ROUGH_SHARE, parameter
         assert np.median(residual) < BAR / 10, parameter
+        assert residual.max() < ROUGHEST, parameter
 
 
 @pytest.mark.parametrize("name", list(catalog()))
@@ -108,12 +111,11 @@ def test_phasors_stay_on_a_quadratic_where_no_edge_or_vertex_passes_a_border(sce
 
 @pytest.mark.parametrize("name", list(catalog()))
 def test_difference_quotients_of_two_steps_agree(scenes, name):
-    # 20 views: of 95 % that have to agree, 16 or more do with a probability of 99.7 %; δ turns the facets of a sphere
+    # 20 views: of 95 % that have to agree, 16 or more do with a probability of 99.7 %
     views = random_views(np.random.default_rng(12), 20)
     for parameter in PARAMETERS:
         difference = difference_quotients(scenes[name][0], views, parameter)
-        share = 0.5 if (name, parameter) == ("sphere", "delta_rad") else 0.8
-        assert np.mean(difference <= 0.01) >= share, parameter
+        assert np.mean(difference <= 0.01) >= 0.8, parameter
 
 
 @pytest.mark.soak
@@ -129,5 +131,4 @@ def test_difference_quotients_agree_in_95_percent_of_four_hundred_views(scenes, 
     views = random_views(np.random.default_rng(78), 400)
     for parameter in PARAMETERS:
         difference = difference_quotients(scenes[name][0], views, parameter)
-        share = 0.5 if (name, parameter) == ("sphere", "delta_rad") else 0.9
-        assert np.mean(difference <= 0.01) >= share, parameter
+        assert np.mean(difference <= 0.01) >= 0.93, parameter  # 95 % less two standard deviations

@@ -33,9 +33,9 @@ def test_the_area_integral_agrees_with_pixels_eight_times_finer(name):
     fine = Renderer(mesh, SENSOR.with_(rows=16 * FINER, cols=16 * FINER)).render(**view).phasor
     truth = fine.reshape(n, 16, FINER, 16, FINER).mean(axis=(2, 4))
     error = np.abs(coarse - truth).max(axis=(1, 2)) / np.abs(truth).max(axis=(1, 2))
-    assert np.median(error) <= 7e-5
-    assert np.mean(error > 1e-4) <= 0.05
-    assert error.max() <= 2e-4
+    assert np.median(error) <= 4e-5
+    assert np.mean(error > 1e-4) <= 0.02
+    assert error.max() <= 1.2e-4
 
 
 def _slipped(name, kind, at_vertices):

@@ -1,0 +1,91 @@
+"""ROS 2 bags of images, as they are read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import InputFileError, UsageError
+
+Z_TOPIC = "/camera/depth/image_rect"
+RANGE_TOPIC = "/camera/range/image"
+AMPLITUDE_TOPIC = "/camera/amplitude/image"
+INFO_TOPIC = "/camera/depth/camera_info"
+
+
+def ros_types() -> Any:
+    """Return the message types of ROS 2.
+
+    Raises
+    ------
+    UsageError
+        The package rosbags is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise UsageError("ROS bags need the package rosbags: pip install 'phasemark[ros]'") from None
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def read_rosbag(path: Path, topic: str | None) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Return the images of a bag, (frames, rows, cols), and what the bag says of unit and quantity.
+
+    Parameters
+    ----------
+    path : Path
+        The bag's folder.
+    topic : str, optional
+        Which images; needed if the bag has several that are not ours. Images of 32FC1 are metres, of 16UC1 mm.
+
+    Raises
+    ------
+    InputFileError
+        It is no bag, or has no such images.
+    """
+    store = ros_types()
+    from rosbags.rosbag2 import Reader
+
+    images: list[NDArray[Any]] = []
+    amplitudes: list[NDArray[Any]] = []
+    units = set()
+    with Reader(path) as reader:
+        of_images = [link for link in reader.connections if link.msgtype == "sensor_msgs/msg/Image"]
+        names = [link.topic for link in of_images]
+        chosen = topic or next((name for name in (RANGE_TOPIC, Z_TOPIC) if name in names), None)
+        if chosen is None and len(set(names)) == 1:
+            chosen = names[0]
+        if chosen not in names:
+            raise InputFileError(f"{path}: say with --topic which images to read: it has {', '.join(names) or 'none'}")
+        wanted = [link for link in of_images if link.topic in (chosen, AMPLITUDE_TOPIC)]
+        for link, _, raw in reader.messages(connections=wanted):
+            message = store.deserialize_cdr(raw, link.msgtype)
+            if link.topic == chosen:
+                images.append(_pixels(message, path))
+                units.add("mm" if message.encoding == "16UC1" else "m")
+            else:
+                amplitudes.append(_pixels(message, path))
+    if not images or len({image.shape for image in images}) > 1:
+        raise InputFileError(f"{path}: '{chosen}' must hold images of one size")
+    values = np.stack(images)
+    arrays = {"range": np.where(values == 0, np.nan, values)}
+    if len(amplitudes) == len(images):
+        arrays["amplitude"] = np.stack(amplitudes)
+    stated = {"unit": units.pop()}
+    if chosen in (RANGE_TOPIC, Z_TOPIC):
+        stated["quantity"] = "range" if chosen == RANGE_TOPIC else "z"
+    return arrays, stated
+
+
+def _pixels(message: Any, path: Path) -> NDArray[Any]:
+    kinds = {"32FC1": "f4", "16UC1": "u2", "mono16": "u2"}
+    if message.encoding not in kinds:
+        raise InputFileError(f"{path}: images must be 32FC1 or 16UC1, got {message.encoding}")
+    order = ">" if message.is_bigendian else "<"
+    kind = np.dtype(order + kinds[message.encoding])
+    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
+    pixels = rows[:, : message.width * kind.itemsize].copy().view(kind).astype(np.float64)
+    return pixels

@@ -1,0 +1,368 @@
+"""Frame sets, as they are built: a job of shards of views, each rendered, captured and placed in the file alone."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data.build import StoredMesh, read_landmarks, write_mesh
+from phasemark.data.frame_plan import FramePlan
+from phasemark.data.frames import (
+    FORMAT,
+    FRAME_FIELDS,
+    SCHEMA_VERSION,
+    VIEW_FIELDS,
+    FrameSet,
+    open_frames,
+)
+from phasemark.data.layout import Layout
+from phasemark.data.production import produce, refuse_unwritable_output
+from phasemark.data.provenance import mesh_sha256, versions
+from phasemark.data.seeds import stream
+from phasemark.data.shards import Place, Progress
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture
+
+_KEYS = ("class_index", "albedo", "wall_m", "floor_m")
+
+
+def build_frames(
+    plan: FramePlan,
+    path: str | os.PathLike[str],
+    *,
+    force: bool = False,
+    resume: bool = False,
+    workers: int | None = None,
+    shard_items: int | None = None,
+    scheduler: str = "threads",
+    progress: Progress | None = None,
+) -> FrameSet:
+    """Render and capture a frame set and write it with its checksum.
+
+    The same plan gives the same bytes, whatever the number of workers or the size of shards. Memory does not grow with
+    the frames. A run that was ended early leaves ``FILE.partial`` and ``FILE.manifest`` if anything was finished.
+
+    Parameters
+    ----------
+    plan : FramePlan
+    path : path-like
+        The file to write; ``FILE.sha256`` goes beside it.
+    force, resume, workers, scheduler
+        As for :func:`phasemark.data.build_bank`.
+    shard_items : int, optional
+        Views rendered at a time; the result does not depend on it.
+    progress : callable (done, total), optional
+        Called from this thread with the number of views finished so far and in all.
+
+    Returns
+    -------
+    FrameSet
+        The frame set, open for reading.
+
+    Raises
+    ------
+    UsageError
+        The plan cannot be built, with the reason; a view that cannot be seen is named.
+    InputFileError
+        A mesh or sensor file cannot be read.
+    OutputExistsError
+        The file exists, another run is writing it, or an unfinished run had another plan.
+    StorageError
+        The disk is full or fails.
+    """
+    if workers is not None and workers < 1:
+        raise UsageError(f"'workers' must be at least 1, got {workers}")
+    refuse_unwritable_output(Path(path), force=force, resume=resume)
+    job = FrameJob(plan)
+    job.check_views()
+    produce(
+        job, path, finished=_finished_identity, force=force, resume=resume, workers=workers, shard_items=shard_items,
+        scheduler=scheduler, progress=progress,
+    )  # fmt: skip
+    return open_frames(path)
+
+
+def _finished_identity(path: Path) -> dict[str, Any]:
+    with open_frames(path) as frames:
+        return frames.identity()
+
+
+class FrameJob:
+    """A frame set to be built (:class:`phasemark.data.shards.Job`): one slab, its items are views.
+
+    Parameters
+    ----------
+    plan : FramePlan
+    stored_mesh : callable, optional
+        Returns the mesh of a class, in place of the mesh file that the plan names.
+    """
+
+    def __init__(self, plan: FramePlan, stored_mesh: StoredMesh | None = None) -> None:
+        self.plan = plan.resolve()
+        self.sensor = self.plan.build_sensor()
+        self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
+        self._renderers = [Renderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks]
+        self._shot_sensor = self.sensor.without_errors(shot_noise=True) if "shot" in self.plan.variants else None
+
+    def spec(self) -> dict[str, Any]:
+        """Return what another process makes the same job from."""
+        return {"kind": "frames", "plan": self.plan.model_dump(mode="json")}
+
+    @property
+    def items(self) -> list[int]:
+        """The number of views."""
+        return [self.plan.views]
+
+    @property
+    def fields(self) -> list[str]:
+        """Names of the large datasets, in the order in which :meth:`make` returns them."""
+        per_frame = ["range", "flags"] if self.sensor.kind == "direct" else ["range", "amplitude", "intensity", "flags"]
+        if self.plan.keep_taps:
+            per_frame.append("taps")
+        if "shot" in self.plan.variants:
+            per_frame.append("range_shot")
+        return [*per_frame, "coverage", *(f"range_{name}" for name in ("hard", "mixed") if name in self.plan.variants)]
+
+    def identity(self) -> dict[str, Any]:
+        """Return all that the file's bytes depend on."""
+        return {
+            "plan": self.plan.model_dump(mode="json"),
+            "versions": versions(),
+            "mesh_sha256": {landmark.name: mesh_sha256(landmark.mesh) for landmark in self.landmarks},
+        }
+
+    def check_views(self) -> None:
+        """Refuse a plan with views that cannot be rendered, before any is.
+
+        Raises
+        ------
+        UsageError
+            Naming the view.
+        """
+        step = 1 << 16
+        for first in range(0, self.plan.views, step):
+            truth = self.plan.draw_truth(first, min(first + step, self.plan.views))
+            views = _views(truth)
+            for k, renderer in enumerate(self._renderers):
+                of_class = np.flatnonzero(truth["class_index"] == k)
+                vertices = renderer.topology.vertices
+                reach = float(np.hypot(vertices[:, 0], vertices[:, 1]).max())
+                lens = views.lens_in_landmark()[of_class]
+                low, high = vertices.min(axis=0) - 1e-3, vertices.max(axis=0) + 1e-3
+                inside = ((lens > low) & (lens < high)).all(axis=1)
+                # NaN (no wall, no floor) compares as false
+                before = truth["wall_m"][of_class] < views.distance_m[of_class] + reach
+                above = -truth["floor_m"][of_class] > vertices[:, 2].min() + views.height_m[of_class]
+                for view in of_class[inside | before | above]:
+                    one = slice(int(view), int(view) + 1)
+                    try:
+                        background = _background(truth["wall_m"][view], truth["floor_m"][view], self.plan)
+                        if background is not None:
+                            background.check_behind(vertices, views[one])
+                        if inside[np.searchsorted(of_class, view)]:
+                            raise UsageError(
+                                "the lens is inside the landmark's bounding box: 'distance_m' is too small"
+                            )
+                    except UsageError as error:
+                        reason = str(error).replace(" in view 0", "")
+                        raise UsageError(f"view {first + int(view)} of the plan cannot be rendered: {reason}") from None
+
+    def lay_out(self) -> tuple[Layout, list[list[Place]]]:
+        """Return all but the large datasets, and where these go."""
+        plan, sensor = self.plan, self.sensor
+        n = plan.views
+        per = plan.frames_per_view
+        with Layout() as layout:
+            file = layout.file
+            file.attrs["format"] = FORMAT
+            file.attrs["schema_version"] = SCHEMA_VERSION
+            file.attrs["plan"] = plan.model_dump_json()
+            file.attrs["sensor"] = sensor.model_dump_json()
+            file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
+            scales = {
+                name: _scale(file, name, values, units, long_name)
+                for name, values, units, long_name in _coordinates(plan, sensor)
+            }
+            for name, values, dims, attributes in self._small(n, per):
+                dataset = file.create_dataset(name, data=values)
+                for axis, dim in enumerate(dims):
+                    dataset.dims[axis].attach_scale(scales[dim])
+                dataset.attrs.update(attributes)
+            places = []
+            for name in self.fields:
+                dims, kind, units, long_name = {**FRAME_FIELDS, **VIEW_FIELDS}[name]
+                shape = [len(scales[dim]) for dim in dims]
+                dataset, offset = layout.reserve(file, name, shape, kind)
+                for axis, dim in enumerate(dims):
+                    dataset.dims[axis].attach_scale(scales[dim])
+                dataset.attrs["long_name"] = long_name
+                dataset.attrs["units"] = units
+                if name in ("range", "range_shot", "range_hard", "range_mixed"):
+                    dataset.attrs["quantity"] = "range"
+                if name == "flags":
+                    masks = [1, 2, 4, 8, 16, 32]
+                    dataset.attrs["flag_masks"] = np.array(masks, np.uint8)
+                    dataset.attrs["flag_meanings"] = "no_return missing saturated dead hot near_wrap"
+                rows_of_item = per if dims[0] == "frame" else 1
+                places.append(Place(offset, rows_of_item * int(np.prod(shape[1:])) * np.dtype(kind).itemsize))
+            for landmark in self.landmarks:
+                write_mesh(file.create_group(f"meshes/{landmark.name}"), landmark)
+        return layout, [places]
+
+    def _small(self, n: int, per: int) -> Iterator[tuple[str, NDArray[Any], tuple[str, ...], dict[str, Any]]]:
+        """Yield the datasets that are written with the header: which view each frame shows, and what is true of it."""
+        frames = np.arange(n * per, dtype="<i8")
+        yield "view_index", (frames // per).astype("<i8"), ("frame",), {"long_name": "view that the frame shows"}
+        yield "seed_index", frames, ("frame",), {"long_name": "number of the frame in the run that drew its noise"}
+        truth = self.plan.draw_truth()
+        names = self.plan.landmark_names()
+        yield (
+            "landmark_class", truth["class_index"].astype("<i2"), ("view",),
+            {
+                "long_name": "number of the landmark's class", "flag_values": np.arange(len(names), dtype="<i2"),
+                "flag_meanings": " ".join(names),
+            },
+        )  # fmt: skip
+        for name, key, units, long_name in _TRUTH:
+            yield name, truth[key].astype("<f8"), ("view",), {"units": units, "long_name": long_name}
+        yield (
+            "split", truth["split_index"], ("view",),
+            {
+                "long_name": "number of the split", "flag_values": np.arange(len(self.plan.splits), dtype=np.uint8),
+                "flag_meanings": " ".join(self.plan.splits),
+            },
+        )  # fmt: skip
+
+    def make(self, slab: int, start: int, stop: int) -> list[NDArray[Any]]:
+        """Render and capture some views."""
+        plan = self.plan
+        truth = plan.draw_truth(start, stop)
+        image, hard_range_m = self._render(truth)
+        stored: dict[str, NDArray[Any]] = {
+            "coverage": image.coverage.astype("<f4"),
+            "range_mixed": image.range_m.astype("<f4"),
+        }
+        if hard_range_m is not None:
+            stored["range_hard"] = hard_range_m.astype("<f4")
+        frames = capture(
+            image, self.sensor, rng=stream(plan.seed, "frames.noise", 0), n_frames=plan.frames_per_view,
+            first_view=start, keep_taps=plan.keep_taps,
+        )  # fmt: skip
+        stored["range"] = frames.range_m.astype("<f4")
+        stored["flags"] = frames.flags
+        if frames.amplitude_e is not None and frames.intensity_e is not None:
+            stored["amplitude"] = frames.amplitude_e.astype("<f4")
+            stored["intensity"] = frames.intensity_e.astype("<f4")
+        if frames.taps_e is not None:
+            stored["taps"] = frames.taps_e.astype("<f4")
+        if self._shot_sensor is not None:
+            shot = capture(
+                image, self._shot_sensor, rng=stream(plan.seed, "frames.noise", 0), n_frames=plan.frames_per_view,
+                first_view=start,
+            )  # fmt: skip
+            stored["range_shot"] = shot.range_m.astype("<f4")
+        return [stored[name] for name in self.fields]
+
+    def read(self, file: h5py.File, slab: int, item: int) -> dict[str, NDArray[Any]]:
+        """Return what a file holds of one view, as :meth:`make` makes it."""
+        per = self.plan.frames_per_view
+        return {
+            name: file[name][item * per : (item + 1) * per] if name in FRAME_FIELDS else file[name][item]
+            for name in self.fields
+        }
+
+    def remake(self, slab: int, item: int) -> dict[str, NDArray[Any]]:
+        """Return the same, rendered and captured again."""
+        made = self.make(slab, item, item + 1)
+        return {name: values[0] for name, values in zip(self.fields, made, strict=True)}
+
+    def _render(self, truth: dict[str, NDArray[Any]]) -> tuple[PhasorImages, NDArray[np.float64] | None]:
+        """Return noise-free images of views, and what their centre rays see; views that share all else go together."""
+        views = _views(truth)
+        table = np.stack([np.nan_to_num(truth[key].astype(float), nan=-1.0) for key in _KEYS], axis=1)
+        kinds, group_of = np.unique(table, axis=0, return_inverse=True)
+        group_of = group_of.reshape(-1)
+        image: PhasorImages | None = None
+        shape = (len(views), self.sensor.rows, self.sensor.cols)
+        hard = np.empty(shape) if "hard" in self.plan.variants else None
+        for k in range(len(kinds)):
+            members = np.flatnonzero(group_of == k)
+            one = members[0]
+            renderer = copy.copy(self._renderers[truth["class_index"][one]])
+            renderer.albedo = float(truth["albedo"][one])
+            background = _background(truth["wall_m"][one], truth["floor_m"][one], self.plan)
+            part = renderer.render_views(views[members], background=background)
+            if image is None:
+                image = PhasorImages(
+                    phasor=np.empty(shape, np.complex128),
+                    intensity=np.empty(shape),
+                    coverage=np.empty(shape),
+                    sensor=self.sensor,
+                    views=views,
+                    harmonics={order: np.empty(shape, np.complex128) for order in part.harmonics},
+                )
+            image.phasor[members], image.intensity[members] = part.phasor, part.intensity
+            image.coverage[members] = part.coverage
+            for order, values in part.harmonics.items():
+                image.harmonics[order][members] = values
+            if hard is not None:
+                centre = renderer.render_views(views[members], background=background, variant="hard")
+                hard[members] = centre.range_m
+        assert image is not None
+        return image, hard
+
+
+_TRUTH = (
+    ("distance", "distance_m", "m", "horizontal distance from the lens to the landmark's axis"),
+    ("delta", "delta_deg", "degree", "angle from which the landmark is seen"),
+    ("bearing", "bearing_deg", "degree", "azimuth of the landmark's axis in the camera frame"),
+    ("height", "height_m", "m", "height of the landmark's origin above the optical axis"),
+    ("albedo", "albedo", "1", "share of light that the landmark returns"),
+    ("wall", "wall_m", "m", "distance of the wall behind, NaN if there is none"),
+    ("floor", "floor_m", "m", "how far the floor lies below the lens, NaN if there is none"),
+)
+
+
+def _views(truth: dict[str, NDArray[Any]]) -> Views:
+    return Views.broadcast(
+        truth["distance_m"], np.deg2rad(truth["delta_deg"]), np.deg2rad(truth["bearing_deg"]), truth["height_m"]
+    )
+
+
+def _background(wall_m: float, floor_m: float, plan: FramePlan) -> Background | None:
+    if np.isnan(wall_m) and np.isnan(floor_m):
+        return None
+    return Background(
+        wall_m=None if np.isnan(wall_m) else float(wall_m),
+        floor_m=None if np.isnan(floor_m) else float(floor_m),
+        wall_albedo=plan.wall_albedo,
+        floor_albedo=plan.floor_albedo,
+    )
+
+
+def _coordinates(plan: FramePlan, sensor: Sensor) -> Iterator[tuple[str, Any, str, str]]:
+    yield "frame", np.arange(plan.views * plan.frames_per_view, dtype="<i8"), "1", "frame"
+    yield "view", np.arange(plan.views, dtype="<i8"), "1", "view, shown by one frame or more"
+    if plan.keep_taps:
+        yield "phase", np.arange(4, dtype="<i4") * 90, "degree", "phase image τ"
+        yield "tap", ["a", "b"], "", "tap of the pixel"
+    yield "row", np.arange(sensor.rows, dtype="<i4"), "1", "pixel row, 0 at the top"
+    yield "col", np.arange(sensor.cols, dtype="<i4"), "1", "pixel column, 0 on the left"
+
+
+def _scale(file: h5py.File, name: str, values: Any, units: str, long_name: str) -> h5py.Dataset:
+    kind = h5py.string_dtype() if isinstance(values[0], str) else values.dtype
+    scale = file.create_dataset(name, data=values, dtype=kind)
+    scale.make_scale(name)
+    scale.attrs["long_name"] = long_name
+    if units:
+        scale.attrs["units"] = units
+    return scale

@@ -1,0 +1,98 @@
+"""Who does the work: threads here, and what makes shards elsewhere (:mod:`phasemark.data.remote`).
+
+Every shard of a build depends on the job and its range of items alone, so a task may be repeated, done twice or moved
+to another worker, and nothing changes.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Protocol, TypeVar
+
+from numpy.typing import NDArray
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class Maker(Protocol):
+    """Makes shards somewhere else; any thread may ask at any time."""
+
+    def make(self, start: int, stop: int) -> Sequence[NDArray[Any]]:
+        """Return the arrays of a range of items."""
+
+    def concurrency(self) -> int:
+        """Return how many shards are worth asking for at once."""
+
+    def close(self) -> None:
+        """End what makes shards; calls of :meth:`make` that wait for an answer fail."""
+
+
+def processors() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run_tasks(
+    task: Callable[[T], R], todo: Iterable[T], n_threads: int, *, stop: Callable[[], None] | None = None
+) -> Iterator[tuple[T, R]]:
+    """Run a task on every item in threads, and yield (item, result) as they are done, in any order.
+
+    An exception of a task, or one that interrupts the caller, ends the run: items in work are finished, no other is
+    begun, and `stop` is called to cut short what waits for others.
+
+    Parameters
+    ----------
+    task : callable
+    todo : iterable
+    n_threads : int
+    stop : callable, optional
+    """
+    items = list(todo)
+    waiting = iter(items)
+    turn = threading.Lock()
+    ended = threading.Event()
+    answers: queue.SimpleQueue[tuple[T, R] | BaseException] = queue.SimpleQueue()
+
+    def work() -> None:
+        while not ended.is_set():
+            with turn:
+                try:
+                    item = next(waiting)
+                except StopIteration:
+                    return
+            try:
+                answers.put((item, task(item)))
+            except BaseException as error:
+                answers.put(error)
+                return
+
+    threads = [threading.Thread(target=work, daemon=True) for _ in range(min(n_threads, len(items)))]
+    finished = False
+    try:
+        for thread in threads:
+            thread.start()
+        for _ in items:
+            answer = _wait(answers)
+            if isinstance(answer, BaseException):
+                raise answer
+            yield answer
+        finished = True
+    finally:
+        ended.set()
+        if not finished and stop is not None:
+            stop()
+        for thread in threads:
+            if thread.ident is not None:
+                thread.join()
+
+
+def _wait(answers: queue.SimpleQueue[Any]) -> Any:
+    while True:
+        try:
+            return answers.get(timeout=0.5)  # a wait without end would hold back signals on some platforms
+        except queue.Empty:
+            continue

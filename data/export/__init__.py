@@ -1,0 +1,83 @@
+"""Frame sets for other programs: npz, 16-bit PNG, CSV, PLY point clouds, BOP, ROS 2 bags."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from phasemark import UsageError
+from phasemark.data.export.bop import write_bop
+from phasemark.data.export.clouds import write_ply
+from phasemark.data.export.images import write_png16
+from phasemark.data.export.rosbag import write_rosbag
+from phasemark.data.export.tables import write_csv, write_npz
+from phasemark.data.frames import FrameSet
+from phasemark.data.measured import Quantity
+from phasemark.data.store import refuse_unwritable, replacing, replacing_folder
+
+__all__ = ["EXPORTS", "export_frames"]
+
+Writer = Callable[[FrameSet, Path, Quantity], None]
+
+EXPORTS: dict[str, tuple[Writer, bool, tuple[Quantity, ...]]] = {
+    "npz": (write_npz, False, ("range", "z")),
+    "csv": (write_csv, False, ("range", "z")),
+    "png16": (write_png16, True, ("range", "z")),
+    "ply": (write_ply, True, ("range",)),
+    "bop": (write_bop, True, ("z",)),
+    "rosbag": (write_rosbag, True, ("z",)),
+}
+"""For each format: who writes it, whether it is a folder, and which quantities it can hold, the usual one first."""
+
+
+def export_frames(
+    frames: FrameSet,
+    path: str | os.PathLike[str],
+    to: str,
+    *,
+    quantity: Quantity | None = None,
+    force: bool = False,
+) -> Path:
+    """Write a frame set in a format of other programs.
+
+    Radial range and z, the distance along the optical axis, are never mixed up: every format says which it holds.
+
+    Parameters
+    ----------
+    frames : FrameSet
+    path : path-like
+        The file, or for ``png16``, ``ply``, ``bop`` and ``rosbag`` the folder, to write.
+    to : {"npz", "csv", "png16", "ply", "bop", "rosbag"}
+        docs/formats.md says what each holds.
+    quantity : {"range", "z"}, optional
+        What ``npz``, ``csv`` and ``png16`` hold; range if left out. BOP and ROS prescribe z.
+    force : bool
+        Whether an existing file or folder may be replaced.
+
+    Returns
+    -------
+    Path
+        `path`.
+
+    Raises
+    ------
+    UsageError
+        The format is unknown or cannot hold the quantity, or what it needs is not installed.
+    OutputExistsError, StorageError
+        As :func:`phasemark.data.write_atomically`.
+    """
+    if to not in EXPORTS:
+        raise UsageError(f"--to must be one of {', '.join(EXPORTS)}, got '{to}'")
+    write, is_folder, quantities = EXPORTS[to]
+    if quantity is not None and quantity not in quantities:
+        raise UsageError(f"--quantity must be {' or '.join(quantities)} for {to}, got '{quantity}'")
+    path = Path(path)
+    if is_folder:
+        with replacing_folder(path, force=force) as temporary:
+            write(frames, temporary, quantity or quantities[0])
+    else:
+        refuse_unwritable(path, force=force)
+        with replacing(path, force=force) as temporary:
+            write(frames, temporary, quantity or quantities[0])
+    return path

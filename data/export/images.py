@@ -1,0 +1,58 @@
+"""Frames as 16-bit grey PNG images, with their scale inside and beside them."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, PngImagePlugin
+
+from phasemark.data.export.samples import blocks, quantity_m, truth_columns
+from phasemark.data.frames import FrameSet
+from phasemark.data.measured import Quantity
+
+FULL_SCALE = 65535
+
+
+def encode_png16(values_m: NDArray[np.float64], metres_per_unit: float, quantity: Quantity) -> bytes:
+    """Return a 16-bit PNG image of values in metres; 0 where invalid, quantity and scale as text chunks."""
+    told = PngImagePlugin.PngInfo()
+    told.add_text("quantity", quantity)
+    told.add_text("metres_per_unit", repr(metres_per_unit))
+    buffer = io.BytesIO()
+    Image.fromarray(to_codes(values_m, metres_per_unit)).save(buffer, format="PNG", pnginfo=told)
+    return buffer.getvalue()
+
+
+def to_codes(values_m: NDArray[np.float64], metres_per_unit: float) -> NDArray[np.uint16]:
+    """Return values as whole numbers of `metres_per_unit`; 0 is kept for invalid ones."""
+    codes = np.clip(np.rint(np.nan_to_num(values_m) / metres_per_unit), 1, FULL_SCALE)
+    return np.where(np.isfinite(values_m), codes, 0).astype(np.uint16)
+
+
+def scale_of(frames: FrameSet, quantity: Quantity) -> float:
+    """Return the metres per unit at which the largest value of all frames is full scale."""
+    largest = 0.0
+    for _, sample in blocks(frames):
+        values = quantity_m(frames, sample, quantity)
+        largest = max(largest, float(np.nanmax(values, initial=0.0)))
+    return (largest or 1.0) / FULL_SCALE
+
+
+def write_png16(frames: FrameSet, folder: Path, quantity: Quantity) -> None:
+    """Write ``NNNNNNNN.png`` for each frame, and ``frames.json`` with the scale and the truth."""
+    metres_per_unit = scale_of(frames, quantity)
+    listed = []
+    for start, sample in blocks(frames):
+        values_m = quantity_m(frames, sample, quantity)
+        truth = truth_columns(frames, sample)
+        for k, image in enumerate(values_m):
+            name = f"{start + k:08d}.png"
+            (folder / name).write_bytes(encode_png16(image, metres_per_unit, quantity))
+            row = {key: values[k].item() for key, values in truth.items()}
+            listed.append({"file": name, **{key: None if value != value else value for key, value in row.items()}})
+    facts = {"quantity": quantity, "unit": "m", "metres_per_unit": metres_per_unit, "invalid": 0, "frames": listed}
+    (folder / "frames.json").write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -1,0 +1,46 @@
+"""Frames as NumPy archives and as comma-separated values."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phasemark.data.export.samples import blocks, quantity_m, truth_columns
+from phasemark.data.frames import FrameSet
+from phasemark.data.measured import Quantity
+
+
+def write_npz(frames: FrameSet, path: Path, quantity: Quantity) -> None:
+    """Write one NPZ file that :func:`phasemark.data.read_frames` reads without being told anything."""
+    found: dict[str, list[Any]] = {}
+    for _, sample in blocks(frames):
+        columns: dict[str, Any] = {"range": quantity_m(frames, sample, quantity).astype(np.float32)}
+        for name in ("amplitude", "intensity"):
+            if f"{name}_e" in sample:
+                columns[name] = sample[f"{name}_e"]
+        columns |= {"flags": sample["flags"], "valid": sample["flags"] == 0, **truth_columns(frames, sample)}
+        for name, values in columns.items():
+            found.setdefault(name, []).append(values)
+    with path.open("wb") as file:
+        arrays: dict[str, Any] = {name: np.concatenate(values) for name, values in found.items()}
+        np.savez(file, **arrays, unit="m", quantity=quantity)
+
+
+def write_csv(frames: FrameSet, path: Path, quantity: Quantity) -> None:
+    """Write one frame a line, row by row from the top left pixel, its truth as a comment in the line before."""
+    rows, cols = frames.sensor.rows, frames.sensor.cols
+    with path.open("w", newline="", encoding="utf-8") as file:
+        file.write(f"# unit=m quantity={quantity} rows={rows} cols={cols}\n")
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([f"r{row}c{col}" for row in range(rows) for col in range(cols)])
+        for start, sample in blocks(frames):
+            truth = truth_columns(frames, sample)
+            # nine digits bring a float32 back as it was
+            lines = quantity_m(frames, sample, quantity).reshape(len(sample["view"]), -1)
+            for k, line in enumerate(lines):
+                told = " ".join(f"{name}={values[k]}" for name, values in truth.items())
+                file.write(f"# frame={start + k} {told}\n")
+                writer.writerow(["" if np.isnan(value) else f"{value:.9g}" for value in line])

@@ -1,0 +1,306 @@
+"""What a frame set is made of: landmarks, a camera, and how the views are spread over distance, angle and the rest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, WithJsonSchema, model_validator
+from scipy import special
+from scipy.stats import qmc
+
+from phasemark import UsageError
+from phasemark.data.plan import MeshPlan, PlanModel, ScenePlan
+from phasemark.data.seeds import stream
+from phasemark.landmarks import LandmarkSpec
+
+KINDS = ("fixed", "uniform", "normal", "sobol")
+Variant = Literal["hard", "mixed", "shot"]
+
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Pair = tuple[_Finite, _Finite]
+
+
+class Distribution(PlanModel):
+    """How a quantity is spread over the views: exactly one of the four.
+
+    Parameters
+    ----------
+    fixed : float
+        The same in all views; in a plan simply the number.
+    uniform : (low, high)
+        Independent in each view.
+    normal : (mean, standard deviation)
+        Independent in each view.
+    sobol : (low, high)
+        Uniform, from one scrambled Sobol sequence over all quantities that ask for it: the views fill their product
+        more evenly than independent draws would.
+    within : (low, high), optional
+        Only with `normal`: the tails beyond are cut off, and the rest is scaled to 1.
+    """
+
+    fixed: _Finite | None = None
+    uniform: _Pair | None = None
+    normal: _Pair | None = None
+    sobol: _Pair | None = None
+    within: _Pair | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        given = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if len(given) != 1:
+            raise UsageError(f"must be a number or have one of {', '.join(KINDS)}, got {', '.join(given) or 'none'}")
+        for name in ("uniform", "sobol", "within"):
+            pair = getattr(self, name)
+            if pair is not None and not pair[0] <= pair[1]:
+                raise UsageError(f"'{name}' must be [low, high] with low ≤ high, got {list(pair)}")
+        if self.normal is not None and self.normal[1] < 0:
+            raise UsageError(f"the standard deviation of 'normal' must not be negative, got {self.normal[1]}")
+        if self.within is not None and self.normal is None:
+            raise UsageError("'within' cuts the tails of 'normal': it stands for nothing without it")
+        return self
+
+    @property
+    def lowest(self) -> float:
+        """The least value that can be drawn."""
+        if self.fixed is not None:
+            return self.fixed
+        if self.normal is not None:
+            return self.within[0] if self.within else (-math.inf if self.normal[1] else self.normal[0])
+        pair = self.uniform or self.sobol
+        assert pair is not None
+        return pair[0]
+
+    @property
+    def highest(self) -> float:
+        """The largest value that can be drawn."""
+        if self.normal is not None:
+            return self.within[1] if self.within else (math.inf if self.normal[1] else self.normal[0])
+        pair = self.uniform or self.sobol
+        return self.lowest if pair is None else pair[1]
+
+    def values(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the values below which the shares `share`, in (0, 1), of all draws lie."""
+        if self.fixed is not None:
+            return np.full(share.shape, self.fixed)
+        if self.normal is not None:
+            mean, std = self.normal
+            if self.within is None or std == 0:
+                return np.asarray(mean + std * special.ndtri(share))
+            low, high = (special.ndtr((bound - mean) / std) for bound in self.within)
+            return np.clip(mean + std * special.ndtri(low + (high - low) * share), *self.within)
+        pair = self.uniform or self.sobol
+        assert pair is not None
+        return pair[0] + (pair[1] - pair[0]) * share
+
+
+def _to_distribution(value: Any, info: ValidationInfo) -> Any:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        value = {"fixed": value}
+    if isinstance(value, Mapping):
+        try:
+            return Distribution(**value)
+        except UsageError as error:
+            text = str(error)
+            raise UsageError(f"'{info.field_name}': {text}") from None
+    return value
+
+
+def _to_plain(value: Distribution | None) -> Any:
+    if value is None:
+        return None
+    if value.fixed is not None:
+        return value.fixed
+    return {k: list(v) for k in (*KINDS, "within") if (v := getattr(value, k)) is not None}
+
+
+_PAIR_SCHEMA = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
+_SPREAD_SCHEMA = {
+    "description": "a number, or how the quantity is spread over the views",
+    "anyOf": [
+        {"type": "number"},
+        {
+            "type": "object",
+            "additionalProperties": False,
+            "properties": {
+                "fixed": {"type": "number"},
+                **dict.fromkeys(("uniform", "normal", "sobol", "within"), _PAIR_SCHEMA),
+            },
+        },
+    ],
+}
+_FORM = (BeforeValidator(_to_distribution), PlainSerializer(_to_plain), WithJsonSchema(_SPREAD_SCHEMA))
+_Spread = Annotated[Distribution, *_FORM]
+_MaybeSpread = Annotated[Distribution | None, *_FORM]
+_Share = Annotated[float, Field(ge=0, le=1)]
+
+QUANTITIES = ("distance_m", "delta_deg", "bearing_deg", "height_m", "albedo", "wall_m", "floor_m")
+"""What can be spread; the place in this list is part of what the random numbers depend on."""
+
+
+class FramePlan(ScenePlan):
+    """A frame set: noisy frames of many views, with their truth.
+
+    Each view shows one of the landmarks, drawn with equal chances.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Names from the catalogue. Without classes, landmarks and meshes: the whole catalogue.
+    landmarks : sequence of LandmarkSpec
+        Further boxes with a solid of revolution, spelled out.
+    meshes : sequence of MeshPlan
+        Landmarks from mesh files.
+    sensor : str
+        A preset's name, or a sensor file (with a ``/`` or ending in ``.toml``).
+    sensor_overrides : mapping
+        Fields of the sensor that replace those of `sensor`.
+    views : int
+        How many views.
+    frames_per_view : int
+        Noisy frames of each view.
+    seed : int
+        Root of all random numbers, 0 … 2⁶⁴ − 1.
+    distance_m, delta_deg, bearing_deg, height_m : number or Distribution
+        The view (PHYSICS section 1).
+    albedo : number or Distribution, optional
+        Replaces the landmarks' own.
+    wall_m, floor_m : number or Distribution, optional
+        What stands behind; nothing if left out.
+    wall_albedo, floor_albedo : float
+    variants : sequence of {"hard", "mixed", "shot"}
+        What to keep beside the full frames: what the centre ray sees, the noise-free mixed range, and frames with shot
+        noise alone.
+    keep_taps : bool
+        Whether to keep what each tap reported.
+    splits : mapping of str to float
+        Shares of the views, adding up to 1. All frames of a view are in one split.
+
+    Raises
+    ------
+    UsageError
+        With one line that names the key, its value and what would be right.
+
+    Examples
+    --------
+    >>> FramePlan(views=10, distance_m={"uniform": [0.8, 1.2]}).distance_m.uniform
+    (0.8, 1.2)
+    """
+
+    views: Annotated[int, Field(ge=1, le=2**32 - 1)]
+    frames_per_view: Annotated[int, Field(ge=1, le=2**31 - 1)] = 1
+    seed: Annotated[int, Field(ge=0, le=2**64 - 1)] = 0
+    distance_m: _Spread = Distribution(uniform=(0.7, 2.1))
+    delta_deg: _Spread = Distribution(uniform=(0.0, 360.0))
+    bearing_deg: _Spread = Distribution(fixed=0.0)
+    height_m: _Spread = Distribution(fixed=0.0)
+    albedo: _MaybeSpread = None
+    wall_m: _MaybeSpread = None
+    floor_m: _MaybeSpread = None
+    wall_albedo: _Share = 0.5
+    floor_albedo: _Share = 0.5
+    variants: tuple[Variant, ...] = ("hard", "mixed")
+    keep_taps: bool = False
+    splits: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], _Share] = Field(
+        default_factory=lambda: {"train": 0.8, "val": 0.1, "test": 0.1}
+    )
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        for name in ("distance_m", "wall_m", "floor_m"):
+            spread = getattr(self, name)
+            if spread is not None and spread.lowest <= 0:
+                hint = "; cut the normal's tail with 'within'" if spread.normal and not spread.within else ""
+                raise UsageError(f"'{name}' must be positive throughout, got {_to_plain(spread)}{hint}")
+        if self.albedo is not None and not 0 < self.albedo.lowest <= self.albedo.highest <= 1:
+            raise UsageError(f"'albedo' must be in (0, 1] throughout, got {_to_plain(self.albedo)}")
+        if not self.splits or abs(sum(self.splits.values()) - 1) > 1e-9:
+            raise UsageError(f"'splits' must be shares that add up to 1, got {self.splits}")
+        if len(set(self.variants)) < len(self.variants):
+            raise UsageError(f"'variants' must not repeat, got {list(self.variants)}")
+        return self
+
+    def resolve(self) -> Self:
+        """Return the plan with every default made explicit; resolving again changes nothing.
+
+        Raises
+        ------
+        UsageError
+            A class or sensor is unknown, two landmarks have one name, or the sensor has no taps to keep.
+        InputFileError
+            The sensor file cannot be read.
+        """
+        specs, meshes = self.resolve_landmarks()
+        sensor = self.build_sensor()
+        if sensor.kind == "direct" and (self.keep_taps or "shot" in self.variants):
+            raise UsageError("'keep_taps' and the variant 'shot' must be left out: a direct sensor has neither")
+        order: tuple[Variant, ...] = ("hard", "mixed", "shot")
+        return self.model_copy(
+            update={
+                "classes": (),
+                "landmarks": tuple(specs),
+                "meshes": tuple(meshes),
+                "sensor_overrides": sensor.model_dump(mode="json"),
+                "variants": tuple(name for name in order if name in self.variants),
+            }
+        )
+
+    def landmark_names(self) -> list[str]:
+        """Names of the classes of a resolved plan, in the order of their numbers."""
+        parts: list[LandmarkSpec | MeshPlan] = [*self.landmarks, *self.meshes]
+        return [part.name for part in parts]
+
+    def draw_truth(self, start: int = 0, stop: int | None = None) -> dict[str, NDArray[Any]]:
+        """Return what is true of some views of a resolved plan; a view's truth depends on seed and number alone.
+
+        Returns
+        -------
+        dict of str to (n,) array
+            The quantities in the plan's units (NaN: no wall, no floor), ``class_index`` and ``split_index``.
+        """
+        stop = self.views if stop is None else stop
+        landmarks: list[LandmarkSpec | MeshPlan] = [*self.landmarks, *self.meshes]
+        truth: dict[str, NDArray[Any]] = {}
+        of_class = self._uniform("class", start, stop) * len(landmarks)
+        truth["class_index"] = np.minimum(of_class.astype(np.int16), len(landmarks) - 1)
+        sobol = self._sobol(start, stop)
+        for name in QUANTITIES:
+            spread: Distribution | None = getattr(self, name)
+            if spread is None:
+                own = np.array([part.albedo for part in landmarks])
+                truth[name] = own[truth["class_index"]] if name == "albedo" else np.full(stop - start, np.nan)
+            elif spread.sobol is not None:
+                truth[name] = spread.values(sobol[name])
+            elif spread.fixed is not None:
+                truth[name] = spread.values(np.zeros(stop - start))
+            else:
+                truth[name] = spread.values(self._uniform(name, start, stop))
+        ends = np.cumsum(list(self.splits.values()))
+        drawn = self._uniform("split", start, stop)
+        truth["split_index"] = np.minimum(np.searchsorted(ends, drawn, side="right"), len(ends) - 1).astype(np.uint8)
+        return truth
+
+    def _uniform(self, purpose: str, start: int, stop: int) -> NDArray[np.float64]:
+        """Return numbers in (0, 1), one a view: number `start` of a stream, and those that follow."""
+        rng = stream(self.seed, f"frames.{purpose}", 0)
+        skipped, offset = divmod(start, 4)  # Philox counts blocks of four numbers
+        rng.bit_generator.advance(skipped)  # type: ignore[attr-defined]
+        raw = rng.random(stop - start + offset)[offset:]
+        return np.maximum(raw, 2.0**-54)
+
+    def _sobol(self, start: int, stop: int) -> dict[str, NDArray[np.float64]]:
+        names = [
+            name for name in QUANTITIES if (spread := getattr(self, name)) is not None and spread.sobol is not None
+        ]
+        if not names:
+            return {}
+        seed = int(stream(self.seed, "frames.sobol", 0).integers(2**63))  # SciPy spawns from it, which Philox cannot
+        engine = qmc.Sobol(len(names), scramble=True, bits=32, rng=np.random.default_rng(seed))
+        if start:
+            engine.fast_forward(start)
+        # SciPy warns when the first draw is not a power of two; one point is, and later draws may have any number
+        points = [engine.random(1)] + ([engine.random(stop - start - 1)] if stop - start > 1 else [])
+        return dict(zip(names, np.vstack(points).T, strict=True))

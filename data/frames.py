@@ -1,0 +1,410 @@
+"""Frame sets, as they are read: frames by index or slice, each read when it is asked for."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, overload
+
+import h5py
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from phasemark import InputFileError, UsageError
+from phasemark.data.bank import read_mesh_group
+from phasemark.data.frame_plan import FramePlan
+from phasemark.data.hdf5 import check_format, dataset_of, frozen, group_of, json_attribute, open_hdf5, reading
+from phasemark.render import Frames, Sensor
+
+FORMAT = "phasemark-frames"
+SCHEMA_VERSION = 1
+
+FRAME_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+    "range": (("frame", "row", "col"), "<f4", "m", "range along the ray, NaN where invalid"),
+    "amplitude": (("frame", "row", "col"), "<f4", "e-", "amplitude per phase image"),
+    "intensity": (("frame", "row", "col"), "<f4", "e-", "intensity per phase image"),
+    "flags": (("frame", "row", "col"), "|u1", "1", "why a pixel is not valid, 0 where it is"),
+    "taps": (("frame", "phase", "tap", "row", "col"), "<f4", "e-", "what each tap reported"),
+    "range_shot": (("frame", "row", "col"), "<f4", "m", "range with shot noise alone, NaN where invalid"),
+}
+VIEW_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+    "coverage": (("view", "row", "col"), "<f4", "1", "share of the pixel that sees the landmark"),
+    "range_hard": (("view", "row", "col"), "<f4", "m", "range that the centre ray sees, without noise"),
+    "range_mixed": (("view", "row", "col"), "<f4", "m", "range mixed over the pixel, without noise"),
+}
+"""Dimensions, type, units and long name of the large datasets."""
+
+_TRUTH = ("distance", "delta", "bearing", "height", "albedo", "wall", "floor")
+
+Sample = dict[str, Any]
+
+
+class FrameSet:
+    """Noisy frames with their truth; made by :func:`open_frames`.
+
+    A sequence of frames: ``frames[17]`` is a dictionary of that frame's arrays and truth, ``frames[10:20]`` the same
+    with one more axis in front. Nothing is read before it is asked for. It can be pickled and used after a fork, so a
+    PyTorch ``DataLoader`` takes it as it is; a context manager.
+
+    Parameters
+    ----------
+    path : Path
+    file : h5py.File
+        The file, open for reading and checked.
+
+    Attributes
+    ----------
+    path : Path
+    plan : FramePlan
+        The resolved plan.
+    sensor : Sensor
+    classes : tuple of str
+    splits : tuple of str
+    versions : dict of str to str
+    truth : dict of str to (views,) array
+        ``class_index``, ``distance_m``, ``delta_rad``, ``bearing_rad``, ``height_m``, ``albedo``, ``wall_m``,
+        ``floor_m``, ``split_index``.
+    view_index : (frames,) int64
+        Which view each frame shows.
+    """
+
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self.path = path
+        self._file: h5py.File | None = file
+        self._process = os.getpid()
+        self._closed = False
+        check_format(file, path, "frame set", FORMAT, SCHEMA_VERSION)
+        self.sensor = Sensor(**json_attribute(file, path, "sensor"))
+        self.plan = FramePlan(**json_attribute(file, path, "plan"))
+        self.versions: dict[str, str] = json_attribute(file, path, "versions")
+        self.classes = tuple(self.plan.landmark_names())
+        self.splits = tuple(self.plan.splits)
+        sizes = {dim: len(dataset_of(file, dim, path)) for dim in ("frame", "view", "row", "col")}
+        sizes |= {"phase": 4, "tap": 2}
+        if (sizes["row"], sizes["col"]) != (self.sensor.rows, self.sensor.cols):
+            raise InputFileError(f"{path}: has {sizes['row']} × {sizes['col']} pixels, but its sensor has others")
+        if sizes["view"] != self.plan.views or sizes["frame"] != self.plan.views * self.plan.frames_per_view:
+            raise InputFileError(
+                f"{path}: has {sizes['frame']} frames of {sizes['view']} views, its plan says otherwise"
+            )
+        wanted = ["range", "flags", "coverage"] + [name for name in ("amplitude", "intensity", "taps") if name in file]
+        wanted += [f"range_{name}" for name in self.plan.variants]
+        self._fields = {name: self._field(file, name, sizes) for name in wanted}
+        self.view_index = frozen(self._column(file, "view_index", sizes["frame"]).astype(np.int64))
+        if self.view_index.min() < 0 or self.view_index.max() >= sizes["view"]:
+            raise InputFileError(f"{path}: 'view_index' names views that are not there")
+        self.truth = self._read_truth(file, sizes["view"])
+        for name in self.classes:
+            group_of(file, f"meshes/{name}", path)
+
+    def _field(self, file: h5py.File, name: str, sizes: dict[str, int]) -> tuple[tuple[int, ...], np.dtype[Any], int]:
+        """Return shape, type and offset of a dataset; the offset is −1 if its values are not in one piece."""
+        dims, kind, _, _ = {**FRAME_FIELDS, **VIEW_FIELDS}[name]
+        dataset = dataset_of(file, name, self.path)
+        shape = tuple(sizes[dim] for dim in dims)
+        if dataset.shape != shape or dataset.dtype.kind != np.dtype(kind).kind:
+            raise InputFileError(
+                f"{self.path}: '{name}' must be {np.dtype(kind)} of shape {shape}, got {dataset.dtype} of shape"
+                f" {dataset.shape}"
+            )
+        offset = dataset.id.get_offset()
+        if offset is not None and offset + math.prod(shape) * dataset.dtype.itemsize > file.id.get_filesize():
+            raise InputFileError(f"{self.path}: cut off in '{name}'")
+        return shape, dataset.dtype, -1 if offset is None else int(offset)
+
+    def _column(self, file: h5py.File, name: str, n: int) -> NDArray[Any]:
+        dataset = dataset_of(file, name, self.path)
+        if dataset.shape != (n,) or dataset.dtype.kind not in "fiu":
+            raise InputFileError(f"{self.path}: '{name}' must be {n} numbers, got {dataset.dtype} of {dataset.shape}")
+        return np.asarray(dataset[...])
+
+    def _read_truth(self, file: h5py.File, n: int) -> dict[str, NDArray[Any]]:
+        truth = {"class_index": self._column(file, "landmark_class", n), "split_index": self._column(file, "split", n)}
+        for name, count in (("class_index", len(self.classes)), ("split_index", len(self.splits))):
+            if truth[name].min() < 0 or truth[name].max() >= count:
+                raise InputFileError(f"{self.path}: '{name}' has numbers outside 0 … {count - 1}")
+        for name in _TRUTH:
+            values = self._column(file, name, n).astype(np.float64)
+            if name not in ("wall", "floor") and not np.isfinite(values).all():
+                raise InputFileError(f"{self.path}: '{name}' must be finite")
+            if name in ("delta", "bearing"):
+                truth[f"{name}_rad"] = np.deg2rad(values)
+            else:
+                truth[name if name == "albedo" else f"{name}_m"] = values
+        return {name: frozen(values) for name, values in truth.items()}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; arrays read before stay usable."""
+        if self._file is not None and self._process == os.getpid():
+            self._file.close()
+        self._file, self._closed = None, True
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"path": self.path, "closed": self._closed}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        with_file = open_hdf5(state["path"], "frame set")
+        with reading(state["path"]):
+            self.__init__(state["path"], with_file)  # type: ignore[misc]
+        if state["closed"]:
+            self.close()
+
+    def _open(self) -> h5py.File:
+        if self._closed:
+            raise UsageError(f"{self.path}: the frame set is closed")
+        if self._file is None or self._process != os.getpid():  # after a fork HDF5's handles are not ours to use
+            self._file, self._process = h5py.File(self.path, "r"), os.getpid()
+        return self._file
+
+    def __len__(self) -> int:
+        return len(self.view_index)
+
+    @overload
+    def __getitem__(self, index: int | np.integer) -> Sample: ...
+    @overload
+    def __getitem__(self, index: slice | Sequence[int] | NDArray[np.integer]) -> Sample: ...
+    def __getitem__(self, index: Any) -> Sample:
+        """Return the arrays and the truth of a frame, or of several with one more axis in front.
+
+        Keys are ``range_m``, ``amplitude_e``, ``intensity_e``, ``flags``, ``taps_e``, ``range_shot_m``, ``coverage``,
+        ``range_hard_m``, ``range_mixed_m`` (those that the file has), ``view``, ``class_name`` and the truth.
+        """
+        one = isinstance(index, int | np.integer)
+        if one:
+            n = len(self)
+            if not -n <= index < n:
+                raise IndexError(f"frame {index} of {n}")
+            numbers = np.array([int(index) % n])
+        elif isinstance(index, slice):
+            numbers = np.arange(len(self))[index]
+        else:
+            numbers = np.asarray(index)
+            if numbers.dtype == bool:
+                numbers = np.flatnonzero(numbers)
+            numbers = np.arange(len(self))[numbers]
+        views = self.view_index[numbers]
+        sample: Sample = {}
+        for name in self._fields:
+            sample[_key(name)] = self._take(name, numbers if name in FRAME_FIELDS else views)
+        sample["view"] = views
+        sample["class_name"] = np.array(self.classes, dtype=object)[self.truth["class_index"][views]]
+        for name, values in self.truth.items():
+            sample[name] = values[views]
+        if not one:
+            return sample
+        return {key: values[0] if values.ndim > 1 else values[:1].tolist()[0] for key, values in sample.items()}
+
+    def _take(self, name: str, numbers: NDArray[np.integer]) -> NDArray[Any]:
+        """Read some rows of a dataset, in the order asked for."""
+        shape, dtype, offset = self._fields[name]
+        file = self._open()
+        if offset < 0:
+            wanted, back = np.unique(numbers, return_inverse=True)
+            with reading(self.path):
+                return np.asarray(file[name][wanted])[back] if len(wanted) else np.empty((0, *shape[1:]), dtype)
+        stride = math.prod(shape[1:]) * dtype.itemsize
+        out = np.empty((len(numbers), *shape[1:]), dtype)
+        flat = out.reshape(len(numbers), math.prod(shape[1:]))
+        descriptor = int(file.id.get_vfd_handle())
+        at = 0
+        while at < len(numbers):  # runs of neighbours are read at once
+            stop = at + 1
+            while stop < len(numbers) and numbers[stop] == numbers[stop - 1] + 1:
+                stop += 1
+            raw = os.pread(descriptor, (stop - at) * stride, offset + int(numbers[at]) * stride)
+            if len(raw) != (stop - at) * stride:
+                raise InputFileError(f"{self.path}: cut off in '{name}'")
+            flat[at:stop] = np.frombuffer(raw, dtype).reshape(stop - at, flat.shape[1])
+            at = stop
+        return out
+
+    def frames(self, index: slice | Sequence[int] | NDArray[np.integer] = slice(None)) -> Frames:
+        """Return frames as the matcher takes them, one position each, (n, 1, rows, cols)."""
+        sample = self[index]
+        amplitude, intensity = sample.get("amplitude_e"), sample.get("intensity_e")
+        return Frames(
+            sample["range_m"][:, None],
+            None if amplitude is None else amplitude[:, None],
+            None if intensity is None else intensity[:, None],
+            flags=sample["flags"][:, None],
+            sensor=self.sensor,
+        )
+
+    def view(self, number: int) -> Frames:
+        """Return all frames of one view, (1, frames_per_view, rows, cols).
+
+        Raises
+        ------
+        UsageError
+            There is no such view.
+        """
+        if not 0 <= number < self.plan.views:
+            raise UsageError(f"view {number} is not there: {self.path} has {self.plan.views}")
+        frames = self.frames(np.flatnonzero(self.view_index == number))
+        return Frames(
+            frames.range_m[:, 0][None],
+            None if frames.amplitude_e is None else frames.amplitude_e[:, 0][None],
+            None if frames.intensity_e is None else frames.intensity_e[:, 0][None],
+            flags=frames.flags[:, 0][None],
+            sensor=self.sensor,
+        )
+
+    def split(self, name: str) -> NDArray[np.int64]:
+        """Return the numbers of the frames of a split, ``train`` for instance.
+
+        Raises
+        ------
+        UsageError
+            There is no such split.
+        """
+        if name not in self.splits:
+            raise UsageError(f"unknown split {name!r}: {self.path} has {', '.join(self.splits)}")
+        of_split = self.truth["split_index"] == self.splits.index(name)
+        return np.flatnonzero(of_split[self.view_index])
+
+    def subset(
+        self, frames: str | Sequence[int] | NDArray[np.integer], transform: Callable[[Sample], Any] | None = None
+    ) -> FrameSubset:
+        """Return some frames, or a split by its name, as a map-style data set."""
+        return FrameSubset(self, self.split(frames) if isinstance(frames, str) else np.asarray(frames), transform)
+
+    def mesh(self, class_name: str) -> trimesh.Trimesh:
+        """Return the mesh of a class, metres, landmark frame.
+
+        Raises
+        ------
+        UsageError
+            The frame set does not have the class.
+        """
+        if class_name not in self.classes:
+            raise UsageError(f"unknown class {class_name!r}: {self.path} has {', '.join(self.classes)}")
+        return read_mesh_group(self._open(), class_name, self.path)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what the file's bytes depend on: resolved plan, versions, mesh hashes."""
+        file = self._open()
+        with reading(self.path):
+            hashes = {name: str(file[f"meshes/{name}"].attrs["sha256"]) for name in self.classes}
+        return {"plan": json_attribute(file, self.path, "plan"), "versions": self.versions, "mesh_sha256": hashes}
+
+    def info(self) -> dict[str, Any]:
+        """Return what the frame set holds, in plain numbers and text."""
+        file = self._open()
+        of_class = np.bincount(self.truth["class_index"], minlength=len(self.classes))
+        of_split = np.bincount(self.truth["split_index"], minlength=len(self.splits))
+        distance_m = self.truth["distance_m"]
+        return {
+            "path": str(self.path),
+            "size_bytes": int(file.id.get_filesize()),
+            "schema_version": int(file.attrs["schema_version"]),
+            "frames": len(self),
+            "views": self.plan.views,
+            "frames_per_view": self.plan.frames_per_view,
+            "views_of_class": dict(zip(self.classes, of_class.tolist(), strict=True)),
+            "views_of_split": dict(zip(self.splits, of_split.tolist(), strict=True)),
+            "distance_m": [float(distance_m.min()), float(distance_m.max())],
+            "fields": list(self._fields),
+            "seed": self.plan.seed,
+            "sensor": self.plan.sensor,
+            "rows": self.sensor.rows,
+            "cols": self.sensor.cols,
+            "mesh_sha256": self.identity()["mesh_sha256"],
+            "versions": self.versions,
+        }
+
+
+class FrameSubset:
+    """Some frames of a frame set, as a map-style data set: ``len()`` and ``[i]``; it can be pickled.
+
+    Parameters
+    ----------
+    frames : FrameSet
+    numbers : (n,) int array
+        Which frames, in which order.
+    transform : callable, optional
+        What to make of each sample; a function of a module, if it is to be pickled.
+    """
+
+    def __init__(
+        self, frames: FrameSet, numbers: NDArray[np.integer], transform: Callable[[Sample], Any] | None = None
+    ) -> None:
+        self.frames, self.numbers, self.transform = frames, numbers, transform
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, index: int) -> Any:
+        sample = self.frames[int(self.numbers[index])]
+        return sample if self.transform is None else self.transform(sample)
+
+
+def _key(name: str) -> str:
+    return {
+        "amplitude": "amplitude_e",
+        "intensity": "intensity_e",
+        "taps": "taps_e",
+        "flags": "flags",
+        "coverage": "coverage",
+    }.get(name, f"{name}_m")
+
+
+def open_frames(path: str | os.PathLike[str], *, untrusted: bool = False) -> FrameSet:
+    """Open a frame set.
+
+    Parameters
+    ----------
+    path : path-like
+    untrusted : bool
+        Whether a child process with limits reads the file first, unless ``FILE.sha256`` vouches for it.
+
+    Returns
+    -------
+    FrameSet
+        A context manager; close it or leave the block when done.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, is not a frame set, was made by a newer version, or is damaged.
+    """
+    path = Path(path)
+    file = open_hdf5(path, "frame set", untrusted=untrusted)
+    try:
+        with reading(path):
+            return FrameSet(path, file)
+    except BaseException:
+        file.close()
+        raise
+
+
+def is_frame_set(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file says that it is a frame set; what it says of itself is all that is looked at.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    bool
+        False also if the file cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            if file.read(8) != b"\x89HDF\r\n\x1a\n":
+                return False
+            return FORMAT.encode() in file.read(1 << 16)
+    except OSError:
+        return False

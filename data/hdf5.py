@@ -1,0 +1,117 @@
+"""Our own HDF5 files as they are opened: checked before anything is read, damage told in one line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark.data.guard import first_reading, refusal
+from phasemark.data.store import has_matching_checksum
+
+
+def open_hdf5(path: Path, what: str, *, untrusted: bool = False) -> h5py.File:
+    """Open an HDF5 file that contains nothing which could lead out of it.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What the file should be, for messages: "bank".
+    untrusted : bool
+        Whether a child process reads the file first, unless ``FILE.sha256`` vouches for it.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, is not HDF5, is damaged, or contains what is refused
+        (:func:`phasemark.data.guard.refusal`).
+    """
+    try:
+        with path.open("rb") as plain:
+            signature = plain.read(8)
+    except OSError as error:
+        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    if signature != b"\x89HDF\r\n\x1a\n":
+        raise InputFileError(f"{path}: not a {what} (not an HDF5 file)")
+    if untrusted and not has_matching_checksum(path):
+        reason = first_reading(path)
+        if reason is not None:
+            raise InputFileError(f"{path}: {reason}")
+    try:
+        reason = refusal(path)
+    except Exception:  # whatever a damaged file makes h5py say
+        raise InputFileError(f"{path}: damaged or cut off: HDF5 cannot open it") from None
+    if reason is not None:
+        raise InputFileError(f"{path}: refused: {reason}")
+    try:
+        return h5py.File(path, "r")
+    except OSError:
+        raise InputFileError(f"{path}: damaged or cut off: HDF5 cannot open it") from None
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn whatever a damaged file makes h5py, json or pydantic say into one line."""
+    try:
+        yield
+    except UsageError as error:
+        raise InputFileError(f"{path}: damaged ({error})") from None
+    except PhasemarkError:
+        raise
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError, LookupError) as error:
+        reason = " ".join(str(error).split())
+        raise InputFileError(f"{path}: damaged ({reason})") from None
+
+
+def check_format(file: h5py.File, path: Path, what: str, expected: str, newest: int) -> None:
+    """Refuse a file of another format, or of a version that is not this one's.
+
+    Raises
+    ------
+    InputFileError
+        With what would help: updating phasemark, or building the file again.
+    """
+    found = file.attrs.get("format")
+    if found != expected:
+        raise InputFileError(f"{path}: not a {what} (its format is {found!r}, must be '{expected}')")
+    version = int(file.attrs["schema_version"])
+    if version != newest:
+        advice = "update phasemark" if version > newest else "build it again"
+        raise InputFileError(f"{path}: has schema version {version}, this phasemark reads {newest}: {advice}")
+
+
+def json_attribute(file: h5py.File, path: Path, name: str) -> dict[str, Any]:
+    """Return an attribute that holds a JSON object."""
+    with reading(path):
+        value = json.loads(file.attrs[name])
+    if not isinstance(value, dict):
+        raise InputFileError(f"{path}: the attribute '{name}' must be a JSON object, got {value!r}")
+    return value
+
+
+def group_of(file: h5py.File, name: str, path: Path) -> h5py.Group:
+    """Return a group, which must be there."""
+    if not isinstance(file.get(name), h5py.Group):
+        raise InputFileError(f"{path}: the group '{name}' is missing")
+    return file[name]
+
+
+def dataset_of(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
+    """Return a dataset, which must be there."""
+    if not isinstance(group.get(name), h5py.Dataset):
+        raise InputFileError(f"{path}: the dataset '{f'{group.name}/{name}'.strip('/')}' is missing")
+    return group[name]
+
+
+def frozen(array: NDArray[Any]) -> NDArray[Any]:
+    """Make an array read-only and return it."""
+    array.flags.writeable = False
+    return np.asarray(array)

@@ -1,0 +1,334 @@
+"""Jobs from plain data, and parts of jobs: what several machines that share nothing build, and one merges."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import InputFileError, OutputExistsError, UsageError
+from phasemark.data.build import BankJob
+from phasemark.data.build_frames import FrameJob
+from phasemark.data.frame_plan import FramePlan
+from phasemark.data.hdf5 import check_format, open_hdf5, reading
+from phasemark.data.layout import Layout
+from phasemark.data.plan import BankPlan
+from phasemark.data.production import produce, refuse_unwritable_output
+from phasemark.data.shards import Job, Place, Progress, difference, make_shard, pieces
+from phasemark.data.store import verify_checksum
+
+FORMAT = "phasemark-part"
+SCHEMA_VERSION = 1
+
+_TRIAL_ITEMS = 64
+
+
+def job_for(plan: BankPlan | FramePlan) -> BankJob | FrameJob:
+    """Return the job that builds what a plan describes, its views checked."""
+    if isinstance(plan, BankPlan):
+        return BankJob(plan)
+    job = FrameJob(plan)
+    job.check_views()
+    return job
+
+
+def job_of(spec: dict[str, Any]) -> Job:
+    """Return the job that :meth:`phasemark.data.shards.Job.spec` describes."""
+    if spec["kind"] == "part":
+        return PartJob(job_of(spec["of"]), spec["part"], spec["parts"])
+    return BankJob(BankPlan(**spec["plan"])) if spec["kind"] == "bank" else FrameJob(FramePlan(**spec["plan"]))
+
+
+def parse_part(text: str) -> tuple[int, int]:
+    """Read ``i/n``, part i of n, counted from 1.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    i, n : int
+
+    Raises
+    ------
+    UsageError
+        It is something else.
+    """
+    first, separator, last = text.partition("/")
+    if not (separator and first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last) <= 1_000_000):
+        raise UsageError(f"--shard must be I/N with 1 ≤ I ≤ N, 2/8 for instance, got '{text}'")
+    return int(first), int(last)
+
+
+class PartJob:
+    """Part i of n of a job, in a file of its own (:class:`phasemark.data.shards.Job`).
+
+    Parameters
+    ----------
+    job : Job
+    part, parts : int
+        Which of how many, counted from 1.
+    """
+
+    def __init__(self, job: Job, part: int, parts: int) -> None:
+        self._job, self._part, self._parts = job, part, parts
+        self._total = sum(job.items)
+        self.start, self.stop = self._total * (part - 1) // parts, self._total * part // parts
+        if self.start == self.stop:
+            raise UsageError(f"--shard {part}/{parts} would be empty: there are only {self._total} items to share")
+        self._pieces = list(pieces(job.items, self.start, self.stop))
+
+    def spec(self) -> dict[str, Any]:
+        """Return what another process makes the same job from."""
+        return {"kind": "part", "of": self._job.spec(), "part": self._part, "parts": self._parts}
+
+    @property
+    def items(self) -> list[int]:
+        """How many items each piece of a slab has."""
+        return [stop - start for _, start, stop in self._pieces]
+
+    def identity(self) -> dict[str, Any]:
+        """Return all that the part's bytes depend on."""
+        return {**self._job.identity(), "shard": f"{self._part}/{self._parts}"}
+
+    def lay_out(self) -> tuple[Layout, list[list[Place]]]:
+        """Return all but the values, and where these go: one dataset of raw bytes for each piece and field."""
+        whole, whole_places = self._job.lay_out()
+        places = []
+        with Layout() as layout:
+            file = layout.file
+            file.attrs["format"] = FORMAT
+            file.attrs["schema_version"] = SCHEMA_VERSION
+            file.attrs["spec"] = json.dumps(self._job.spec(), ensure_ascii=False)
+            file.attrs["identity"] = json.dumps(self._job.identity(), sort_keys=True, ensure_ascii=False)
+            file.attrs["header_sha256"] = whole.sha256()
+            file.attrs["items"] = np.array([self.start, self.stop, self._total], dtype="<i8")
+            for k, (slab, start, stop) in enumerate(self._pieces):
+                fields = []
+                for field, where in enumerate(whole_places[slab]):
+                    _, offset = layout.reserve(file, _name(k, field), (stop - start, where.stride), "|u1")
+                    fields.append(Place(offset, where.stride))
+                places.append(fields)
+        return layout, places
+
+    def make(self, slab: int, start: int, stop: int) -> list[NDArray[Any]]:
+        """Make some items of a piece."""
+        of, first, _ = self._pieces[slab]
+        return self._job.make(of, first + start, first + stop)
+
+
+def _name(piece: int, field: int) -> str:
+    return f"piece{piece}_field{field}"
+
+
+def build_part(
+    plan: BankPlan | FramePlan,
+    part: tuple[int, int],
+    path: str | os.PathLike[str],
+    *,
+    force: bool = False,
+    resume: bool = False,
+    workers: int | None = None,
+    shard_items: int | None = None,
+    scheduler: str = "threads",
+    progress: Progress | None = None,
+) -> Path:
+    """Build part i of n of a bank or frame set, for :func:`merge_parts` to put together.
+
+    Parameters
+    ----------
+    plan : BankPlan or FramePlan
+    part : (i, n)
+        Counted from 1.
+    path : path-like
+        The part's own file.
+    force, resume, workers, shard_items, scheduler, progress
+        As for :func:`phasemark.data.build_bank`, which says what is raised.
+
+    Returns
+    -------
+    Path
+        `path`.
+    """
+    refuse_unwritable_output(Path(path), force=force, resume=resume)
+    return produce(
+        PartJob(job_for(plan), *part), path, finished=_finished_identity, force=force, resume=resume, workers=workers,
+        shard_items=shard_items, scheduler=scheduler, progress=progress,
+    )  # fmt: skip
+
+
+def _finished_identity(path: Path) -> dict[str, Any]:
+    with open_hdf5(path, "shard") as file, reading(path):
+        check_format(file, path, "shard", FORMAT, SCHEMA_VERSION)
+        spec: dict[str, Any] = json.loads(file.attrs["identity"])
+        start, stop, total = (int(k) for k in file.attrs["items"])
+        parts = round(total / (stop - start))
+        for n in range(max(1, parts - 1), parts + 2):
+            for i in range(1, n + 1):
+                if (total * (i - 1) // n, total * i // n) == (start, stop):
+                    return {**spec, "shard": f"{i}/{n}"}
+    return {**spec, "shard": None}
+
+
+def merge_parts(
+    parts: Sequence[str | os.PathLike[str]],
+    path: str | os.PathLike[str],
+    *,
+    force: bool = False,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Put the parts of a bank or frame set together; the file has the bytes that one run would have written.
+
+    Parameters
+    ----------
+    parts : sequence of path-like
+        All parts, in any order, each with its checksum beside it.
+    path : path-like
+        The file to write.
+    force, resume, progress
+        As for :func:`phasemark.data.build_bank`.
+
+    Returns
+    -------
+    Path
+        `path`.
+
+    Raises
+    ------
+    InputFileError
+        A part cannot be read, is damaged, or belongs to another plan; or parts are missing.
+    OutputExistsError, StorageError
+        As for :func:`phasemark.data.build_bank`.
+    """
+    refuse_unwritable_output(Path(path), force=force, resume=resume)
+    if not parts:
+        raise UsageError("give the shards to merge")
+    opened = [_Part(Path(part)) for part in parts]
+    try:
+        job = MergeJob(opened)
+        return produce(job, path, finished=lambda _: job.identity(), force=force, resume=resume, progress=progress)
+    finally:
+        for part in opened:
+            part.file.close()
+
+
+class _Part:
+    """An open part."""
+
+    def __init__(self, path: Path) -> None:
+        verify_checksum(path)
+        self.path = path
+        self.file: h5py.File = open_hdf5(path, "shard")
+        try:
+            with reading(path):
+                check_format(self.file, path, "shard", FORMAT, SCHEMA_VERSION)
+                self.spec: dict[str, Any] = json.loads(self.file.attrs["spec"])
+                self.identity: dict[str, Any] = json.loads(self.file.attrs["identity"])
+                self.header_sha256 = str(self.file.attrs["header_sha256"])
+                self.start, self.stop, self.total = (int(k) for k in self.file.attrs["items"])
+        except BaseException:
+            self.file.close()
+            raise
+
+
+class MergeJob:
+    """A job whose items have been made already, in parts (:class:`phasemark.data.shards.Job`)."""
+
+    def __init__(self, parts: Sequence[_Part]) -> None:
+        first, *others = parts
+        for other in others:
+            if changes := difference(first.identity, other.identity):
+                raise InputFileError(f"{other.path}: is of another run than {first.path} ({'; '.join(changes[:4])})")
+        self._parts = sorted(parts, key=lambda part: part.start)
+        reached = 0
+        for part in self._parts:
+            if part.start > reached:
+                raise InputFileError(f"shards are missing: no items {reached} … {part.start - 1} of {first.total}")
+            if part.start < reached:
+                raise InputFileError(f"{part.path}: repeats items from {part.start} on, which another shard has")
+            reached = part.stop
+        if reached < first.total:
+            raise InputFileError(f"shards are missing: no items {reached} … {first.total - 1} of {first.total}")
+        with reading(first.path):
+            self._job = job_of(first.spec)
+        if changes := difference(first.identity, json.loads(json.dumps(self._job.identity()))):
+            raise OutputExistsError(
+                f"{first.path}: was built elsewhere with something else ({'; '.join(changes[:4])}): merge it there"
+            )
+
+    def spec(self) -> dict[str, Any]:
+        """Return what the parts were made from."""
+        return self._job.spec()
+
+    @property
+    def items(self) -> Sequence[int]:
+        """How many items each slab has."""
+        return self._job.items
+
+    def identity(self) -> dict[str, Any]:
+        """Return all that the file's bytes depend on."""
+        return self._job.identity()
+
+    def lay_out(self) -> tuple[Layout, list[list[Place]]]:
+        """Return all but the values, and where these go."""
+        layout, places = self._job.lay_out()
+        for part in self._parts:
+            if part.header_sha256 != layout.sha256():
+                raise InputFileError(f"{part.path}: its header would differ from the merged file's: merge it elsewhere")
+        self._n_fields = [len(fields) for fields in places]
+        return layout, places
+
+    def make(self, slab: int, start: int, stop: int) -> list[NDArray[Any]]:
+        """Read some items of a slab from the parts."""
+        found: list[list[NDArray[Any]]] = [[] for _ in range(self._n_fields[slab])]
+        for part in self._parts:
+            for k, (of, low, high) in enumerate(pieces(self._job.items, part.start, part.stop)):
+                first, last = max(low, start), min(high, stop)
+                if of == slab and first < last:
+                    with reading(part.path):
+                        for field, values in enumerate(found):
+                            values.append(part.file[_name(k, field)][first - low : last - low])
+        return [np.concatenate(values) for values in found]
+
+
+def estimate(plan: BankPlan | FramePlan, *, workers: int = 1) -> dict[str, Any]:
+    """Return how large a bank or frame set would be and about how long it would take, from a small trial.
+
+    Parameters
+    ----------
+    plan : BankPlan or FramePlan
+    workers : int
+        Processors that will work on it.
+
+    Returns
+    -------
+    dict
+        ``images`` or ``views`` and ``frames``, ``bytes``, ``seconds``.
+    """
+    job = job_for(plan)
+    layout, _ = job.lay_out()
+    total = sum(job.items)
+    make_shard(job, 0, 1)  # compiled code is loaded
+    count = min(_TRIAL_ITEMS, total)
+    step = max(1, total // count)
+    begun = time.perf_counter()
+    run = 8
+    made = 0
+    for first in range(0, total, step * run):
+        made += min(run, total - first)
+        make_shard(job, first, min(first + run, total))
+    seconds = (time.perf_counter() - begun) / made * total / workers
+    if isinstance(plan, FramePlan):
+        items = {"views": total, "frames": total * plan.frames_per_view}
+    else:
+        items = {"images": total}
+    return {**items, "bytes": layout.size, "seconds": seconds}

@@ -1,0 +1,44 @@
+"""Reports as one HTML page that loads nothing: the frame all of them share, pictures inside it, numbers in tables."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+
+import jinja2
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+
+def page_template(package: str, name: str) -> jinja2.Template:
+    """Return a template of a package; it may extend ``page.html.j2``, which has the style, a title and a content block.
+
+    Its filter ``number`` is :func:`short_number`.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(package, "."), jinja2.PackageLoader("phasemark.data", ".")]),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters["number"] = short_number
+    return environment.get_template(name)
+
+
+def figure_png(figure: Figure) -> bytes:
+    """Return a figure as PNG, 110 dots an inch."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()
+
+
+def embedded_png(png: bytes, alternative: str) -> Markup:
+    """Return an image element that holds a PNG; `alternative` says in words what it shows."""
+    return Markup('<img alt="{}" src="data:image/png;base64,{}">').format(alternative, base64.b64encode(png).decode())
+
+
+def short_number(value: float) -> str:
+    """Write a number with as many digits as it deserves in a table."""
+    if not math.isfinite(value):
+        return "–"
+    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"

@@ -1,0 +1,277 @@
+"""Shards made elsewhere: by worker processes of this machine, or on a Dask cluster.
+
+A shard travels as raw bytes and is placed in the file here, so workers need no shared disk; only mesh files that a
+plan names must lie at the same path everywhere, and are compared by their hash. A worker that dies is replaced, and its
+shard made again.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import queue
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import PhasemarkError, StorageError, UsageError
+from phasemark.data.executor import Maker
+from phasemark.data.shards import Job, difference, make_shard
+
+ATTEMPTS = 20
+"""How often a shard is tried again when workers die under it."""
+
+CONNECT_SECONDS = 10
+"""How long a Dask scheduler may take to answer."""
+
+_LENGTH = struct.Struct("<q")
+
+
+def open_maker(scheduler: str, job: Job) -> Maker | None:
+    """Return what makes a job's shards: None for threads of this process.
+
+    Parameters
+    ----------
+    scheduler : str
+        ``threads``, ``local:N``, or a Dask scheduler's address such as ``tcp://host:8786``.
+    job : Job
+
+    Raises
+    ------
+    UsageError
+        It is none of these, Dask is not installed, or its scheduler cannot be reached.
+    """
+    if scheduler == "threads":
+        return None
+    kind, _, count = scheduler.partition(":")
+    if kind == "local":
+        if not (count.isdecimal() and 1 <= int(count) <= 1024):
+            raise UsageError(f"--scheduler local:N needs a number of processes, got '{scheduler}'")
+        return ProcessMaker(job, int(count))
+    if "://" not in scheduler:
+        raise UsageError(
+            f"--scheduler must be threads, local:N or an address such as tcp://HOST:8786, got '{scheduler}'"
+        )
+    return DaskMaker(job, scheduler)
+
+
+@functools.lru_cache(maxsize=4)
+def _job(spec: str, identity: str) -> Job:
+    """Return the job that was sent, if this process would make the same bytes of it."""
+    from phasemark.data.jobs import job_of
+
+    job = job_of(json.loads(spec))
+    changes = difference(json.loads(identity), json.loads(json.dumps(job.identity())))
+    if changes:
+        raise UsageError(f"a worker would make other bytes ({'; '.join(changes[:4])}): install the same everywhere")
+    return job
+
+
+def make_bytes(spec: str, identity: str, start: int, stop: int) -> list[bytes]:
+    """Make a shard in a worker and return the raw bytes of its arrays."""
+    return [np.ascontiguousarray(array).tobytes() for array in make_shard(_job(spec, identity), start, stop)]
+
+
+def _described(job: Job) -> tuple[str, str]:
+    return json.dumps(job.spec()), json.dumps(job.identity())
+
+
+class ProcessMaker:
+    """Makes shards in worker processes, each an ordinary program that ends when this process does.
+
+    Parameters
+    ----------
+    job : Job
+    n : int
+        How many processes.
+    """
+
+    def __init__(self, job: Job, n: int) -> None:
+        self._described = _described(job)
+        self._n = n
+        self._idle: queue.SimpleQueue[_Process | None] = queue.SimpleQueue()
+        for _ in range(n):
+            self._idle.put(None)
+        self._all: set[_Process] = set()
+        self._guard = threading.Lock()
+        self._closed = False
+
+    def concurrency(self) -> int:
+        """Return the number of processes."""
+        return self._n
+
+    def make(self, start: int, stop: int) -> Sequence[NDArray[Any]]:
+        """Have a process make a shard; another one if it dies."""
+        worker = self._idle.get()
+        try:
+            for _ in range(ATTEMPTS):
+                if worker is None:
+                    worker = self._begin()
+                answer = worker.ask(start, stop)
+                if answer is not None:
+                    return [np.frombuffer(raw, np.uint8) for raw in answer]
+                self._end(worker)
+                worker = None
+            raise StorageError(f"{ATTEMPTS} worker processes died over items {start} … {stop - 1}")
+        finally:
+            self._idle.put(worker)
+
+    def _begin(self) -> _Process:
+        with self._guard:
+            if self._closed:
+                raise StorageError("the worker processes have been ended")
+            worker = _Process(*self._described)
+            self._all.add(worker)
+        return worker
+
+    def _end(self, worker: _Process) -> None:
+        worker.end()
+        with self._guard:
+            self._all.discard(worker)
+
+    def close(self) -> None:
+        """End all processes."""
+        with self._guard:
+            self._closed = True
+            for worker in self._all:
+                worker.end()
+            self._all.clear()
+
+
+class _Process:
+    """One worker process."""
+
+    def __init__(self, spec: str, identity: str) -> None:
+        self._child = subprocess.Popen(
+            [sys.executable, "-c", "from phasemark.data.remote import serve; serve()"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is for the program that asks, which then ends its workers
+        )
+        with suppress(OSError):
+            self._send({"spec": spec, "identity": identity})
+
+    def _send(self, request: dict[str, Any]) -> None:
+        assert self._child.stdin is not None
+        self._child.stdin.write(json.dumps(request).encode() + b"\n")
+        self._child.stdin.flush()
+
+    def ask(self, start: int, stop: int) -> list[bytes] | None:
+        """Return a shard's bytes; None if the process is no more."""
+        assert self._child.stdout is not None
+        try:
+            self._send({"start": start, "stop": stop})
+            count = _LENGTH.unpack(_exactly(self._child.stdout, 8))[0]
+            if count < 0:  # an error's message
+                kind, message = json.loads(_exactly(self._child.stdout, -count))
+                raise _ERRORS.get(kind, PhasemarkError)(message)
+            return [
+                _exactly(self._child.stdout, _LENGTH.unpack(_exactly(self._child.stdout, 8))[0]) for _ in range(count)
+            ]
+        except PhasemarkError:
+            raise
+        except (OSError, EOFError, ValueError):
+            return None
+
+    def end(self) -> None:
+        """Kill the process."""
+        self._child.kill()
+        self._child.wait()
+        for pipe in (self._child.stdin, self._child.stdout):
+            with suppress(OSError, ValueError):
+                assert pipe is not None
+                pipe.close()
+
+
+_ERRORS: dict[str, type[PhasemarkError]] = {kind.__name__: kind for kind in PhasemarkError.__subclasses__()}
+
+
+def _exactly(pipe: IO[bytes], size: int) -> bytes:
+    data = pipe.read(size)
+    if len(data) < size:
+        raise EOFError
+    return data
+
+
+class DaskMaker:
+    """Makes shards on a Dask cluster.
+
+    Parameters
+    ----------
+    job : Job
+    address : str
+        Of the scheduler.
+    """
+
+    def __init__(self, job: Job, address: str) -> None:
+        try:
+            from distributed import Client
+        except ImportError:
+            raise UsageError("--scheduler with an address needs Dask: pip install 'phasemark[dask]'") from None
+        try:
+            connect: Any = Client
+            self._client: Any = connect(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise UsageError(f"no Dask scheduler answers at {address} ({' '.join(str(error).split())})") from None
+        self._described = _described(job)
+        self._serial = iter(range(sys.maxsize))
+        self._closed = False
+
+    def concurrency(self) -> int:
+        """Return twice the number of the cluster's threads, so that none waits."""
+        return max(2, 2 * int(sum(self._client.nthreads().values())))
+
+    def make(self, start: int, stop: int) -> Sequence[NDArray[Any]]:
+        """Have the cluster make a shard; again, if its worker dies."""
+        from distributed import KilledWorker
+
+        for _ in range(ATTEMPTS):
+            if self._closed:
+                break
+            key = f"phasemark-{id(self)}-{start}-{stop}-{next(self._serial)}"  # a new key: nothing is remembered of it
+            future = self._client.submit(make_bytes, *self._described, start, stop, key=key, pure=False, retries=5)
+            try:
+                return [np.frombuffer(raw, np.uint8) for raw in future.result()]
+            except KilledWorker:
+                continue
+            except PhasemarkError:
+                raise
+            except (OSError, EOFError):
+                continue
+            finally:
+                future.release()
+        raise StorageError(f"the cluster lost items {start} … {stop - 1} {ATTEMPTS} times")
+
+    def close(self) -> None:
+        """Leave the cluster."""
+        if not self._closed:
+            self._closed = True
+            self._client.close(timeout=2)
+
+
+def serve() -> None:
+    """Answer requests from standard input until there are no more: the program of a worker process."""
+    requests, answers = sys.stdin.buffer, sys.stdout.buffer
+    sys.stdout = sys.stderr  # nothing a library prints may get between the answers
+    with suppress(BrokenPipeError, KeyboardInterrupt):
+        described = json.loads(requests.readline())
+        while line := requests.readline():
+            request = json.loads(line)
+            try:
+                arrays = make_bytes(described["spec"], described["identity"], request["start"], request["stop"])
+            except PhasemarkError as error:
+                raw = json.dumps([type(error).__name__, str(error)]).encode()
+                answers.write(_LENGTH.pack(-len(raw)) + raw)
+            else:
+                answers.write(_LENGTH.pack(len(arrays)))
+                for array in arrays:
+                    answers.write(_LENGTH.pack(len(array)))
+                    answers.write(array)
+            answers.flush()

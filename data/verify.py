@@ -1,0 +1,165 @@
+"""Whether a bank or a frame set is what it claims to be: checksum, schema, values, and some of it rendered again."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import InputFileError
+from phasemark.data.bank import Bank, open_bank
+from phasemark.data.build import BankJob
+from phasemark.data.build_frames import FrameJob
+from phasemark.data.frames import FrameSet, open_frames
+from phasemark.data.hdf5 import reading
+from phasemark.data.provenance import mesh_sha256
+from phasemark.data.seeds import stream
+from phasemark.data.store import verify_checksum
+from phasemark.render import wrap_difference_m
+
+TOLERANCE_M = 1e-5
+"""Embree and the C library differ by instruction set; ranges made elsewhere agree to this."""
+TOLERANCE = 1e-5
+"""The same for phasors, intensities and coverages, of the brightest pixel."""
+_NOISY_SHARE = 0.01
+"""Share of a view's noisy pixels that may differ: where rounding decides about a photon or a threshold."""
+_BLOCK_BYTES = 1 << 24
+
+
+def verify_bank(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0) -> dict[str, Any]:
+    """Check a bank: its checksum before it is opened, then schema, shapes and values, then images rendered again.
+
+    Parameters
+    ----------
+    path : path-like
+        The bank, with ``FILE.sha256`` beside it.
+    sample : int
+        How many random images to render again.
+    seed : int
+        Which.
+
+    Returns
+    -------
+    dict
+        What was checked, in plain numbers and text.
+
+    Raises
+    ------
+    InputFileError
+        Naming the first thing that is wrong.
+    """
+    digest = verify_checksum(path)
+    with open_bank(path, untrusted=True) as bank:
+        job = BankJob(bank.plan, bank.mesh)
+        return _verify(Path(path), digest, bank, job, sample, seed)
+
+
+def verify_frames(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0) -> dict[str, Any]:
+    """Check a frame set as :func:`verify_bank` checks a bank, with views rendered and captured again.
+
+    Parameters
+    ----------
+    path : path-like
+        The frame set, with ``FILE.sha256`` beside it.
+    sample : int
+        How many random views to make again, with all frames of each.
+    seed : int
+        Which.
+
+    Returns
+    -------
+    dict
+        What was checked, in plain numbers and text.
+
+    Raises
+    ------
+    InputFileError
+        Naming the first thing that is wrong.
+    """
+    digest = verify_checksum(path)
+    with open_frames(path, untrusted=True) as frames:
+        job = FrameJob(frames.plan, frames.mesh)
+        return _verify(Path(path), digest, frames, job, sample, seed)
+
+
+def _verify(
+    path: Path, digest: str, opened: Bank | FrameSet, job: BankJob | FrameJob, sample: int, seed: int
+) -> dict[str, Any]:
+    with h5py.File(path, "r") as file, reading(path):
+        values = _check_values(file, path)
+        for landmark in job.landmarks:
+            if mesh_sha256(landmark.mesh) != file[f"meshes/{landmark.name}"].attrs["sha256"]:
+                raise InputFileError(f"{path}: the mesh of '{landmark.name}' is not what its sha256 says")
+        slab_of = np.repeat(np.arange(len(job.items)), job.items)
+        first = np.cumsum([0, *job.items])
+        chosen = stream(seed, "verify", 0).choice(len(slab_of), size=min(sample, len(slab_of)), replace=False)
+        for item in np.sort(chosen):
+            slab = int(slab_of[item])
+            within = int(item - first[slab])
+            _compare(path, int(item), job, job.read(file, slab, within), job.remake(slab, within))
+    return {
+        "path": str(path),
+        "sha256": digest,
+        "values": values,
+        "rendered_again": len(chosen),
+        "same_versions": opened.versions == job.identity()["versions"],
+    }
+
+
+def _check_values(file: h5py.File, path: Path) -> int:
+    """Refuse infinities, and NaN but where a range is invalid; return how many values there are."""
+    count = 0
+
+    def check(name: str, item: Any) -> None:
+        nonlocal count
+        if not isinstance(item, h5py.Dataset) or item.dtype.kind != "f":
+            return
+        may_be_nan = name.startswith("range") or name in ("wall", "floor")
+        per_row = max(1, item.nbytes // max(1, len(item)))
+        step = max(1, _BLOCK_BYTES // per_row)
+        for start in range(0, len(item), step):
+            block = item[start : start + step]
+            count += block.size
+            wrong = np.isinf(block) if may_be_nan else ~np.isfinite(block)
+            if name == "range" and "flags" in file:
+                wrong |= np.isnan(block) != (file["flags"][start : start + step] != 0)
+            if wrong.any():
+                place = np.argwhere(wrong)[0]
+                where = ", ".join(str(int(k)) for k in (place[0] + start, *place[1:]))
+                raise InputFileError(f"{path}: '{name}' has {block[tuple(place)]} at ({where}), which cannot be")
+
+    file.visititems(check)
+    return count
+
+
+def _compare(
+    path: Path, item: int, job: BankJob | FrameJob, stored: dict[str, NDArray[Any]], made: dict[str, NDArray[Any]]
+) -> None:
+    for name, old in stored.items():
+        new = made[name].reshape(old.shape)
+        if name == "flags":
+            share = float(np.mean(old != new))
+            if share > _NOISY_SHARE:
+                raise InputFileError(
+                    f"{path}: 'flags' of view {item} differ in {share:.1%} of the pixels when made again"
+                )
+            continue
+        nan_differs = np.isnan(old) != np.isnan(new)
+        gap = np.nan_to_num(new.astype(float) - old.astype(float))
+        if name.startswith("range"):
+            gap = wrap_difference_m(gap, job.sensor)
+            limit = TOLERANCE_M
+        else:
+            limit = TOLERANCE * float(np.nanmax(np.abs(old), initial=1e-30))
+        wrong = nan_differs | (np.abs(gap) > limit)
+        noisy = name in ("range", "amplitude", "intensity", "taps", "range_shot")
+        if float(np.mean(wrong)) > (_NOISY_SHARE if noisy else 0.0):
+            place = np.unravel_index(int(np.argmax(np.abs(gap) + nan_differs)), gap.shape)
+            raise InputFileError(
+                f"{path}: '{name}' of item {item} is not what rendering it again gives: {old[place]} at"
+                f" {tuple(int(k) for k in place)}, now {new[place]}"
+            )

@@ -1,0 +1,245 @@
+"""Exports hold the frames' own values, say what they are, and come back as they were."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from phasemark import OutputExistsError, UsageError
+from phasemark.cli import main
+from phasemark.data import FramePlan, build_frames, export_frames, read_frames
+from phasemark.render import Views, preset
+
+SENSOR = preset("pmd-16x16")
+PLAN = FramePlan(
+    classes=["cone", "post"],
+    views=12,
+    frames_per_view=2,
+    seed=3,
+    distance_m={"uniform": [0.8, 1.5]},
+    bearing_deg={"uniform": [-3, 3]},
+    height_m={"uniform": [-0.03, 0.03]},
+    splits={"train": 0.5, "test": 0.5},
+)
+"""No wall: some pixels are invalid."""
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    with build_frames(PLAN, tmp_path_factory.mktemp("frames") / "frames.h5") as opened:
+        yield opened
+
+
+def exported(frames, tmp_path, to, quantity=None):
+    return export_frames(frames, tmp_path / f"out-{to}", to, quantity=quantity)
+
+
+@pytest.mark.parametrize("quantity", ["range", "z"])
+@pytest.mark.parametrize(
+    ("to", "options", "tolerance_m"),
+    [
+        ("npz", {}, 1e-6),  # float32 of z, below 2 m
+        ("csv", {"unit": "m"}, 1e-8),  # nine digits
+        ("png16", {}, 2e-4),  # half of 15 m / 65535
+        ("rosbag", {}, 1e-6),
+    ],
+)
+def test_frames_come_back_as_ranges(frames, tmp_path, to, options, tolerance_m, quantity):
+    if to == "rosbag":
+        pytest.importorskip("rosbags")
+        topic = {"range": "/camera/range/image", "z": "/camera/depth/image_rect"}[quantity]
+        path, options = exported(frames, tmp_path, to), {"topic": topic}
+    else:
+        path = exported(frames, tmp_path, to, quantity)
+    if to == "csv":
+        options = {**options, "quantity": quantity}
+    back = read_frames(path, sensor=SENSOR, **options)
+    expected = frames[:]["range_m"]
+    np.testing.assert_array_equal(np.isnan(back.range_m[0]), np.isnan(expected))
+    np.testing.assert_allclose(back.range_m[0], expected, rtol=0, atol=tolerance_m)
+
+
+def test_range_and_z_are_told_apart(frames, tmp_path):
+    of_range, of_z = (
+        np.load(exported(frames, tmp_path, "npz", quantity).rename(tmp_path / quantity)) for quantity in ("range", "z")
+    )
+    assert (str(of_range["quantity"]), str(of_z["quantity"])) == ("range", "z")
+    np.testing.assert_allclose(of_z["range"], of_range["range"] * SENSOR.axis_cosine(), rtol=1e-6)
+    with pytest.raises(UsageError, match="--quantity must be z for bop, got 'range'"):
+        exported(frames, tmp_path, "bop", "range")
+    with pytest.raises(UsageError, match=r"but .* says z"):
+        read_frames(tmp_path / "z", sensor=SENSOR, quantity="range")
+
+
+def test_an_image_states_its_quantity_and_scale(frames, tmp_path):
+    folder = exported(frames, tmp_path, "png16", "z")
+    facts = json.loads((folder / "frames.json").read_text())
+    with Image.open(folder / "00000005.png") as image:
+        assert image.text["quantity"] == facts["quantity"] == "z"
+        assert float(image.text["metres_per_unit"]) == facts["metres_per_unit"]
+        codes = np.asarray(image)
+    assert codes.max() <= 65535
+    expected = frames[5]["range_m"] * SENSOR.axis_cosine()
+    np.testing.assert_array_equal(codes == 0, np.isnan(expected))
+    # half a unit of rounding
+    assert (
+        np.nanmax(np.abs(np.where(codes, codes * facts["metres_per_unit"], np.nan) - expected))
+        < 0.51 * facts["metres_per_unit"]
+    )
+    assert len(facts["frames"]) == 24
+    assert facts["frames"][5]["class"] == frames[5]["class_name"]
+
+
+def test_a_point_cloud_lies_on_the_pixels_rays(frames, tmp_path):
+    cloud = trimesh.load(exported(frames, tmp_path, "ply") / "00000003.ply")
+    range_m = frames[3]["range_m"]
+    seen = np.isfinite(range_m)
+    np.testing.assert_allclose(np.linalg.norm(cloud.vertices, axis=1), range_m[seen], rtol=1e-6)
+    rows, cols = np.nonzero(seen)
+    tangent = np.tan(np.deg2rad(11))
+    # PHYSICS section 2: d ∝ (1, tan α (1 − 2u/cols), tan α (1 − 2v/rows)) at the pixel's centre
+    np.testing.assert_allclose(cloud.vertices[:, 1] / cloud.vertices[:, 0], tangent * (1 - (cols + 0.5) / 8), atol=1e-6)
+    np.testing.assert_allclose(cloud.vertices[:, 2] / cloud.vertices[:, 0], tangent * (1 - (rows + 0.5) / 8), atol=1e-6)
+
+
+def bop_images(folder):
+    for kind in ("train", "test"):
+        for scene in sorted((folder / kind).iterdir()):
+            camera = json.loads((scene / "scene_camera.json").read_text())
+            truth = json.loads((scene / "scene_gt.json").read_text())
+            info = json.loads((scene / "scene_gt_info.json").read_text())
+            for key in truth:
+                yield kind, scene, key, camera[key], truth[key][0], info[key][0]
+
+
+def test_bop_depth_and_masks_fit_the_projected_model(frames, tmp_path):
+    folder = exported(frames, tmp_path, "bop")
+    infos = json.loads((folder / "models" / "models_info.json").read_text())
+    models = {int(k): trimesh.load(folder / "models" / f"obj_{int(k):06d}.ply", process=False) for k in infos}
+    count = 0
+    for kind, scene, key, camera, truth, info in bop_images(folder):
+        numbers = frames.split(kind)
+        sample = frames[numbers[int(key) + 1000 * int(scene.name)]]
+        assert frames.classes[truth["obj_id"] - 1] == sample["class_name"]
+        matrix = np.reshape(camera["cam_K"], (3, 3))
+        rotation, translation = np.reshape(truth["cam_R_m2c"], (3, 3)), np.array(truth["cam_t_m2c"])
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) > 0
+        points = models[truth["obj_id"]].vertices @ rotation.T + translation
+        u, v, w = matrix @ points.T
+        box = info["bbox_obj"]
+        low, high = np.min([u / w, v / w], axis=1), np.max([u / w, v / w], axis=1)
+        inside = np.clip(low, 0, 15), np.clip(high, 0, 15)
+        # a pixel is in the mask when half of it sees the landmark: its centre is about half a pixel within the outline;
+        # the tip of a cone fills half a pixel only some way down
+        np.testing.assert_allclose(box[0], inside[0][0], atol=1)
+        np.testing.assert_allclose(box[1], inside[0][1], atol=2)
+        np.testing.assert_allclose([box[0] + box[2] - 1, box[1] + box[3] - 1], inside[1], atol=1)
+        with Image.open(scene / "depth" / f"{int(key):06d}.png") as image:
+            depth_mm = np.asarray(image) * camera["depth_scale"]
+        expected = np.nan_to_num(1000 * sample["range_m"] * SENSOR.axis_cosine())
+        np.testing.assert_allclose(depth_mm, expected, atol=0.51 * camera["depth_scale"])
+        for name in ("mask", "mask_visib"):
+            with Image.open(scene / name / f"{int(key):06d}_000000.png") as image:
+                assert (np.asarray(image) > 0).sum() == info["px_count_all"]
+        assert (scene / "gray" / f"{int(key):06d}.png").exists()
+        count += 1
+    assert count == 24
+    targets = json.loads((folder / "test_targets_bop19.json").read_text())
+    assert len(targets) == len(frames.split("test"))
+
+
+def test_a_bop_model_is_in_millimetres_about_its_centre_and_knows_its_symmetry(frames, tmp_path):
+    folder = exported(frames, tmp_path, "bop") / "models"
+    info = json.loads((folder / "models_info.json").read_text())["1"]
+    model = trimesh.load(folder / "obj_000001.ply", process=False)
+    np.testing.assert_allclose(model.bounds.mean(axis=0), 0, atol=1e-3)
+    np.testing.assert_allclose([info["size_x"], info["size_y"], info["size_z"]], [240, 160, 300], atol=1e-3)
+    # the tip of the cone is nearer to the box's corners than these are to each other: 3D diagonal of the box
+    assert abs(info["diameter"] - max(np.sqrt(240**2 + 160**2 + 150**2), np.sqrt(120**2 + 80**2 + 300**2))) < 1e-3
+    (turn,) = info["symmetries_discrete"]
+    turned = model.vertices @ np.reshape(turn, (4, 4))[:3, :3].T + np.reshape(turn, (4, 4))[:3, 3]
+    distance = np.linalg.norm(turned[:, None] - model.vertices[None, :400], axis=2).min(axis=0)
+    assert np.median(distance) < 1.0  # mm: the turned box has its corners where it had them
+
+
+def test_the_bag_is_a_ros_2_bag_with_labelled_quantities(frames, tmp_path):
+    rosbags = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    seen = {}
+    with rosbags.Reader(exported(frames, tmp_path, "rosbag")) as reader:
+        for link, time_ns, raw in reader.messages():
+            seen.setdefault(link.topic, []).append((time_ns, store.deserialize_cdr(raw, link.msgtype)))
+    assert {topic: len(messages) for topic, messages in seen.items()} == {
+        "/tf_static": 1, "/tf": 24, "/camera/depth/image_rect": 24, "/camera/range/image": 24,
+        "/camera/amplitude/image": 24, "/camera/depth/camera_info": 24,
+    }  # fmt: skip
+    time_ns, depth = seen["/camera/depth/image_rect"][7]
+    assert time_ns == round(7e9 / SENSOR.frame_rate_hz)
+    assert (depth.encoding, depth.height, depth.width, depth.header.frame_id) == (
+        "32FC1",
+        16,
+        16,
+        "camera_optical_frame",
+    )
+    z = frames[7]["range_m"] * SENSOR.axis_cosine()
+    np.testing.assert_allclose(depth.data.view("<f4").reshape(16, 16), z, rtol=1e-6)
+    info = seen["/camera/depth/camera_info"][7][1]
+    # the centre of the first pixel is at 0 in ROS: the middle of 16 pixels at 7.5
+    np.testing.assert_allclose(
+        info.k, [8 / np.tan(np.deg2rad(11)), 0, 7.5, 0, 8 / np.tan(np.deg2rad(11)), 7.5, 0, 0, 1]
+    )
+    pose = seen["/tf"][7][1].transforms[0]
+    sample = frames[7]
+    rotation, translation = Views.broadcast(
+        sample["distance_m"], sample["delta_rad"], sample["bearing_rad"], sample["height_m"]
+    ).landmark2cam()
+    got = pose.transform
+    np.testing.assert_allclose([got.translation.x, got.translation.y, got.translation.z], translation[0], atol=1e-12)
+    np.testing.assert_allclose(matrix_of(got.rotation), rotation[0], atol=1e-12)
+    static = seen["/tf_static"][0][1].transforms[0].transform.rotation
+    # the optical frame's z axis points forward, its x axis to the right
+    np.testing.assert_allclose(matrix_of(static), [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-12)
+
+
+def matrix_of(q):
+    x, y, z, w = q.x, q.y, q.z, q.w
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def test_an_existing_folder_needs_force_and_is_replaced_whole(frames, tmp_path):
+    folder = exported(frames, tmp_path, "ply")
+    (folder / "stray").write_text("x")
+    with pytest.raises(OutputExistsError, match="--force"):
+        exported(frames, tmp_path, "ply")
+    export_frames(frames, folder, "ply", force=True)
+    assert not (folder / "stray").exists()
+    assert len(list(folder.iterdir())) == 24
+    assert [entry.name for entry in tmp_path.iterdir()] == ["out-ply"]
+
+
+def test_an_unknown_format_is_named(frames, tmp_path):
+    with pytest.raises(UsageError, match="--to must be one of npz, csv, png16, ply, bop, rosbag, got 'gif'"):
+        exported(frames, tmp_path, "gif")
+
+
+def test_the_commands_export_import_and_show(frames, tmp_path, capsys):
+    out = tmp_path / "set.npz"
+    assert main(["frames", "export", str(frames.path), "--to", "npz", "-o", str(out)]) == 0
+    assert main(["frames", "import", str(out), "-o", str(tmp_path / "again.npz")]) == 0
+    assert main(["frames", "show", str(out), "-o", str(tmp_path / "a.png")]) == 0
+    assert main(["frames", "show", str(frames.path), "--index", "5", "-o", str(tmp_path / "b.png")]) == 0
+    assert main(["frames", "show", str(frames.path), "--index", "24", "-o", str(tmp_path / "c.png")]) == 2
+    assert "--index must be below 24" in capsys.readouterr().err
+    again = read_frames(tmp_path / "again.npz", sensor=SENSOR)
+    np.testing.assert_array_equal(again.range_m[0], frames[:]["range_m"].astype(float))

@@ -1,0 +1,317 @@
+"""A sensor fitted to frames of a board: truth recovered from simulated cameras, and what is said when it cannot be."""
+
+import json
+import math
+import tomllib
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from phasemark import UsageError
+from phasemark.cli import main
+from phasemark.render import Flag, Frames, Sensor, camera_unit, capture, fit_sensor, preset
+from phasemark.render.correlation import correlation_curve
+from phasemark.render.fit import FEWEST_FRAMES
+from phasemark.render.flat_field import board_image
+from phasemark.render.stray import spread_light
+
+PMD, BAD_DAY = preset("pmd-16x16"), preset("pmd-16x16-wiggle")
+FAR = (0.8, 1.2, 2.0, 3.0, 4.0, 5.0)
+NEAR = tuple(np.linspace(0.7, 3.2, 8))
+Z = stats.norm.ppf(1 - 1e-3 / 2 / 40)  # 99.9 % over the about 40 numbers that this file compares: 4.2 σ
+
+
+def take(sensor, distance_m, n=50, *, seed=0, albedo=0.8, amplitude=True, intensity=True, gain=1.0):
+    """Frames of a board; `gain` turns electrons into units of somebody's own."""
+    rng = np.random.default_rng([seed, round(1000 * distance_m)])
+    frames = capture(board_image(sensor, distance_m, albedo), sensor, rng=rng, n_frames=n)
+    return Frames(
+        frames.range_m,
+        gain * frames.amplitude_e if amplitude else None,
+        gain * frames.intensity_e if intensity else None,
+        sensor=sensor,
+    )
+
+
+def fitted(sensor, distances, n=50, *, base=PMD, amplitude_unit="electrons", **options):
+    boards = [take(sensor, d, n, **options) for d in distances]
+    fit = fit_sensor(boards, distances, base=base, albedo=[0.8], amplitude_unit=amplitude_unit)
+    for name, one in fit.estimates.items():
+        print(f"{name} = {one.value:.6g} ± {one.std_error}: {one.note}")
+    return fit
+
+
+def meets(fit, name, truth):
+    one = fit.estimates[name]
+    return one.value == pytest.approx(truth, abs=Z * one.std_error)
+
+
+# Truth recovered: 50 frames of 256 pixels a board; intervals of 99.9 % over all numbers, from the fit's own errors
+
+
+def test_the_published_camera_is_recovered_from_ranges_at_several_distances():
+    camera = PMD.with_(ambient_e=4000.0, range_offset_m=0.07, phase_offset_std_rad=0.01)
+    fit = fitted(camera, FAR, amplitude=False, intensity=False)
+    assert meets(fit, "signal_e", camera.signal_e)  # K = 0.5 is the assumed one, and is right
+    assert meets(fit, "ambient_e", 4000.0)
+    delay = camera_unit(camera).delay_rad[0]
+    assert meets(fit, "range_offset_m", delay.mean() * camera.metres_per_radian)
+    assert meets(fit, "phase_offset_std_rad", delay.std(ddof=1))
+    assert fit.estimates["signal_e"].std_error < 0.05 * camera.signal_e
+    assert fit.estimates["contrast"].std_error is None
+    assert fit.sensor.modulation == "sine"
+    assert any("No wiggling is seen" in note for note in fit.notes)
+
+
+def test_amplitude_and_intensity_tell_contrast_light_and_read_noise_apart():
+    camera = PMD.with_(contrast=0.4, signal_e=20_000.0, ambient_e=5000.0, read_noise_e=60.0)
+    fit = fitted(camera, FAR[:5])
+    for name in ("contrast", "signal_e", "ambient_e", "read_noise_e"):
+        assert meets(fit, name, getattr(camera, name))
+        assert fit.estimates[name].std_error < 0.05 * getattr(camera, name)
+    without_intensity = fitted(camera, FAR[:5], intensity=False)
+    assert meets(without_intensity, "contrast", 0.4)
+    assert meets(without_intensity, "ambient_e", 5000.0 + 2 * 60.0**2)  # which read noise looks like
+    assert without_intensity.estimates["read_noise_e"].std_error is None
+
+
+def test_photon_transfer_finds_the_electrons_of_an_arbitrary_unit():
+    camera = PMD.with_(contrast=0.4, ambient_e=5000.0)
+    fit = fitted(camera, FAR[:5], n=200, gain=0.037, amplitude_unit="arbitrary")
+    note = next(note for note in fit.notes if "electrons a unit" in note)
+    scale, error = (float(word) for word in note.split("gives ")[1].split(" electrons")[0].split(" ± "))
+    assert scale == pytest.approx(1 / 0.037, abs=Z * error)
+    assert meets(fit, "signal_e", camera.signal_e)
+    assert meets(fit, "ambient_e", 5000.0)
+    assert meets(fit, "read_noise_e", 0.0)
+    assert meets(fit, "contrast", 0.4)  # a ratio: no unit in it
+    aside = fitted(camera, FAR[:1], gain=0.037, amplitude_unit="arbitrary")
+    assert any("left aside" in note for note in aside.notes)
+
+
+def test_a_bad_day_is_recovered_within_its_intervals():
+    # square waves, patterns, stray light, converter, defects, told apart from 8 distances of 100 frames
+    fit = fitted(BAD_DAY, NEAR, 100)
+    unit = camera_unit(BAD_DAY)
+    alive = ~(unit.dead | unit.hot)
+    assert set(fit.sensor.dead_pixels) == {(int(r), int(c)) for r, c in np.argwhere(~alive)}
+    assert fit.sensor.hot_pixels == ()
+    # the truth of this unit, not of its make: mean sensitivity, light that stray light leaves, mean dark signal
+    board = board_image(BAD_DAY, 1.0, 0.8)
+    kept = (spread_light(board.intensity, BAD_DAY) / board.intensity)[0]
+    response = unit.response.mean(axis=0)
+    assert meets(fit, "signal_e", BAD_DAY.signal_e * (response * kept)[alive].mean())
+    ambient = (BAD_DAY.ambient_e * response + unit.dark_e.sum(axis=0))[alive].mean()
+    assert meets(fit, "ambient_e", ambient)  # dark current is taken for ambient light, as the base has none
+    assert meets(fit, "read_noise_e", math.sqrt(BAD_DAY.read_noise_e**2 + BAD_DAY.code_e**2 / 12))
+    delay = unit.delay_rad.mean(axis=0)[alive]
+    assert meets(fit, "phase_offset_std_rad", delay.std(ddof=1))
+    # K: the amplitude wiggles with the range, which the spread over distances allows for
+    assert meets(fit, "contrast", 0.5)
+
+
+def test_the_fitted_wiggling_is_the_camera_s_own():
+    fit = fitted(BAD_DAY, NEAR, 100)
+    assert [k for k, _, _ in fit.sensor.harmonics] == [3, 7]
+    unit = camera_unit(BAD_DAY)
+    alive = ~(unit.dead | unit.hot)
+    phase = np.linspace(NEAR[0], NEAR[-1], 60) / BAD_DAY.metres_per_radian
+
+    def error_m(sensor, delay):
+        d = [correlation_curve(phase + delay + i * math.pi / 2, sensor.correlation_harmonics) for i in range(4)]
+        turn = np.exp(1j * (np.arctan2(d[3] - d[1], d[0] - d[2]) - phase))
+        return np.angle(turn) * sensor.metres_per_radian
+
+    true = error_m(BAD_DAY, unit.delay_rad[:, alive].mean())
+    found = error_m(fit.sensor, fit.sensor.range_offset_m / fit.sensor.metres_per_radian)
+    print(f"wiggling: fitted curve off by {1e3 * np.abs(found - true).max():.2f} mm at most, of {np.ptp(true):.3f} m")
+    # orders 3 and 7 meet in the 12th harmonic of the error by a_3 a_7 · c/4πf = 5.4 mm, which the fit cannot follow
+    assert np.abs(found - true).max() < 5.4e-3
+    assert np.ptp(true) > 0.3
+
+
+def test_standard_errors_are_those_of_repeated_fits():
+    # 24 cameras' worth of frames: the spread of each estimate over its stated error, 99.9 % interval of χ² over 4
+    camera, n = PMD.with_(ambient_e=4000.0, read_noise_e=80.0), 24
+    names = ("range_offset_m", "signal_e", "contrast", "ambient_e", "read_noise_e")
+    found = {name: [] for name in names}
+    for seed in range(n):
+        boards = [take(camera, d, 20, seed=100 + seed) for d in (0.8, 2.0, 3.0)]
+        fit = fit_sensor(boards, (0.8, 2.0, 3.0), base=PMD, albedo=[0.8])
+        for name in names:
+            one = fit.estimates[name]
+            truth = 0.0 if name == "range_offset_m" else getattr(camera, name)
+            found[name].append((one.value - truth) / one.std_error)
+    high = stats.chi2.ppf(1 - 1e-3 / len(names), n)
+    for name in names:
+        pulls = np.array(found[name])
+        print(f"{name}: mean of pulls {pulls.mean():.2f}, r.m.s. {np.sqrt((pulls**2).mean()):.2f}")
+        assert (pulls**2).sum() < high  # errors may be stated too large, never too small
+
+
+def test_a_direct_sensor_has_an_offset_and_one_figure_of_noise():
+    camera = preset("vl53l5cx-8x8").with_(range_offset_m=0.02, dead_pixels=((1, 2),))
+    fit = fitted(camera, (1.0, 2.0), base=preset("vl53l5cx-8x8"), amplitude=False, intensity=False)
+    assert meets(fit, "range_offset_m", 0.02)
+    assert meets(fit, "range_std_m", 0.004)
+    assert fit.sensor.dead_pixels == ((1, 2),)
+    assert fit.sensor.kind == "direct"
+
+
+# What one distance tells, and what is odd
+
+
+def test_one_distance_says_that_offset_and_wiggling_cannot_be_told_apart():
+    fit = fitted(PMD, (1.0,), amplitude=False, intensity=False)
+    assert any("cannot be told apart from one distance" in note for note in fit.notes)
+    assert any("one number of noise" in note for note in fit.notes)
+    assert meets(fit, "signal_e", PMD.signal_e)  # the assumed K and no ambient light happen to be right
+    assert meets(fit, "range_offset_m", 0.0)
+
+
+def test_noisy_stuck_and_far_pixels_are_found():
+    frames = take(PMD, 1.0)
+    range_m, rng = frames.range_m.copy(), np.random.default_rng(0)
+    range_m[..., 2, 3] += rng.normal(0, 0.15, 50)
+    range_m[..., 4, 5] = 1.05
+    range_m[..., 6, 7] += 0.5
+    range_m[..., 8, 9] = np.nan
+    fit = fit_sensor([Frames(range_m, sensor=PMD)], [1.0], base=PMD, albedo=[0.8])
+    assert fit.sensor.hot_pixels == ((2, 3), (4, 5), (6, 7))
+    assert fit.sensor.dead_pixels == ((8, 9),)
+    assert meets(fit, "range_offset_m", 0.0)  # they are not in the other numbers
+    assert meets(fit, "phase_offset_std_rad", 0.0)
+
+
+def test_frames_behind_a_filter_in_time_are_noticed():
+    rng = np.random.default_rng(2)
+    white = rng.normal(0, 0.02, (201, 16, 16))
+    board = board_image(PMD, 1.0, 0.8).range_m[0]
+    smooth = fit_sensor([Frames(board + (white[1:] + white[:-1]) / 2, sensor=PMD)], [1.0], base=PMD)
+    assert smooth.frame_correlation == pytest.approx(0.5, abs=4 * smooth.frame_correlation_std_error)
+    assert any("not independent" in note for note in smooth.notes)
+    plain = fit_sensor([Frames(board + white, sensor=PMD)], [1.0], base=PMD)
+    assert abs(plain.frame_correlation) < 4 * plain.frame_correlation_std_error
+    assert not any("not independent" in note for note in plain.notes)
+    errors = [fit.estimates["range_offset_m"].std_error / fit.range_std_m.mean() for fit in (smooth, plain)]
+    assert errors[0] / errors[1] == pytest.approx(math.sqrt(3), rel=0.05)  # (1 + r) / (1 − r) at r = ½
+
+
+def test_a_range_beyond_the_wrap_has_an_error_about_zero():
+    fit = fitted(
+        PMD.with_(signal_e=5e6, range_offset_m=0.03), (14.95, 16.0), base=PMD, amplitude=False, intensity=False
+    )
+    assert fit.sensor.range_offset_m == pytest.approx(0.03, abs=0.005)
+
+
+def test_a_distance_at_which_few_pixels_answer_is_left_out():
+    frames = take(PMD, 2.0)
+    flags = np.zeros(frames.range_m.shape, int)
+    flags[..., :12, :] = Flag.NO_RETURN
+    weak = Frames(frames.range_m, flags=flags, sensor=PMD)
+    fit = fit_sensor([take(PMD, 1.0, amplitude=False, intensity=False), weak], [1.0, 2.0], base=PMD, albedo=[0.8])
+    assert any("at 2 m were left out: 25 %" in note for note in fit.notes)
+    assert fit.sensor.dead_pixels == ()
+
+
+@pytest.mark.parametrize(
+    ("frames", "distances", "albedo", "message"),
+    [
+        ([10], [1.0, 2.0], None, "each set of frames needs its distance: got 1 of frames and 2"),
+        ([10], [0.0], None, "'distance' must be a positive number of metres, got 0"),
+        ([10], [math.nan], None, "'distance' must be a positive number of metres, got nan"),
+        ([10], [1.0], [1.5], r"'albedo' must be in \(0, 1\], got 1.5"),
+        ([10], [1.0], [0.5, 0.6], "one albedo, or one for each of the 1 distances, got 2"),
+        ([1], [1.0], None, f"too few frames at 1 m: 1, but at least {FEWEST_FRAMES} are needed"),
+        ([FEWEST_FRAMES - 1], [1.0], None, f"but at least {FEWEST_FRAMES} are needed to know a pixel's noise to 25 %"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused_in_one_line(frames, distances, albedo, message):
+    boards = [Frames(np.full((n, 16, 16), 1.0), sensor=PMD) for n in frames]
+    with pytest.raises(UsageError, match=message) as caught:
+        fit_sensor(boards, distances, base=PMD, albedo=albedo)
+    assert "\n" not in str(caught.value)
+
+
+def test_frames_without_a_valid_pixel_are_refused():
+    with pytest.raises(UsageError, match="no pixel is valid"):
+        fit_sensor([Frames(np.full((20, 16, 16), np.nan), sensor=PMD)], [1.0], base=PMD)
+
+
+def test_one_frame_repeated_is_refused():
+    with pytest.raises(UsageError, match="no noise"):
+        fit_sensor([Frames(np.ones((20, 16, 16)), sensor=PMD)], [1.0], base=PMD)
+
+
+# The command and its file
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fit")
+    for d in (1.0, 2.0):
+        frames = take(PMD, d)
+        np.savez(folder / f"{d:g}.npz", range=1e3 * frames.range_m, amplitude=frames.amplitude_e,
+                 intensity=frames.intensity_e, unit="mm", quantity="range")  # fmt: skip
+    np.savetxt(folder / "short.csv", np.ones((3, 256)), delimiter=",")
+    np.savetxt(folder / "narrow.csv", np.ones((10, 12)), delimiter=",")
+    np.savetxt(folder / "empty.csv", np.full((10, 256), np.nan), delimiter=",")
+    return folder
+
+
+def run(*arguments):
+    return main(["sensor", "fit", *map(str, arguments)])
+
+
+def test_the_command_writes_a_sensor_file_that_says_what_was_measured(folder, tmp_path, capsys):
+    out = tmp_path / "mycam.toml"
+    boards = (folder / "1.npz", folder / "2.npz", "--distance", 1.0, "--distance", 2.0, "--albedo", 0.8)
+    assert run(*boards, "-o", out, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    text = out.read_text(encoding="utf-8")
+    sensor = Sensor.from_toml(out)
+    assert sensor == Sensor(**tomllib.loads(text)) == Sensor(**answer["sensor"])
+    assert sensor.signal_e == pytest.approx(PMD.signal_e, rel=0.01)
+    for line in text.splitlines():  # every number says where it comes from
+        assert line.startswith("#") or not line or "  # measured" in line or "  # assumed: " in line
+    assert main(["sensor", "show", str(out)]) == 0
+    assert main(["sensor", "characterise", str(out), "-o", str(tmp_path / "sheet"), "--frames", "4"]) == 0
+    assert run(*boards, "-o", out) == 4  # it exists
+    assert "exists already" in capsys.readouterr().err
+    assert run(*boards, "-o", out, "--force") == 0
+    printed = capsys.readouterr().out
+    assert "signal_e" in printed
+    assert printed.splitlines()[-1] == str(out)
+
+
+def test_positions_of_one_file_take_their_distances_in_order(folder, tmp_path):
+    both = np.concatenate([take(PMD, d).range_m for d in (1.0, 2.0)])
+    np.savez(tmp_path / "both.npz", range=both, unit="m", quantity="range")
+    assert run(tmp_path / "both.npz", "--distance", 1.0, "--distance", 2.0, "-o", tmp_path / "a.toml") == 0
+    assert abs(Sensor.from_toml(tmp_path / "a.toml").range_offset_m) < 0.002  # 20 mm / √(50 · 256), 4 times and more
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "part"),
+    [
+        (["short.csv", "--distance", "1"], 2, f"at least {FEWEST_FRAMES} are needed"),
+        (["1.npz", "--distance", "-1"], 2, "must be a positive number of metres, got -1"),
+        (["1.npz", "--distance", "near"], 2, "--distance"),
+        (["1.npz"], 2, "--distance"),
+        (["1.npz", "2.npz", "--distance", "1"], 2, "each set of frames needs its distance"),
+        (["narrow.csv", "--distance", "1"], 3, "12 values, must have 256"),
+        (["empty.csv", "--distance", "1"], 2, "no pixel is valid"),
+        (["missing.npz", "--distance", "1"], 3, "cannot be read"),
+        (["1.npz", "--distance", "1", "--sensor", "nothing"], 2, "unknown sensor 'nothing'"),
+        (["1.npz", "--distance", "1", "--amplitude-unit", "volts"], 2, "'electrons' or 'arbitrary'"),
+    ],
+)
+def test_the_command_says_in_one_line_what_is_wrong(folder, tmp_path, capsys, monkeypatch, arguments, code, part):
+    monkeypatch.chdir(folder)
+    stated = [] if "npz" in arguments[0] else ["--unit", "m", "--quantity", "range"]
+    assert run(*arguments, *stated, "-o", tmp_path / "a.toml") == code
+    error = capsys.readouterr().err
+    assert part in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "a.toml").exists()

@@ -1,0 +1,128 @@
+"""The formats: files of every version that was released open, plans explain themselves, other programs read ours."""
+
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+import tomllib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from regenerate_golden import BANK, BANK_PLAN, FRAMES, FRAMES_PLAN
+
+from phasemark import InputFileError, UsageError
+from phasemark.cli import main
+from phasemark.data import (
+    PLAN_KINDS,
+    build_bank,
+    build_frames,
+    check_plan,
+    open_bank,
+    open_frames,
+    plan_example,
+    plan_schema,
+    verify_bank,
+    verify_frames,
+)
+
+DOCS = Path(__file__).parent.parent / "docs"
+
+
+def test_the_golden_bank_of_version_1_opens_and_is_what_is_built_today(tmp_path):
+    with open_bank(BANK) as golden, build_bank(BANK_PLAN, tmp_path / "bank.h5") as built:
+        assert golden.classes == built.classes == ("cone",)
+        for i, j in np.ndindex(2, 2):
+            # across machines: docs/formats.md promises 1e-5 of the brightest pixel
+            atol = 1e-5 * np.abs(golden.phasor("cone", i, j)).max()
+            np.testing.assert_allclose(built.phasor("cone", i, j), golden.phasor("cone", i, j), rtol=0, atol=atol)
+
+
+def test_the_golden_frames_of_version_1_open_and_are_what_is_built_today(tmp_path):
+    with open_frames(FRAMES) as golden, build_frames(FRAMES_PLAN, tmp_path / "frames.h5") as built:
+        assert golden.plan == built.plan
+        old, new = golden[:], built[:]
+        assert old.keys() == new.keys()
+        for name in ("range_m", "range_hard_m", "range_mixed_m"):
+            np.testing.assert_allclose(new[name], old[name], rtol=0, atol=1e-5)  # metres, across machines
+        np.testing.assert_array_equal(old["flags"], new["flags"])
+        np.testing.assert_array_equal(old["distance_m"], new["distance_m"])
+
+
+def test_the_golden_files_verify():
+    verify_bank(BANK)
+    verify_frames(FRAMES)
+
+
+@pytest.mark.parametrize(("golden", "read"), [(BANK, open_bank), (FRAMES, open_frames)])
+def test_a_newer_version_is_refused_by_its_number(tmp_path, golden, read):
+    path = tmp_path / golden.name
+    shutil.copy(golden, path)
+    with h5py.File(path, "r+") as file:
+        file.attrs["schema_version"] = 2
+    with pytest.raises(InputFileError, match="has schema version 2, this phasemark reads 1: update phasemark"):
+        read(path)
+
+
+def test_netcdf4_and_h5dump_read_the_files():
+    netcdf4 = pytest.importorskip("netCDF4")
+    with netcdf4.Dataset(FRAMES) as file, open_frames(FRAMES) as frames:
+        assert file["range"].dimensions == ("frame", "row", "col")
+        assert file["range"].units == "m"
+        np.testing.assert_array_equal(np.ma.filled(file["range"][:], np.nan), frames[:]["range_m"])
+    with netcdf4.Dataset(BANK) as file:
+        assert file["lower/phasor"].dimensions == ("distance", "delta", "frequency", "row", "col", "iq")
+    if shutil.which("h5dump"):
+        done = subprocess.run(["h5dump", "-H", FRAMES], capture_output=True, text=True, check=True)
+        assert 'DATASET "range"' in done.stdout
+
+
+@pytest.mark.parametrize("kind", PLAN_KINDS)
+def test_the_example_of_a_plan_is_a_plan_and_fits_its_schema(tmp_path, kind):
+    path = tmp_path / "plan.toml"
+    path.write_text(plan_example(kind), encoding="utf-8")
+    assert check_plan(path) == (kind, PLAN_KINDS[kind](**tomllib.loads(plan_example(kind))).resolve())
+    schema = plan_schema(kind)
+    assert set(tomllib.loads(plan_example(kind))) <= set(schema["properties"])
+    assert schema["additionalProperties"] is False
+    assert set(schema["properties"]) == set(PLAN_KINDS[kind].model_fields)
+
+
+def test_plan_commands_print_and_check(tmp_path, capsys):
+    assert main(["plan", "example", "frames"]) == 0
+    path = tmp_path / "plan.toml"
+    path.write_text(capsys.readouterr().out, encoding="utf-8")
+    assert main(["plan", "check", str(path), "--json"]) == 0
+    checked = json.loads(capsys.readouterr().out)
+    assert checked["kind"] == "frames"
+    assert checked["plan"]["views"] == 1000
+    assert main(["plan", "schema", "bank"]) == 0
+    assert "distance_m" in json.loads(capsys.readouterr().out)["properties"]
+    path.write_text(path.read_text(encoding="utf-8").replace("views = 1000", "views = -1"), encoding="utf-8")
+    assert main(["plan", "check", str(path)]) == 2
+    assert re.search(r"plan\.toml: 'views' must be .* got -1", capsys.readouterr().err)
+    with pytest.raises(UsageError, match="unknown kind of plan 'sweep'"):
+        plan_schema("sweep")
+
+
+@pytest.mark.parametrize("golden", [BANK, FRAMES], ids=["bank", "frames"])
+def test_the_documentation_has_a_row_for_every_dataset_and_attribute(golden):
+    """docs/formats.md is the contract: what lies in a file is in its tables."""
+    text = (DOCS / "formats.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([^`\n]+)`", text))
+    with h5py.File(golden) as file:
+        found = set(file.attrs)
+
+        def note(name, item):
+            if isinstance(item, h5py.Dataset):
+                found.add(name.split("/")[-1])
+
+        file.visititems(note)
+    assert found - named == set()
+
+
+def test_the_checksum_is_that_of_sha256sum():
+    digest, name = (BANK.parent / "bank-v1.h5.sha256").read_text().split()
+    assert (digest, name) == (hashlib.sha256(BANK.read_bytes()).hexdigest(), "bank-v1.h5")

@@ -1,0 +1,413 @@
+"""Frame sets: what is drawn, what lies in the file, the same bytes however it is built, and what verify finds."""
+
+import hashlib
+import pickle
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+import xarray
+
+from phasemark import InputFileError, OutputExistsError, UsageError
+from phasemark.data import (
+    BankPlan,
+    Distribution,
+    FramePlan,
+    build_bank,
+    build_frames,
+    build_part,
+    estimate,
+    grid_loss,
+    merge_parts,
+    open_frames,
+    parse_part,
+    read_frames,
+    verify_bank,
+    verify_frames,
+    write_checksum,
+)
+from phasemark.data.seeds import stream
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.render import Background, Renderer, capture, preset
+
+PLAN = FramePlan(
+    classes=["cone", "post"],
+    views=20,
+    frames_per_view=3,
+    seed=7,
+    distance_m={"uniform": [0.8, 1.2]},
+    delta_deg={"sobol": [0, 180]},
+    bearing_deg={"normal": [0, 1.5], "within": [-4, 4]},
+    height_m={"sobol": [-0.02, 0.02]},
+    albedo={"uniform": [0.5, 0.9]},
+    wall_m={"uniform": [3, 5]},
+    variants=["hard", "mixed", "shot"],
+    keep_taps=True,
+)
+
+
+@pytest.fixture(scope="module")
+def frames_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("frames") / "frames.h5"
+    build_frames(PLAN, path).close()
+    return path
+
+
+@pytest.fixture
+def frames(frames_file):
+    with open_frames(frames_file) as opened:
+        yield opened
+
+
+def sha256(path):
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+# --- plans -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({}, "'views' is missing"),
+        ({"views": 0}, "'views' must be greater than or equal to 1, got 0"),
+        ({"views": 1, "distance_m": {"normal": [1, 0.1]}}, "'distance_m' must be positive throughout"),
+        ({"views": 1, "distance_m": {}}, "'distance_m': must be a number or have one of fixed, uniform"),
+        ({"views": 1, "delta_deg": {"uniform": [0, 1], "fixed": 3}}, "'delta_deg': must be a number or have one of"),
+        ({"views": 1, "delta_deg": {"uniform": [1, 0]}}, "low ≤ high"),
+        ({"views": 1, "wall_m": -1}, "'wall_m' must be positive"),
+        ({"views": 1, "albedo": {"uniform": [0, 1]}}, "'albedo' must be in"),
+        ({"views": 1, "splits": {"train": 0.5}}, "'splits' must be shares that add up to 1"),
+        ({"views": 1, "colour": "red"}, "unknown key 'colour'"),
+        ({"views": 1, "delta_deg": {"gauss": [0, 1]}}, "unknown key 'gauss'"),
+        ({"views": 1, "delta_deg": {"fixed": 0, "within": [0, 1]}}, "'within' cuts the tails of 'normal'"),
+    ],
+)
+def test_a_plan_that_cannot_be_is_refused_by_its_key(fields, message):
+    with pytest.raises(UsageError, match=message.replace("(", r"\(")):
+        FramePlan(**fields)
+
+
+def test_a_resolved_plan_says_everything_and_resolves_to_itself():
+    resolved = PLAN.resolve()
+    assert resolved.resolve() == resolved
+    assert FramePlan(**resolved.model_dump(mode="json")) == resolved
+    assert [part.name for part in resolved.landmarks] == ["cone", "post"]
+
+
+def test_a_view_that_cannot_be_seen_is_named_before_anything_is_rendered(tmp_path):
+    plan = FramePlan(classes=["cone"], views=50, distance_m={"uniform": [0.7, 1.5]}, wall_m=1.3, seed=1)
+    with pytest.raises(UsageError, match=r"view \d+ of the plan cannot be rendered: the wall at 1.3 m is before"):
+        build_frames(plan, tmp_path / "frames.h5")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_truth_of_a_view_depends_on_its_number_alone():
+    plan = PLAN.resolve()
+    whole = plan.draw_truth()
+    for start, stop in ((0, 1), (3, 4), (5, 11), (19, 20)):
+        for name, values in plan.draw_truth(start, stop).items():
+            np.testing.assert_array_equal(values, whole[name][start:stop])
+
+
+def test_values_follow_their_distributions():
+    n = 20_000
+    plan = FramePlan(
+        views=n,
+        seed=3,
+        distance_m={"uniform": [1, 2]},
+        delta_deg={"sobol": [0, 180]},
+        bearing_deg={"normal": [0.5, 2]},
+        height_m={"normal": [0, 1], "within": [-1, 2]},
+        floor_m=1.0,
+        splits={"a": 0.25, "b": 0.75},
+    ).resolve()
+    truth = plan.draw_truth()
+    # Kolmogorov's distance of n independent values exceeds 2.2 / √n with probability 1.3e-4; seven are looked at
+    limit = 2.2 / np.sqrt(n)
+    from scipy import stats
+
+    assert stats.kstest(truth["distance_m"], stats.uniform(1, 1).cdf).statistic < limit
+    assert stats.kstest(truth["bearing_deg"], stats.norm(0.5, 2).cdf).statistic < limit
+    assert stats.kstest(truth["height_m"], stats.truncnorm(-1, 2).cdf).statistic < limit
+    # a Sobol sequence fills the interval far more evenly than independent draws do
+    assert stats.kstest(truth["delta_deg"], stats.uniform(0, 180).cdf).statistic < 0.05 * limit
+    assert np.all(truth["floor_m"] == 1)
+    assert np.isnan(truth["wall_m"]).all()
+    # binomial counts, 99.9 % corrected for five: 4.1 standard deviations
+    assert abs((truth["split_index"] == 0).mean() - 0.25) < 4.1 * np.sqrt(0.25 * 0.75 / n)
+    for k in range(4):
+        assert abs((truth["class_index"] == k).mean() - 0.25) < 4.1 * np.sqrt(0.25 * 0.75 / n)
+
+
+def test_quantities_are_independent_of_one_another():
+    truth = PLAN.model_copy(update={"views": 4000}).resolve().draw_truth()
+    names = ["distance_m", "delta_deg", "bearing_deg", "height_m", "albedo", "wall_m", "class_index", "split_index"]
+    correlation = np.corrcoef([truth[name] for name in names]) - np.eye(len(names))
+    assert np.abs(correlation).max() < 4.3 / np.sqrt(4000)  # 99.9 % over 28 pairs
+
+
+# --- bytes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"workers": 1}, {"workers": 3, "shard_items": 7}, {"workers": 8, "shard_items": 1}, {"scheduler": "local:2"}],
+    ids=str,
+)
+def test_the_same_bytes_for_any_workers_shards_and_processes(frames_file, tmp_path, options):
+    build_frames(PLAN, tmp_path / "again.h5", **options).close()
+    assert sha256(tmp_path / "again.h5") == sha256(frames_file)
+
+
+def test_parts_built_apart_merge_to_the_bytes_of_one_run(frames_file, tmp_path):
+    parts = [build_part(PLAN, (i, 3), tmp_path / f"part{i}.h5") for i in (1, 2, 3)]
+    merge_parts(parts[::-1], tmp_path / "merged.h5")
+    assert sha256(tmp_path / "merged.h5") == sha256(frames_file)
+    with pytest.raises(InputFileError, match=r"shards are missing: no items 6 … 12 of 20"):
+        merge_parts([parts[0], parts[2]], tmp_path / "other.h5")
+    with pytest.raises(InputFileError, match="repeats items from 0 on"):
+        merge_parts([*parts, parts[0]], tmp_path / "other.h5")
+    stranger = build_part(PLAN.model_copy(update={"seed": 8}), (2, 3), tmp_path / "stranger.h5")
+    with pytest.raises(InputFileError, match=r"is of another run than .*plan\.seed: 7 → 8"):
+        merge_parts([parts[0], stranger, parts[2]], tmp_path / "other.h5")
+
+
+def test_parts_of_a_bank_merge_too(tmp_path):
+    plan = BankPlan(classes=["cone", "post"], distance_m="0.9:1.1:0.1", delta_deg="0:180:30")
+    build_bank(plan, tmp_path / "whole.h5").close()
+    parts = [build_part(plan, (i, 4), tmp_path / f"part{i}.h5") for i in (1, 2, 3, 4)]
+    merge_parts(parts, tmp_path / "merged.h5")
+    assert sha256(tmp_path / "merged.h5") == sha256(tmp_path / "whole.h5")
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "1", "a/b", "1/", "-1/3"])
+def test_a_shard_is_written_i_of_n(text):
+    with pytest.raises(UsageError, match="--shard must be I/N"):
+        parse_part(text)
+
+
+def test_resuming_a_finished_set_changes_nothing_and_of_another_plan_is_refused(frames_file):
+    before = sha256(frames_file)
+    build_frames(PLAN, frames_file, resume=True).close()
+    assert sha256(frames_file) == before
+    with pytest.raises(OutputExistsError, match=r"plan\.seed: 7 → 8"):
+        build_frames(PLAN.model_copy(update={"seed": 8}), frames_file, resume=True)
+
+
+def test_a_dry_run_knows_the_size(frames_file):
+    facts = estimate(PLAN)
+    assert facts["bytes"] == frames_file.stat().st_size
+    assert (facts["views"], facts["frames"]) == (20, 60)
+    assert facts["seconds"] > 0
+
+
+# --- content ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_file_holds_what_renderer_and_sensor_make_of_each_view(frames):
+    sensor = preset("pmd-16x16")
+    truth = frames.truth
+    for view in (0, 7, 19):
+        name = frames.classes[truth["class_index"][view]]
+        renderer = Renderer(build_mesh(catalog()[name]), sensor, albedo=truth["albedo"][view])
+        where = [truth[key][view] for key in ("distance_m", "delta_rad", "bearing_rad", "height_m")]
+        background = Background(wall_m=truth["wall_m"][view])
+        image = renderer.render(*where, background=background)
+        hard = renderer.render(*where, background=background, variant="hard")
+        expected = capture(image, sensor, rng=stream(7, "frames.noise", 0), n_frames=3, first_view=view, keep_taps=True)
+        sample = frames[3 * view : 3 * view + 3]
+        assert sample["class_name"].tolist() == [name] * 3
+        assert sample["view"].tolist() == [view] * 3
+        for key, values in (
+            ("range_m", expected.range_m[0]),
+            ("amplitude_e", expected.amplitude_e[0]),
+            ("intensity_e", expected.intensity_e[0]),
+            ("flags", expected.flags[0]),
+            ("taps_e", expected.taps_e[0]),
+            ("range_hard_m", np.repeat(hard.range_m, 3, axis=0)),
+            ("range_mixed_m", np.repeat(image.range_m, 3, axis=0)),
+            ("coverage", np.repeat(image.coverage, 3, axis=0)),
+        ):
+            np.testing.assert_array_equal(sample[key], values.astype(sample[key].dtype), err_msg=key)
+
+
+def test_frames_come_by_number_slice_and_list(frames):
+    assert len(frames) == 60
+    one, some, picked = frames[17], frames[10:20], frames[[17, 3, 17]]
+    assert one["range_m"].shape == (16, 16)
+    assert isinstance(one["distance_m"], float)
+    assert isinstance(one["class_name"], str)
+    np.testing.assert_array_equal(one["range_m"], some["range_m"][7])
+    np.testing.assert_array_equal(picked["range_m"][[0, 2]], [one["range_m"]] * 2)
+    assert frames[-1]["view"] == 19
+    assert frames[5:5]["range_m"].shape == (0, 16, 16)
+    with pytest.raises(IndexError):
+        frames[60]
+    assert frames.frames([17]).range_m.shape == (1, 1, 16, 16)
+    assert frames.view(5).range_m.shape == (1, 3, 16, 16)
+
+
+def test_splits_share_the_views_and_no_view_is_in_two(frames):
+    numbers = [frames.split(name) for name in frames.splits]
+    assert sorted(np.concatenate(numbers)) == list(range(60))
+    views = [set(frames.view_index[part]) for part in numbers]
+    assert sum(map(len, views)) == 20
+    with pytest.raises(UsageError, match="unknown split 'night'"):
+        frames.split("night")
+
+
+def distance_of(sample):
+    return sample["distance_m"]
+
+
+def test_it_is_a_map_style_data_set_that_other_processes_can_read(frames, frames_file):
+    subset = frames.subset("train", transform=distance_of)
+    again = pickle.loads(pickle.dumps(subset))
+    assert [again[k] for k in range(len(again))] == [subset[k] for k in range(len(subset))]
+    program = (
+        "import multiprocessing as mp, sys, numpy as np\n"
+        "from phasemark.data import open_frames\n"
+        "frames = open_frames(sys.argv[1])\n"
+        "def total(k): return float(np.nansum(frames[k]['range_m']))\n"
+        "with mp.get_context('fork').Pool(2) as pool:\n"
+        "    assert pool.map(total, range(60)) == [total(k) for k in range(60)]\n"
+        "assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", program, frames_file], check=True)
+
+
+def test_a_closed_set_says_so(frames_file):
+    frames = open_frames(frames_file)
+    frames.close()
+    with pytest.raises(UsageError, match="closed"):
+        frames[0]
+
+
+def test_a_packed_copy_reads_the_same(frames, frames_file, tmp_path):
+    copy = tmp_path / "packed.h5"
+    with h5py.File(frames_file) as source, h5py.File(copy, "w") as target:
+        for key, value in source.attrs.items():
+            target.attrs[key] = value
+        for name, item in source.items():
+            if isinstance(item, h5py.Group):
+                source.copy(item, target)
+            elif item.ndim > 1:
+                target.create_dataset(name, data=item[...], chunks=True, compression="gzip")
+            else:
+                target.create_dataset(name, data=item[...])
+    with open_frames(copy) as packed:
+        for index in (5, slice(3, 30, 4)):
+            np.testing.assert_array_equal(packed[index]["range_m"], frames[index]["range_m"])
+
+
+def test_xarray_shows_labelled_axes_with_units(frames, frames_file):
+    with xarray.open_dataset(frames_file, engine="h5netcdf") as data:
+        assert data["range"].dims == ("frame", "row", "col")
+        assert data["coverage"].dims == ("view", "row", "col")
+        assert data["taps"].dims == ("frame", "phase", "tap", "row", "col")
+        assert data["range"].attrs["units"] == "m"
+        assert data["delta"].attrs["units"] == "degree"
+        np.testing.assert_array_equal(data["range"].values, frames[:]["range_m"])
+
+
+def test_the_matcher_reads_a_frame_set_as_measured_frames(frames, frames_file):
+    measured = read_frames(frames_file, sensor=frames.sensor)
+    np.testing.assert_array_equal(measured.range_m[0], frames[:]["range_m"].astype(float))
+
+
+# --- verify ----------------------------------------------------------------------------------------------------------
+
+
+def test_verify_passes_what_was_built(frames_file):
+    report = verify_frames(frames_file, sample=20)
+    assert report["rendered_again"] == 20
+    assert report["sha256"] == sha256(frames_file)
+
+
+@pytest.mark.parametrize("n", [100, pytest.param(5000, marks=pytest.mark.soak)])
+def test_verify_reports_every_flipped_bit_and_every_cut(frames_file, tmp_path, n):
+    rng = np.random.default_rng(5)
+    content = frames_file.read_bytes()
+    path = tmp_path / "frames.h5"
+    (tmp_path / "frames.h5.sha256").write_bytes((frames_file.parent / "frames.h5.sha256").read_bytes())
+    reported = 0
+    for k in range(n):
+        data = bytearray(content)
+        if k % 4 == 3:
+            del data[int(rng.integers(len(data))) :]
+        else:
+            data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
+        path.write_bytes(data)
+        try:
+            verify_frames(path)
+        except InputFileError:
+            reported += 1
+    assert reported == n
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("range", np.inf, "'range' has inf"),
+        ("coverage", np.nan, "'coverage' has nan"),
+        ("range_mixed", 0.01, "'range_mixed' of item"),
+        ("range", 0.01, "'range' of item"),
+        ("flags", 1, "'range' has"),
+    ],
+)
+def test_verify_finds_what_a_forged_checksum_hides(frames_file, tmp_path, name, change, message):
+    path = tmp_path / "frames.h5"
+    path.write_bytes(frames_file.read_bytes())
+    with h5py.File(path, "r+") as file:
+        if np.isfinite(change) and name.startswith("range"):
+            file[name][...] = file[name][...] + np.float32(change)
+        else:
+            file[name][0, 8, 8] = change
+    write_checksum(path)
+    with pytest.raises(InputFileError, match=message):
+        verify_frames(path, sample=20)
+
+
+def test_verify_renders_a_bank_again(tmp_path):
+    path = tmp_path / "bank.h5"
+    build_bank(BankPlan(classes=["cone"], distance_m="0.9,1", delta_deg="0:90:45"), path).close()
+    assert verify_bank(path)["rendered_again"] > 0
+    with h5py.File(path, "r+") as file:
+        file["lower/phasor"][1, 1] *= 1.001
+    write_checksum(path, force=True)
+    with pytest.raises(InputFileError, match="'phasor' of item"):
+        verify_bank(path, sample=100)
+
+
+def test_the_loss_of_a_grid_follows_from_its_spacing(tmp_path):
+    steps = {}
+    for name, distance, delta in (("coarse", "0.9:1.1:0.02", "0:90:2"), ("fine", "0.9:1.1:0.01", "0:90:1")):
+        with build_bank(BankPlan(classes=["cone"], distance_m=distance, delta_deg=delta), tmp_path / name) as bank:
+            steps[name] = grid_loss(bank, 300, seed=1)
+    coarse, fine = steps["coarse"], steps["fine"]
+    # a uniform error within half a step has an r.m.s. of step / √12; distance and δ are coupled, which adds to both
+    assert 0.02 / np.sqrt(12) * 0.9 < coarse["distance_rms_m"] < 0.02 / np.sqrt(12) * 1.5
+    assert 2 / np.sqrt(12) * 0.9 < coarse["delta_rms_deg"] < 2 / np.sqrt(12) * 4
+    # half the step costs a quarter of χ², as far as the phasors are smooth
+    assert 2.5 < coarse["chi2_median"] / fine["chi2_median"] < 6
+    assert coarse["mismatch_99"] > fine["mismatch_99"] > fine["mismatch_median"] > 0
+    # the Fisher information is the sensor's and the landmark's, not the grid's
+    assert coarse["suggested_distance_m"] == pytest.approx(fine["suggested_distance_m"], rel=0.1)
+
+
+def test_a_file_of_a_newer_version_names_it(frames_file, tmp_path):
+    path = tmp_path / "frames.h5"
+    path.write_bytes(frames_file.read_bytes())
+    with h5py.File(path, "r+") as file:
+        file.attrs["schema_version"] = 9
+    with pytest.raises(InputFileError, match="has schema version 9, this phasemark reads 1: update phasemark"):
+        open_frames(path)
+
+
+def test_a_distribution_knows_its_bounds():
+    assert Distribution(normal=(1, 2)).lowest == -np.inf
+    assert Distribution(normal=(1, 2), within=(0, 3)).highest == 3
+    assert Distribution(fixed=2).highest == 2

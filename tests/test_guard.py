@@ -1,0 +1,217 @@
+"""Files from strangers: nothing outside is opened, nothing runs away, and each ends in an answer or one line."""
+
+import os
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+from phasemark import InputFileError
+from phasemark.cli import main
+from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_bank, open_frames, read_frames
+from phasemark.data.guard import first_reading, refusal
+from phasemark.render import preset
+
+SENSOR = preset("pmd-16x16")
+
+
+@pytest.fixture(scope="module")
+def bank_bytes(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bank") / "bank.h5"
+    build_bank(BankPlan(classes=["cone"], distance_m="1", delta_deg="0:90:45", model="planar"), path).close()
+    return path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def frames_bytes(tmp_path_factory):
+    path = tmp_path_factory.mktemp("frames") / "frames.h5"
+    build_frames(FramePlan(classes=["cone"], views=3, frames_per_view=2), path).close()
+    return path.read_bytes()
+
+
+@pytest.fixture
+def canary(tmp_path):
+    """A pipe: whoever opens it to read waits for ever, so that it cannot be opened unnoticed."""
+    path = tmp_path / "canary"
+    os.mkfifo(path)
+    return path
+
+
+def external_link(file, canary):
+    file["range"] = h5py.ExternalLink(str(canary), "/range")
+
+
+def deep_external_link(file, canary):
+    file["a/b/c"] = h5py.ExternalLink(str(canary), "/range")
+
+
+def external_storage(file, canary):
+    file.create_dataset("range", (1, 16, 16), "f4", external=[(str(canary), 0, 1024)])
+
+
+def virtual_dataset(file, canary):
+    layout = h5py.VirtualLayout((1, 16, 16), "f4")
+    layout[0] = h5py.VirtualSource(str(canary), "range", (16, 16))
+    file.create_virtual_dataset("range", layout)
+
+
+def link_out_of_its_group(file, canary):
+    file["a/range"] = h5py.SoftLink("/somewhere/else")
+
+
+def plugin_filter(file, canary):
+    creation = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    creation.set_chunk((1, 16, 16))
+    creation.set_filter(32015, h5py.h5z.FLAG_OPTIONAL, ())  # zstandard: a plug-in
+    h5py.h5d.create(file.id, b"range", h5py.h5t.IEEE_F32LE, h5py.h5s.create_simple((1, 16, 16)), creation)
+
+
+def declares_8_terabytes(file, canary):
+    file.create_dataset("range", (2**33, 16, 16), "f4", chunks=(1, 16, 16))
+
+
+def deflate_bomb(file, canary):
+    file.create_dataset("range", data=np.zeros((2**16, 16, 16), "f4"), chunks=(2**10, 16, 16), compression=9)
+
+
+def groups_without_end(file, canary):
+    group = file
+    for _ in range(40):
+        group = group.create_group("g")
+    group["range"] = 1.0
+
+
+TRICKS = {
+    external_link: "external link",
+    deep_external_link: "external link",
+    external_storage: "another file",
+    virtual_dataset: "virtual dataset",
+    link_out_of_its_group: "soft link out of its group",
+    plugin_filter: "filter 32015",
+    declares_8_terabytes: "declares far more",
+    deflate_bomb: "declares far more",
+    groups_without_end: "without end",
+}
+
+
+@pytest.fixture(params=TRICKS, ids=lambda trick: trick.__name__)
+def trick(request, tmp_path, canary, recwarn):
+    path = tmp_path / "trick.h5"
+    with h5py.File(path, "w") as file:
+        request.param(file, canary)
+    return path, TRICKS[request.param]
+
+
+def test_each_trick_is_refused_by_its_name(trick):
+    path, reason = trick
+    assert reason in refusal(path)
+    assert reason in first_reading(path)
+    for read in (open_bank, open_frames, lambda path: read_frames(path, sensor=SENSOR, unit="m", quantity="range")):
+        with pytest.raises(InputFileError, match=reason):
+            read(path)
+
+
+def test_refusing_takes_little_memory(trick):
+    path, _ = trick
+    program = (
+        "import resource, sys; from phasemark.data.guard import refusal\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "assert refusal(sys.argv[1])\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
+    )
+    grown = subprocess.run([sys.executable, "-c", program, path], capture_output=True, text=True, check=True).stdout
+    assert int(grown) < 20 << 10  # KiB: the file's metadata, none of its values
+
+
+def test_what_a_cycle_of_groups_holds_is_looked_at_once(tmp_path):
+    path = tmp_path / "cycle.h5"
+    with h5py.File(path, "w") as file:
+        outer = file.create_group("a")
+        outer.create_group("b")["c"] = outer
+        file["a/range"] = np.ones((1, 16, 16))
+    assert refusal(path) is None
+    assert first_reading(path) is None
+
+
+def test_an_honest_file_passes(tmp_path, bank_bytes, frames_bytes):
+    for content in (bank_bytes, frames_bytes):
+        path = tmp_path / "honest.h5"
+        path.write_bytes(content)
+        assert refusal(path) is None
+        assert first_reading(path) is None
+
+
+def test_filters_of_hdf5_itself_are_read(tmp_path):
+    path = tmp_path / "packed.h5"
+    values = np.random.default_rng(1).uniform(1, 2, (5, 16, 16))
+    with h5py.File(path, "w") as file:
+        file.create_dataset("range", data=values, chunks=True, compression="gzip", shuffle=True, fletcher32=True)
+    frames = read_frames(path, sensor=SENSOR, unit="m", quantity="range", untrusted=True)
+    np.testing.assert_array_equal(frames.range_m[0], values)
+
+
+def test_an_npz_bomb_is_refused(tmp_path):
+    path = tmp_path / "bomb.npz"
+    np.savez_compressed(path, range=np.zeros((2**16, 16, 16), "f4"))
+    with pytest.raises(InputFileError, match="far more than its size can hold"):
+        read_frames(path, sensor=SENSOR, unit="m", quantity="range")
+
+
+def mutate(content, rng):
+    """Flip, cut, repeat or overwrite some of a file."""
+    data = bytearray(content)
+    for _ in range(int(rng.integers(1, 6))):
+        kind, at = rng.integers(4), int(rng.integers(len(data)))
+        # most of what HDF5 interprets lies in the first pages
+        at = at % 4096 if rng.random() < 0.7 else at
+        if kind == 0:
+            data[at] ^= 1 << int(rng.integers(8))
+        elif kind == 1:
+            data[at : at + 8] = rng.bytes(8)
+        elif kind == 2:
+            data[at : at + 4] = b"\xff\xff\xff\xff"
+        elif len(data) > 1000:
+            del data[-int(rng.integers(1, len(data) // 2)) :]
+    return bytes(data)
+
+
+def busy_seconds():
+    """Processor time of this process and its children: other programs' load does not count."""
+    return sum(os.times()[:4])
+
+
+def check_mutants(tmp_path, contents, n, seed):
+    """Every reading command ends on every mutant within 5 s, with an answer or exit 3; return how many were refused."""
+    rng = np.random.default_rng(seed)
+    refused = 0
+    (tmp_path / "good.h5").write_bytes(contents["bank"])
+    for k in range(n):
+        kind = ("bank", "frames")[k % 2]
+        path = tmp_path / f"{kind}.h5"
+        path.write_bytes(mutate(contents[kind], rng))
+        commands = {
+            "bank": [["bank", "info", str(path)], ["bank", "verify", str(path)]],
+            "frames": [
+                ["frames", "info", str(path)],
+                ["match", str(tmp_path / "good.h5"), str(path), "--unit", "m", "--quantity", "range"],
+            ],
+        }[kind]
+        command = commands[(k // 2) % 2]
+        begun = busy_seconds()
+        code = main(command)
+        assert busy_seconds() - begun < 5, f"mutant {k} of seed {seed} took too long"
+        assert code in (0, 3), f"mutant {k} of seed {seed} ended with {code}"
+        refused += code == 3
+    return refused
+
+
+def test_mutated_files_end_with_an_answer_or_exit_3(tmp_path, bank_bytes, frames_bytes, capsys):
+    contents = {"bank": bank_bytes, "frames": frames_bytes}
+    assert check_mutants(tmp_path, contents, 12, 1) > 0
+
+
+@pytest.mark.soak
+def test_two_thousand_mutated_files_end_with_an_answer_or_exit_3(tmp_path, bank_bytes, frames_bytes, capsys):
+    check_mutants(tmp_path, {"bank": bank_bytes, "frames": frames_bytes}, 2000, 2)

@@ -1,0 +1,249 @@
+"""Large files are built in shards: whole or not there, continued after any end, the same bytes however made."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from toy_job import ToyJob, check_toy_file
+
+from phasemark import OutputExistsError, StorageError, UsageError
+from phasemark.data.remote import open_maker
+from phasemark.data.shards import build, difference, manifest_path, partial_path
+
+HERE = Path(__file__).parent
+
+
+def names(folder):
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def run_program(text, **options):
+    """Start a Python program that can import the tests' helpers."""
+    environment = {**os.environ, "PYTHONPATH": str(HERE)}
+    return subprocess.Popen([sys.executable, "-c", text], env=environment, text=True, **options)
+
+
+class Stop(Exception):
+    pass
+
+
+def stop_after(items):
+    """A progress function that ends the run when so many items are done."""
+
+    def progress(done, total):
+        if done >= items:
+            raise Stop
+
+    return progress
+
+
+@pytest.fixture
+def unfinished(tmp_path):
+    path = tmp_path / "toy"
+    with pytest.raises(Stop):
+        build(ToyJob(), path, workers=1, shard_items=1, progress=stop_after(4))
+    return path
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3, 8])
+@pytest.mark.parametrize("shard_items", [1, 7, 64])
+def test_the_bytes_depend_on_neither_workers_nor_shards(tmp_path, workers, shard_items):
+    build(ToyJob(), tmp_path / "one", workers=1)
+    build(ToyJob(), tmp_path / "other", workers=workers, shard_items=shard_items)
+    check_toy_file(tmp_path / "other")
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
+    assert names(tmp_path) == ["one", "one.sha256", "other", "other.sha256"]
+
+
+def test_an_unfinished_run_is_beside_the_file_and_not_under_its_name(unfinished):
+    assert names(unfinished.parent) == ["toy.manifest", "toy.partial"]
+
+
+def test_resuming_makes_only_what_is_missing(unfinished):
+    made = []
+
+    class Watched(ToyJob):
+        def make(self, slab, start, stop):
+            made.append((slab, start, stop))
+            return super().make(slab, start, stop)
+
+    build(Watched(), unfinished, resume=True)
+    check_toy_file(unfinished)
+    # writing the header again spoils the shard that shares its 64 kB page, and no other
+    assert 4 <= len(made) <= 6
+    assert names(unfinished.parent) == ["toy", "toy.sha256"]
+
+
+def test_a_shard_that_rotted_since_is_made_again(unfinished):
+    with partial_path(unfinished).open("r+b") as file:
+        file.seek(-150_000, os.SEEK_END)
+        file.write(b"rot")
+        file.seek(250_000)
+        file.write(b"rot")
+    build(ToyJob(), unfinished, resume=True)
+    check_toy_file(unfinished)
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "garbage", "half a line"])
+def test_a_damaged_manifest_costs_work_but_nothing_else(unfinished, damage):
+    manifest = manifest_path(unfinished)
+    text = manifest.read_bytes()
+    changed = {"cut": text[:-20], "empty": b"", "garbage": b"\x00\xff" * 50, "half a line": text + b'{"shard": 7, "sh'}
+    manifest.write_bytes(changed[damage])
+    build(ToyJob(), unfinished, resume=True, force=True)
+    check_toy_file(unfinished)
+
+
+def test_a_run_of_another_plan_is_not_continued_and_the_difference_named(unfinished):
+    with pytest.raises(OutputExistsError, match=r"another plan \(plan\.mark: 0 → 1\)"):
+        build(ToyJob(mark=1), unfinished, resume=True)
+    build(ToyJob(), unfinished, resume=True)
+    check_toy_file(unfinished)
+
+
+def test_an_unfinished_run_is_not_thrown_away_unasked(unfinished):
+    with pytest.raises(OutputExistsError, match="--resume continues it, --force starts over"):
+        build(ToyJob(), unfinished)
+    build(ToyJob(), unfinished, force=True)
+    check_toy_file(unfinished)
+
+
+def test_a_run_that_finished_nothing_leaves_nothing(tmp_path):
+    class Broken(ToyJob):
+        def make(self, slab, start, stop):
+            raise UsageError("no")
+
+    with pytest.raises(UsageError, match="no"):
+        build(Broken(), tmp_path / "toy")
+    assert names(tmp_path) == []
+
+
+def test_a_second_run_on_one_output_is_refused_while_the_first_goes_on(tmp_path):
+    path = tmp_path / "toy"
+    begun, refused = threading.Event(), []
+
+    def progress(done, total):
+        begun.set()
+
+    first = threading.Thread(
+        target=build, args=(ToyJob(seconds=0.1), path), kwargs={"workers": 1, "shard_items": 1, "progress": progress}
+    )
+    first.start()
+    begun.wait()
+    for resume in (False, True):
+        with pytest.raises(OutputExistsError, match=r"unfinished run|another run is writing it") as error:
+            build(ToyJob(), path, resume=resume)
+        refused.append(str(error.value))
+    first.join()
+    assert "another run is writing it" in refused[1]
+    check_toy_file(path)
+    assert names(tmp_path) == ["toy", "toy.sha256"]
+
+
+def test_readers_see_the_old_file_or_the_new_one(tmp_path):
+    path = tmp_path / "toy"
+    build(ToyJob(mark=0), path)
+    contents = {path.read_bytes()}
+    build(ToyJob(mark=1), tmp_path / "new")
+    contents.add((tmp_path / "new").read_bytes())
+    ended, seen = threading.Event(), []
+
+    def read():
+        while not ended.is_set():
+            seen.append(path.read_bytes() in contents)
+
+    readers = [threading.Thread(target=read) for _ in range(4)]
+    for reader in readers:
+        reader.start()
+    for mark in (1, 0, 1, 0):
+        build(ToyJob(mark=mark), path, force=True)
+    ended.set()
+    for reader in readers:
+        reader.join()
+    assert len(seen) > 10
+    assert all(seen)
+
+
+@pytest.mark.parametrize("action", ["kill", "ENOSPC", pytest.param("EIO", marks=pytest.mark.soak)])
+def test_a_build_ended_at_any_call_to_the_system_leaves_old_or_new_and_resumes(action):
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # hundreds of fsyncs take a minute on a disk
+    with tempfile.TemporaryDirectory(dir=memory) as folder:
+        done = subprocess.run(
+            [sys.executable, HERE / "crash_points.py", folder, action],
+            env={**os.environ, "PYTHONPATH": str(HERE)}, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    # two rounds, without and with an old file: layout, manifest, three shards, commit, hash, publication
+    assert int(done.stdout) > 30
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_command_exits_with_its_code_and_can_be_resumed(tmp_path, number, code):
+    path = tmp_path / "toy"
+    program = f"""
+import sys
+from phasemark import cli
+from phasemark.data.shards import build
+from toy_job import ToyJob
+
+def run(arguments):
+    build(ToyJob(items=(400, 3), seconds=0.02), {str(path)!r}, workers=2, shard_items=1)
+
+cli._run = run
+sys.exit(cli.main([]))
+"""
+    with run_program(program, stderr=subprocess.PIPE) as child:
+        wait_for(lambda: manifest_path(path).exists() and manifest_path(path).read_bytes().count(b"\n") > 1)
+        child.send_signal(number)
+        child.communicate(timeout=20)
+    assert child.returncode == code
+    assert names(tmp_path) == ["toy.manifest", "toy.partial"]
+    build(ToyJob(items=(400, 3)), path, resume=True)
+    check_toy_file(path, (400, 3))
+
+
+def wait_for(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("size_kb", [64, 256, 700, 900])
+def test_a_full_disk_is_an_error_and_the_run_resumes_when_there_is_room(tmp_path, size_kb):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size_kb}k", "tmpfs", disk], capture_output=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip("mounting a small disk needs privileges")
+    try:
+        path = disk / "toy"
+        if size_kb < 800:  # the file has 800 kB
+            with pytest.raises(StorageError, match="No space left"):
+                build(ToyJob(), path)
+            assert names(disk) == []
+            subprocess.run(["mount", "-o", "remount,size=2m", disk], check=True)
+        build(ToyJob(), path, resume=True)
+        check_toy_file(path)
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+def test_differences_are_named_by_key():
+    old = {"plan": {"a": 1, "b": [{"c": 2}], "gone": None}, "versions": {"numpy": "1"}}
+    new = {"plan": {"a": 1, "b": [{"c": 3}]}, "versions": {"numpy": "2"}}
+    assert difference(old, new) == ["plan.b[0].c: 2 → 3", 'versions.numpy: "1" → "2"']
+
+
+@pytest.mark.parametrize("scheduler", ["local", "local:0", "local:x", "processes", "dask"])
+def test_an_unknown_scheduler_is_named(scheduler):
+    with pytest.raises(UsageError, match="--scheduler"):
+        open_maker(scheduler, ToyJob())
