@@ -23,26 +23,37 @@ from phasemark.matcher.match import Candidate, Match, Matches
 from phasemark.matcher.matcher import Matcher, background_image
 from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
 from phasemark.matcher.surroundings import Surroundings, estimate_surroundings
+from phasemark.matcher.sweep import read_sweep, run_sweep
+from phasemark.matcher.sweep_compare import Difference, compare_cells
+from phasemark.matcher.sweep_plan import Condition, Method, SweepPlan, load_sweep, shipped_sweeps
+from phasemark.matcher.sweep_tables import Cell, SweepTrials
 from phasemark.matcher.trials import Conditions, Trials, TrialSummary, run_trials
 
 __all__ = [
     "PRIOR_STD",
     "Bound",
     "Candidate",
+    "Cell",
+    "Condition",
     "Conditions",
+    "Difference",
     "Estimate",
     "FilteredFrames",
     "Match",
     "Matcher",
     "Matches",
+    "Method",
     "PixelKalman",
     "PixelState",
     "RobotPose",
     "Surroundings",
+    "SweepPlan",
+    "SweepTrials",
     "TrialSummary",
     "Trials",
     "ViewEstimate",
     "background_image",
+    "compare_cells",
     "confusion_probability",
     "covers",
     "cramer_rao",
@@ -51,9 +62,13 @@ __all__ = [
     "kalman",
     "kalman_filter",
     "kalman_step",
+    "load_sweep",
     "nees",
     "phasor_mean",
+    "read_sweep",
     "robot_poses",
+    "run_sweep",
     "run_trials",
     "share",
+    "shipped_sweeps",
 ]

@@ -176,9 +176,7 @@ def _map(cells: Sequence[Cell], quantity: str) -> Figure:
     for row, method in zip(panels, methods, strict=True):
         for panel, (parameter, (label, unit, scale)) in zip(row, _SHOWN.items(), strict=True):
             factor = 1.0 if quantity == "ratio" else scale
-            table = np.array(
-                [[_map_value(cells, method, quantity, parameter, d, a) * factor for a in x] for d in y]
-            )
+            table = np.array([[_map_value(cells, method, quantity, parameter, d, a) * factor for a in x] for d in y])
             shown = panel.imshow(table, aspect="auto", origin="lower", cmap="cividis")
             middle = np.nanmean([np.nanmin(table), np.nanmax(table)]) if np.isfinite(table).any() else 0.0
             for i, j in np.ndindex(table.shape):
@@ -200,8 +198,7 @@ def _map_value(
     found: list[Estimate] = [
         getattr(cell, quantity)[parameter]
         for cell in cells
-        if cell.method == method
-        and (cell.condition.distance_m, cell.condition.delta_deg) == (distance_m, delta_deg)
+        if cell.method == method and (cell.condition.distance_m, cell.condition.delta_deg) == (distance_m, delta_deg)
     ]
     return _median([estimate.value for estimate in found])
 
@@ -266,7 +263,9 @@ def _confusion(trials: SweepTrials) -> Figure:
         panel.imshow(table, cmap="cividis", vmin=0, vmax=1, aspect="auto")
         for i, j in np.ndindex(table.shape):
             text = f"{100 * table[i, j]:.3g} %" if table[i, j] else "0"
-            panel.text(j, i, text, ha="center", va="center", color="black" if table[i, j] > 0.5 else "white", fontsize=7)
+            panel.text(
+                j, i, text, ha="center", va="center", color="black" if table[i, j] > 0.5 else "white", fontsize=7
+            )
         panel.set_xticks(range(len(names)), names, fontsize=8)
         panel.set_yticks(range(len(present)), [trials.classes[k] for k in present], fontsize=8)
         panel.set_xlabel("found")

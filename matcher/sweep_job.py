@@ -12,7 +12,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,8 +29,8 @@ from phasemark.matcher.filters import FilteredFrames, kalman_filter, phasor_mean
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.models import VIEW
-from phasemark.matcher.sweep_plan import Condition, Method, SweepPlan
-from phasemark.render import Background, Renderer, Sensor, Views, capture
+from phasemark.matcher.sweep_plan import Method, SweepPlan
+from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture
 
 FORMAT = "phasemark-trials"
 SCHEMA_VERSION = 1
@@ -216,7 +216,8 @@ class SweepJob:
         rng = stream(self.plan.seed, "sweep.noise", number)
         n_frames = self.all_conditions[number].n_frames
         frames = capture(image, true, rng=rng, n_frames=n_frames, first_view=first)
-        return (phasor_mean if method.filter == "phasor-mean" else kalman_filter)(replace(frames, sensor=believed))
+        seen = Frames(frames.range_m, frames.amplitude_e, frames.intensity_e, flags=frames.flags, sensor=believed)
+        return (phasor_mean if method.filter == "phasor-mean" else kalman_filter)(seen)
 
     def bound(self, number: int, method: Method, views: Views) -> NDArray[np.float64]:
         """Return the Cramér–Rao bound of the true world at some views, (n, 4, 4), NaN for what is not estimated."""
