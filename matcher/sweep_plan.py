@@ -236,7 +236,8 @@ class SweepPlan(ScenePlan):
     def _sobol(self, axes: dict[str, tuple[float, ...]]) -> list[dict[str, float]]:
         if not axes:
             return [{}]
-        rng = stream(self.seed, "sweep.design", 0)
+        # the scrambling spawns streams of its own, which a Philox keyed by hand cannot
+        rng = np.random.default_rng(int(stream(self.seed, "sweep.design", 0).integers(2**63)))
         exponent = math.ceil(math.log2(self.points))
         unit = qmc.Sobol(len(axes), rng=rng).random_base2(exponent)[: self.points]
         low = np.array([min(values) for values in axes.values()])

@@ -2,43 +2,16 @@
 
 import numpy as np
 import pytest
+from own_matchers import Fails
 
 from phasemark import OutputExistsError, UsageError
-from phasemark.matcher.match import Match
 from phasemark.matcher.sweep import read_sweep, run_sweep
 from phasemark.matcher.sweep_plan import Method, SweepPlan, load_sweep, shipped_sweeps
 
 EXACT = ("condition", "trial", "truth", "estimate", "bound", "covariance", "chi2", "p_value", "found", "accepted")
 
 
-def nearest_to_mean(frames):
-    """A matcher that looks at the mean range only; good enough to be judged."""
-    return [
-        Match(class_name="cone", accepted=True, distance_m=float(np.nanmean(frames.range_m[k])) + 0.1, delta_rad=0.5)
-        for k in range(len(frames))
-    ]
-
-
-class Fails:
-    """Works for some batches, then raises; the number of calls is the test's."""
-
-    left = 0
-
-    def __call__(self, frames):
-        if Fails.left == 0:
-            raise ZeroDivisionError("no luck")
-        Fails.left -= 1
-        return nearest_to_mean(frames)
-
-
-fails = Fails()
-
-
-def nan_view(frames):
-    return [Match(class_name="cone", accepted=True) for _ in range(len(frames))]
-
-
-def plan(matcher="test_sweep:nearest_to_mean", **changes):
+def plan(matcher="own_matchers:nearest_to_mean", **changes):
     given = {
         "name": "small", "trials": 100, "classes": ["cone"], "axes": {"distance_m": [0.95, 1.05], "n_frames": [3]},
         "bank_distance_m": (0.9, 1.1), "methods": [Method(name="mine", method=matcher)],
@@ -74,14 +47,14 @@ def test_a_sweep_reads_back(reference):
 
 
 def test_methods_see_the_same_frames_and_another_method_changes_nothing(reference, tmp_path):
-    methods = [Method(name=name, method="test_sweep:nearest_to_mean") for name in ("mine", "again")]
+    methods = [Method(name=name, method="own_matchers:nearest_to_mean") for name in ("mine", "again")]
     both = run_sweep(plan(methods=methods), tmp_path)
     np.testing.assert_array_equal(both.estimate[:, 0], both.estimate[:, 1])
     np.testing.assert_array_equal(both.estimate[:, :1], reference[1].estimate)
 
 
 def test_a_failed_sweep_keeps_what_is_done_and_goes_on(reference, tmp_path):
-    failing = plan("test_sweep:fails")
+    failing = plan("own_matchers:fails")
     Fails.left = 3
     with pytest.raises(UsageError, match=r"method 'mine', condition 1, trials 50 … 99: .* ZeroDivisionError: no luck"):
         run_sweep(failing, tmp_path, workers=1)
@@ -98,7 +71,7 @@ def test_truths_lie_off_the_grid_within_their_spread(reference):
 
 
 def test_rounds_go_on_until_the_rmse_is_known(tmp_path):
-    trials = run_sweep(plan(trials=20, until_percent=10.0, max_trials=2000), tmp_path)
+    trials = run_sweep(plan(trials=20, until_percent=10.0, max_trials=2000, spread=(0.01, 6.0)), tmp_path)
     n = np.bincount(trials.condition)
     assert (n > 20).all()
     for cell in trials.cells():
@@ -126,9 +99,9 @@ def test_a_wrong_plan_is_refused_in_one_line(changes, message):
 @pytest.mark.parametrize(
     ("matcher", "message"),
     [
-        ("test_sweep:nan_view", "view that is not finite"),
+        ("own_matchers:nan_view", "view that is not finite"),
         ("no_such_module:match", "cannot be imported"),
-        ("test_sweep:EXACT", "must be callable"),
+        ("own_matchers:NOT_CALLABLE", "must be callable"),
     ],
 )
 def test_a_bad_matcher_is_told_in_one_line(matcher, message, tmp_path):
