@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from phasemark.data import Bank, BankPlan, FramePlan
     from phasemark.landmarks import LandmarkSpec
-    from phasemark.matcher import FilteredFrames, Match, Matches
+    from phasemark.matcher import FilteredFrames, LandmarkMap, Match, Matches, RobotPose
     from phasemark.render import Background, Estimate, Sensor
 
 __all__ = ["app", "main"]
@@ -47,6 +47,7 @@ Start with
   phasemark bank build -o bank.h5   a bank of model images to match your frames against
   phasemark match bank.h5 measured.csv --unit m --quantity range
   phasemark sensor fit frames.npz --distance 1.0 -o mycam.toml    a camera of your own, from frames of a flat board
+  phasemark drive                   a robot on a tour of 20 m, corrected at four landmarks
   phasemark --help                  all commands; COMMAND --help explains one
 """
 
@@ -815,6 +816,14 @@ def _match(
         tuple[float, float, float] | None,
         typer.Option("--prior", metavar="X Y DEG", help="Where the robot is thought to be; orders the solutions."),
     ] = None,
+    prior_std: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--prior-std", metavar="M DEG", help="How well: standard deviations of x and y, and of heading."),
+    ] = None,
+    map_file: Annotated[
+        Path | None,
+        typer.Option("--map", metavar="MAP", help="Where the landmarks stand (.toml), instead of --landmark-xy."),
+    ] = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", help="Draw measured, model and residual into this .png.")
     ] = None,
@@ -826,13 +835,22 @@ def _match(
     All frames of a file are averaged: the camera stands still. A file of shape (n, frames, rows, cols) has n positions.
     """
     from phasemark.data import open_bank, read_frames
-    from phasemark.matcher import Matcher, kalman_filter, phasor_mean
+    from phasemark.matcher import Matcher, kalman_filter, load_map, phasor_mean
 
     filters = {"kalman": kalman_filter, "phasor-mean": phasor_mean}
     if filter_name not in filters:
         raise UsageError(f"unknown filter '{filter_name}': give {' or '.join(filters)}")
-    if prior is not None and landmark_xy is None:
-        raise UsageError("--prior needs --landmark-xy: without it there is no robot position")
+    if map_file is not None and landmark_xy is not None:
+        raise UsageError("--map and --landmark-xy both say where the landmark stands: give one of them")
+    if prior is not None and landmark_xy is None and map_file is None:
+        raise UsageError("--prior needs --landmark-xy or --map: without it there is no robot position")
+    if prior_std is not None and prior is None:
+        raise UsageError("--prior-std needs --prior, which it belongs to")
+    if prior_std is not None and not min(prior_std) > 0:
+        raise UsageError(f"--prior-std must be two positive numbers, got {prior_std[0]:g} {prior_std[1]:g}")
+    landmarks = None if landmark_xy is None else _one_landmark(landmark_xy, landmark_yaw)
+    if map_file is not None:
+        landmarks = load_map(map_file)
     if plot is not None and plot.suffix.lower() != ".png":
         raise UsageError(f"the picture must be a .png file, got '{plot}'")
     background = _background(wall, floor)
@@ -873,8 +891,8 @@ def _match(
     answers = []
     for match in matches:
         answer = match.as_dict()
-        if landmark_xy is not None:
-            answer["poses"] = _poses(match, landmark_xy, math.radians(landmark_yaw), math.radians(pan), prior)
+        if landmarks is not None:
+            answer["poses"] = _poses(match, landmarks, map_file is None, math.radians(pan), prior, prior_std)
         answers.append(answer)
     if as_json:
         _echo_json({"bank": str(bank), "frames": str(frames), "matches": answers})
@@ -1007,6 +1025,64 @@ def _sweep_compare(
     typer.echo(f"{sum(one.significant for one in found)} of {len(found)} differences are significant")
 
 
+@app.command("drive")
+def _drive(
+    plan_file: Annotated[
+        Path | None, typer.Argument(metavar="[PLAN]", help="A plan (.toml); without it a tour of 20 m.")
+    ] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for tables, summary, picture and animation.")] = Path(
+        "out/drive"
+    ),
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")] = 2005,
+    example: Annotated[
+        bool, typer.Option("--example", help="Print the plan of that tour, and do nothing else.")
+    ] = False,
+    workers: _Workers = None,
+    as_json: _Json = False,
+    force: _Force = False,
+) -> None:
+    """Drive a robot from landmark to landmark, its odometry corrected on the way."""
+    from phasemark.matcher.drive import (
+        OUTPUTS,
+        default_drive,
+        example_drive,
+        load_drive_plan,
+        run_drive,
+        summary,
+        write_drive,
+    )
+
+    if example:
+        typer.echo(example_drive(), nl=False)
+        return
+    plan = default_drive() if plan_file is None else load_drive_plan(plan_file)
+    _refuse_existing([out / name for name in OUTPUTS], force)
+    _make_folder(out)
+    with _Progress("driving, cm") as progress:
+        drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
+    files = write_drive(drive, out, force=force)
+    facts = summary(drive)
+    if as_json:
+        _echo_json({"files": [str(path) for path in files], **facts})
+        return
+    _echo_table(
+        ("error", "at the end", "largest", "heading at the end", "largest"),
+        (
+            (
+                title,
+                f"{facts[f'{key}_final_position_error_m']:.3f} m",
+                f"{facts[f'{key}_largest_position_error_m']:.3f} m",
+                f"{facts[f'{key}_final_heading_error_deg']:.2f}°",
+                f"{facts[f'{key}_largest_heading_error_deg']:.2f}°",
+            )
+            for title, key in (("dead reckoning", "dead_reckoned"), ("corrected", "corrected"))
+        ),
+    )
+    typer.echo(f"{facts['way_m']:.1f} m, {facts['corrections']} corrections at {facts['stops']} stops")
+    for path in files:
+        typer.echo(path)
+
+
 def _numbered(path: Path, n: int) -> list[Path]:
     """Return the names of n pictures; more than one get a number before the suffix."""
     return [path] if n == 1 else [path.with_stem(f"{path.stem}-{k}") for k in range(n)]
@@ -1032,29 +1108,66 @@ def _save_match_pictures(
         write_atomically(path, buffer.getvalue(), force=force)
 
 
+def _one_landmark(xy: tuple[float, float], yaw_deg: float) -> LandmarkMap:
+    """Return the map of a landmark of any class."""
+    from phasemark.matcher import LandmarkMap, MappedLandmark
+
+    if not all(map(math.isfinite, (*xy, yaw_deg))):
+        raise UsageError(
+            f"--landmark-xy and --landmark-yaw must be finite numbers, got {xy[0]:g} {xy[1]:g} and {yaw_deg:g}"
+        )
+    only = MappedLandmark(name="landmark", class_name="any", x_m=xy[0], y_m=xy[1], yaw_deg=yaw_deg)
+    return LandmarkMap(landmark=(only,))
+
+
 def _poses(
     match: Match,
-    landmark_xy: tuple[float, float],
-    landmark_yaw_rad: float,
+    landmarks: LandmarkMap,
+    any_class: bool,
     pan_rad: float,
     prior: tuple[float, float, float] | None,
+    prior_std: tuple[float, float] | None,
 ) -> list[dict[str, Any]]:
     """Return the robot poses of a match as plain numbers, best first; none if there is no landmark."""
     from phasemark.matcher import robot_poses
 
-    if match.class_name is None:
-        return []
-    believed = None if prior is None else (prior[0], prior[1], math.radians(prior[2]))
-    poses = robot_poses(match, landmark_xy, landmark_yaw_rad, pan_rad, prior=believed)
-    return [
-        {
-            "x_m": pose.x_m,
-            "y_m": pose.y_m,
-            "heading_deg": math.degrees(pose.heading_rad),
-            "covariance": None if pose.covariance is None else pose.covariance.tolist(),
-        }
-        for pose in poses
-    ]
+    believed, covariance = None, None
+    if prior is not None:
+        believed = (prior[0], prior[1], math.radians(prior[2]))
+    if prior_std is not None:
+        xy, heading = prior_std[0] ** 2, math.radians(prior_std[1]) ** 2
+        covariance = [[xy, 0.0, 0.0], [0.0, xy, 0.0], [0.0, 0.0, heading]]
+    if any_class:
+        only = landmarks.landmark[0]
+        poses = robot_poses(match, only.xy_m, only.yaw_rad, pan_rad, prior=believed, prior_covariance=covariance)
+        return [_plain_pose(pose) for pose in poses]
+    placements = landmarks.poses(match, pan_rad, prior=believed, prior_covariance=covariance)
+    return [{"landmark": placement.landmark.name, **_plain_pose(placement.pose)} for placement in placements]
+
+
+def _plain_pose(pose: RobotPose) -> dict[str, Any]:
+    covariance = pose.covariance
+    std = None if covariance is None else [math.sqrt(max(float(covariance[k, k]), 0.0)) for k in range(3)]
+    return {
+        "x_m": pose.x_m,
+        "y_m": pose.y_m,
+        "heading_deg": math.degrees(pose.heading_rad),
+        "std": None if std is None else {"x_m": std[0], "y_m": std[1], "heading_deg": math.degrees(std[2])},
+        "covariance": None if covariance is None else covariance.tolist(),
+        "mahalanobis": _plain(pose.mahalanobis),
+    }
+
+
+def _pose_text(pose: Mapping[str, Any]) -> str:
+    """Return a pose as text, each number ± its standard deviation where there is one."""
+    name = f"{pose['landmark']}: " if "landmark" in pose else ""
+    std = pose["std"]
+    if std is None:
+        return f"{name}({pose['x_m']:.3f}, {pose['y_m']:.3f}) m heading {pose['heading_deg']:.2f}°"
+    return (
+        f"{name}({pose['x_m']:.4f} ± {std['x_m']:.4f}, {pose['y_m']:.4f} ± {std['y_m']:.4f}) m"
+        f" heading {pose['heading_deg']:.2f} ± {std['heading_deg']:.2f}°"
+    )
 
 
 _FREE = {"bearing": "bearing_rad", "height": "height_m"}
@@ -1081,10 +1194,7 @@ def _echo_matches(answers: Sequence[dict[str, Any]]) -> None:
                 f"{answer['delta_deg']:.2f}{_plus_minus(answer, 'delta_rad', 180 / math.pi, 3)}" if found else "",
                 "yes" if answer["accepted"] else "no",
                 "" if answer["p_value"] is None else f"{answer['p_value']:.3g}",
-                "  or  ".join(
-                    f"({pose['x_m']:.3f}, {pose['y_m']:.3f}) m heading {pose['heading_deg']:.2f}°"
-                    for pose in answer.get("poses", ())
-                ),
+                "  or  ".join(_pose_text(pose) for pose in answer.get("poses", ())),
             )
         )
     _echo_table(("position", "class", "D (m)", "δ (°)", "accepted", "p", "robot"), rows)

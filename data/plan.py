@@ -295,12 +295,7 @@ def read_plan(path: str | os.PathLike[str], model: type[P]) -> P:
         With one line that names the file, the key, the value and what would be right.
     """
     path = Path(path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:  # the last: nested without end
-        raise InputFileError(f"{path}: not a TOML file ({error})") from None
+    table = read_toml(path)
     try:
         plan = model(**table)
     except UsageError as error:
@@ -312,6 +307,23 @@ def read_plan(path: str | os.PathLike[str], model: type[P]) -> P:
 
 def _is_file(sensor: str) -> bool:
     return sensor.endswith(".toml") or "/" in sensor
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read or is not TOML.
+    """
+    path = Path(path)
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:  # the last: nested without end
+        raise InputFileError(f"{path}: not a TOML file ({error})") from None
 
 
 def factored_refusal(plan: BankPlan) -> str | None:
@@ -348,6 +360,7 @@ def _from_catalog(name: str) -> LandmarkSpec:
 def _as_usage_error(error: ValidationError) -> UsageError:
     first = error.errors()[0]
     own = first.get("ctx", {}).get("error")
-    if isinstance(own, UsageError) and len(first["loc"]) <= 1:
-        return own  # it names key and value already
+    if isinstance(own, UsageError):
+        key = ".".join(map(str, first["loc"]))
+        return own if f"'{key}'" in str(own) or not key else UsageError(f"{key}: {own}")
     return UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"])

@@ -18,6 +18,7 @@ from phasemark.data import write_atomically
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh, catalog, mesh_picture
 from phasemark.matcher import kalman_filter
+from phasemark.matcher.drive import default_drive, drive_picture, run_drive
 from phasemark.render import Background, Renderer, capture, preset
 from phasemark.render.plot import draw_range
 
@@ -92,6 +93,7 @@ def write(figure: Figure, name: str) -> None:
 def main() -> None:
     """Write every picture."""
     write(demo_figure(), "demo.png")
+    write(drive_picture(run_drive(default_drive())), "drive.png")
     bench = Path(__file__).parent.parent / "out" / "bench.json"
     if bench.exists():
         write(cost_figure(json.loads(bench.read_text(encoding="utf-8"))["peer"]["rows"]), "cost.png")

@@ -19,18 +19,20 @@ from phasemark.matcher.filters import (
     kalman_step,
     phasor_mean,
 )
+from phasemark.matcher.landmark_map import LandmarkMap, MappedLandmark, Placement, load_map
 from phasemark.matcher.match import Candidate, Match, Matches
 from phasemark.matcher.matcher import Matcher, background_image
 from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
 from phasemark.matcher.surroundings import Surroundings, estimate_surroundings
 from phasemark.matcher.sweep import read_sweep, run_sweep
 from phasemark.matcher.sweep_compare import Difference, compare_cells
-from phasemark.matcher.sweep_plan import Condition, Method, SweepPlan, load_sweep, shipped_sweeps
+from phasemark.matcher.sweep_plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, load_sweep
 from phasemark.matcher.sweep_tables import Cell, SweepTrials
 from phasemark.matcher.trials import Conditions, Trials, TrialSummary, run_trials
 
 __all__ = [
     "PRIOR_STD",
+    "SHIPPED_SWEEPS",
     "Bound",
     "Candidate",
     "Cell",
@@ -39,12 +41,15 @@ __all__ = [
     "Difference",
     "Estimate",
     "FilteredFrames",
+    "LandmarkMap",
+    "MappedLandmark",
     "Match",
     "Matcher",
     "Matches",
     "Method",
     "PixelKalman",
     "PixelState",
+    "Placement",
     "RobotPose",
     "Surroundings",
     "SweepPlan",
@@ -62,6 +67,7 @@ __all__ = [
     "kalman",
     "kalman_filter",
     "kalman_step",
+    "load_map",
     "load_sweep",
     "nees",
     "phasor_mean",
@@ -70,5 +76,4 @@ __all__ = [
     "run_sweep",
     "run_trials",
     "share",
-    "shipped_sweeps",
 ]

@@ -107,7 +107,7 @@ def cramer_rao(
     >>> renderer = Renderer(build_mesh(catalog()["cylinder"]), preset("pmd-16x16"))
     >>> bound = cramer_rao(renderer, Views.broadcast(1.0, 0.5), pixels="lower")
     >>> [round(float(bound.std(name)[0]), 5) for name in bound.free]
-    [0.00033, 0.00392]
+    [0.00036, 0.00531]
     """
     nuisances = (("albedo",) if on == "phasors" else ()) if nuisances is None else tuple(nuisances)
     for name in nuisances:
@@ -242,7 +242,16 @@ class Estimate:
 
 
 def share(successes: int, n: int) -> Estimate:
-    """Return a share with its exact (Clopper–Pearson) 95 % interval."""
+    """Return a share with its exact (Clopper–Pearson) 95 % interval.
+
+    Parameters
+    ----------
+    successes, n : int
+
+    Returns
+    -------
+    Estimate
+    """
     if n == 0:
         return Estimate(math.nan, 0.0, 1.0)
     low, high = stats.binomtest(int(successes), n).proportion_ci(0.95, method="exact")
@@ -270,6 +279,19 @@ def mean_of(values: ArrayLike) -> Estimate:
 
 
 def covers(error: ArrayLike, covariance: ArrayLike, level: float = 0.95) -> NDArray[np.bool_]:
-    """Return whether each error lies inside its ellipsoid of a probability, (n,)."""
+    """Return whether each error lies inside its ellipsoid of a probability.
+
+    Parameters
+    ----------
+    error : (n, p) array_like
+        Estimate less truth, angles wrapped.
+    covariance : (n, p, p) array_like
+    level : float
+        The ellipsoid's probability.
+
+    Returns
+    -------
+    (n,) bool
+    """
     e = np.asarray(error, np.float64)
     return np.asarray(nees(e, covariance) <= stats.chi2.ppf(level, e.shape[1]))

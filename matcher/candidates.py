@@ -23,7 +23,7 @@ from phasemark.render import PhasorImages
 
 _T = TypeVar("_T", bound=np.generic)
 
-_UNDECIDED, _SHARE = 50.0, 0.5
+_UNDECIDED, _SHARE = 300.0, 0.5
 """Other classes start too where their cost is larger by no more than this, and this share of the best: between the
 grid's points none of them fits."""
 

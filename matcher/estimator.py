@@ -110,11 +110,12 @@ class MaximumLikelihood:
         if self.auto or not exact:
             self._rendered = RenderedModel(bank, self.background, workers or _usual_workers())
         fine = (1, 1) if self.background is not None and "bearing_rad" not in self.free else (2, 3)
-        stride = tuple(
+        along, around = (
             max(1, min(step, (len(grid) - 1) // 4))
             for step, grid in zip(fine, (bank.distance_m, bank.delta_rad), strict=True)
         )
-        self._search = Search(bank, self._behind, (stride[0], stride[1]), "bearing_rad" in self.free)
+        self._stride = (along, around)
+        self._search = Search(bank, self._behind, self._stride, "bearing_rad" in self.free)
         self._symmetry = [int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes]
 
     def match(self, frames: FilteredFrames) -> list[Match]:
@@ -138,7 +139,7 @@ class MaximumLikelihood:
         for k in range(len(frames)):
             one = frames[k : k + 1]
             evidence = Evidence.from_frames(one, self.on)
-            around = estimate_surroundings(one)
+            around = estimate_surroundings(one, bearing_known="bearing_rad" not in self.free)
             background = around.background
             bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(one, evidence))
             assert self._rendered is not None
@@ -151,6 +152,12 @@ class MaximumLikelihood:
                 models = _Models(self._rendered.with_background(background), scout)
                 seen = without_background(seen, around)
             fits = self._searched(models, evidence, seen, bare, background, behind)
+            if background is not None and self._is_doubtful(fits):
+                # what was taken for background, or lies beside it, may be landmark: search with both in the images
+                assert behind is not None
+                search = Search(self.bank, behind, self._stride, "bearing_rad" in self.free)
+                again = self._searched(models, evidence, evidence.seen, bare, background, behind, search)
+                fits = Fits.joined([fits, again])
             answers.extend(self._answers(one, fits, bare, [background]))
         return answers
 
@@ -162,8 +169,10 @@ class MaximumLikelihood:
         bare: NDArray[np.float64],
         background: Background | None,
         behind: PhasorImages | None,
+        search: Search | None = None,
     ) -> Fits:
         """Search and fit; where nothing fits, search again from many more places."""
+        search = search or self._search
         enough = self._worth_a_search(evidence, bare)
         side_peaks = evidence.on == "phasors" or background is not None
         n_modes = _MODES if background is None else _MODES_BEFORE_BACKGROUND
@@ -177,19 +186,26 @@ class MaximumLikelihood:
             hope = cost < bare[frame] if evidence.on == "ranges" else True
             return np.asarray(frame[(cost > limit) & hope])
 
-        starts = self._search.starts(_some(seen, enough), n_modes, all_classes=all_classes)
+        starts = search.starts(_some(seen, enough), n_modes, all_classes=all_classes)
         sides = () if background is None else (-_BESIDE_RAD, _BESIDE_RAD)
         fits = [self._fit(models, evidence, enough, starts, sides, behind)]
         poor = doubtful(fits[0])
         if poor.size:
-            starts = self._search.starts(_some(seen, poor), _MODES_AGAIN, all_classes=all_classes)
+            starts = search.starts(_some(seen, poor), _MODES_AGAIN, all_classes=all_classes)
             fits.append(self._fit(models, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True))
             poor = doubtful(fits[-1])
         if poor.size and models.scout is not None:  # too little may be smooth for the scout to see the way
-            starts = self._search.starts(_some(seen, poor), n_modes, all_classes=all_classes)
+            starts = search.starts(_some(seen, poor), n_modes, all_classes=all_classes)
             direct = _Models(models.final, None)
             fits.append(self._fit(direct, evidence, poor, starts, (-_BESIDE_RAD, _BESIDE_RAD), behind))
         return Fits.joined(fits)
+
+    def _is_doubtful(self, fits: Fits) -> bool:
+        """Return whether the best fit of one frame is worse than good ones are."""
+        if not np.isfinite(fits.cost).any():
+            return False
+        best = fits.cost.argmin()
+        return bool(fits.cost[best] > stats.chi2.isf(_DOUBTFUL, max(int(fits.dof[best]), 1)))
 
     def _worth_a_search(self, evidence: Evidence, bare: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return which frames have enough returns to place a landmark, and are not explained without one."""

@@ -43,7 +43,9 @@ class Surroundings:
     pure: NDArray[np.bool_]
 
 
-def estimate_surroundings(frames: FilteredFrames, index: int = 0, landmark_scale: float = 1.0) -> Surroundings:
+def estimate_surroundings(
+    frames: FilteredFrames, index: int = 0, landmark_scale: float = 1.0, *, bearing_known: bool = True
+) -> Surroundings:
     """Estimate wall and floor behind the landmark of one frame.
 
     Parameters
@@ -53,6 +55,9 @@ def estimate_surroundings(frames: FilteredFrames, index: int = 0, landmark_scale
         Which of them.
     landmark_scale : float
         How much brighter the landmark is than its model: albedos count relative to it.
+    bearing_known : bool
+        Whether the landmark stands on the optical axis. Otherwise the azimuth of what is near takes its place: the wall
+        is perpendicular to the line of sight, and a bearing of 4° ignored would move its two ends by 3 %.
 
     Returns
     -------
@@ -72,7 +77,11 @@ def estimate_surroundings(frames: FilteredFrames, index: int = 0, landmark_scale
     pure = lonely if lonely.sum() >= _FEWEST else far
     if far.sum() < _FEWEST:
         return Surroundings(None, nothing, nothing)
-    down = -_level_z(sensor)
+    ray = _level_rays(sensor)
+    if not bearing_known:
+        azimuth = float(np.arctan2(ray[1], ray[0])[returned & ~far].mean())
+        forward = ranges * (np.cos(azimuth) * ray[0] + np.sin(azimuth) * ray[1])
+    down = -ray[2]
     above = pure & (down <= 0)
     wall_m = _weighted_middle(forward[above] if above.sum() >= 3 else forward[pure])
     drop = down * ranges
@@ -115,14 +124,14 @@ def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(np.logical_and.reduce([padded[i : i + rows, j : j + cols] for i in range(3) for j in range(3)]))
 
 
-def _level_z(sensor: Sensor) -> NDArray[np.float64]:
-    """Return the upward component of the ray of every pixel's centre, (rows, cols)."""
+def _level_rays(sensor: Sensor) -> NDArray[np.float64]:
+    """Return the ray of every pixel's centre in the level camera, (3, rows, cols), unit vectors."""
     tan_h, tan_v = sensor.tan_half_angles
     u0, v0 = sensor.centre_px
     v, u = np.mgrid[: sensor.rows, : sensor.cols] + 0.5
     ray = np.stack([np.ones_like(u), tan_h * 2 * (u0 - u) / sensor.cols, tan_v * 2 * (v0 - v) / sensor.rows])
     ray /= np.linalg.norm(ray, axis=0)
-    return np.asarray(np.einsum("k,krc->rc", sensor.cam2level[2], ray))
+    return np.asarray(np.einsum("jk,krc->jrc", sensor.cam2level, ray))
 
 
 def _weighted_middle(values: NDArray[np.float64]) -> float:

@@ -198,14 +198,12 @@ def _read(plan: SweepPlan, folder: Path, n_rounds: int) -> SweepTrials:
     arrays = {name: values[order] for name, values in arrays.items()}
     for name in ("condition", "trial", "dof", "found", "modes"):
         arrays[name] = arrays[name].astype(np.int64)
-    bank = plan.bank_plan(plan.methods[0])
-    landmarks = (*bank.landmarks, *bank.meshes)
     return SweepTrials(
         conditions=plan.conditions(),
         methods=tuple(method.name for method in plan.methods),
         free=tuple(method.parameters for method in plan.methods),
-        classes=tuple(part.name for part in landmarks),
-        symmetry=tuple(part.symmetry for part in landmarks),
+        classes=plan.class_names,
+        symmetry=tuple(part.symmetry for part in plan.parts()),
         outlier=plan.outlier,
         **{**arrays, "accepted": arrays["accepted"].astype(np.bool_)},
     )

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -198,7 +198,7 @@ class SweepJob:
         mesh = self.landmarks[condition.class_name].mesh
         if condition.dimension_error:
             mesh = mesh.copy()
-            mesh.apply_scale(1 + condition.dimension_error)
+            mesh.vertices *= 1 + condition.dimension_error
         return Renderer(mesh, sensor, albedo=condition.albedo)
 
     def background(self, number: int) -> Background | None:
@@ -245,7 +245,9 @@ class SweepJob:
         key = plan.model_dump_json()
         if key not in self._banks:
             self._banks[key] = build_bank(plan)
-        background = Background(wall_m=wall_m) if wall_m else "auto" if method.knows == "auto" else None
+        background: Background | Literal["auto"] | None = Background(wall_m=wall_m) if wall_m else None
+        if method.knows == "auto":
+            background = "auto"
         if method.method == "nearest":
             return Matcher(self._banks[key], background=background, false_alarm=method.false_alarm).match
         return Matcher(

@@ -16,10 +16,13 @@ from scipy.stats import qmc
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, parse_grid
-from phasemark.data.plan import PlanModel, ScenePlan, factored_refusal, read_plan
+from phasemark.data.plan import MeshPlan, PlanModel, ScenePlan, factored_refusal, read_plan
 from phasemark.data.seeds import stream
+from phasemark.landmarks import LandmarkSpec
 
 _MOST_CELLS = 100_000
+SHIPPED_SWEEPS = ("paper", "distance-angle-noise", "robustness")
+"""Names of the plans that come with the program."""
 
 
 @dataclass(frozen=True)
@@ -255,8 +258,12 @@ class SweepPlan(ScenePlan):
     @property
     def class_names(self) -> tuple[str, ...]:
         """Names of all landmarks, those of the catalogue first."""
-        plan = self.bank_plan(self.methods[0])
-        return tuple(part.name for part in (*plan.landmarks, *plan.meshes))
+        return tuple(part.name for part in self.parts())
+
+    def parts(self) -> list[LandmarkSpec | MeshPlan]:
+        """Return all landmarks, those of the catalogue first."""
+        specs, meshes = self.resolve_landmarks()
+        return [*specs, *meshes]
 
     def bank_plan(self, method: Method) -> BankPlan:
         """Return the resolved plan of the bank a method matches against."""
@@ -267,20 +274,14 @@ class SweepPlan(ScenePlan):
             meshes=self.meshes,
             sensor=self.sensor,
             sensor_overrides=self.sensor_overrides,
-            distance_m=f"{low!r}:{high!r}:{method.bank_step[0]!r}",
+            distance_m=f"{low!r}:{high!r}:{method.bank_step[0]!r}",  # type: ignore[arg-type]  # a grid's text
             model=method.bank_model,
         ).resolve()
-        symmetry = math.gcd(*(part.symmetry for part in (*plan.landmarks, *plan.meshes)))
+        symmetry = math.gcd(*(part.symmetry for part in self.parts()))
         fields = {**plan.model_dump(), "delta_deg": f"0:{360 / symmetry!r}:{method.bank_step[1]!r}"}
         if factored_refusal(plan) is not None:
             fields["layout"] = "full"
         return BankPlan(**fields).resolve()
-
-
-def shipped_sweeps() -> tuple[str, ...]:
-    """Return the names of the plans that come with the program."""
-    folder = resources.files("phasemark.matcher").joinpath("plans")
-    return tuple(sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml")))
 
 
 def load_sweep(name_or_file: str | os.PathLike[str]) -> SweepPlan:
@@ -294,9 +295,9 @@ def load_sweep(name_or_file: str | os.PathLike[str]) -> SweepPlan:
         There is no such plan; or with one line that names the file, the key, the value and what would be right.
     """
     name = os.fspath(name_or_file)
-    if name in shipped_sweeps():
+    if name in SHIPPED_SWEEPS:
         with resources.as_file(resources.files("phasemark.matcher").joinpath("plans", f"{name}.toml")) as path:
             return read_plan(path, SweepPlan)
     if not (name.endswith(".toml") or Path(name).exists()):
-        raise UsageError(f"unknown sweep '{name}': give {', '.join(shipped_sweeps())}, or a .toml file")
+        raise UsageError(f"unknown sweep '{name}': give {', '.join(SHIPPED_SWEEPS)}, or a .toml file")
     return read_plan(Path(name), SweepPlan)

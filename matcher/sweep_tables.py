@@ -153,7 +153,7 @@ class SweepTrials:
         bounded = np.isfinite(std).all(axis=1)
         honest = inner & np.isfinite(covariance).all(axis=(1, 2))
         squared = nees(error[honest], covariance[honest]) if honest.any() else np.empty(0)
-        limits = stats.chi2.ppf(LEVELS, len(at))
+        limits = [float(stats.chi2.ppf(level, len(at))) for level in LEVELS]
         typical = np.median(bound[bounded], axis=0) if bounded.any() else np.full(bound.shape[1:], np.nan)
         condition_number, weak = _observability(typical, at)
         return Cell(

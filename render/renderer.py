@@ -92,7 +92,7 @@ class Renderer:
         What finds the face a ray meets; "auto" is Embree where the package embreex is installed.
     splits : int
         Every pixel is first cut into splits × splits boxes, at most 4 × 4. 1 is enough where surfaces are smooth over
-        a pixel, as those of landmarks are; bumps finer than a pixel take 2.
+        a pixel, as those of landmarks are; bumps finer than a pixel take 3.
 
     Raises
     ------

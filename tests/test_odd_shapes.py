@@ -22,7 +22,7 @@ BUDGET = {
     "L bracket": (1, 5e-5, 5e-5),
     "hidden box": (1, 5e-5, 5e-5),
     "bowl": (1, 1e-4, 5e-5),
-    "lump": (2, 1e-4, 5e-5),
+    "lump": (3, 1e-4, 5e-5),
     "blob": (1, 2e-4, 1e-4),
     "coarse bowl": (1, 5e-4, 1e-4),
     "scan": (4, 1e-3, 1e-4),

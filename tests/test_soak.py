@@ -4,10 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
+from phasemark.matcher.bounds import nees
+from phasemark.matcher.drive import Equipment, default_drive, pose_error, run_drive
 from phasemark.render import Background, Renderer, capture, predicted_range_std, preset
 from phasemark.render.intersect import make_intersector
 
@@ -95,3 +98,22 @@ def test_the_right_class_is_found_in_two_thousand_random_trials(tmp_path):
             )
             frames = capture(image, SENSOR, rng=rng, n_frames=50)
             assert set(matcher.match(kalman_filter(frames)).class_name) == {name}
+
+
+def test_fifty_drives_stay_within_2_cm_and_0_6_degrees_after_corrections_and_know_how_well_they_do():
+    plan = default_drive()
+    equipment = Equipment.of(plan)
+    drives = [run_drive(plan, seed=seed, equipment=equipment) for seed in range(50)]
+    stops = [stop for drive in drives for stop in drive.corrections]
+    assert len(stops) >= 4 * len(drives)
+    after = np.array([pose_error(stop.after, stop.true) for stop in stops])
+    assert math.sqrt(np.mean(np.sum(after[:, :2] ** 2, axis=1))) <= 0.02
+    assert math.degrees(math.sqrt(np.mean(after[:, 2] ** 2))) <= 0.6
+    # N = 50 drives, about 250 corrections of 3 degrees of freedom each; 99.9 % over the two cells
+    low, high = stats.chi2.ppf([0.0005 / 2, 1 - 0.0005 / 2], 3 * len(stops))
+    before = np.array([pose_error(stop.before, stop.true) for stop in stops])
+    assert low < nees(after, np.array([stop.covariance_after for stop in stops])).sum() < high
+    assert low < nees(before, np.array([stop.covariance_before for stop in stops])).sum() < high
+    end = np.array([pose_error(drive.dead_reckoned[-1], drive.true[-1]) for drive in drives])
+    assert math.sqrt(np.mean(np.sum(end[:, :2] ** 2, axis=1))) > 0.2
+    assert math.degrees(math.sqrt(np.mean(end[:, 2] ** 2))) > 5

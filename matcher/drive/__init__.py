@@ -1,0 +1,40 @@
+"""A robot that stays on its path: odometry corrected before landmarks, simulated from light to pose."""
+
+from phasemark.matcher.drive.output import OUTPUTS, path_csv, stops_csv, summary, write_drive
+from phasemark.matcher.drive.picture import drive_animation, drive_picture
+from phasemark.matcher.drive.plan import (
+    CameraPlan,
+    DrivePlan,
+    OdometryPlan,
+    PathPlan,
+    StopPlan,
+    default_drive,
+    example_drive,
+    load_drive_plan,
+)
+from phasemark.matcher.drive.pose_filter import PoseFilter
+from phasemark.matcher.drive.simulate import Drive, Equipment, Stop, pose_error, run_drive
+
+__all__ = [
+    "OUTPUTS",
+    "CameraPlan",
+    "Drive",
+    "DrivePlan",
+    "Equipment",
+    "OdometryPlan",
+    "PathPlan",
+    "PoseFilter",
+    "Stop",
+    "StopPlan",
+    "default_drive",
+    "drive_animation",
+    "drive_picture",
+    "example_drive",
+    "load_drive_plan",
+    "path_csv",
+    "pose_error",
+    "run_drive",
+    "stops_csv",
+    "summary",
+    "write_drive",
+]

@@ -1,0 +1,140 @@
+"""Following a path of straight pieces by pure pursuit, and aiming the camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_AIM_ROUNDS = 4
+"""The lens moves as the camera turns, by millimetres of a metre: each round leaves about a tenth of the error."""
+
+
+class Path:
+    """A path of straight pieces, walked once from one end to the other.
+
+    Parameters
+    ----------
+    waypoints_m : (n, 2) array_like
+    """
+
+    def __init__(self, waypoints_m: ArrayLike) -> None:
+        self._points = np.asarray(waypoints_m, np.float64)
+        self._at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self._points, axis=0), axis=1))])
+        self.progress_m = 0.0
+        """How much of the path lies behind; it only grows, so a path may cross itself."""
+
+    @property
+    def length_m(self) -> float:
+        """From end to end."""
+        return float(self._at[-1])
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the end is reached."""
+        return self.progress_m >= self.length_m - 1e-9
+
+    @property
+    def start_heading_rad(self) -> float:
+        """From the first waypoint to the second."""
+        along = self._points[1] - self._points[0]
+        return math.atan2(along[1], along[0])
+
+    def point(self, progress_m: float) -> NDArray[np.float64]:
+        """Return the point so far along the path; past the end the last piece goes on, so that the robot passes it."""
+        if progress_m > self.length_m:
+            along = (self._points[-1] - self._points[-2]) / (self._at[-1] - self._at[-2])
+            return np.asarray(self._points[-1] + along * (progress_m - self.length_m))
+        return np.array([np.interp(progress_m, self._at, self._points[:, k]) for k in range(2)])
+
+    def advance(self, xy_m: ArrayLike, reach_m: float) -> None:
+        """Move the progress to the point nearest to the robot, at most `reach_m` further on.
+
+        Parameters
+        ----------
+        xy_m : (2,) array_like
+        reach_m : float
+        """
+        ahead = np.linspace(self.progress_m, min(self.progress_m + reach_m, self.length_m), 21)
+        points = np.stack([np.interp(ahead, self._at, self._points[:, k]) for k in range(2)], axis=1)
+        self.progress_m = float(ahead[np.linalg.norm(points - np.asarray(xy_m), axis=1).argmin()])
+
+    def turn_rate(self, pose: Sequence[float] | NDArray[np.float64], speed_m_s: float, lookahead_m: float) -> float:
+        """Return the turn rate of the arc that leads to the point ahead, rad/s: 2 v sin(α) / distance.
+
+        Parameters
+        ----------
+        pose : (x, y, heading)
+        speed_m_s, lookahead_m : float
+        """
+        goal = self.point(self.progress_m + lookahead_m) - np.asarray(pose[:2])
+        angle = math.remainder(math.atan2(goal[1], goal[0]) - pose[2], math.tau)
+        if abs(angle) > math.pi / 2:  # behind: turn towards it as fast as any arc would
+            return math.copysign(2 * speed_m_s / lookahead_m, angle)
+        return 2 * speed_m_s * math.sin(angle) / max(float(np.linalg.norm(goal)), 1e-6)
+
+
+def lens_pose(
+    pose: Sequence[float] | NDArray[np.float64], pan_rad: float, pan_offset_m: ArrayLike, lens_offset_m: ArrayLike
+) -> NDArray[np.float64]:
+    """Return the lens and the heading of its optical axis, (x, y, heading): PHYSICS section 8 the other way round.
+
+    Parameters
+    ----------
+    pose : (x, y, heading)
+        Of the robot.
+    pan_rad : float
+        β.
+    pan_offset_m, lens_offset_m : (2,) array_like
+    """
+    heading = pose[2] + pan_rad
+    lens = np.asarray(pose[:2]) + _turned(pan_offset_m, pose[2]) + _turned(lens_offset_m, heading)
+    return np.array([*lens, math.remainder(heading, math.tau)])
+
+
+def pan_towards(
+    pose: Sequence[float] | NDArray[np.float64],
+    target_m: ArrayLike,
+    pan_offset_m: ArrayLike,
+    lens_offset_m: ArrayLike,
+) -> float:
+    """Return the pan angle that points the optical axis at a point, radians in (−π, π].
+
+    Parameters
+    ----------
+    pose : (x, y, heading)
+    target_m : (2,) array_like
+    pan_offset_m, lens_offset_m : (2,) array_like
+    """
+    pan = 0.0
+    for _ in range(_AIM_ROUNDS):
+        to = np.asarray(target_m) - lens_pose(pose, pan, pan_offset_m, lens_offset_m)[:2]
+        pan = math.remainder(math.atan2(to[1], to[0]) - pose[2], math.tau)
+    return pan
+
+
+def view_of(
+    lens: Sequence[float] | NDArray[np.float64], landmark_xy_m: ArrayLike, landmark_yaw_rad: float
+) -> tuple[float, float, float]:
+    """Return (D, δ, b) of a landmark seen from a lens, PHYSICS sections 1 and 8.
+
+    Parameters
+    ----------
+    lens : (x, y, heading of the optical axis)
+    landmark_xy_m : (2,) array_like
+    landmark_yaw_rad : float
+    """
+    to = np.asarray(landmark_xy_m) - np.asarray(lens[:2])
+    line_of_sight = math.atan2(to[1], to[0])
+    return (
+        float(np.hypot(*to)),
+        math.remainder(line_of_sight - landmark_yaw_rad, math.tau),
+        math.remainder(line_of_sight - lens[2], math.tau),
+    )
+
+
+def _turned(vector: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[cos, -sin], [sin, cos]]) @ np.asarray(vector, np.float64)

@@ -1,0 +1,225 @@
+"""The drive seen from above: three paths, ellipses, landmarks; as a picture, and as an animation."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Ellipse, Polygon
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import stats
+
+from phasemark.landmarks import catalog
+from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
+from phasemark.render.plot import draw_range
+
+_TRUE, _DEAD, _CORRECTED, _MARK = "#1a1a1a", "#c8553d", "#2a6fbb", "#5b8c5a"
+_ENLARGED = 10.0
+"""Ellipses of centimetres would be lost in a room of metres."""
+_LEVEL = 0.95
+_MOVING_FRAMES, _MOVING_MS, _STANDING_MS = 100, 80, 1500
+_COLOURS = 64
+
+
+def drive_picture(drive: Drive) -> Figure:
+    """Draw the room with the three paths, and beside it the errors over the way.
+
+    Parameters
+    ----------
+    drive : Drive
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure = Figure(figsize=(13.5, 6.6), layout="constrained")
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.75, 1))
+    room = figure.add_subplot(grid[:, 0])
+    _draw_room(room, drive)
+    room.plot(*drive.true[:, :2].T, color=_TRUE, lw=2.6, label="true")
+    room.plot(*drive.dead_reckoned[:, :2].T, color=_DEAD, lw=1.4, label="dead reckoning")
+    room.plot(*drive.corrected[:, :2].T, color=_CORRECTED, lw=1.2, ls="--", label="corrected")
+    for stop in drive.stops:
+        _draw_stop(room, stop)
+    final = pose_error(drive.dead_reckoned[-1], drive.true[-1])
+    room.set_title(
+        f"{drive.way_m[-1]:.1f} m, {len(drive.corrections)} corrections; dead reckoning ends"
+        f" {np.hypot(*final[:2]):.2f} m and {abs(math.degrees(final[2])):.0f}° off",
+        fontsize=10,
+    )
+    # the legend stands below the room: no corner of it is sure to be empty
+    room.plot([], [], color=_CORRECTED, lw=0.8, label=f"95 % ellipses before and after a correction, × {_ENLARGED:g}")
+    room.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=4, fontsize=8, frameon=False)
+    _draw_errors(figure.add_subplot(grid[0, 1]), drive, position=True)
+    _draw_errors(figure.add_subplot(grid[1, 1]), drive, position=False)
+    return figure
+
+
+def drive_animation(drive: Drive) -> bytes:
+    """Return the drive as an animated GIF: the paths grow, and at each stop the camera's frame is shown.
+
+    Parameters
+    ----------
+    drive : Drive
+    """
+    figure = Figure(figsize=(9.0, 4.8), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    room, frame = figure.subplots(1, 2, width_ratios=(2.2, 1))
+    _draw_room(room, drive)
+    lines = [
+        room.plot([], [], color=color, lw=width, ls=style, label=label)[0]
+        for color, width, style, label in (
+            (_TRUE, 2.4, "-", "true"),
+            (_DEAD, 1.3, "-", "dead reckoning"),
+            (_CORRECTED, 1.2, "--", "corrected"),
+        )
+    ]
+    robot = Polygon(_outline(drive.true[0]), closed=True, fc=_TRUE, ec="none", zorder=5)
+    room.add_patch(robot)
+    room.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, fontsize=7, frameon=False)
+    _no_frame(frame)
+    canvas.draw()
+    figure.set_layout_engine("none")  # nothing moves any more
+    moving: list[Artist] = [*lines, robot]
+    for artist in moving:
+        artist.set_animated(True)  # drawn over what stands still, which is drawn anew at stops alone
+    still = None
+    images, durations = [], []
+    for index, stop in _moments(drive):
+        if stop is not None:
+            _draw_stop(room, stop)
+            _draw_frame(frame, stop)
+        if stop is not None or still is None:
+            canvas.draw()
+            still = canvas.copy_from_bbox(figure.bbox)
+        canvas.restore_region(still)
+        for line, path in zip(lines, (drive.true, drive.dead_reckoned, drive.corrected), strict=True):
+            line.set_data(*path[: index + 1, :2].T)
+        robot.set_xy(_outline(drive.true[index]))
+        for artist in moving:
+            room.draw_artist(artist)
+        images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
+        durations.append(_MOVING_MS if stop is None else _STANDING_MS)
+    palette = images[-1].quantize(_COLOURS)  # the last image has every colour, the first ones hardly any red
+    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    buffer = io.BytesIO()
+    images[0].save(buffer, "GIF", save_all=True, append_images=images[1:], duration=durations, loop=0)
+    return buffer.getvalue()
+
+
+def _moments(drive: Drive) -> list[tuple[int, Stop | None]]:
+    """Return which rows of the drive are shown, in order; a stop with its own row."""
+    step = max(1, len(drive.way_m) // _MOVING_FRAMES)
+    moments: dict[int, Stop | None] = dict.fromkeys([*range(0, len(drive.way_m), step), len(drive.way_m) - 1])
+    for stop in drive.stops:
+        moments[int(np.searchsorted(drive.time_s, stop.time_s - 1e-6))] = stop
+    return sorted(moments.items())
+
+
+def _draw_room(axes: Axes, drive: Drive) -> None:
+    """Draw walls, planned path and landmarks."""
+    plan = drive.plan
+    if plan.map.room_m:
+        axes.add_patch(Polygon(plan.map.room_m, closed=True, fc="none", ec="#777777", lw=2.5))
+    axes.plot(*np.array(plan.path.waypoints_m).T, color="#bbbbbb", lw=5, solid_joinstyle="round", zorder=0)
+    specs = catalog()
+    for landmark in plan.map.landmark:
+        box = specs[landmark.class_name].box
+        corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * [box.length_m / 2, box.width_m / 2]
+        corners = corners @ _rotation(landmark.yaw_rad).T + landmark.xy_m
+        axes.add_patch(Polygon(corners, closed=True, fc=_MARK, ec="none"))
+        axes.annotate(
+            f"{landmark.name}: {landmark.class_name}",
+            landmark.xy_m,
+            (0, -13),
+            textcoords="offset points",
+            ha="center",
+            fontsize=8,
+            color=_MARK,
+        )
+    everything = np.concatenate([drive.true, drive.dead_reckoned])[:, :2]
+    corners = np.array([*plan.map.room_m, *(landmark.xy_m for landmark in plan.map.landmark)])
+    low = np.minimum(everything.min(axis=0), corners.min(axis=0)) - 0.25
+    high = np.maximum(everything.max(axis=0), corners.max(axis=0)) + 0.25
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x (m)", ylabel="y (m)")
+
+
+def _draw_stop(axes: Axes, stop: Stop) -> None:
+    """Draw the line of sight, and the ellipses before and after; a refused measurement is a cross."""
+    axes.plot([stop.true[0], stop.landmark.x_m], [stop.true[1], stop.landmark.y_m], color=_MARK, lw=0.6, ls=":")
+    if not stop.used:
+        axes.plot(*stop.true[:2], "x", color=_DEAD, ms=7, zorder=5)
+        return
+    for pose, covariance, width in (
+        (stop.before, stop.covariance_before, 0.8),
+        (stop.after, stop.covariance_after, 1.4),
+    ):
+        axes.add_patch(_ellipse(pose, covariance, width))
+    axes.add_patch(Circle((float(stop.true[0]), float(stop.true[1])), 0.035, fc=_TRUE, ec="none", zorder=4))
+
+
+def _ellipse(pose: NDArray[np.float64], covariance: NDArray[np.float64], width: float) -> Ellipse:
+    values, vectors = np.linalg.eigh(covariance[:2, :2])
+    axes = 2 * _ENLARGED * np.sqrt(np.maximum(values, 0) * stats.chi2.ppf(_LEVEL, 2))
+    angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
+    centre = (float(pose[0]), float(pose[1]))
+    return Ellipse(centre, float(axes[1]), float(axes[0]), angle=angle, fc="none", ec=_CORRECTED, lw=width, zorder=3)
+
+
+def _draw_frame(axes: Axes, stop: Stop) -> None:
+    axes.clear()
+    seen = stop.range_m[np.isfinite(stop.range_m)]
+    draw_range(axes, stop.range_m, near_m=0.5, far_m=float(seen.max(initial=1.0)), colour_bar=False)
+    found = stop.match.class_name or "nothing"
+    verdict = "used" if stop.used else "refused"
+    text = f"{found} at {stop.match.distance_m:.2f} m" if stop.match.class_name else found
+    axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    axes.set_title(f"{stop.landmark.name}: {text}\n{verdict}", fontsize=9)
+
+
+def _no_frame(axes: Axes) -> None:
+    axes.set(xticks=[], yticks=[], aspect="equal", xlim=(0, 16), ylim=(16, 0))
+    axes.set_title("what the camera sees at a stop\n", fontsize=9)
+
+
+def _draw_errors(axes: Axes, drive: Drive, *, position: bool) -> None:
+    """Draw the errors of dead reckoning and filter over the way, and what the filter thinks of its own."""
+    for pose, color, label in (
+        (drive.dead_reckoned, _DEAD, "dead reckoning"),
+        (drive.corrected, _CORRECTED, "corrected"),
+    ):
+        error = pose_error(pose, drive.true)
+        value = 100 * np.hypot(error[:, 0], error[:, 1]) if position else np.degrees(np.abs(error[:, 2]))
+        axes.plot(drive.way_m, np.maximum(value, 1e-3), color=color, lw=1.2, label=label)
+    variance = (
+        1e4 * (drive.covariance[:, 0, 0] + drive.covariance[:, 1, 1])
+        if position
+        else np.degrees(1) ** 2 * drive.covariance[:, 2, 2]
+    )
+    axes.plot(drive.way_m, np.sqrt(variance), color=_CORRECTED, lw=0.9, ls=":", label="its own standard deviation")
+    for stop in drive.corrections:
+        axes.axvline(stop.way_m, color=_MARK, lw=0.7, zorder=0)
+    limits = (0.1, 300.0) if position else (0.02, 60.0)
+    axes.set(yscale="log", ylim=limits, xlim=(0, float(drive.way_m[-1])))
+    axes.set_ylabel("position error (cm)" if position else "heading error (°)")
+    if position:
+        axes.legend(fontsize=7, loc="upper left")
+    else:
+        axes.set_xlabel("way (m); a green line is a correction")
+
+
+def _outline(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return an arrowhead for the robot, (4, 2)."""
+    shape = np.array([[0.28, 0.0], [-0.18, 0.16], [-0.10, 0.0], [-0.18, -0.16]])
+    return np.asarray(shape @ _rotation(float(pose[2])).T + pose[:2])
+
+
+def _rotation(angle_rad: float) -> NDArray[np.float64]:
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[cos, -sin], [sin, cos]])

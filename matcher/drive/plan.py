@@ -1,0 +1,228 @@
+"""What a drive is made of: map, path, odometry, camera and rules, as a TOML file or in code."""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from phasemark import UsageError
+from phasemark.data.plan import PlanModel, read_toml
+from phasemark.matcher.landmark_map import LandmarkMap, Point, Std, load_map
+
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Share = Annotated[float, Field(gt=0, lt=1)]
+LEAST_CLEARANCE_M = 0.6
+"""A landmark nearer to a wall cannot be told from it."""
+
+
+class PathPlan(PlanModel):
+    """Where to go.
+
+    Parameters
+    ----------
+    waypoints_m : sequence of (x, y)
+        The path runs straight from one to the next; the robot starts at the first, facing the second.
+    speed_m_s : float
+        As the wheels have it.
+    lookahead_m : float
+        The robot steers for the point of the path so far ahead of it (pure pursuit).
+    turn_limit_deg_s : float
+        Fastest turn.
+    step_s : float
+        Time between two readings of the odometry.
+    start_std_m, start_std_deg : float
+        How well the first pose is known.
+    """
+
+    waypoints_m: Annotated[tuple[Point, ...], Field(min_length=2)]
+    speed_m_s: _Positive = 0.4
+    lookahead_m: _Positive = 0.5
+    turn_limit_deg_s: _Positive = 60.0
+    step_s: _Positive = 0.05
+    start_std_m: Std = 0.005
+    start_std_deg: Std = 0.2
+
+    @model_validator(mode="after")
+    def _goes_somewhere(self) -> Self:
+        for k in range(1, len(self.waypoints_m)):
+            if self.waypoints_m[k] == self.waypoints_m[k - 1]:
+                raise UsageError(f"'waypoints_m.{k}' must differ from the one before, got {self.waypoints_m[k]}")
+        return self
+
+    @property
+    def start_covariance(self) -> NDArray[np.float64]:
+        """Of (x, y, heading), (3, 3)."""
+        return np.diag(np.square([self.start_std_m, self.start_std_m, math.radians(self.start_std_deg)]))
+
+
+class OdometryPlan(PlanModel):
+    """How wheels and gyro err; the filter knows these figures, never the errors themselves.
+
+    Parameters
+    ----------
+    slip_std : float
+        Of the share of the way by which the wheels turn in vain, drawn once a drive.
+    slip_walk_per_sqrt_m : float
+        How that share wanders.
+    along_m_per_sqrt_m, across_m_per_sqrt_m : float
+        Random error of the way driven, forward and sideways.
+    gyro_bias_std_deg_s : float
+        Of the gyro's bias at the start.
+    gyro_bias_walk_deg_s_per_sqrt_s : float
+        How the bias wanders.
+    gyro_noise_deg_per_sqrt_s : float
+        Angle random walk.
+    """
+
+    slip_std: Std = 0.03
+    slip_walk_per_sqrt_m: Std = 0.003
+    along_m_per_sqrt_m: Std = 0.004
+    across_m_per_sqrt_m: Std = 0.004
+    gyro_bias_std_deg_s: Std = 0.2
+    gyro_bias_walk_deg_s_per_sqrt_s: Std = 0.005
+    gyro_noise_deg_per_sqrt_s: Std = 0.1
+
+
+class CameraPlan(PlanModel):
+    """The camera on its pan unit.
+
+    Parameters
+    ----------
+    sensor : str
+        A preset's name.
+    n_frames : int
+        Frames a stop.
+    pan_limit_deg : float
+        The pan unit turns so far to both sides.
+    pan_std_deg : float
+        How well it reaches the angle it was told.
+    pan_offset_m, lens_offset_m : (x, y)
+        Where the pan axis is on the robot, and the lens on the pan unit (PHYSICS section 8).
+    wall_albedo : float
+    """
+
+    sensor: str = "pmd-16x16"
+    n_frames: Annotated[int, Field(ge=2, le=10_000)] = 50
+    pan_limit_deg: Annotated[float, Field(gt=0, le=180)] = 150.0
+    pan_std_deg: Std = 0.05
+    pan_offset_m: Point = (0.10, 0.0)
+    lens_offset_m: Point = (0.04, 0.0)
+    wall_albedo: Annotated[float, Field(gt=0, le=1)] = 0.5
+
+
+class StopPlan(PlanModel):
+    """When to stop for a landmark, and what to believe.
+
+    Parameters
+    ----------
+    distance_m : (low, high)
+        A landmark is in view between these distances of the lens.
+    across_std_m : float
+        Largest predicted D·σ_δ, from the Cramér–Rao bound at the view that the robot believes in.
+    every_m : float
+        How often it looks for a landmark while it drives.
+    again_m : float
+        Way before it stops for the same landmark again after a correction.
+    retry_m : float
+        And after a measurement that was refused.
+    gate : float
+        A measurement as improbable as 1 − gate is refused.
+    """
+
+    distance_m: tuple[_Positive, _Positive] = (0.8, 1.8)
+    across_std_m: _Positive = 0.01
+    every_m: _Positive = 0.1
+    again_m: _Positive = 4.0
+    retry_m: _Positive = 0.3
+    gate: _Share = 0.9999
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if self.distance_m[0] >= self.distance_m[1]:
+            raise UsageError(f"'distance_m' must be (low, high), got {self.distance_m}")
+        return self
+
+
+class DrivePlan(PlanModel):
+    """A drive through a room with landmarks.
+
+    Parameters
+    ----------
+    map : LandmarkMap
+        In a file either a table, or the name of a map file relative to the plan's folder.
+    path : PathPlan
+    odometry : OdometryPlan
+    camera : CameraPlan
+    stop : StopPlan
+
+    Raises
+    ------
+    UsageError
+        With one line that names the key, its value and what would be right.
+    """
+
+    map: LandmarkMap
+    path: PathPlan
+    odometry: OdometryPlan = OdometryPlan()
+    camera: CameraPlan = CameraPlan()
+    stop: StopPlan = StopPlan()
+
+    @model_validator(mode="after")
+    def _fits_the_room(self) -> Self:
+        for k, point in enumerate(self.path.waypoints_m):
+            if not self.map.is_inside(point):
+                raise UsageError(f"'path.waypoints_m.{k}' must be inside 'map.room_m', got {point}")
+        for k, landmark in enumerate(self.map.landmark):
+            clearance = self.map.wall_clearance_m(landmark.xy_m)
+            if clearance < LEAST_CLEARANCE_M:
+                raise UsageError(
+                    f"'map.landmark.{k}' must stand at least {LEAST_CLEARANCE_M} m from every wall,"
+                    f" got {clearance:.3g} m"
+                )
+        return self
+
+
+def load_drive_plan(path: str | os.PathLike[str]) -> DrivePlan:
+    """Read the plan of a drive from a TOML file.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    DrivePlan
+
+    Raises
+    ------
+    InputFileError
+        The file, or the map it names, cannot be read or is not TOML.
+    UsageError
+        With one line that names the file, the key, the value and what would be right.
+    """
+    path = Path(path)
+    table = read_toml(path)
+    if isinstance(table.get("map"), str):
+        table["map"] = load_map(path.parent / table["map"])
+    try:
+        return DrivePlan(**table)
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
+
+
+def example_drive() -> str:
+    """Return the text of the shipped plan: a tour of 20 m past four landmarks."""
+    return (files("phasemark.matcher") / "plans" / "drive.toml").read_text(encoding="utf-8")
+
+
+def default_drive() -> DrivePlan:
+    """Return the shipped plan."""
+    return DrivePlan(**tomllib.loads(example_drive()))

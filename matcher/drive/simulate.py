@@ -1,0 +1,395 @@
+"""A whole drive: follow the path, look out for landmarks, stop, measure, correct, drive on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data import Bank, BankPlan, build_bank
+from phasemark.data.seeds import stream
+from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
+from phasemark.matcher.bounds import cramer_rao
+from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
+from phasemark.matcher.drive.odometry import OdometryModel, World, moved
+from phasemark.matcher.drive.plan import DrivePlan
+from phasemark.matcher.drive.pose_filter import PoseFilter
+from phasemark.matcher.filters import kalman_filter
+from phasemark.matcher.landmark_map import MappedLandmark
+from phasemark.matcher.match import Match
+from phasemark.matcher.matcher import Matcher
+from phasemark.render import Background, Renderer, Sensor, Views, capture, preset
+
+FREE = ("distance_m", "delta_rad", "bearing_rad")
+"""The robot points the camera by its own wrong estimate, so the bearing is unknown too."""
+_BANK_STEP_M, _BANK_STEP_DEG, _BANK_MARGIN_M = 0.02, 2.0, 0.3
+_MOST_WAY = 1.5
+"""A robot that has driven so many times the length of its path has lost it."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """One stop before a landmark; poses are (x, y, heading), metres and radians.
+
+    Parameters
+    ----------
+    time_s, way_m : float
+        When the frames were all taken, and what the wheels had turned by then.
+    landmark : MappedLandmark
+        Which one the robot stopped for.
+    predicted_across_std_m : float
+        D·σ_δ of the Cramér–Rao bound at the view that the robot believed in.
+    view : (D, δ, b)
+        The true one.
+    pan_rad : float
+        Which the pan unit was told.
+    match : Match
+    measured : (3,) float64, or None
+        The robot's pose after the match, of all solutions the one nearest to what the filter believed.
+    measured_covariance : (3, 3) float64, or None
+    distance_squared : float
+        Its squared Mahalanobis distance from that belief.
+    used : bool
+        Whether it passed.
+    true, before, after : (3,) float64
+        The true pose, and the filter's before and after the correction.
+    covariance_before, covariance_after : (3, 3) float64
+    range_m : (rows, cols) float64
+        The filtered frame.
+    """
+
+    time_s: float
+    way_m: float
+    landmark: MappedLandmark
+    predicted_across_std_m: float
+    view: tuple[float, float, float]
+    pan_rad: float
+    match: Match
+    measured: NDArray[np.float64] | None
+    measured_covariance: NDArray[np.float64] | None
+    distance_squared: float
+    used: bool
+    true: NDArray[np.float64]
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+    covariance_before: NDArray[np.float64]
+    covariance_after: NDArray[np.float64]
+    range_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """What a drive gave; poses are (x, y, heading) by row, metres and radians.
+
+    Parameters
+    ----------
+    plan : DrivePlan
+    seed : int
+    time_s, way_m : (n,) float64
+        At every step, and what the wheels had turned by then.
+    true, dead_reckoned, corrected : (n, 3) float64
+        The true pose; that of the odometry alone; the filter's.
+    covariance : (n, 3, 3) float64
+        Of the corrected pose.
+    stops : tuple of Stop
+    """
+
+    plan: DrivePlan
+    seed: int
+    time_s: NDArray[np.float64]
+    way_m: NDArray[np.float64]
+    true: NDArray[np.float64]
+    dead_reckoned: NDArray[np.float64]
+    corrected: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    stops: tuple[Stop, ...]
+
+    @property
+    def corrections(self) -> tuple[Stop, ...]:
+        """The stops whose measurement was used."""
+        return tuple(stop for stop in self.stops if stop.used)
+
+
+def pose_error(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return estimate less truth, the heading's difference wrapped; (..., 3)."""
+    error = estimate - truth
+    error[..., 2] = np.remainder(error[..., 2] + math.pi, math.tau) - math.pi
+    return np.asarray(error)
+
+
+@dataclass(frozen=True, eq=False)
+class Equipment:
+    """What a robot brings along: camera, bank, matcher, and a model of each class.
+
+    One set serves any number of drives with the same classes and camera.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    matcher : Matcher
+    renderers : dict of str to Renderer
+    """
+
+    sensor: Sensor
+    matcher: Matcher
+    renderers: dict[str, Renderer] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, plan: DrivePlan, workers: int | None = None) -> Equipment:
+        """Build the bank in memory, over the distances where the robot stops and a margin.
+
+        Parameters
+        ----------
+        plan : DrivePlan
+        workers : int, optional
+            Threads; None: one for each processor.
+
+        Raises
+        ------
+        UsageError
+            The catalogue has no such class, or no such camera is shipped.
+        """
+        sensor = preset(plan.camera.sensor)
+        specs = catalog()
+        names = list(dict.fromkeys(landmark.class_name for landmark in plan.map.landmark))
+        for name in names:
+            if name not in specs:
+                raise UsageError(f"'map.landmark.class' must be one of {', '.join(specs)}, got {name!r}")
+        bank = _bank(plan, names, workers)
+        matcher = Matcher(bank, "refine", free=FREE, background="auto", workers=workers)
+        return cls(sensor, matcher, {name: _renderer(specs[name], sensor) for name in names})
+
+
+def _renderer(spec: LandmarkSpec, sensor: Sensor) -> Renderer:
+    return Renderer(build_mesh(spec), sensor, albedo=spec.albedo)
+
+
+def _bank(plan: DrivePlan, names: Sequence[str], workers: int | None) -> Bank:
+    low, high = plan.stop.distance_m
+    low = max(low - _BANK_MARGIN_M, 0.5)
+    steps = math.ceil((high + _BANK_MARGIN_M - low) / _BANK_STEP_M)
+    distance = tuple(low + k * _BANK_STEP_M for k in range(steps + 1))
+    delta = tuple(k * _BANK_STEP_DEG for k in range(round(180 / _BANK_STEP_DEG)))
+    bank = BankPlan(classes=tuple(names), sensor=plan.camera.sensor, distance_m=distance, delta_deg=delta)
+    return build_bank(bank, None, workers=workers)
+
+
+def run_drive(
+    plan: DrivePlan,
+    *,
+    seed: int = 2005,
+    equipment: Equipment | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Drive:
+    """Drive along a path, correcting the odometry before landmarks.
+
+    At each step the wheels turn by what the speed asks for; slip, sideways errors and the gyro's bias and noise come
+    from `seed`. The robot steers by its corrected pose. Where a landmark is in view and the Cramér–Rao bound at the
+    believed view promises D·σ_δ below the plan's limit, the robot stops, points the camera at where it believes the
+    landmark, takes its frames, rendered at the true pose before the room's wall, matches them with distance, side and
+    bearing free, and corrects the pose by the filter. The wall that a frame shows is the plane across the line of sight
+    at the distance of the room's wall behind the landmark (PHYSICS section 3). A landmark with another one in the
+    camera's field is passed by.
+
+    Parameters
+    ----------
+    plan : DrivePlan
+    seed : int
+        Of everything random.
+    equipment : Equipment, optional
+        From an earlier drive; built if not given.
+    workers : int, optional
+        Threads; None: one for each processor.
+    progress : callable (done, total), optional
+        Called with the way done and the length of the path, both in centimetres.
+
+    Returns
+    -------
+    Drive
+
+    Raises
+    ------
+    UsageError
+        A class or the camera is unknown, or the robot lost its path.
+    """
+    rng = stream(seed, "drive", 0)
+    return _Driver(plan, seed, equipment or Equipment.of(plan, workers), rng).drive(progress)
+
+
+class _Driver:
+    """One drive as it goes on."""
+
+    def __init__(self, plan: DrivePlan, seed: int, equipment: Equipment, rng: np.random.Generator) -> None:
+        self.plan, self.seed, self.equipment, self.rng = plan, seed, equipment, rng
+        self.path = Path(plan.path.waypoints_m)
+        start = np.array([*plan.path.waypoints_m[0], self.path.start_heading_rad])
+        model = OdometryModel.of(plan.odometry)
+        self.world = World(start, plan.path.start_covariance, model, rng)
+        self.filter = PoseFilter(start.tolist(), plan.path.start_covariance, model, plan.stop.gate)
+        self.dead = np.array([*start, 0.0, 0.0])
+        self.time_s = self.way_m = 0.0
+        self.not_before_m: dict[str, float] = {}
+        self.really = [_where_it_is(landmark, rng) for landmark in plan.map.landmark]
+        self.log: list[tuple[NDArray[np.float64], ...]] = []
+        self.stops: list[Stop] = []
+
+    def drive(self, progress: Progress | None) -> Drive:
+        """Go to the end of the path."""
+        path, plan = self.path, self.plan
+        next_look_m = 0.0
+        self._note()
+        while not path.is_done:
+            if self.way_m >= next_look_m:
+                next_look_m += plan.stop.every_m
+                self._look()
+                if progress is not None:
+                    progress(round(100 * path.progress_m), round(100 * path.length_m))
+            self._step()
+            if self.way_m > _MOST_WAY * path.length_m + 1:
+                raise UsageError(
+                    f"the robot has lost its path after {self.way_m:.1f} m: give 'path.lookahead_m' or"
+                    " 'path.turn_limit_deg_s' room for its corners, or let it see a landmark earlier"
+                )
+        time_s, way_m, true, dead, corrected, covariance = (np.stack(column) for column in zip(*self.log, strict=True))
+        return Drive(plan, self.seed, time_s, way_m, true, dead, corrected, covariance, tuple(self.stops))
+
+    def _step(self) -> None:
+        plan = self.plan.path
+        limit = math.radians(plan.turn_limit_deg_s)
+        rate = float(np.clip(self.path.turn_rate(self.filter.pose, plan.speed_m_s, plan.lookahead_m), -limit, limit))
+        way = plan.speed_m_s * plan.step_s
+        reading = self.world.step(way, rate * plan.step_s, plan.step_s)
+        self.filter.predict(reading)
+        self.dead = moved(self.dead, reading)
+        self.path.advance(self.filter.pose[:2], plan.lookahead_m)
+        self.time_s += plan.step_s
+        self.way_m += way
+        self._note()
+
+    def _note(self) -> None:
+        self.log.append(
+            (
+                np.array(self.time_s),
+                np.array(self.way_m),
+                self.world.state[:3].copy(),
+                self.dead[:3].copy(),
+                self.filter.pose.copy(),
+                self.filter.pose_covariance.copy(),
+            )
+        )
+
+    def _look(self) -> None:
+        """Stop for the first landmark that promises enough."""
+        for k, landmark in enumerate(self.plan.map.landmark):
+            if self.way_m >= self.not_before_m.get(landmark.name, 0.0):
+                promised = self._promise(landmark)
+                if promised <= self.plan.stop.across_std_m:
+                    self._measure(k, promised)
+
+    def _promise(self, landmark: MappedLandmark) -> float:
+        """Return D·σ_δ of the bound at the believed view; infinite if the landmark is not in view."""
+        plan, sensor = self.plan, self.equipment.sensor
+        pan = self._pan(landmark)
+        lens = self._lens(self.filter.pose, pan)
+        distance, delta, _ = view_of(lens, landmark.xy_m, landmark.yaw_rad)
+        low, high = plan.stop.distance_m
+        if not low <= distance <= high or abs(pan) > math.radians(plan.camera.pan_limit_deg):
+            return math.inf
+        half_field = math.radians(sensor.half_angle_h_deg)
+        for other in plan.map.landmark:
+            if other is not landmark and abs(view_of(lens, other.xy_m, 0.0)[2]) < 2 * half_field:
+                wall = plan.map.wall_distance_m(lens[:2], lens[2])
+                if wall is None or view_of(lens, other.xy_m, 0.0)[0] < wall:
+                    return math.inf
+        bound = cramer_rao(
+            self.equipment.renderers[landmark.class_name],
+            Views.broadcast(distance, delta),
+            free=FREE,
+            n_frames=plan.camera.n_frames,
+            background=self._wall(lens[:2], landmark.xy_m),
+        )
+        std = float(bound.std("delta_rad")[0])
+        return distance * std if math.isfinite(std) else math.inf
+
+    def _measure(self, k: int, promised: float) -> None:
+        """Stand still, take frames at the true pose, match, correct."""
+        plan, landmark = self.plan, self.plan.map.landmark[k]
+        camera, sensor = plan.camera, self.equipment.sensor
+        xy, yaw = self.really[k]
+        pan = self._pan(landmark)
+        lens = self._lens(self.world.state[:3], pan + math.radians(camera.pan_std_deg) * self.rng.standard_normal())
+        view = view_of(lens, xy, yaw)
+        renderer = self.equipment.renderers[landmark.class_name]
+        image = renderer.render(*view, background=self._wall(lens[:2], xy))
+        filtered = kalman_filter(capture(image, sensor, rng=self.rng, n_frames=camera.n_frames))
+        standing_s = camera.n_frames / sensor.frame_rate_hz
+        self.world.stand(standing_s)
+        self.filter.stand(standing_s)
+        self.time_s += standing_s
+        match = self.equipment.matcher.match(filtered)[0]
+        before, covariance_before = self.filter.pose.copy(), self.filter.pose_covariance.copy()
+        placements = []
+        if match.accepted:
+            placements = plan.map.poses(
+                match,
+                pan,
+                prior=before.tolist(),
+                prior_covariance=covariance_before,
+                pan_offset_xy_m=camera.pan_offset_m,
+                lens_offset_xy_m=camera.lens_offset_m,
+                pan_std_rad=math.radians(camera.pan_std_deg),
+            )
+        used, squared = self.filter.correct(placements)
+        nearest = placements[0].pose if placements else None
+        self.stops.append(
+            Stop(
+                time_s=self.time_s,
+                way_m=self.way_m,
+                landmark=landmark,
+                predicted_across_std_m=promised,
+                view=view,
+                pan_rad=pan,
+                match=match,
+                measured=None if nearest is None else np.array([nearest.x_m, nearest.y_m, nearest.heading_rad]),
+                measured_covariance=None if nearest is None else nearest.covariance,
+                distance_squared=squared,
+                used=used is not None,
+                true=self.world.state[:3].copy(),
+                before=before,
+                after=self.filter.pose.copy(),
+                covariance_before=covariance_before,
+                covariance_after=self.filter.pose_covariance.copy(),
+                range_m=filtered.range_m[0],
+            )
+        )
+        self.not_before_m[landmark.name] = self.way_m + (plan.stop.retry_m if used is None else plan.stop.again_m)
+        self._note()
+
+    def _pan(self, landmark: MappedLandmark) -> float:
+        """Return the pan angle that should point at a landmark."""
+        camera = self.plan.camera
+        return pan_towards(self.filter.pose, landmark.xy_m, camera.pan_offset_m, camera.lens_offset_m)
+
+    def _lens(self, pose: NDArray[np.float64], pan_rad: float) -> NDArray[np.float64]:
+        return lens_pose(pose, pan_rad, self.plan.camera.pan_offset_m, self.plan.camera.lens_offset_m)
+
+    def _wall(self, lens_m: NDArray[np.float64], landmark_m: Sequence[float]) -> Background | None:
+        """Return the room's wall behind a landmark."""
+        heading = math.atan2(landmark_m[1] - lens_m[1], landmark_m[0] - lens_m[0])
+        wall = self.plan.map.wall_distance_m(lens_m, heading)
+        return None if wall is None else Background(wall_m=wall, wall_albedo=self.plan.camera.wall_albedo)
+
+
+def _where_it_is(landmark: MappedLandmark, rng: np.random.Generator) -> tuple[tuple[float, float], float]:
+    """Draw where a landmark really stands, given how well it was surveyed."""
+    x, y, yaw = np.array([*landmark.xy_m, landmark.yaw_rad]) + np.sqrt(np.diag(landmark.covariance)) * (
+        rng.standard_normal(3)
+    )
+    return (float(x), float(y)), float(yaw)

@@ -1,0 +1,105 @@
+"""The examples do what they say, on recordings made from closed forms."""
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "real_recording.py"
+NOISE_M = 0.004
+TAN = np.tan(np.radians(22.5))
+
+
+def zone_distances(distance, yaw):
+    """Return z of 8 × 8 zones: the mean range over a zone, weighted by the light, times the cosine of its centre."""
+    place = TAN * (1 - (np.arange(8 * 16) + 0.5) / 64)
+    z, y = np.meshgrid(place, place, indexing="ij")
+    # a ray (1, y, z) turned by the yaw advances cos − y sin towards the panel
+    advance = np.cos(yaw) - y * np.sin(yaw)
+    length = np.sqrt(1 + y**2 + z**2)
+    range_m = distance / advance * length
+    light = advance / length / range_m**2
+
+    def zones(values):
+        return values.reshape(8, 16, 8, 16).sum(axis=(1, 3))
+
+    centre = TAN * (1 - (np.arange(8) + 0.5) / 4)
+    return zones(light * range_m) / zones(light) / np.sqrt(1 + centre[:, None] ** 2 + centre**2)
+
+
+def write_recording(path, distance_m, yaw_deg, rng, edge=6):
+    """Write what zones see of a wide panel, a floor in the lowest two rows, and what is past the panel."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        zones = range(64)
+        writer.writerow(["panel_x_m", "yaw_deg", *(f"mm_{i}" for i in zones), *(f"status_{i}" for i in zones)])
+        for distance, yaw in zip(distance_m, np.radians(yaw_deg), strict=True):
+            z = zone_distances(distance, yaw) + NOISE_M * rng.standard_normal((8, 8))
+            status = np.full((8, 8), 5)
+            z[6:] = 0.03
+            z[:, edge:] = 1.9 + 0.3 * rng.random((8, 8 - edge))
+            status[rng.random((8, 8)) < 0.1] = 255
+            z[status == 255] = 0.5 * rng.random((status == 255).sum())
+            writer.writerow([distance, np.degrees(yaw), *np.round(1e3 * z).astype(int).ravel(), *status.ravel()])
+
+
+def run(*arguments):
+    return subprocess.run([sys.executable, EXAMPLE, *map(str, arguments)], capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("edge", [6, 8])
+def test_a_panel_is_followed_before_a_floor_and_a_room(tmp_path, edge):
+    rng = np.random.default_rng(8)
+    n = 60
+    distance, yaw = rng.uniform(0.5, 1.5, n), rng.uniform(-30, 30, n)
+    write_recording(tmp_path / "panel.csv", distance, yaw, rng, edge)
+    done = run(tmp_path / "panel.csv", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    frame, d, d_std, delta, delta_std, chi2 = np.loadtxt(
+        tmp_path / "out" / "estimates.csv", delimiter=",", skiprows=1, unpack=True
+    )
+    index = frame.astype(int)
+    assert len(index) == n
+    for error, std in ((d - distance[index], d_std), (delta - yaw[index], delta_std)):
+        # its own standard deviation is honest: mean square within 99.9 % of χ² of 60, and no bias
+        assert 0.55 < np.mean((error / std) ** 2) < 1.65
+        assert abs(np.mean(error / std)) < 3.3 / np.sqrt(n)
+    assert np.median(np.abs(d - distance[index])) < 0.003
+    assert 0.8 < np.median(chi2) < 1.2
+    assert (tmp_path / "out" / "estimates.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n", "no column 'mm_0'"),
+        ("", "no column 'mm_0'"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused_in_one_line(tmp_path, text, message):
+    path = tmp_path / "wrong.csv"
+    path.write_text(text)
+    done = run(path, "--out", tmp_path / "out")
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert message in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_recording_without_a_panel_is_refused(tmp_path):
+    write_recording(tmp_path / "floor.csv", [0.05], [0.0], np.random.default_rng(1), edge=1)
+    done = run(tmp_path / "floor.csv", "--out", tmp_path / "out")
+    assert (done.returncode, done.stderr) == (3, "error: no frame shows a panel\n")
+
+
+@pytest.mark.skipif("PHASEMARK_RECORDING" not in os.environ, reason="PHASEMARK_RECORDING names no recording")
+def test_the_recording_at_hand_agrees_with_its_motion_capture(tmp_path):
+    done = run(os.environ["PHASEMARK_RECORDING"], "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    frames, mad_mm, rms_deg = done.stdout.split()[0], done.stdout.split("MAD ")[1], done.stdout.split("r.m.s. ")[1]
+    assert int(frames) >= 250
+    assert float(mad_mm.split()[0]) <= 10
+    assert float(rms_deg.split("°")[0]) <= 4
