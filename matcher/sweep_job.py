@@ -52,6 +52,7 @@ _FIELDS: tuple[tuple[str, tuple[int, ...], str, str], ...] = (
     ("seconds", (), "<f8", "time of the match, an equal share of its batch"),
 )
 _WIGGLES = (3, 5, 7)
+_RENDERERS_KEPT = 16
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,7 @@ class SweepJob:
         self.class_names = tuple(self.landmarks)
         self._banks: dict[str, Bank] = {}
         self._matchers: dict[tuple[str, float], Callable[[FilteredFrames], Sequence[Match]]] = {}
+        self._renderers: dict[tuple[Any, ...], Renderer] = {}
         self._guard = threading.Lock()
 
     def spec(self) -> dict[str, Any]:
@@ -193,13 +195,19 @@ class SweepJob:
         return self.believed_sensor(number).with_(**changes)
 
     def renderer(self, number: int, sensor: Sensor) -> Renderer:
-        """Return what renders the true landmark of a condition."""
+        """Return what renders the true landmark of a condition; those used last are kept, for they take time to make."""
         condition = self.all_conditions[number]
-        mesh = self.landmarks[condition.class_name].mesh
-        if condition.dimension_error:
-            mesh = mesh.copy()
-            mesh.vertices *= 1 + condition.dimension_error
-        return Renderer(mesh, sensor, albedo=condition.albedo)
+        key = (condition.class_name, condition.dimension_error, condition.albedo, sensor.model_dump_json())
+        with self._guard:
+            if key not in self._renderers:
+                mesh = self.landmarks[condition.class_name].mesh
+                if condition.dimension_error:
+                    mesh = mesh.copy()
+                    mesh.vertices *= 1 + condition.dimension_error
+                self._renderers[key] = Renderer(mesh, sensor, albedo=condition.albedo)
+                if len(self._renderers) > _RENDERERS_KEPT:
+                    self._renderers.pop(next(iter(self._renderers)))
+            return self._renderers[key]
 
     def background(self, number: int) -> Background | None:
         """Return what truly stands behind the landmark."""
