@@ -447,7 +447,10 @@ def _bank_build(
     ] = None,
     distance: Annotated[str | None, typer.Option("--distance", metavar="START:STOP:STEP", help="Metres.")] = None,
     delta: Annotated[str | None, typer.Option("--delta", metavar="START:STOP:STEP", help="Degrees.")] = None,
-    model: Annotated[str | None, typer.Option("--model", help="ray, or planar: the paper's own generator.")] = None,
+    model: Annotated[
+        str | None,
+        typer.Option("--model", help="ray; hard: centre rays, nothing mixed; or planar: the paper's own generator."),
+    ] = None,
     full: Annotated[bool, typer.Option("--full", help="Every class at every D and δ; a must for meshes.")] = False,
     workers: _Workers = None,
     resume: _Resume = False,
@@ -983,13 +986,30 @@ def _sweep_report(
     from phasemark.matcher.sweep_tables import json_rows
 
     report = write_report(folder)
-    cells = read_sweep(folder)[1].cells()
+    trials = read_sweep(folder)[1]
+    cells = trials.cells()
     if as_json:
         _echo_json({"report": str(report), "cells": json_rows([cell.row() for cell in cells])})
         return
-    for sentence in summary(cells):
+    for sentence in summary(trials, cells):
         typer.echo(sentence)
     typer.echo(report)
+
+
+@_sweep_app.command("frames")
+def _sweep_frames(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A sweep's folder.")],
+    condition: Annotated[int, typer.Argument(metavar="CONDITION", help="As in its trials.csv.", min=0)],
+    trial: Annotated[int, typer.Argument(metavar="TRIAL", help="As in its trials.csv.", min=0)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The noisy frames as .npz, to be matched again.")],
+    force: _Force = False,
+) -> None:
+    """Take the frames of one trial of a sweep again, bit for bit."""
+    from phasemark.data import write_measured
+    from phasemark.matcher.sweep_examples import sweep_frames
+
+    _refuse_existing([out], force)
+    typer.echo(write_measured(sweep_frames(folder, condition, trial), out, force=force))
 
 
 @_sweep_app.command("compare")

@@ -26,6 +26,7 @@ from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_po
 from phasemark.matcher.surroundings import Surroundings, estimate_surroundings
 from phasemark.matcher.sweep import read_sweep, run_sweep
 from phasemark.matcher.sweep_compare import Difference, compare_cells
+from phasemark.matcher.sweep_examples import sweep_frames
 from phasemark.matcher.sweep_plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, load_sweep
 from phasemark.matcher.sweep_tables import Cell, SweepTrials
 from phasemark.matcher.trials import Conditions, Trials, TrialSummary, run_trials
@@ -76,4 +77,5 @@ __all__ = [
     "run_sweep",
     "run_trials",
     "share",
+    "sweep_frames",
 ]

@@ -87,7 +87,9 @@ class MaximumLikelihood:
         if pixels not in ("all", "lower"):
             raise UsageError(f"'pixels' must be all or lower, got {pixels!r}")
         if bank.plan.model != "ray":
-            raise UsageError("the bank was made by the planar generator, which knows no edges: refine needs a ray bank")
+            raise UsageError(
+                f"the bank's model is '{bank.plan.model}', which knows no mixed pixels: refine needs 'ray'"
+            )
         self.bank = bank
         self.free = check_free(free)
         self.on: Quantity = on

@@ -85,8 +85,23 @@ def run_sweep(
         rounds.append(following)
         trials = _read(plan, folder, len(rounds))
         following = _next_round(plan, trials, rounds)
-    write_tables(plan, trials, folder)
+    write_atomically(folder / "trials.csv", csv_bytes(trials.trial_rows()), force=True)
+    write_cells(plan, trials, folder)
     return trials
+
+
+def read_plan_of(folder: str | os.PathLike[str]) -> SweepPlan:
+    """Read the plan of a sweep.
+
+    Raises
+    ------
+    InputFileError
+        There is no sweep.
+    """
+    plan = _stored_plan(Path(folder))
+    if plan is None:
+        raise InputFileError(f"{folder}: holds no sweep: 'phasemark sweep run' makes one")
+    return plan
 
 
 def read_sweep(folder: str | os.PathLike[str]) -> tuple[SweepPlan, SweepTrials]:
@@ -98,9 +113,7 @@ def read_sweep(folder: str | os.PathLike[str]) -> tuple[SweepPlan, SweepTrials]:
         There is no sweep, or a file of it is damaged.
     """
     folder = Path(folder)
-    plan = _stored_plan(folder)
-    if plan is None:
-        raise InputFileError(f"{folder}: holds no sweep: 'phasemark sweep run' makes one")
+    plan = read_plan_of(folder)
     n = 0
     while _round_path(folder, n).is_file():
         n += 1
@@ -109,11 +122,10 @@ def read_sweep(folder: str | os.PathLike[str]) -> tuple[SweepPlan, SweepTrials]:
     return plan, _read(plan, folder, n)
 
 
-def write_tables(plan: SweepPlan, trials: SweepTrials, folder: Path) -> tuple[Cell, ...]:
-    """Write trials.csv, cells.csv and sweep.json, and return the cells."""
+def write_cells(plan: SweepPlan, trials: SweepTrials, folder: Path) -> tuple[Cell, ...]:
+    """Write cells.csv and sweep.json, and return the cells."""
     cells = trials.cells()
     rows = [cell.row() for cell in cells]
-    write_atomically(folder / "trials.csv", csv_bytes(trials.trial_rows()), force=True)
     write_atomically(folder / "cells.csv", csv_bytes(rows), force=True)
     table = {"plan": plan.model_dump(mode="json"), "versions": versions(), "cells": json_rows(rows)}
     text = json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False)
@@ -184,8 +196,8 @@ def _next_round(plan: SweepPlan, trials: SweepTrials, rounds: list[Round]) -> Ro
 def _read(plan: SweepPlan, folder: Path, n_rounds: int) -> SweepTrials:
     parts: dict[str, list[Any]] = {}
     names = (
-        "condition", "trial", "truth", "estimate", "bound", "covariance", "chi2", "p_value", "p_none", "seconds",
-        "dof", "found", "modes", "accepted",
+        "condition", "trial", "truth", "confusion", "estimate", "bound", "covariance", "chi2", "p_value", "p_none",
+        "seconds", "dof", "found", "modes", "accepted",
     )  # fmt: skip
     for number in range(n_rounds):
         path = _round_path(folder, number)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -24,13 +25,14 @@ from phasemark.data.build import read_landmarks
 from phasemark.data.layout import Layout
 from phasemark.data.seeds import stream
 from phasemark.data.shards import Place
-from phasemark.matcher.bounds import cramer_rao
-from phasemark.matcher.filters import FilteredFrames, kalman_filter, phasor_mean
+from phasemark.matcher.bounds import confusion_probability, cramer_rao
+from phasemark.matcher.filters import FilteredFrames, PixelState, kalman_filter, phasor_mean
+from phasemark.matcher.likelihood import Quantity, counts
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.models import VIEW
 from phasemark.matcher.sweep_plan import Method, SweepPlan
-from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture
+from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, predicted_range_std
 
 FORMAT = "phasemark-trials"
 SCHEMA_VERSION = 1
@@ -51,6 +53,12 @@ _FIELDS: tuple[tuple[str, tuple[int, ...], str, str], ...] = (
     ("modes", (), "<i2", "explanations kept, the best included"),
     ("seconds", (), "<f8", "time of the match, an equal share of its batch"),
 )
+_SHARED_FIELDS: tuple[tuple[str, tuple[int, ...], str, str], ...] = (
+    ("truth", (_N,), "<f8", "distance_m, delta_rad, bearing_rad, height_m"),
+    ("confusion", (), "<f8", "bound on the probability of a wrong class; NaN where it was not computed"),
+)
+_CONFUSION_TRIALS = 8
+"""For so many views of a condition, which hardly differ, the bound on class confusion is computed."""
 _WIGGLES = (3, 5, 7)
 _RENDERERS_KEPT = 16
 
@@ -89,10 +97,12 @@ class SweepJob:
         self.all_conditions = plan.conditions()
         bank = plan.bank_plan(plan.methods[0])
         self.sensor = bank.build_sensor()
-        self.landmarks = {part.name: part for part in read_landmarks(bank.landmarks, bank.meshes, None)}
-        self.class_names = tuple(self.landmarks)
+        known = read_landmarks(bank.landmarks, bank.meshes)
+        self.class_names = tuple(part.name for part in known)
+        self.objects = {part.name: part for part in (*known, *read_landmarks(plan.strangers, ()))}
         self._banks: dict[str, Bank] = {}
         self._matchers: dict[tuple[str, float], Callable[[FilteredFrames], Sequence[Match]]] = {}
+        self._references: dict[float, Matcher] = {}
         self._renderers: dict[tuple[Any, ...], Renderer] = {}
         self._guard = threading.Lock()
 
@@ -107,7 +117,12 @@ class SweepJob:
     @property
     def items(self) -> list[int]:
         """The number of trials of each condition."""
-        return [self.of.trials] * len(self.of.conditions)
+        most = self.plan.stranger_trials
+        return [min(self.of.trials, most) if self.is_stranger(k) else self.of.trials for k in self.of.conditions]
+
+    def is_stranger(self, number: int) -> bool:
+        """Return whether a condition shows an object that stands in no bank."""
+        return self.all_conditions[number].class_name not in self.class_names
 
     def identity(self) -> dict[str, Any]:
         """Return all that the trials depend on."""
@@ -115,7 +130,7 @@ class SweepJob:
             "plan": self.plan.model_dump(mode="json"),
             "round": self.spec()["round"],
             "versions": versions(),
-            "mesh_sha256": {name: mesh_sha256(part.mesh) for name, part in self.landmarks.items()},
+            "mesh_sha256": {name: mesh_sha256(part.mesh) for name, part in self.objects.items()},
         }
 
     def lay_out(self) -> tuple[Layout, list[list[Place]]]:
@@ -126,20 +141,21 @@ class SweepJob:
             file.attrs["format"] = FORMAT
             file.attrs["schema_version"] = SCHEMA_VERSION
             file.attrs["identity"] = json.dumps(self.identity(), sort_keys=True, ensure_ascii=False)
-            file.create_dataset("condition", data=np.repeat(self.of.conditions, self.of.trials).astype("<i4"))
-            numbers = np.arange(self.of.first, self.of.first + self.of.trials)
-            file.create_dataset("trial", data=np.tile(numbers, len(self.of.conditions)).astype("<i8"))
+            file.create_dataset("condition", data=np.repeat(self.of.conditions, self.items).astype("<i4"))
+            numbers = np.concatenate([self.of.first + np.arange(count) for count in self.items])
+            file.create_dataset("trial", data=numbers.astype("<i8"))
             first = []
-            dataset, offset = layout.reserve(file, "truth", (n, _N), "<f8")
-            dataset.attrs["long_name"] = "distance_m, delta_rad, bearing_rad, height_m"
-            first.append(Place(offset, _N * 8))
+            for name, shape, kind, long_name in _SHARED_FIELDS:
+                dataset, offset = layout.reserve(file, name, (n, *shape), kind)
+                dataset.attrs["long_name"] = long_name
+                first.append(Place(offset, int(np.prod(shape)) * np.dtype(kind).itemsize))
             for name, shape, kind, long_name in _FIELDS:
                 dataset, offset = layout.reserve(file, name, (n, methods, *shape), kind)
                 dataset.attrs["long_name"] = long_name
                 first.append(Place(offset, methods * int(np.prod(shape)) * np.dtype(kind).itemsize))
         return layout, [
-            [Place(place.offset + slab * self.of.trials * place.stride, place.stride) for place in first]
-            for slab in range(len(self.of.conditions))
+            [Place(place.offset + int(before) * place.stride, place.stride) for place in first]
+            for before in np.cumsum([0, *self.items[:-1]])
         ]
 
     def make(self, slab: int, start: int, stop: int) -> list[NDArray[Any]]:
@@ -156,7 +172,9 @@ class SweepJob:
             if kind not in frames:
                 frames[kind] = self.frames(number, method, views, first)
             what = (method.on, method.parameters, method.pixels)
-            if what not in bounds:
+            if what not in bounds and self.is_stranger(number):
+                bounds[what] = np.full((len(views), _N, _N), np.nan)
+            elif what not in bounds:
                 bounds[what] = self.bound(number, method, views)
             begun = time.perf_counter()
             matches = self._match(number, m, frames[kind], first)
@@ -164,7 +182,8 @@ class SweepJob:
             out["bound"][:, m] = bounds[what]
             for name, values in self._table(matches, method).items():
                 out[name][:, m] = values
-        return [truth.astype("<f8"), *(out[name] for name, *_ in _FIELDS)]
+        confusion = self.confusion(number, views, first)
+        return [truth.astype("<f8"), confusion.astype("<f8"), *(out[name] for name, *_ in _FIELDS)]
 
     def views(self, number: int, first: int, stop: int) -> Views:
         """Return the true views of some trials of a condition."""
@@ -194,16 +213,18 @@ class SweepJob:
             changes["phase_offset_std_rad"] = self.plan.fixed_pattern_rad
         return self.believed_sensor(number).with_(**changes)
 
-    def renderer(self, number: int, sensor: Sensor) -> Renderer:
-        """Return what renders the true landmark of a condition; those used last are kept, for they take time to make."""
+    def renderer(self, number: int, sensor: Sensor, *, dimension_error: float | None = None) -> Renderer:
+        """Return what renders the true landmark of a condition; the latest are kept, for they take time to make."""
         condition = self.all_conditions[number]
-        key = (condition.class_name, condition.dimension_error, condition.albedo, sensor.model_dump_json())
+        if dimension_error is None:
+            dimension_error = condition.dimension_error
+        key = (condition.class_name, dimension_error, condition.albedo, sensor.model_dump_json())
         with self._guard:
             if key not in self._renderers:
-                mesh = self.landmarks[condition.class_name].mesh
-                if condition.dimension_error:
+                mesh = self.objects[condition.class_name].mesh
+                if dimension_error:
                     mesh = mesh.copy()
-                    mesh.vertices *= 1 + condition.dimension_error
+                    mesh.vertices *= 1 + dimension_error
                 self._renderers[key] = Renderer(mesh, sensor, albedo=condition.albedo)
                 if len(self._renderers) > _RENDERERS_KEPT:
                     self._renderers.pop(next(iter(self._renderers)))
@@ -216,16 +237,19 @@ class SweepJob:
 
     def frames(self, number: int, method: Method, views: Views, first: int) -> FilteredFrames:
         """Return the filtered frames of some trials, as a method gets them; `first` is the first one's number."""
-        true = self.true_sensor(number)
-        believed = self.believed_sensor(number)
-        if method.on == "phasors":
+        seen = self.raw_frames(number, views, first, on=method.on)
+        return (phasor_mean if method.filter == "phasor-mean" else kalman_filter)(seen)
+
+    def raw_frames(self, number: int, views: Views, first: int, *, on: Quantity = "ranges") -> Frames:
+        """Return the frames of some trials, (n, n_frames, rows, cols), with the sensor that a method believes in."""
+        true, believed = self.true_sensor(number), self.believed_sensor(number)
+        if on == "phasors":
             true, believed = (sensor.with_(max_phase_std_rad=None) for sensor in (true, believed))
         image = self.renderer(number, true).render_views(views, background=self.background(number))
         rng = stream(self.plan.seed, "sweep.noise", number)
         n_frames = self.all_conditions[number].n_frames
         frames = capture(image, true, rng=rng, n_frames=n_frames, first_view=first)
-        seen = Frames(frames.range_m, frames.amplitude_e, frames.intensity_e, flags=frames.flags, sensor=believed)
-        return (phasor_mean if method.filter == "phasor-mean" else kalman_filter)(seen)
+        return Frames(frames.range_m, frames.amplitude_e, frames.intensity_e, flags=frames.flags, sensor=believed)
 
     def bound(self, number: int, method: Method, views: Views) -> NDArray[np.float64]:
         """Return the Cramér–Rao bound of the true world at some views, (n, 4, 4), NaN for what is not estimated."""
@@ -236,6 +260,55 @@ class SweepJob:
             background=self.background(number),
         )  # fmt: skip
         return _spread(found.covariance, free, len(views))
+
+    def confusion(self, number: int, views: Views, first: int) -> NDArray[np.float64]:
+        """Return a bound on how often another class explains a frame better, (n,); NaN beyond the first few trials.
+
+        It is that of a matcher that knows the world: filtered frames without noise, as they would be were the model
+        right, are matched, and the costs of the other classes are their distances (PHYSICS section 7).
+        """
+        found = np.full(len(views), np.nan)
+        n = min(len(views), _CONFUSION_TRIALS - first)
+        if n <= 0 or self.is_stranger(number):
+            return found
+        if len(self.class_names) == 1:
+            found[:n] = 0.0
+            return found
+        condition = self.all_conditions[number]
+        sensor = self.believed_sensor(number)
+        plain = Views.broadcast(views.distance_m[:n], views.delta_rad[:n])
+        renderer = self.renderer(number, sensor, dimension_error=0.0)
+        image = renderer.render_views(plain, background=self.background(number))
+        std_m = predicted_range_std(image.amplitude, image.intensity, sensor)
+        counted = counts(image.phasor, image.intensity, sensor)
+        exact = FilteredFrames(
+            np.where(counted, image.range_m, np.nan),
+            np.where(counted, std_m / math.sqrt(condition.n_frames), np.nan),
+            None,
+            None,
+            np.where(counted, PixelState.RETURN, PixelState.NO_RETURN).astype(np.uint8),
+            np.where(counted, float(condition.n_frames), 0.0),
+            sensor,
+        )
+        squares = np.full((n, len(self.class_names)), np.inf)
+        for k, match in enumerate(self._reference(condition.wall_m).match(exact)):
+            for other in match.alternatives:
+                c = self.class_names.index(other.class_name)
+                if other.class_name != condition.class_name:
+                    squares[k, c] = min(squares[k, c], other.cost)
+            if match.class_name not in (None, condition.class_name):
+                squares[k, self.class_names.index(str(match.class_name))] = 0.0
+        found[:n] = confusion_probability(squares)
+        return found
+
+    def _reference(self, wall_m: float) -> Matcher:
+        """Return maximum likelihood on ranges before a known background."""
+        with self._guard:
+            if wall_m not in self._references:
+                background = Background(wall_m=wall_m) if wall_m else None
+                bank = self._bank(Method(name="reference"))
+                self._references[wall_m] = Matcher(bank, "refine", background=background, workers=1)
+            return self._references[wall_m]
 
     def matcher(self, number: int, m: int) -> Callable[[FilteredFrames], Sequence[Match]]:
         """Return a method, ready to match the frames of a condition."""
@@ -249,19 +322,28 @@ class SweepJob:
     def _matcher(self, method: Method, wall_m: float) -> Callable[[FilteredFrames], Sequence[Match]]:
         if ":" in method.method:
             return _imported(method.method)
-        plan = self.plan.bank_plan(method)
-        key = plan.model_dump_json()
-        if key not in self._banks:
-            self._banks[key] = build_bank(plan)
+        bank = self._bank(method)
         background: Background | Literal["auto"] | None = Background(wall_m=wall_m) if wall_m else None
         if method.knows == "auto":
             background = "auto"
         if method.method == "nearest":
-            return Matcher(self._banks[key], background=background, false_alarm=method.false_alarm).match
+            return Matcher(bank, background=background, false_alarm=method.false_alarm).match
         return Matcher(
-            self._banks[key], "refine", free=method.parameters, background=background, false_alarm=method.false_alarm,
+            bank, "refine", free=method.parameters, background=background, false_alarm=method.false_alarm,
             on=method.on, pixels=method.pixels, workers=1,
         ).match  # fmt: skip
+
+    def bank(self, m: int) -> Bank:
+        """Return the bank of a method."""
+        with self._guard:
+            return self._bank(self.plan.methods[m])
+
+    def _bank(self, method: Method) -> Bank:
+        plan = self.plan.bank_plan(method)
+        key = plan.model_dump_json()
+        if key not in self._banks:
+            self._banks[key] = build_bank(plan, workers=1)
+        return self._banks[key]
 
     def _match(self, number: int, m: int, frames: FilteredFrames, first: int) -> Matches:
         method = self.plan.methods[m]

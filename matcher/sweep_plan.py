@@ -69,6 +69,8 @@ class Condition:
 
 AXES = tuple(field.name for field in fields(Condition))
 """Names of a condition's fields, each of which may be an axis."""
+MODEL_ERRORS = ("bearing_deg", "height_m", "pitch_deg", "wiggling", "unit", "dimension_error")
+"""Axes on which the world differs from what a method takes it to be, unless they are 0."""
 _WHOLE = ("n_frames", "unit")
 _LIMITS: dict[str, tuple[float, float]] = {
     "distance_m": (1e-3, 1e3), "noise_factor": (1e-3, 1e3), "n_frames": (1, 100_000), "bearing_deg": (-45, 45),
@@ -101,7 +103,8 @@ class Method(PlanModel):
         What is estimated beside distance and angle.
     knows : {"wall", "auto", "nothing"}
         Whether the background is known, estimated from the frames, or taken to be none.
-    bank_model : {"ray", "planar"}
+    bank_model : {"ray", "hard", "planar"}
+        As in :class:`phasemark.data.BankPlan`; "hard" and "planar" know no mixed pixels and go with ``nearest`` only.
     bank_step : (metres, degrees)
         Spacing of the bank's grid.
     false_alarm : float
@@ -114,9 +117,21 @@ class Method(PlanModel):
     pixels: Literal["all", "lower"] = "all"
     free: tuple[Literal["bearing", "height"], ...] = ()
     knows: Literal["wall", "auto", "nothing"] = "wall"
-    bank_model: Literal["ray", "planar"] = "ray"
+    bank_model: Literal["ray", "hard", "planar"] = "ray"
     bank_step: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (0.01, 1.0)
     false_alarm: Annotated[float, Field(gt=0, lt=1)] = 0.01
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if self.method == "refine" and self.bank_model != "ray":
+            raise UsageError(f"methods: '{self.name}' refines, which needs 'bank_model' ray, got {self.bank_model}")
+        if self.method == "nearest" and (self.free or self.on != "ranges" or self.pixels != "all"):
+            raise UsageError(
+                f"methods: 'free', 'on' and 'pixels' belong to method refine, but '{self.name}' is nearest"
+            )
+        if self.method == "nearest" and self.knows == "auto":
+            raise UsageError(f"methods: '{self.name}' is nearest, and cannot estimate a background")
+        return self
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -149,6 +164,10 @@ class SweepPlan(ScenePlan):
     methods : sequence of Method
     classes, landmarks, meshes, sensor, sensor_overrides
         As in :class:`phasemark.data.BankPlan`.
+    strangers : sequence of LandmarkSpec
+        Objects that stand in no bank, seen under the same conditions: the right answer is that there is no landmark.
+    stranger_trials : int
+        Of each stranger under each condition, at most.
     bank_distance_m : (low, high)
         Distances that the banks cover.
     fixed_pattern_rad : float
@@ -173,6 +192,8 @@ class SweepPlan(ScenePlan):
     axes: dict[str, _Axis] = Field(default_factory=dict)
     spread: tuple[Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=360)]] = (0.01, 1.0)
     methods: Annotated[tuple[Method, ...], Field(min_length=1)] = (Method(name="refine"),)
+    strangers: tuple[LandmarkSpec, ...] = ()
+    stranger_trials: Annotated[int, Field(ge=2, le=1_000_000)] = 50
     bank_distance_m: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (0.7, 2.1)
     fixed_pattern_rad: Annotated[float, Field(ge=0, le=1)] = 0.002
     outlier: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (0.05, 5.0)
@@ -198,6 +219,10 @@ class SweepPlan(ScenePlan):
         names = [method.name for method in self.methods]
         if len(set(names)) < len(names):
             raise UsageError(f"methods: each needs a name of its own, got {', '.join(names)}")
+        known = self.class_names
+        for k, stranger in enumerate(self.strangers):
+            if stranger.name in (*known, *(other.name for other in self.strangers[:k]), "none"):
+                raise UsageError(f"strangers: '{stranger.name}' must have a name of its own, unlike any class")
         return self
 
     def resolve(self) -> Self:
@@ -213,7 +238,7 @@ class SweepPlan(ScenePlan):
         return type(self)(**{**self.model_dump(), **spelled_out})
 
     def conditions(self) -> tuple[Condition, ...]:
-        """Return the points of the design, classes slowest.
+        """Return the points of the design, classes slowest and strangers last.
 
         Raises
         ------
@@ -221,18 +246,19 @@ class SweepPlan(ScenePlan):
             There are more than 100 000.
         """
         axes = {name: self.axes[name] for name in AXES if name in self.axes}
+        names = (*self.class_names, *(stranger.name for stranger in self.strangers))
         if self.design == "sobol":
             points = self._sobol(axes)
         elif self.design == "star":
             base = {name: values[0] for name, values in axes.items()}
             points = [base, *({**base, n: value} for n, values in axes.items() for value in values[1:])]
         else:
-            if math.prod(map(len, axes.values())) * len(self.class_names) > _MOST_CELLS:
+            if math.prod(map(len, axes.values())) * len(names) > _MOST_CELLS:
                 raise UsageError(f"axes: the grid has more than {_MOST_CELLS} cells: thin an axis, or use 'sobol'")
             points = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
         return tuple(
             Condition(name, **{k: int(v) if k in _WHOLE else v for k, v in point.items()})  # type: ignore[arg-type]
-            for name in self.class_names
+            for name in names
             for point in points
         )
 

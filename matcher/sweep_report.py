@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,17 +16,19 @@ import numpy as np
 from phasemark.data import versions, write_atomically
 from phasemark.data.page import embedded_png, figure_png, page_template
 from phasemark.matcher.bounds import Estimate
-from phasemark.matcher.sweep import read_sweep, write_tables
+from phasemark.matcher.sweep import read_sweep, write_cells
+from phasemark.matcher.sweep_examples import worst_examples
 from phasemark.matcher.sweep_figures import sweep_figures
 from phasemark.matcher.sweep_plan import SweepPlan
 from phasemark.matcher.sweep_tables import Cell, SweepTrials, condition_axes
 
 _MOST_ROWS = 80
-_MOST_WORST = 12
+_MOST_EXAMPLES = 8
+_PARAMETERS = (("distance_m", "distance", " mm", 1e3), ("delta_rad", "angle", "°", 180 / math.pi))
 
 
 def write_report(folder: str | os.PathLike[str]) -> Path:
-    """Write ``report.html`` and ``figures/`` of a sweep into its folder, over those that are there.
+    """Write ``report.html``, ``figures/`` and the table of cells into a sweep's folder, over those that are there.
 
     Parameters
     ----------
@@ -44,10 +47,11 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     """
     folder = Path(folder)
     plan, trials = read_sweep(folder)
-    cells = write_tables(plan, trials, folder)
+    cells = write_cells(plan, trials, folder)
+    landmarks = [cell for cell in cells if not cell.stranger]
     (folder / "figures").mkdir(exist_ok=True)
     shown = []
-    for figure in sweep_figures(trials, cells):
+    for figure in sweep_figures(plan, trials, cells):
         png, svg = figure_png(figure.figure), io.BytesIO()
         with matplotlib.rc_context({"svg.hashsalt": "phasemark"}):  # or the names inside would differ each time
             figure.figure.savefig(svg, format="svg", metadata={"Date": None})
@@ -57,40 +61,74 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     axes = condition_axes([cell.condition for cell in cells])
     page = page_template("phasemark.matcher", "sweep.html.j2").render(
         plan=plan,
-        summary=summary(cells),
+        summary=summary(trials, cells),
         figures=shown,
+        examples=_examples(plan, trials, folder),
         header=(*axes, "method", "n", "D RMSE (mm)", "bound", "ratio", "δ RMSE (°)", "bound", "ratio", "outliers",
                 "class right", "NEES/p", "95 % coverage"),
-        rows=[_row(cell, axes) for cell in _worst_first(cells)[:_MOST_ROWS]],
-        n_cells=len(cells),
-        worst=_worst_trials(trials),
+        rows=[_row(cell, axes) for cell in _worst_first(landmarks)[:_MOST_ROWS]],
+        n_cells=len(landmarks),
         facts=_facts(plan, trials),
     )  # fmt: skip
     return write_atomically(folder / "report.html", page.encode(), force=True)
 
 
-def summary(cells: Sequence[Cell]) -> list[str]:
-    """Say in a sentence for each method what was found."""
-    sentences = []
-    for method in dict.fromkeys(cell.method for cell in cells):
-        mine = [cell for cell in cells if cell.method == method]
-        n = sum(cell.n for cell in mine)
-        right = sum(round(cell.class_right.value * cell.n) for cell in mine)
-        parts = []
-        for name, label, unit, scale in (("distance_m", "distance", " mm", 1e3), ("delta_rad", "angle", "°", 57.29578)):
-            rmse = [cell.rmse[name].value * scale for cell in mine if math.isfinite(cell.rmse[name].value)]
-            ratio = [cell.ratio[name].value for cell in mine if math.isfinite(cell.ratio[name].value)]
-            if rmse and ratio:
-                parts.append(
-                    f"{np.median(rmse):.2g}{unit} in {label} (cells from {min(rmse):.2g} to {max(rmse):.2g}), "
-                    f"{np.median(ratio):.2f} times the Cramér–Rao bound"
-                )
-        outliers = sum(cell.outliers.value * cell.answered.value * cell.n for cell in mine if cell.answered.value)
-        sentences.append(
-            f"{method}: in the median cell the root mean square error is {' and '.join(parts) or 'not known'}; the "
-            f"class was right in {right} of {n} trials, and {round(outliers)} answers were outliers."
-        )
-    return sentences
+def summary(trials: SweepTrials, cells: Sequence[Cell]) -> list[str]:
+    """Say in three sentences what was found: how accurate each method is, where it fails, which classes it finds."""
+    landmarks = [cell for cell in cells if not cell.stranger]
+    methods = trials.methods
+    accurate = "; ".join(f"{method} {_accuracy([c for c in landmarks if c.method == method])}" for method in methods)
+    sentences = [f"Root mean square errors in the median cell, and their ratios to the Cramér–Rao bound: {accurate}."]
+    worst = []
+    for method in methods:
+        mine = [cell for cell in landmarks if cell.method == method and _badness(cell) > -math.inf]
+        outliers = sum(round(c.outliers.value * c.answered.value * c.n) for c in mine if c.answered.value)
+        if mine:
+            cell = max(mine, key=_badness)
+            worst.append(
+                f"for {method}, {_badness(cell):.3g} times the bound at {_where(cell, landmarks)}"
+                + (f" ({outliers} outliers in all)" if outliers else "")
+            )
+    if worst:
+        sentences.append(f"The worst cells are, {'; '.join(worst)}.")
+    strangers = [cell for cell in cells if cell.stranger]
+    parts = []
+    for method in methods:
+        right, n = _count([cell for cell in landmarks if cell.method == method])
+        part = f"{method} found the right class in {right} of {n} trials"
+        if strangers:
+            refused, of = _count([cell for cell in strangers if cell.method == method])
+            part += f" and refused {refused} of {of} strangers"
+        parts.append(part)
+    return [*sentences, f"{'; '.join(parts)}."]
+
+
+def _accuracy(cells: Sequence[Cell]) -> str:
+    parts = []
+    for name, label, unit, scale in _PARAMETERS:
+        rmse = [cell.rmse[name].value * scale for cell in cells if math.isfinite(cell.rmse[name].value)]
+        ratio = [cell.ratio[name].value for cell in cells if math.isfinite(cell.ratio[name].value)]
+        if rmse and ratio:
+            parts.append(f"{np.median(rmse):.2g}{unit} in {label} ({np.median(ratio):.3g} times)")
+    return " and ".join(parts) or "no answer"
+
+
+def _count(cells: Sequence[Cell]) -> tuple[int, int]:
+    return sum(round(cell.class_right.value * cell.n) for cell in cells), sum(cell.n for cell in cells)
+
+
+def _where(cell: Cell, cells: Sequence[Cell]) -> str:
+    axes = condition_axes([one.condition for one in cells])
+    values = [(name, getattr(cell.condition, name)) for name in axes]
+    return ", ".join(str(value) if name == "class_name" else f"{name} = {value:g}" for name, value in values)
+
+
+def _badness(cell: Cell) -> float:
+    return max((ratio.value for ratio in cell.ratio.values() if math.isfinite(ratio.value)), default=-math.inf)
+
+
+def _worst_first(cells: Sequence[Cell]) -> list[Cell]:
+    return sorted(cells, key=lambda cell: -_badness(cell))
 
 
 def _with_interval(value: Estimate, scale: float = 1.0) -> str:
@@ -99,42 +137,29 @@ def _with_interval(value: Estimate, scale: float = 1.0) -> str:
     return f"{value.value * scale:.3g} [{value.low * scale:.3g}, {value.high * scale:.3g}]"
 
 
-def _worst_first(cells: Sequence[Cell]) -> list[Cell]:
-    def badness(cell: Cell) -> float:
-        return -max((r.value for r in cell.ratio.values() if math.isfinite(r.value)), default=math.inf)
-
-    return sorted(cells, key=badness)
-
-
 def _row(cell: Cell, axes: Sequence[str]) -> list[str]:
     values = [getattr(cell.condition, name) for name in axes]
     out = [f"{value:g}" if isinstance(value, int | float) else str(value) for value in values]
     out += [cell.method, str(cell.n)]
-    for name, scale in (("distance_m", 1e3), ("delta_rad", 180 / math.pi)):
+    for name, _, _, scale in _PARAMETERS:
         out += [_with_interval(cell.rmse[name], scale), f"{cell.bound[name] * scale:.3g}"]
         out.append(_with_interval(cell.ratio[name]))
     out += [_with_interval(one) for one in (cell.outliers, cell.class_right, cell.nees, cell.coverage[0.95])]
     return out
 
 
-def _worst_trials(trials: SweepTrials) -> list[list[str]]:
-    error = trials.error
-    rows = []
-    for m, method in enumerate(trials.methods):
-        with np.errstate(invalid="ignore"):
-            scaled = np.abs(error[:, m, :2]) / np.array([1e-3, math.radians(0.1)])
-        badness = np.where(np.isfinite(scaled).all(axis=1), scaled.max(axis=1), np.inf)
-        for k in np.argsort(-badness, kind="stable")[: _MOST_WORST // len(trials.methods) + 1]:
-            found = trials.found[k, m]
-            rows.append(
-                [
-                    method, str(trials.condition[k]), str(trials.trial[k]), trials.classes[trials.true_class[k]],
-                    "none" if found < 0 else trials.classes[found], f"{trials.truth[k, 0]:.4f}",
-                    f"{1e3 * error[k, m, 0]:.3g}", f"{math.degrees(trials.truth[k, 1]):.2f}",
-                    f"{math.degrees(error[k, m, 1]):.3g}", f"{trials.p_value[k, m]:.2g}",
-                ]
-            )  # fmt: skip
-    return rows
+def _examples(plan: SweepPlan, trials: SweepTrials, folder: Path) -> list[dict[str, Any]]:
+    where = shlex.quote(str(folder))
+    of_each = max(1, _MOST_EXAMPLES // len(plan.methods))
+    return [
+        {
+            "title": f"{example.method}: condition {example.condition}, trial {example.trial}",
+            "text": example.text,
+            "image": embedded_png(figure_png(example.figure), example.text),
+            "command": f"phasemark sweep frames {where} {example.condition} {example.trial} -o frames.npz",
+        }
+        for example in worst_examples(plan, trials, of_each)
+    ]
 
 
 def _facts(plan: SweepPlan, trials: SweepTrials) -> dict[str, Any]:

@@ -41,6 +41,8 @@ class SweepTrials:
     condition, trial : (n,) int64
     truth : (n, 4) float64
         distance_m, delta_rad, bearing_rad, height_m.
+    confusion : (n,) float64
+        Bound on the probability of a wrong class; NaN where it was not computed.
     estimate : (n, m, 4) float64
         NaN where there is none.
     bound, covariance : (n, m, 4, 4) float64
@@ -60,6 +62,7 @@ class SweepTrials:
     condition: NDArray[np.int64]
     trial: NDArray[np.int64]
     truth: NDArray[np.float64]
+    confusion: NDArray[np.float64]
     estimate: NDArray[np.float64]
     bound: NDArray[np.float64]
     covariance: NDArray[np.float64]
@@ -77,14 +80,16 @@ class SweepTrials:
 
     @property
     def true_class(self) -> NDArray[np.int64]:
-        """Number of each trial's class; (n,)."""
-        of_condition = np.array([self.classes.index(condition.class_name) for condition in self.conditions])
+        """Number of each trial's class, −1 for a stranger, which has none; (n,)."""
+        number = {name: k for k, name in enumerate(self.classes)}
+        of_condition = np.array([number.get(condition.class_name, -1) for condition in self.conditions])
         return np.asarray(of_condition[self.condition])
 
     @property
     def error(self) -> NDArray[np.float64]:
-        """Estimate less truth, δ wrapped by the true landmark's symmetry; (n, m, 4)."""
+        """Estimate less truth, δ wrapped by the true landmark's symmetry; (n, m, 4), NaN for strangers."""
         error = self.estimate - self.truth[:, None]
+        error[self.true_class < 0] = np.nan
         period = 2 * math.pi / np.array(self.symmetry, np.float64)[self.true_class][:, None]
         error[:, :, 1] -= period * np.round(error[:, :, 1] / period)
         return error
@@ -142,6 +147,11 @@ class SweepTrials:
         covariance = self.covariance[rows, m][:, at[:, None], at]
         n = len(error)
         found = self.found[rows, m]
+        accepted = self.accepted[rows, m]
+        stranger = condition.class_name not in self.classes
+        right = ~accepted if stranger else found == self.classes.index(condition.class_name)
+        confusion = self.confusion[rows]
+        confusion = confusion[np.isfinite(confusion)]
         answered = np.isfinite(error).all(axis=1) & (found >= 0)
         limit = np.array(
             [self.outlier[0], math.radians(self.outlier[1]), math.radians(self.outlier[1]), self.outlier[0]]
@@ -163,9 +173,11 @@ class SweepTrials:
             free=self.free[m],
             n=n,
             answered=wilson(int(answered.sum()), n),
-            accepted=wilson(int(self.accepted[rows, m].sum()), n),
+            accepted=wilson(int(accepted.sum()), n),
             outliers=wilson(int(gross.sum()), int(answered.sum())),
-            class_right=wilson(int((found == self.classes.index(condition.class_name)).sum()), n),
+            stranger=stranger,
+            class_right=wilson(int(right.sum()), n),
+            confusion_bound=float(confusion.mean()) if len(confusion) else math.nan,
             found={
                 name: int((found == k).sum()) for k, name in [*enumerate(self.classes), (-1, "none")]
             },
@@ -207,8 +219,14 @@ class Cell:
     free : tuple of str
     n : int
         Trials.
-    answered, accepted, class_right : Estimate
+    stranger : bool
+        Whether the condition shows an object that stands in no bank; it has no errors and no bound.
+    answered, accepted : Estimate
         Shares of all trials.
+    class_right : Estimate
+        Share of all trials whose class was found; of a stranger's, those that were refused.
+    confusion_bound : float
+        Mean bound on the probability of a wrong class, for a matcher that knows the world.
     outliers : Estimate
         Share of the answered trials whose error is beyond the plan's limits.
     found : dict of str to int
@@ -237,10 +255,12 @@ class Cell:
     method: str
     free: tuple[str, ...]
     n: int
+    stranger: bool
     answered: Estimate
     accepted: Estimate
     outliers: Estimate
     class_right: Estimate
+    confusion_bound: float
     found: dict[str, int]
     bias: dict[str, Estimate]
     rmse: dict[str, Estimate]
@@ -256,6 +276,7 @@ class Cell:
     def row(self) -> dict[str, Any]:
         """Return the cell as one flat row of cells.csv; what a method does not estimate is NaN."""
         out: dict[str, Any] = {"cell": self.number, **asdict(self.condition), "method": self.method, "n": self.n}
+        out |= {"stranger": int(self.stranger), "confusion_bound": self.confusion_bound}
         for name in ("answered", "accepted", "outliers", "class_right", "nees"):
             out |= _flat(name, getattr(self, name))
         for name in VIEW:

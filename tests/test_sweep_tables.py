@@ -30,8 +30,8 @@ def linear_sweep(n: int, rng: np.random.Generator, bias=(0.0, 0.0), told: float 
         conditions=(Condition("box"),), methods=("least squares",), free=(("distance_m", "delta_rad"),),
         classes=("box",), symmetry=(2,), outlier=(0.05, 5.0), condition=np.zeros(n, np.int64), trial=np.arange(n),
         truth=truth, estimate=estimate, bound=covariance, covariance=told * covariance, chi2=flat, p_value=flat,
-        p_none=0 * flat, seconds=flat, dof=np.ones((n, 1), np.int64), found=np.zeros((n, 1), np.int64),
-        modes=np.ones((n, 1), np.int64), accepted=np.ones((n, 1), np.bool_),
+        p_none=0 * flat, confusion=np.full(n, np.nan), seconds=flat, dof=np.ones((n, 1), np.int64),
+        found=np.zeros((n, 1), np.int64), modes=np.ones((n, 1), np.int64), accepted=np.ones((n, 1), np.bool_),
     )  # fmt: skip
 
 
