@@ -61,7 +61,7 @@ _landmark_app = typer.Typer(help="The landmarks: the catalogue and mesh files.")
 _sensor_app = typer.Typer(help="The cameras: shipped presets and sensor files.")
 _bank_app = typer.Typer(help="Banks of model images.")
 _frames_app = typer.Typer(help="Sets of noisy frames with their truth.")
-_plan_app = typer.Typer(help="Plans: what banks and frame sets are built from.")
+_plan_app = typer.Typer(help="Plans: what banks and frame sets are built from, and sweeps and drives run from.")
 app.add_typer(_landmark_app, name="landmark")
 app.add_typer(_sensor_app, name="sensor")
 app.add_typer(_bank_app, name="bank")
@@ -742,17 +742,17 @@ def _merge(shards: Sequence[Path], out: Path, resume: bool, force: bool) -> None
 
 
 @_plan_app.command("example")
-def _plan_example(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank or frames.")]) -> None:
+def _plan_example(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank, frames, sweep or drive.")]) -> None:
     """Print a plan with comments; it can be used as it is."""
-    from phasemark.data import plan_example
+    from phasemark.matcher.plan_kinds import plan_example
 
     typer.echo(plan_example(kind), nl=False)
 
 
 @_plan_app.command("schema")
-def _plan_schema(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank or frames.")]) -> None:
+def _plan_schema(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank, frames, sweep or drive.")]) -> None:
     """Print the JSON Schema of a kind of plan, for editors and other programs."""
-    from phasemark.data import plan_schema
+    from phasemark.matcher.plan_kinds import plan_schema
 
     _echo_json(plan_schema(kind))
 
@@ -760,11 +760,13 @@ def _plan_schema(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank 
 @_plan_app.command("check")
 def _plan_check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A plan (.toml).")],
-    kind: Annotated[str | None, typer.Option("--kind", help="bank or frames, if the plan leaves it open.")] = None,
+    kind: Annotated[
+        str | None, typer.Option("--kind", help="bank, frames, sweep or drive, if the plan leaves it open.")
+    ] = None,
     as_json: _Json = False,
 ) -> None:
     """Check a plan and say what it is; with --json print it with every default made explicit."""
-    from phasemark.data import check_plan
+    from phasemark.matcher.plan_kinds import check_plan
 
     found, plan = check_plan(file, kind)
     if as_json:

@@ -108,7 +108,7 @@ def bias_arrows(cells: Sequence[Cell]) -> Figure:
         arrows = np.array([[one.value for one in mean[name]] for name in ("delta_rad", "distance_m")])
         sure = np.array([[one.low > 0 or one.high < 0 for one in mean[name]] for name in SHOWN]).any(axis=0)
         _arrows(panel, places, arrows, sure)
-        panel.set_title(f"{method}", fontsize=9)
+        panel.set_title(method, fontsize=9, loc="left")
     for panel in [panel for row in rows for panel in row][len(methods) :]:
         panel.set_axis_off()
     return figure
@@ -139,6 +139,7 @@ def observability(cells: Sequence[Cell]) -> Figure:
         ]
     )
     _arrows(right, places, weak, True, both_ways=True)
+    right.set_title("weakest direction", fontsize=9, loc="left")
     return figure
 
 
@@ -278,14 +279,14 @@ def _arrows(
             {"headwidth": 1, "headlength": 0, "headaxislength": 0, "pivot": "mid"} if both_ways else {}
         )
         drawn = panel.quiver(
-            a, d, *arrows, angles="uv", scale_units="width", scale=7 * longest, width=0.006,
+            a, d, *arrows, angles="uv", scale_units="width", scale=1.7 * longest * max(len(set(a)), 4), width=0.006,
             color=np.broadcast_to(np.where(sure, style(0)[0], "#b0b0b0"), len(places)).tolist(), **look,
         )  # fmt: skip
         length = float(f"{longest:.1g}")
         panel.quiverkey(
-            drawn, 0.74, 1.04, length, f"{length:g}° or {length:g} mm", labelpos="E", fontproperties={"size": 8}
+            drawn, 0.72, 1.05, length, f"{length:g}° or {length:g} mm", labelpos="E", fontproperties={"size": 8}
         )
-    panel.margins(0.15)
+    panel.margins(0.25)
     panel.set_xticks(sorted(set(a)))
     panel.set_yticks(sorted(set(d)))
     panel.set_xlabel(AXIS_LABEL["delta_deg"])

@@ -1,5 +1,7 @@
 """Matchers as users write them, some of them bad, for the tests of sweeps."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from phasemark.matcher.match import Match
@@ -28,6 +30,10 @@ class Fails:
 
 
 fails = Fails()
+
+
+def off_by_3_mm(frames):
+    return [replace(match, distance_m=match.distance_m + 0.003) for match in nearest_to_mean(frames)]
 
 
 def nan_view(frames):
