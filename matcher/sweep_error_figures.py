@@ -273,6 +273,7 @@ def _arrows(
 ) -> None:
     """Draw arrows over the plane, 1° to the right as long as 1 mm upwards."""
     d, a = np.array(places).T
+    panel.plot(a, d, ".", color="#808080", markersize=3)
     longest = float(np.nanmax(np.hypot(*arrows))) if np.isfinite(arrows).any() else 0.0
     if longest > 0:
         look: dict[str, Any] = (

@@ -89,7 +89,7 @@ def _trust_figures(trials: SweepTrials, cells: Sequence[Cell]) -> Iterator[Sweep
             "nees",
             "Is the covariance honest?",
             "Quantiles of the squared error by the method's own covariance, against χ². On the diagonal the covariance "
-            "is honest; above it, too small. The axis is cut at twice its neighbour.",
+            "is honest; above it, too small. The axis is cut at one and a half times its neighbour.",
             trust.nees_quantiles(trials),
         )
         yield SweepFigure(

@@ -57,7 +57,7 @@ _SHARED_FIELDS: tuple[tuple[str, tuple[int, ...], str, str], ...] = (
     ("truth", (_N,), "<f8", "distance_m, delta_rad, bearing_rad, height_m"),
     ("confusion", (), "<f8", "bound on the probability of a wrong class; NaN where it was not computed"),
 )
-_CONFUSION_TRIALS = 8
+_CONFUSION_TRIALS = 4
 """For so many views of a condition, which hardly differ, the bound on class confusion is computed."""
 _WIGGLES = (3, 5, 7)
 _RENDERERS_KEPT = 16

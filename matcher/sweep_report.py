@@ -23,7 +23,15 @@ from phasemark.matcher.sweep_plan import SweepPlan
 from phasemark.matcher.sweep_tables import Cell, SweepTrials, condition_axes
 
 _MOST_ROWS = 80
+_READABLE_IN = 6.5
+"""Wider figures keep their size on a phone, to be moved about."""
 _MOST_EXAMPLES = 8
+_SAID = {
+    "class_name": "{}", "distance_m": "D = {:g} m", "delta_deg": "δ = {:g}°", "noise_factor": "{:g} times the noise",
+    "n_frames": "{:g} frames", "bearing_deg": "a bearing of {:g}°", "height_m": "a height of {:g} m",
+    "pitch_deg": "a pitch of {:g}°", "albedo": "an albedo of {:g}", "wall_m": "a wall at {:g} m (0: none)",
+    "wiggling": "wiggling of {:g}", "unit": "unit {:g}", "dimension_error": "dimensions off by {:g}",
+}  # fmt: skip
 _PARAMETERS = (("distance_m", "distance", " mm", 1e3), ("delta_rad", "angle", "°", 180 / math.pi))
 
 
@@ -54,10 +62,14 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     for figure in sweep_figures(plan, trials, cells):
         png, svg = figure_png(figure.figure), io.BytesIO()
         with matplotlib.rc_context({"svg.hashsalt": "phasemark"}):  # or the names inside would differ each time
+            figure.figure.set_layout_engine("none")  # it is laid out already
             figure.figure.savefig(svg, format="svg", metadata={"Date": None})
         write_atomically(folder / "figures" / f"{figure.name}.png", png, force=True)
         write_atomically(folder / "figures" / f"{figure.name}.svg", svg.getvalue(), force=True)
-        shown.append({"title": figure.title, "text": figure.text, "image": embedded_png(png, figure.title)})
+        wide = figure.figure.get_figwidth() > _READABLE_IN
+        shown.append(
+            {"title": figure.title, "text": figure.text, "image": embedded_png(png, figure.title), "wide": wide}
+        )
     axes = condition_axes([cell.condition for cell in cells])
     page = page_template("phasemark.matcher", "sweep.html.j2").render(
         plan=plan,
@@ -100,7 +112,8 @@ def summary(trials: SweepTrials, cells: Sequence[Cell]) -> list[str]:
             refused, of = _count([cell for cell in strangers if cell.method == method])
             part += f" and refused {refused} of {of} strangers"
         parts.append(part)
-    return [*sentences, f"{'; '.join(parts)}."]
+    classes = "; ".join(parts)
+    return [*sentences, f"{classes[:1].upper()}{classes[1:]}."]
 
 
 def _accuracy(cells: Sequence[Cell]) -> str:
@@ -120,7 +133,7 @@ def _count(cells: Sequence[Cell]) -> tuple[int, int]:
 def _where(cell: Cell, cells: Sequence[Cell]) -> str:
     axes = condition_axes([one.condition for one in cells])
     values = [(name, getattr(cell.condition, name)) for name in axes]
-    return ", ".join(str(value) if name == "class_name" else f"{name} = {value:g}" for name, value in values)
+    return ", ".join(_SAID[name].format(value) if name in _SAID else f"{name} = {value:g}" for name, value in values)
 
 
 def _badness(cell: Cell) -> float:

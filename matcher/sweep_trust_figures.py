@@ -38,7 +38,7 @@ def nees_quantiles(trials: SweepTrials) -> Figure:
         panel.plot(expected, squared[keep], mark, color=colour, markersize=2.5, label=method)
         top = max(top, float(expected[-1]))
     panel.plot([0, top], [0, top], color="black", linewidth=0.8, label="honest")
-    panel.set_ylim(0, 2 * top)
+    panel.set_ylim(0, 1.5 * top)
     panel.set_xlabel("quantile of χ² (–)")
     panel.set_ylabel("quantile of eᵀP⁻¹e (–)")
     panel.grid(linewidth=0.3)

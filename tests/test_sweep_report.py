@@ -30,7 +30,7 @@ trials = 12
 stranger_trials = 5
 classes = ["cone", "cylinder"]
 bank_distance_m = [0.9, 1.1]
-axes = { distance_m = [0.95, 1.05], delta_deg = [20.0, 70.0], noise_factor = [1.0, 4.0], n_frames = [3] }
+axes = { distance_m = [0.95, 1.05], delta_deg = [20.0, 70.0], n_frames = [3] }
 strangers = [{ name = "bare-box", box = { length_m = 0.24, width_m = 0.16, height_m = 0.15 } }]
 
 [[methods]]
@@ -67,7 +67,7 @@ def test_the_report_is_one_page_that_loads_nothing(folder):
     figures = sorted(path.stem for path in (folder / "figures").glob("*.png"))
     assert figures == sorted(path.stem for path in (folder / "figures").glob("*.svg"))
     assert figures == sorted(
-        ["rmse-distance-m", "rmse-delta-deg", "rmse-noise-factor", "map-ratio", "map-rmse", "bias-arrows",
+        ["rmse-distance-m", "rmse-delta-deg", "map-ratio", "map-rmse", "bias-arrows",
          "observability", "position-in-cell", "models", "confusion", "confusion-bound", "risk", "roc"]
     )  # fmt: skip
     # one image a figure, and up to eight examples
@@ -91,10 +91,9 @@ def test_three_sentences_say_what_was_found(folder):
     right = int((trials.found[:, 0] == trials.true_class)[trials.true_class >= 0].sum())
     refused = int((~trials.accepted[:, 0])[trials.true_class < 0].sum())
     strangers = int((trials.true_class < 0).sum())
-    assert strangers == 5 * 8  # stranger_trials, not trials
-    assert (
-        f"nearest found the right class in {right} of {n} trials and refused {refused} of {strangers}" in sentences[2]
-    )
+    assert strangers == 5 * 4  # stranger_trials, not trials
+    expected = f"Nearest found the right class in {right} of {n} trials and refused {refused} of {strangers} strangers"
+    assert sentences[2].startswith(expected)
 
 
 def test_the_frames_of_a_trial_are_those_that_were_judged(folder, tmp_path):
@@ -110,7 +109,7 @@ def test_the_frames_of_a_trial_are_those_that_were_judged(folder, tmp_path):
 
 def test_a_trial_that_was_never_made_is_refused(folder, capsys, tmp_path):
     assert main(["sweep", "frames", str(folder), "99", "0", "-o", str(tmp_path / "one.npz")]) == 2
-    assert "has conditions 0 … 23, got 99" in capsys.readouterr().err
+    assert "has conditions 0 … 11, got 99" in capsys.readouterr().err
     with pytest.raises(UsageError, match="has trials 0 … 11 of a condition, got 12"):
         sweep_frames(folder, 0, 12)
 
@@ -127,26 +126,26 @@ def test_strangers_have_no_error_and_are_right_if_refused(folder):
 def test_the_bound_on_class_confusion_is_that_of_a_distance_that_grows_with_the_root_of_the_frames():
     plan = SweepPlan(
         name="confusion", trials=2, classes=["cone", "cylinder"], bank_distance_m=(1.7, 1.8), spread=(0.0, 0.0),
-        axes={"distance_m": [1.75], "noise_factor": [2.5], "n_frames": [1, 4, 16]},
+        axes={"distance_m": [1.75], "noise_factor": [2.5], "n_frames": [1, 4, 9]},
     ).resolve()  # fmt: skip
     job = SweepJob(plan, Round(0, (0, 1, 2), 0, 2))
     bounds = [job.confusion(number, job.views(number, 0, 2), 0) for number in range(3)]
     # Σ Q(d/2) over one other class, d² proportional to the frames
     half_distance = stats.norm.isf([bound[0] for bound in bounds])
-    assert 0.2 < half_distance[0] < 3  # a probability that a test can see
-    # the other class's nearest view hardly moves; the residual's minimum is found to 1e-3
-    np.testing.assert_allclose(half_distance[1:] / half_distance[0], [2, 4], rtol=5e-3)
-    assert np.isnan(job.confusion(0, job.views(0, 8, 10), 8)).all()
+    # the other class's nearest view hardly moves, and where it lies its distance is at its minimum
+    np.testing.assert_allclose(half_distance[1:] / half_distance[0], [2, 3], rtol=5e-3)
+    assert np.isnan(job.confusion(0, job.views(0, 4, 6), 4)).all()
 
 
 def test_a_hard_bank_holds_what_centre_rays_see():
     with build_bank(hard_or_not("hard")) as bank:
         mesh = build_mesh(catalog()["cone"])
-        seen = Renderer(mesh, bank.sensor, albedo=0.8).render([0.95], [np.deg2rad(20)], variant="hard")
-        image = bank.image("cone", int(np.argmin(abs(bank.distance_m - 0.95))), 4)
+        seen = Renderer(mesh, bank.sensor, albedo=0.8).render(bank.distance_m[1], np.deg2rad(20), variant="hard")
+        image = bank.image("cone", 1, 4)
         assert set(np.unique(image.coverage)) == {0.0, 1.0}
-        # float32 in the bank
-        np.testing.assert_allclose(image.phasor, seen.phasor, rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(image.coverage, seen.coverage)
+        # a bank's upper images are those at δ = 0: a cone of flat facets, turned, differs by 1e-3 in a normal
+        np.testing.assert_allclose(image.phasor, seen.phasor, rtol=0, atol=1e-3)
 
 
 def hard_or_not(model):
@@ -177,7 +176,7 @@ def test_a_matcher_that_is_3_mm_off_is_marked_and_its_angles_are_not(tmp_path):
 
 def test_any_false_mark_at_all_has_the_probability_that_is_stated():
     rng = np.random.default_rng(77)
-    runs = 300
+    runs = 150
     any_marked = sum(
         any(one.significant for one in compare_cells(linear_sweep(150, rng).cells(), linear_sweep(150, rng).cells()))
         for _ in range(runs)
@@ -210,12 +209,14 @@ def test_the_commands_tell_what_is_wrong_in_one_line(folder, tmp_path, capsys):
     assert not (tmp_path / "x").exists()
 
 
-def test_a_matcher_of_ones_own_joins_the_methods(folder, tmp_path, capsys):
+def test_a_matcher_of_ones_own_joins_the_methods(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("phasemark.matcher.sweep_report.write_report", lambda folder: folder / "report.html")
     plan = folder.parent / "plan.toml"
     options = ["--trials", "2", "--matcher", "own_matchers:off_by_3_mm", "-o", str(tmp_path / "own")]
     assert main(["sweep", "run", str(plan), *options]) == 0
+    capsys.readouterr()
     assert main(["sweep", "report", str(tmp_path / "own"), "--json"]) == 0
-    cells = json.loads(capsys.readouterr().out.split("\n", 1)[1])["cells"]
+    cells = json.loads(capsys.readouterr().out)["cells"]
     assert {cell["method"] for cell in cells} == {"nearest", "planar", "mean range", "own_matchers:off_by_3_mm"}
 
 
