@@ -1,7 +1,7 @@
 """Draw the pictures of the documentation into docs/images: ``python docs/figures.py``.
 
-That of accuracy against cost shows the numbers of the last ``make bench``, in out/bench.json; those of accuracy come from
-the sweeps that ``phasemark sweep run NAME --out out/NAME`` left, NAME being that of a shipped plan.
+That of accuracy against cost shows the numbers of the last ``make bench``, in out/bench.json; those of accuracy come
+from the sweeps that ``phasemark sweep run NAME --out out/NAME`` left, NAME being that of a shipped plan.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ _BESIDE_AGAIN_RAD = tuple(math.radians(side) for side in (-3.0, -2.0, -1.5, -1.0
 _FINE, _COARSE = (0.011, math.radians(1.1)), (0.022, math.radians(2.2))
 """Widest grids, metres and radians, on which interpolation is at the bound, and on which it shows the way."""
 _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
-_LIKELY = 100.0
+LIKELY = 100.0
 """An explanation whose cost is larger by this has no probability worth telling."""
 _MARGIN = 500.0
 """A rough fit whose cost is larger by this does not become the best one: a column of pixels on the wrong side of an
@@ -250,7 +250,7 @@ class MaximumLikelihood:
         # of what the scout found, the likely ones are refined again; the others keep their distance from the best
         order = np.lexsort((fits.cost, fits.frame))
         least = _least_of_frame(fits, len(evidence.weight))
-        likely = [k for k in order if fits.cost[k] < least[fits.frame[k]] + _LIKELY]
+        likely = [k for k in order if fits.cost[k] < least[fits.frame[k]] + LIKELY]
         chosen: list[int] = []
         for k in likely:
             same = [j for j in chosen if fits.frame[j] == fits.frame[k]]
@@ -297,7 +297,7 @@ class MaximumLikelihood:
         others = others.reshape(-1, 2)
         source = others[:, 0]
         return refine(
-            model, evidence, fits.frame[source], others[:, 1], fits.view[source], settings, fits.cost[source] + _LIKELY
+            model, evidence, fits.frame[source], others[:, 1], fits.view[source], settings, fits.cost[source] + LIKELY
         )
 
     def _bare_wall_cost(self, one: FilteredFrames, evidence: Evidence) -> NDArray[np.float64]:

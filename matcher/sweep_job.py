@@ -26,6 +26,7 @@ from phasemark.data.layout import Layout
 from phasemark.data.seeds import stream
 from phasemark.data.shards import Place
 from phasemark.matcher.bounds import confusion_probability, cramer_rao
+from phasemark.matcher.estimator import LIKELY
 from phasemark.matcher.filters import FilteredFrames, PixelState, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood import Quantity, counts
 from phasemark.matcher.match import Match, Matches
@@ -265,7 +266,8 @@ class SweepJob:
         """Return a bound on how often another class explains a frame better, (n,); NaN beyond the first few trials.
 
         It is that of a matcher that knows the world: filtered frames without noise, as they would be were the model
-        right, are matched, and the costs of the other classes are their distances (PHYSICS section 7).
+        right, are matched, and the costs of the other classes are their distances (PHYSICS section 7). Beyond a squared
+        distance of 100 the matcher does not follow a class; it then counts as that far away, which adds 3e-7.
         """
         found = np.full(len(views), np.nan)
         n = min(len(views), _CONFUSION_TRIALS - first)
@@ -290,7 +292,8 @@ class SweepJob:
             np.where(counted, float(condition.n_frames), 0.0),
             sensor,
         )
-        squares = np.full((n, len(self.class_names)), np.inf)
+        squares = np.full((n, len(self.class_names)), LIKELY)
+        squares[:, self.class_names.index(condition.class_name)] = np.inf
         for k, match in enumerate(self._reference(condition.wall_m).match(exact)):
             for other in match.alternatives:
                 c = self.class_names.index(other.class_name)

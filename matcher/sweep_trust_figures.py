@@ -16,7 +16,7 @@ from phasemark.matcher.sweep_style import logarithmic, methods_of, panels, style
 from phasemark.matcher.sweep_tables import LEVELS, Cell, SweepTrials
 
 _MOST_POINTS = 2000
-_LEAST_BOUND = 1e-12
+_LEAST_BOUND = 1e-7
 
 
 def nees_quantiles(trials: SweepTrials) -> Figure:

@@ -1,6 +1,7 @@
 """What is made of a finished sweep: report, figures, single trials taken again, comparison, and the command line."""
 
 import json
+import math
 import re
 
 import numpy as np
@@ -12,7 +13,7 @@ from test_sweep_tables import linear_sweep
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.data import build_bank, read_frames
-from phasemark.landmarks import build_mesh, catalog
+from phasemark.landmarks import Box, Cylinder, LandmarkSpec, build_mesh, catalog
 from phasemark.matcher.filters import kalman_filter
 from phasemark.matcher.sweep import read_sweep, run_sweep
 from phasemark.matcher.sweep_compare import compare_cells
@@ -124,14 +125,20 @@ def test_strangers_have_no_error_and_are_right_if_refused(folder):
 
 
 def test_the_bound_on_class_confusion_is_that_of_a_distance_that_grows_with_the_root_of_the_frames():
+    alike = [
+        LandmarkSpec(name=name, box=Box(**BOX), upper=Cylinder(radius_m=radius_m, height_m=0.15))
+        for name, radius_m in (("thin", 0.06), ("thick", 0.062))
+    ]
     plan = SweepPlan(
-        name="confusion", trials=2, classes=["cone", "cylinder"], bank_distance_m=(1.7, 1.8), spread=(0.0, 0.0),
-        axes={"distance_m": [1.75], "noise_factor": [2.5], "n_frames": [1, 4, 9]},
+        name="confusion", trials=2, landmarks=alike, bank_distance_m=(0.95, 1.05), spread=(0.0, 0.0),
+        axes={"distance_m": [1.003], "n_frames": [10, 40, 90]},
     ).resolve()  # fmt: skip
     job = SweepJob(plan, Round(0, (0, 1, 2), 0, 2))
     bounds = [job.confusion(number, job.views(number, 0, 2), 0) for number in range(3)]
     # Σ Q(d/2) over one other class, d² proportional to the frames
     half_distance = stats.norm.isf([bound[0] for bound in bounds])
+    # ranges change by the 2 mm that the radii differ, some 2/3 of them over 28 pixels, each known to 20 mm / √10
+    assert half_distance[0] == pytest.approx(0.5 * math.sqrt(28 * 10) * 2 / 20, rel=0.5)
     # the other class's nearest view hardly moves, and where it lies its distance is at its minimum
     np.testing.assert_allclose(half_distance[1:] / half_distance[0], [2, 3], rtol=5e-3)
     assert np.isnan(job.confusion(0, job.views(0, 4, 6), 4)).all()
