@@ -61,10 +61,12 @@ _landmark_app = typer.Typer(help="The landmarks: the catalogue and mesh files.")
 _sensor_app = typer.Typer(help="The cameras: shipped presets and sensor files.")
 _bank_app = typer.Typer(help="Banks of model images.")
 _frames_app = typer.Typer(help="Sets of noisy frames with their truth.")
-_plan_app = typer.Typer(help="Plans: what banks and frame sets are built from.")
+_plan_app = typer.Typer(help="Plans: what banks and frame sets are built from, and sweeps and drives run from.")
 app.add_typer(_landmark_app, name="landmark")
 app.add_typer(_sensor_app, name="sensor")
 app.add_typer(_bank_app, name="bank")
+_sweep_app = typer.Typer(help="Accuracy sweeps: how accurate, where, and says who.")
+app.add_typer(_sweep_app, name="sweep")
 app.add_typer(_frames_app, name="frames")
 app.add_typer(_plan_app, name="plan")
 
@@ -445,7 +447,10 @@ def _bank_build(
     ] = None,
     distance: Annotated[str | None, typer.Option("--distance", metavar="START:STOP:STEP", help="Metres.")] = None,
     delta: Annotated[str | None, typer.Option("--delta", metavar="START:STOP:STEP", help="Degrees.")] = None,
-    model: Annotated[str | None, typer.Option("--model", help="ray, or planar: the paper's own generator.")] = None,
+    model: Annotated[
+        str | None,
+        typer.Option("--model", help="ray; hard: centre rays, nothing mixed; or planar: the paper's own generator."),
+    ] = None,
     full: Annotated[bool, typer.Option("--full", help="Every class at every D and δ; a must for meshes.")] = False,
     workers: _Workers = None,
     resume: _Resume = False,
@@ -737,17 +742,17 @@ def _merge(shards: Sequence[Path], out: Path, resume: bool, force: bool) -> None
 
 
 @_plan_app.command("example")
-def _plan_example(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank or frames.")]) -> None:
+def _plan_example(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank, frames, sweep or drive.")]) -> None:
     """Print a plan with comments; it can be used as it is."""
-    from phasemark.data import plan_example
+    from phasemark.matcher.plan_kinds import plan_example
 
     typer.echo(plan_example(kind), nl=False)
 
 
 @_plan_app.command("schema")
-def _plan_schema(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank or frames.")]) -> None:
+def _plan_schema(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank, frames, sweep or drive.")]) -> None:
     """Print the JSON Schema of a kind of plan, for editors and other programs."""
-    from phasemark.data import plan_schema
+    from phasemark.matcher.plan_kinds import plan_schema
 
     _echo_json(plan_schema(kind))
 
@@ -755,11 +760,13 @@ def _plan_schema(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank 
 @_plan_app.command("check")
 def _plan_check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A plan (.toml).")],
-    kind: Annotated[str | None, typer.Option("--kind", help="bank or frames, if the plan leaves it open.")] = None,
+    kind: Annotated[
+        str | None, typer.Option("--kind", help="bank, frames, sweep or drive, if the plan leaves it open.")
+    ] = None,
     as_json: _Json = False,
 ) -> None:
     """Check a plan and say what it is; with --json print it with every default made explicit."""
-    from phasemark.data import check_plan
+    from phasemark.matcher.plan_kinds import check_plan
 
     found, plan = check_plan(file, kind)
     if as_json:
@@ -930,6 +937,114 @@ def _demo(
         _echo_table(header, summary_rows(result.select(shifted=shifted)))
         typer.echo("")
     typer.echo(report)
+
+
+@_sweep_app.command("run")
+def _sweep_run(
+    plan: Annotated[
+        str, typer.Argument(metavar="PLAN|NAME", help="A plan (.toml), or paper, distance-angle-noise or robustness.")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for trials, tables and the report.")],
+    trials: Annotated[
+        int | None, typer.Option("--trials", help="Trials of each condition, in place of the plan's.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Root of all random numbers.")] = None,
+    matcher: Annotated[
+        str | None,
+        typer.Option("--matcher", metavar="MODULE:NAME", help="Your own matcher, beside the plan's methods."),
+    ] = None,
+    workers: _Workers = None,
+    scheduler: Annotated[
+        str, typer.Option("--scheduler", help="threads, local:N (processes), or a Dask scheduler's address.")
+    ] = "threads",
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a sweep that was interrupted.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Start over where the folder holds a sweep.")] = False,
+) -> None:
+    """Run a sweep and write its tables and report."""
+    from phasemark.matcher.sweep import run_sweep
+    from phasemark.matcher.sweep_plan import Method, SweepPlan, load_sweep
+    from phasemark.matcher.sweep_report import write_report
+
+    loaded = load_sweep(plan)
+    changes: dict[str, Any] = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
+    if matcher is not None:
+        changes["methods"] = (*loaded.methods, Method(name=matcher, method=matcher))
+    with _Progress("trials") as progress:
+        run_sweep(
+            SweepPlan(**{**loaded.model_dump(), **changes}), out, workers=workers, scheduler=scheduler, resume=resume,
+            force=force, progress=progress,
+        )  # fmt: skip
+    typer.echo(write_report(out))
+
+
+@_sweep_app.command("report")
+def _sweep_report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A sweep's folder.")],
+    as_json: _Json = False,
+) -> None:
+    """Write a sweep's tables, figures and report again."""
+    from phasemark.matcher.sweep import read_sweep
+    from phasemark.matcher.sweep_report import summary, write_report
+    from phasemark.matcher.sweep_tables import json_rows
+
+    report = write_report(folder)
+    trials = read_sweep(folder)[1]
+    cells = trials.cells()
+    if as_json:
+        _echo_json({"report": str(report), "cells": json_rows([cell.row() for cell in cells])})
+        return
+    for sentence in summary(trials, cells):
+        typer.echo(sentence)
+    typer.echo(report)
+
+
+@_sweep_app.command("frames")
+def _sweep_frames(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A sweep's folder.")],
+    condition: Annotated[int, typer.Argument(metavar="CONDITION", help="As in its trials.csv.", min=0)],
+    trial: Annotated[int, typer.Argument(metavar="TRIAL", help="As in its trials.csv.", min=0)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The noisy frames as .npz, to be matched again.")],
+    force: _Force = False,
+) -> None:
+    """Take the frames of one trial of a sweep again, bit for bit."""
+    from phasemark.data import write_measured
+    from phasemark.matcher.sweep_examples import sweep_frames
+
+    _refuse_existing([out], force)
+    typer.echo(write_measured(sweep_frames(folder, condition, trial), out, force=force))
+
+
+@_sweep_app.command("compare")
+def _sweep_compare(
+    first: Annotated[Path, typer.Argument(metavar="DIR1", help="A sweep's folder.")],
+    second: Annotated[Path, typer.Argument(metavar="DIR2", help="Another one's.")],
+    everything: Annotated[bool, typer.Option("--all", help="Show the differences that may be chance too.")] = False,
+    as_json: _Json = False,
+) -> None:
+    """Compare two sweeps cell by cell; significant differences are marked, corrected for their number."""
+    import dataclasses
+
+    from phasemark.matcher.sweep import read_sweep
+    from phasemark.matcher.sweep_compare import compare_cells
+
+    found = compare_cells(*(read_sweep(folder)[1].cells() for folder in (first, second)))
+    if as_json:
+        rows = [dataclasses.asdict(one) for one in found]
+        _echo_json([{key: _plain(value) for key, value in row.items()} for row in rows])
+        return
+    shown = [one for one in found if one.significant or everything]
+    _echo_table(
+        ("class", "D (m)", "δ (°)", "noise", "frames", "method", "quantity", str(first), str(second), "p", ""),
+        (
+            (
+                one.condition.class_name, f"{one.condition.distance_m:g}", f"{one.condition.delta_deg:g}",
+                f"{one.condition.noise_factor:g}", str(one.condition.n_frames), one.method, one.quantity,
+                f"{one.first:.4g}", f"{one.second:.4g}", f"{one.p_value:.2g}", "*" if one.significant else "",
+            )
+            for one in shown
+        ),
+    )  # fmt: skip
+    typer.echo(f"{sum(one.significant for one in found)} of {len(found)} differences are significant")
 
 
 @app.command("drive")

@@ -35,6 +35,7 @@ from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.shards import Place, Progress
 from phasemark.landmarks import LandmarkSpec, Revolution, build_mesh, read_mesh
 from phasemark.render import PhasorImages, PlanarLandmark, Renderer, Sensor, Views, planar_images
+from phasemark.render.renderer import Variant
 
 ImagesOf = Callable[[Views], PhasorImages]
 StoredMesh = Callable[[str], trimesh.Trimesh]
@@ -237,7 +238,7 @@ def _refuse_impossible(plan: BankPlan) -> None:
         raise UsageError(f"no factored bank: {reason}; build a full one (--full, layout = 'full')")
     if plan.model == "planar" and plan.meshes:
         raise UsageError(
-            f"'model' must be 'ray' for '{plan.meshes[0].name}', which comes from a mesh file, got 'planar'"
+            f"'model' must be 'ray' or 'hard' for '{plan.meshes[0].name}', which comes from a mesh file, got 'planar'"
         )
 
 
@@ -271,7 +272,8 @@ def _images_of(
         )
     mesh = landmark.mesh if landmark.spec is None else build_mesh(landmark.spec, part=part)
     renderer = Renderer(mesh, sensor, albedo=landmark.albedo, harmonics=plan.harmonics)
-    return lambda views: renderer.render_views(views, rows=rows)
+    variant: Variant = "hard" if plan.model == "hard" else "exact"
+    return lambda views: renderer.render_views(views, rows=rows, variant=variant)
 
 
 def _top_view(spec: LandmarkSpec) -> PlanarLandmark:

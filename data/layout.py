@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -100,6 +100,7 @@ class Layout:
 
     def __init__(self) -> None:
         self._memory = SparseMemory()
+        self._reserved: list[tuple[int, int]] = []
         self.file = h5py.File(self._memory, "w")
 
     def __enter__(self) -> Self:
@@ -120,7 +121,9 @@ class Layout:
         space = h5py.h5s.create_simple(tuple(shape))
         kind = h5py.h5t.py_create(np.dtype(dtype))
         dataset = h5py.h5d.create(group.id, name.encode(), kind, space, creation)
-        return h5py.Dataset(dataset), int(dataset.get_offset())
+        offset = int(dataset.get_offset())
+        self._reserved.append((offset, offset + int(np.prod(shape)) * np.dtype(dtype).itemsize))
+        return h5py.Dataset(dataset), offset
 
     @property
     def size(self) -> int:
@@ -138,6 +141,8 @@ class Layout:
     def write_to(self, descriptor: int) -> None:
         """Claim the whole file's space on disk and write all but the reserved arrays, once the file is closed.
 
+        What an earlier run has placed in the reserved arrays stays as it is.
+
         Raises
         ------
         OSError
@@ -147,7 +152,20 @@ class Layout:
             os.posix_fallocate(descriptor, 0, len(self._memory))
         os.ftruncate(descriptor, len(self._memory))
         for offset, page in self._memory.pages():
-            place(descriptor, offset, page)
+            for start, stop in _gaps(offset, offset + len(page), sorted(self._reserved)):
+                place(descriptor, start, page[start - offset : stop - offset])
+
+
+def _gaps(start: int, stop: int, taken: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """Yield what of a range is not taken; `taken` is in order and without overlap."""
+    for low, high in taken:
+        if high <= start or low >= stop:
+            continue
+        if start < low:
+            yield start, low
+        start = high
+    if start < stop:
+        yield start, stop
 
 
 def place(descriptor: int, offset: int, data: NDArray[Any] | memoryview) -> None:

@@ -177,8 +177,9 @@ class BankPlan(ScenePlan):
     distance_m, delta_deg : str, number or sequence of numbers
         Grids as :func:`phasemark.data.parse_grid` reads them. A last δ that repeats the first by the landmarks'
         common symmetry is dropped. Default: 0.7 m to 2.1 m in steps of 1 cm, and one period in steps of 1°.
-    model : {"ray", "planar"}
-        The ray caster, or the paper's own generator in two dimensions.
+    model : {"ray", "hard", "planar"}
+        The ray caster; the same with the centre ray of each pixel alone, so that nothing is mixed; or the paper's own
+        generator in two dimensions.
     layout : {"factored", "full"}
         Lower and upper images apart (the paper's saving), or every class at every distance and angle.
     albedo : float, optional
@@ -199,7 +200,7 @@ class BankPlan(ScenePlan):
 
     distance_m: Annotated[_Grid, AfterValidator(_positive)] = Field(default=DEFAULT_DISTANCE_M, validate_default=True)
     delta_deg: _Grid | None = None
-    model: Literal["ray", "planar"] = "ray"
+    model: Literal["ray", "hard", "planar"] = "ray"
     layout: Literal["factored", "full"] = "factored"
     albedo: _Albedo | None = None
     harmonics: tuple[Annotated[int, Field(ge=2, le=99)], ...] = ()

@@ -1,4 +1,4 @@
-"""The kinds of plan there are: an example of each, its JSON Schema, and which kind a file is."""
+"""The kinds of plan of files: an example of each, its JSON Schema, and which kind a file is."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import os
 import tomllib
 from importlib import resources
 from typing import Any
+
+from pydantic import BaseModel
 
 from phasemark import UsageError
 from phasemark.data.frame_plan import FramePlan
@@ -50,7 +52,12 @@ def plan_schema(kind: str) -> dict[str, Any]:
     UsageError
         There is no such kind.
     """
-    schema = _model(kind).model_json_schema()
+    return schema_of(kind, _model(kind))
+
+
+def schema_of(kind: str, model: type[BaseModel]) -> dict[str, Any]:
+    """Return the JSON Schema of a model as that of a kind of plan."""
+    schema = model.model_json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": f"phasemark {kind} plan"}
 
 

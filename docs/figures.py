@@ -1,6 +1,7 @@
 """Draw the pictures of the documentation into docs/images: ``python docs/figures.py``.
 
-That of accuracy against cost shows the numbers of the last ``make bench``, in out/bench.json.
+That of accuracy against cost shows the numbers of the last ``make bench``, in out/bench.json; those of accuracy come
+from the sweeps that ``phasemark sweep run NAME --out out/NAME`` left, NAME being that of a shipped plan.
 """
 
 from __future__ import annotations
@@ -23,6 +24,14 @@ from phasemark.render import Background, Renderer, capture, preset
 from phasemark.render.plot import draw_range
 
 IMAGES = Path(__file__).parent / "images"
+OUT = Path(__file__).parent.parent / "out"
+SWEEP_FIGURES = {
+    "accuracy-distance.png": "paper/figures/rmse-distance-m.png",
+    "accuracy-position.png": "paper/figures/position-in-cell.png",
+    "accuracy-noise.png": "distance-angle-noise/figures/rmse-noise-factor.png",
+    "accuracy-frames.png": "distance-angle-noise/figures/rmse-n-frames.png",
+    "accuracy-models.png": "robustness/figures/models.png",
+}
 
 
 def demo_figure() -> Figure:
@@ -94,7 +103,10 @@ def main() -> None:
     """Write every picture."""
     write(demo_figure(), "demo.png")
     write(drive_picture(run_drive(default_drive())), "drive.png")
-    bench = Path(__file__).parent.parent / "out" / "bench.json"
+    for name, source in SWEEP_FIGURES.items():
+        if (OUT / source).exists():
+            write_atomically(IMAGES / name, (OUT / source).read_bytes(), force=True)
+    bench = OUT / "bench.json"
     if bench.exists():
         write(cost_figure(json.loads(bench.read_text(encoding="utf-8"))["peer"]["rows"]), "cost.png")
 

@@ -24,13 +24,22 @@ from phasemark.matcher.match import Candidate, Match, Matches
 from phasemark.matcher.matcher import Matcher, background_image
 from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
 from phasemark.matcher.surroundings import Surroundings, estimate_surroundings
+from phasemark.matcher.sweep import read_sweep, run_sweep
+from phasemark.matcher.sweep_compare import Difference, compare_cells
+from phasemark.matcher.sweep_examples import sweep_frames
+from phasemark.matcher.sweep_plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, load_sweep
+from phasemark.matcher.sweep_tables import Cell, SweepTrials
 from phasemark.matcher.trials import Conditions, Trials, TrialSummary, run_trials
 
 __all__ = [
     "PRIOR_STD",
+    "SHIPPED_SWEEPS",
     "Bound",
     "Candidate",
+    "Cell",
+    "Condition",
     "Conditions",
+    "Difference",
     "Estimate",
     "FilteredFrames",
     "LandmarkMap",
@@ -38,15 +47,19 @@ __all__ = [
     "Match",
     "Matcher",
     "Matches",
+    "Method",
     "PixelKalman",
     "PixelState",
     "Placement",
     "RobotPose",
     "Surroundings",
+    "SweepPlan",
+    "SweepTrials",
     "TrialSummary",
     "Trials",
     "ViewEstimate",
     "background_image",
+    "compare_cells",
     "confusion_probability",
     "covers",
     "cramer_rao",
@@ -56,9 +69,13 @@ __all__ = [
     "kalman_filter",
     "kalman_step",
     "load_map",
+    "load_sweep",
     "nees",
     "phasor_mean",
+    "read_sweep",
     "robot_poses",
+    "run_sweep",
     "run_trials",
     "share",
+    "sweep_frames",
 ]

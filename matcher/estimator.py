@@ -41,7 +41,7 @@ _CLOSE_BY_RAD = tuple(math.radians(side) for side in (-0.7, -0.28, -0.12, 0.12, 
 _FINE, _COARSE = (0.011, math.radians(1.1)), (0.022, math.radians(2.2))
 """Widest grids, metres and radians, on which interpolation is at the bound, and on which it shows the way."""
 _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
-_LIKELY = 100.0
+LIKELY = 100.0
 """An explanation whose cost is larger by this has no probability worth telling."""
 _MARGIN = 500.0
 """A rough fit whose cost is larger by this does not become the best one: a column of pixels on the wrong side of an
@@ -91,7 +91,9 @@ class MaximumLikelihood:
         if pixels not in ("all", "lower"):
             raise UsageError(f"'pixels' must be all or lower, got {pixels!r}")
         if bank.plan.model != "ray":
-            raise UsageError("the bank was made by the planar generator, which knows no edges: refine needs a ray bank")
+            raise UsageError(
+                f"the bank's model is '{bank.plan.model}', which knows no mixed pixels: refine needs 'ray'"
+            )
         self.bank = bank
         self.free = check_free(free)
         self.on: Quantity = on
@@ -277,7 +279,7 @@ class MaximumLikelihood:
         # of what the scout found, the likely ones are refined again; the others keep their distance from the best
         order = np.lexsort((fits.cost, fits.frame))
         least = _least_of_frame(fits, len(evidence.weight))
-        likely = [k for k in order if fits.cost[k] < least[fits.frame[k]] + _LIKELY]
+        likely = [k for k in order if fits.cost[k] < least[fits.frame[k]] + LIKELY]
         chosen: list[int] = []
         for k in likely:
             same = [j for j in chosen if fits.frame[j] == fits.frame[k]]
@@ -324,7 +326,7 @@ class MaximumLikelihood:
         others = np.array([(k, c) for k in best for c in range(n_class) if c != fits.class_index[k]], np.int64)
         others = others.reshape(-1, 2)
         source = others[:, 0]
-        limit = fits.cost[source] + _LIKELY
+        limit = fits.cost[source] + LIKELY
         return refine(
             model, evidence, fits.frame[source], others[:, 1], fits.view[source], settings, limit, at_first_sight=True
         )

@@ -15,18 +15,9 @@ from regenerate_golden import BANK, BANK_PLAN, FRAMES, FRAMES_PLAN
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
-from phasemark.data import (
-    PLAN_KINDS,
-    build_bank,
-    build_frames,
-    check_plan,
-    open_bank,
-    open_frames,
-    plan_example,
-    plan_schema,
-    verify_bank,
-    verify_frames,
-)
+from phasemark.data import build_bank, build_frames, open_bank, open_frames, verify_bank, verify_frames
+from phasemark.data import plan_schema as data_plan_schema
+from phasemark.matcher.plan_kinds import KINDS, check_plan, plan_example, plan_schema
 
 DOCS = Path(__file__).parent.parent / "docs"
 
@@ -79,15 +70,19 @@ def test_netcdf4_and_h5dump_read_the_files():
         assert 'DATASET "range"' in done.stdout
 
 
-@pytest.mark.parametrize("kind", PLAN_KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_the_example_of_a_plan_is_a_plan_and_fits_its_schema(tmp_path, kind):
     path = tmp_path / "plan.toml"
     path.write_text(plan_example(kind), encoding="utf-8")
-    assert check_plan(path) == (kind, PLAN_KINDS[kind](**tomllib.loads(plan_example(kind))).resolve())
+    found, plan = check_plan(path)
+    assert found == kind
+    given = type(plan)(**tomllib.loads(plan_example(kind)))
+    assert plan == (given if kind == "drive" else given.resolve())
+    assert plan == check_plan(path, kind)[1]
     schema = plan_schema(kind)
     assert set(tomllib.loads(plan_example(kind))) <= set(schema["properties"])
     assert schema["additionalProperties"] is False
-    assert set(schema["properties"]) == set(PLAN_KINDS[kind].model_fields)
+    assert set(schema["properties"]) == set(type(plan).model_fields)
 
 
 def test_plan_commands_print_and_check(tmp_path, capsys):
@@ -103,8 +98,10 @@ def test_plan_commands_print_and_check(tmp_path, capsys):
     path.write_text(path.read_text(encoding="utf-8").replace("views = 1000", "views = -1"), encoding="utf-8")
     assert main(["plan", "check", str(path)]) == 2
     assert re.search(r"plan\.toml: 'views' must be .* got -1", capsys.readouterr().err)
-    with pytest.raises(UsageError, match="unknown kind of plan 'sweep'"):
-        plan_schema("sweep")
+    assert main(["plan", "schema", "tour"]) == 2
+    assert "unknown kind of plan 'tour': there are bank, frames, sweep, drive" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="unknown kind of plan 'tour'"):
+        data_plan_schema("tour")
 
 
 @pytest.mark.parametrize("golden", [BANK, FRAMES], ids=["bank", "frames"])

@@ -1,0 +1,88 @@
+"""What a sweep's figures have in common: colours that differ for the colour-blind, marks that differ without colour."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from phasemark.matcher.sweep_plan import MODEL_ERRORS, Condition
+from phasemark.matcher.sweep_tables import Cell
+
+_STYLES = (
+    ("#0072B2", "o", "-"), ("#D55E00", "s", "--"), ("#009E73", "^", ":"), ("#CC79A7", "D", "-."),
+    ("#56B4E9", "v", "-"), ("#E69F00", "P", "--"),
+)  # fmt: skip
+SHOWN = {"distance_m": ("distance", "mm", 1e3), "delta_rad": ("angle δ", "°", 180 / math.pi)}
+"""Parameters that are drawn: name, unit, and the factor to it."""
+AXIS_LABEL = {
+    "distance_m": "distance D (m)", "delta_deg": "angle δ (°)", "noise_factor": "noise, relative to the sensor's",
+    "n_frames": "frames averaged", "bearing_deg": "bearing (°)", "height_m": "height (m)", "pitch_deg": "pitch (°)",
+    "albedo": "albedo", "wall_m": "wall (m), 0: none", "wiggling": "wiggling, relative to square against square",
+    "unit": "unit, 0: no fixed pattern", "dimension_error": "relative error of the dimensions",
+}  # fmt: skip
+LOGARITHMIC = ("distance_m", "noise_factor", "n_frames", "albedo")
+
+
+@dataclass(frozen=True)
+class SweepFigure:
+    """A figure with what it shows in words.
+
+    Parameters
+    ----------
+    name : str
+        Of its files.
+    title, text : str
+    figure : Figure
+    """
+
+    name: str
+    title: str
+    text: str
+    figure: Figure
+
+
+def style(k: int) -> tuple[str, str, str]:
+    """Return colour, mark and stroke of method k."""
+    return _STYLES[k % len(_STYLES)]
+
+
+def methods_of(cells: Sequence[Cell]) -> list[str]:
+    """Return the names of the methods in the plan's order."""
+    return list(dict.fromkeys(cell.method for cell in cells))
+
+
+def panels(columns: int, rows: int = 1, *, width: float = 5.0, height: float = 3.7) -> tuple[Figure, list[list[Axes]]]:
+    """Return a figure with rows of panels; width and height of one, inches."""
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    return figure, [list(row) for row in figure.subplots(rows, columns, squeeze=False)]
+
+
+def median(values: Sequence[float]) -> float:
+    """Return the median of the finite values, NaN if there is none."""
+    finite = [value for value in values if math.isfinite(value)]
+    return float(np.median(finite)) if finite else math.nan
+
+
+def logarithmic(axis: Axis, ticks: Sequence[float] | None = None) -> None:
+    """Make an axis logarithmic, its numbers written out: 0.2, not 2 × 10⁻¹."""
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})  # type: ignore[attr-defined]
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    if ticks is None:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(plain)
+    else:
+        axis.set_ticks(list(ticks))
+        axis.set_major_formatter(plain)
+    axis.set_minor_formatter(NullFormatter())
+
+
+def is_nominal(condition: Condition) -> bool:
+    """Return whether a condition is as a method takes it to be."""
+    return all(getattr(condition, name) == 0 for name in MODEL_ERRORS)

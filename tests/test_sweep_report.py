@@ -1,0 +1,236 @@
+"""What is made of a finished sweep: report, figures, single trials taken again, comparison, and the command line."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from own_matchers import nearest_to_mean
+from scipy import stats
+from test_sweep_tables import linear_sweep
+
+from phasemark import UsageError
+from phasemark.cli import main
+from phasemark.data import build_bank, read_frames
+from phasemark.landmarks import Box, Cylinder, LandmarkSpec, build_mesh, catalog
+from phasemark.matcher.filters import kalman_filter
+from phasemark.matcher.sweep import read_sweep, run_sweep
+from phasemark.matcher.sweep_compare import compare_cells
+from phasemark.matcher.sweep_examples import sweep_frames
+from phasemark.matcher.sweep_job import Round, SweepJob
+from phasemark.matcher.sweep_plan import Method, SweepPlan
+from phasemark.matcher.sweep_report import summary, write_report
+from phasemark.render import Renderer, preset
+
+BOX = {"length_m": 0.24, "width_m": 0.16, "height_m": 0.15}
+STEP = (0.02, 5.0)
+PLAN = """
+name = "small"
+trials = 12
+stranger_trials = 5
+classes = ["cone", "cylinder"]
+bank_distance_m = [0.9, 1.1]
+axes = { distance_m = [0.95, 1.05], delta_deg = [20.0, 70.0], n_frames = [3] }
+strangers = [{ name = "bare-box", box = { length_m = 0.24, width_m = 0.16, height_m = 0.15 } }]
+
+[[methods]]
+name = "nearest"
+method = "nearest"
+bank_step = [0.02, 5.0]
+
+[[methods]]
+name = "planar"
+method = "nearest"
+bank_model = "planar"
+bank_step = [0.02, 5.0]
+
+[[methods]]
+name = "mean range"
+method = "own_matchers:nearest_to_mean"
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A sweep and its report, made on the command line."""
+    place = tmp_path_factory.mktemp("report")
+    (place / "plan.toml").write_text(PLAN, encoding="utf-8")
+    assert main(["sweep", "run", str(place / "plan.toml"), "-o", str(place / "out"), "--workers", "2"]) == 0
+    return place / "out"
+
+
+def test_the_report_is_one_page_that_loads_nothing(folder):
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert len(page.encode()) < 3_000_000
+    assert re.findall(r'(?:src|href)="(?!data:)', page) == []
+    assert "<script" not in page
+    figures = sorted(path.stem for path in (folder / "figures").glob("*.png"))
+    assert figures == sorted(path.stem for path in (folder / "figures").glob("*.svg"))
+    assert figures == sorted(
+        ["rmse-distance-m", "rmse-delta-deg", "map-ratio", "map-rmse", "bias-arrows",
+         "observability", "position-in-cell", "models", "confusion", "confusion-bound", "risk", "roc"]
+    )  # fmt: skip
+    # one image a figure, and up to eight examples
+    assert len(figures) < page.count("<img") <= len(figures) + 8
+    assert page.count("phasemark sweep frames") == page.count("<img") - len(figures)
+
+
+def test_a_report_regenerates_bit_for_bit(folder):
+    files = [folder / "report.html", *sorted((folder / "figures").iterdir())]
+    before = [file.read_bytes() for file in files]
+    write_report(folder)
+    for file, content in zip(files, before, strict=True):
+        assert file.read_bytes() == content, file.name
+
+
+def test_three_sentences_say_what_was_found(folder):
+    _, trials = read_sweep(folder)
+    sentences = summary(trials, trials.cells())
+    assert len(sentences) == 3
+    n = int((trials.true_class >= 0).sum())
+    right = int((trials.found[:, 0] == trials.true_class)[trials.true_class >= 0].sum())
+    refused = int((~trials.accepted[:, 0])[trials.true_class < 0].sum())
+    strangers = int((trials.true_class < 0).sum())
+    assert strangers == 5 * 4  # stranger_trials, not trials
+    expected = f"Nearest found the right class in {right} of {n} trials and refused {refused} of {strangers} strangers"
+    assert sentences[2].startswith(expected)
+
+
+def test_the_frames_of_a_trial_are_those_that_were_judged(folder, tmp_path):
+    _, trials = read_sweep(folder)
+    for k in (0, 100, len(trials) - 1):
+        condition, trial = int(trials.condition[k]), int(trials.trial[k])
+        again = nearest_to_mean(kalman_filter(sweep_frames(folder, condition, trial)))[0]
+        assert again.distance_m == trials.estimate[k, 2, 0]
+    assert main(["sweep", "frames", str(folder), "3", "7", "-o", str(tmp_path / "one.npz")]) == 0
+    read = read_frames(tmp_path / "one.npz", sensor=preset("pmd-16x16"))
+    np.testing.assert_array_equal(read.range_m, sweep_frames(folder, 3, 7).range_m)
+
+
+def test_a_trial_that_was_never_made_is_refused(folder, capsys, tmp_path):
+    assert main(["sweep", "frames", str(folder), "99", "0", "-o", str(tmp_path / "one.npz")]) == 2
+    assert "has conditions 0 … 11, got 99" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="has trials 0 … 11 of a condition, got 12"):
+        sweep_frames(folder, 0, 12)
+
+
+def test_strangers_have_no_error_and_are_right_if_refused(folder):
+    _, trials = read_sweep(folder)
+    for cell in trials.cells():
+        assert cell.stranger == (cell.condition.class_name == "bare-box")
+        if cell.stranger:
+            assert np.isnan(cell.rmse["distance_m"].value)
+            assert cell.class_right.value == pytest.approx(1 - cell.accepted.value)
+
+
+def test_the_bound_on_class_confusion_is_that_of_a_distance_that_grows_with_the_root_of_the_frames():
+    alike = [
+        LandmarkSpec(name=name, box=Box(**BOX), upper=Cylinder(radius_m=radius_m, height_m=0.15))
+        for name, radius_m in (("thin", 0.06), ("thick", 0.062))
+    ]
+    plan = SweepPlan(
+        name="confusion", trials=2, landmarks=alike, bank_distance_m=(0.95, 1.05), spread=(0.0, 0.0),
+        axes={"distance_m": [1.003], "n_frames": [10, 40, 90]},
+    ).resolve()  # fmt: skip
+    job = SweepJob(plan, Round(0, (0, 1, 2), 0, 2))
+    bounds = [job.confusion(number, job.views(number, 0, 2), 0) for number in range(3)]
+    # Σ Q(d/2) over one other class, d² proportional to the frames
+    half_distance = stats.norm.isf([bound[0] for bound in bounds])
+    # ranges change by the 2 mm that the radii differ, some 2/3 of them over 28 pixels, each known to 20 mm / √10
+    assert half_distance[0] == pytest.approx(0.5 * math.sqrt(28 * 10) * 2 / 20, rel=0.5)
+    # the other class's nearest view hardly moves, and where it lies its distance is at its minimum
+    np.testing.assert_allclose(half_distance[1:] / half_distance[0], [2, 3], rtol=5e-3)
+    assert np.isnan(job.confusion(0, job.views(0, 4, 6), 4)).all()
+
+
+def test_a_hard_bank_holds_what_centre_rays_see():
+    with build_bank(hard_or_not("hard")) as bank:
+        mesh = build_mesh(catalog()["cone"])
+        seen = Renderer(mesh, bank.sensor, albedo=0.8).render(bank.distance_m[1], np.deg2rad(20), variant="hard")
+        image = bank.image("cone", 1, 4)
+        assert set(np.unique(image.coverage)) == {0.0, 1.0}
+        np.testing.assert_array_equal(image.coverage, seen.coverage)
+        # a bank's upper images are those at δ = 0: a cone of flat facets, turned, differs by 1e-3 in a normal
+        np.testing.assert_allclose(image.phasor, seen.phasor, rtol=0, atol=1e-3)
+
+
+def hard_or_not(model):
+    method = Method(name="m", method="nearest", bank_model=model, bank_step=(0.05, 5.0))
+    return SweepPlan(name="bank", classes=["cone"], bank_distance_m=(0.9, 1.1), methods=[method]).bank_plan(method)
+
+
+def test_a_sweep_does_not_differ_from_itself(folder, capsys):
+    assert main(["sweep", "compare", str(folder), str(folder), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found
+    assert not any(one["significant"] for one in found)
+
+
+def test_a_matcher_that_is_3_mm_off_is_marked_and_its_angles_are_not(tmp_path):
+    cells = []
+    for name in ("nearest_to_mean", "off_by_3_mm"):
+        plan = SweepPlan(
+            name="off", trials=200, classes=["cone"], bank_distance_m=(0.9, 1.1), outlier=(1.0, 90.0),
+            axes={"distance_m": [1.0], "n_frames": [3]}, methods=[Method(name="mine", method=f"own_matchers:{name}")],
+        )  # fmt: skip
+        cells.append(run_sweep(plan, tmp_path / name).cells())
+    found = {one.quantity: one for one in compare_cells(*cells)}
+    assert found["rmse distance_m"].significant
+    assert not found["rmse delta_rad"].significant
+    assert not found["class_right"].significant
+
+
+def test_any_false_mark_at_all_has_the_probability_that_is_stated():
+    rng = np.random.default_rng(77)
+    runs = 150
+    any_marked = sum(
+        any(one.significant for one in compare_cells(linear_sweep(150, rng).cells(), linear_sweep(150, rng).cells()))
+        for _ in range(runs)
+    )
+    # 5 quantities of which two can differ at all: Holm makes it about 2 %; 99.9 % limit for 5 %
+    assert any_marked <= stats.binom.ppf(0.999, runs, 0.05)
+
+
+def test_sweeps_that_share_no_condition_cannot_be_compared(folder):
+    cells = linear_sweep(10, np.random.default_rng(1)).cells()
+    with pytest.raises(UsageError, match="share no condition"):
+        compare_cells(cells, read_sweep(folder)[1].cells())
+
+
+def test_the_commands_tell_what_is_wrong_in_one_line(folder, tmp_path, capsys):
+    plan = tmp_path / "bad.toml"
+    plan.write_text(PLAN.replace("[0.95, 1.05]", "[0.95, 1.2]"), encoding="utf-8")
+    for arguments, code, message in (
+        (["sweep", "run", "papper", "-o", str(tmp_path / "x")], 2, "unknown sweep 'papper': give paper, "),
+        (["sweep", "run", str(plan), "-o", str(tmp_path / "x")], 2, r"bad.toml: axes: 'distance_m' must leave"),
+        (["sweep", "run", "paper", "--trials", "0", "-o", str(tmp_path / "x")], 2, "'trials' must be greater"),
+        (["sweep", "run", "paper", "-o", str(folder)], 4, "holds a sweep"),
+        (["sweep", "run", "paper", "-o", str(folder), "--resume"], 4, "was begun with another plan"),
+        (["sweep", "report", str(tmp_path)], 3, "holds no sweep"),
+    ):
+        assert main(arguments) == code, arguments
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1, error
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_matcher_of_ones_own_joins_the_methods(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("phasemark.matcher.sweep_report.write_report", lambda folder: folder / "report.html")
+    plan = folder.parent / "plan.toml"
+    options = ["--trials", "2", "--matcher", "own_matchers:off_by_3_mm", "-o", str(tmp_path / "own")]
+    assert main(["sweep", "run", str(plan), *options]) == 0
+    capsys.readouterr()
+    assert main(["sweep", "report", str(tmp_path / "own"), "--json"]) == 0
+    cells = json.loads(capsys.readouterr().out)["cells"]
+    assert {cell["method"] for cell in cells} == {"nearest", "planar", "mean range", "own_matchers:off_by_3_mm"}
+
+
+@pytest.mark.parametrize("kind", ["nearest", "refine"])
+def test_bank_models_without_mixed_pixels_go_with_the_nearest_image_only(kind):
+    if kind == "nearest":
+        assert Method(name="a", method=kind, bank_model="hard").bank_model == "hard"
+        return
+    with pytest.raises(UsageError, match="'a' refines, which needs 'bank_model' ray, got hard"):
+        Method(name="a", method=kind, bank_model="hard")
