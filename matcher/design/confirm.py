@@ -1,30 +1,33 @@
 """Whether the bound keeps its word: simulated noisy frames, matched, for a design and for the catalogue.
 
-Each set is seen at the distance of its worst bound, from sides over half a period with the worst one among them, and
-at random places over the whole range. Every frame set is captured, filtered and matched by maximum likelihood against
-the set's own bank, so errors are those of the whole program; the angle's error is taken modulo the box's symmetry.
+Each set is seen at the distance of its worst bound from sides over half a period, the worst one among them; then, with
+fresh frames, from the side that turned out worst; and at random places over the whole range. Frames are captured,
+filtered and matched by maximum likelihood against the set's own bank, so errors are those of the whole program; the
+angle's error is taken modulo the box's symmetry.
 """
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.data import BankPlan, build_bank
+from phasemark.data import BankPlan, build_bank, parse_grid
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh
 from phasemark.matcher.bounds import Estimate, cramer_rao, efficiency, share
 from phasemark.matcher.design.plan import DesignPlan
-from phasemark.matcher.design.search import Scored
+from phasemark.matcher.design.search import Design, Progress, Scored, counter
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.trials import Conditions, noisy_frames
 from phasemark.render import Renderer, Sensor, Views
 
-SIDES = 13
+SIDE_STEP_DEG = 3.75
+_FRESH, _ANYWHERE = 4, 4
 _BANK_STEPS = 150
 _BANK_STEP_M = 0.01
 _FRAMES_AT_ONCE = 200
@@ -32,11 +35,11 @@ _FRAMES_AT_ONCE = 200
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Frames of some views, matched; (k, n) arrays: k places or sides, n frames of each.
+    """Filtered frames, matched; (k, n) arrays: k sides, n frames from each.
 
     Parameters
     ----------
-    distance_m, delta_rad : (k,) or (k, n) float64
+    distance_m, delta_rad : (k, n) float64
         The truth.
     bound_m : (k, n) float64
         Position bound at the truth, the root of the trace of its covariance.
@@ -71,12 +74,6 @@ class Trial:
         """Return the root mean square error at one place, metres."""
         return root_mean_square(self.error_m[k])
 
-    def largest(self) -> tuple[int, Estimate]:
-        """Return where the root mean square error is largest, judged by every other frame, and measured on the rest."""
-        judged = np.nanmean(self.error_m[:, ::2] ** 2, axis=1)
-        k = int(judged.argmax())
-        return k, root_mean_square(self.error_m[k, 1::2])
-
 
 @dataclass(frozen=True, eq=False)
 class Confirmation:
@@ -86,17 +83,15 @@ class Confirmation:
     ----------
     sides : Trial
         At the distance of the worst bound; the last of the k sides is that of the worst bound.
+    worst : Trial
+        Fresh frames from the one of these sides where the root mean square error was largest; k = 1.
     anywhere : Trial
         Random distances over the range, random sides; k = 1.
     """
 
     sides: Trial
+    worst: Trial
     anywhere: Trial
-
-    @property
-    def at_worst(self) -> Estimate:
-        """Root mean square position error at the worst view of the bound, metres."""
-        return self.sides.rmse(-1)
 
 
 def root_mean_square(error: NDArray[np.float64]) -> Estimate:
@@ -134,13 +129,17 @@ def confirm(
     plan : DesignPlan
         Its seed, range and number of frames count.
     n : int
-        Filtered frames at every side, and ten times as many anywhere; spread evenly over the classes.
+        Filtered frames at every side, four times as many at the worst one and anywhere; spread evenly over the classes.
     purpose : str
         Keeps the random streams of two sets apart.
     workers : int
         Threads.
     progress : callable
         Called after each class of each part.
+
+    Returns
+    -------
+    Confirmation
     """
     near, far = plan.distance_m
     step = max(_BANK_STEP_M, (far - near) / _BANK_STEPS)
@@ -148,28 +147,36 @@ def confirm(
         landmarks=scored.specs,
         sensor=plan.sensor,
         sensor_overrides=plan.sensor_overrides,
-        distance_m=f"{0.9 * near:.4f}:{1.1 * far:.4f}:{step:.4f}",
+        distance_m=tuple(parse_grid(f"{0.9 * near:.4f}:{1.1 * far:.4f}:{step:.4f}", "distance_m").tolist()),
     )
     matcher = Matcher(build_bank(bank_plan, workers=workers), method="refine", workers=workers)
     period = scored.specs[0].delta_period_rad
-    distance, worst = scored.bound.worst_view
-    sides = np.append(np.linspace(0.0, period / 2, SIDES), worst)
+    distance, side = scored.bound.worst_view
+    steps = round(math.degrees(period / 2) / SIDE_STEP_DEG)
+    sides = np.append(np.linspace(0.0, period / 2, steps + 1), side)
     each = max(1, math.ceil(n / len(scored.specs)))
-    rng = stream(plan.seed, f"{purpose} places", 0)
-    parts: list[tuple[Trial, Trial]] = []
-    for k, spec in enumerate(scored.specs):
-        renderer = Renderer(build_mesh(spec), sensor, albedo=spec.albedo)
-        views = (
-            Views.broadcast(distance, np.repeat(sides, each)),
-            Views.broadcast(rng.uniform(near, far, 10 * each), rng.uniform(0.0, period, 10 * each)),
-        )
+    renderers = {s.name: Renderer(build_mesh(s), sensor, albedo=s.albedo) for s in scored.specs}
+
+    def tried(part: str, k: int, views: Callable[[np.random.Generator], Views]) -> Trial:
         trials = []
-        for index, some in enumerate(views):
-            frames = stream(plan.seed, f"{purpose} frames", 2 * k + index)
-            trials.append(_matched(matcher, renderer, spec.name, some, plan, period, frames, workers))
+        for index, (name, renderer) in enumerate(renderers.items()):
+            places, frames = (stream(plan.seed, f"{purpose} {part} {what}", index) for what in ("places", "frames"))
+            trials.append(_matched(matcher, renderer, name, views(places), plan, period, frames, workers))
             progress()
-        parts.append((_shaped(trials[0], len(sides)), _shaped(trials[1], 1)))
-    return Confirmation(*(_joined([part[index] for part in parts]) for index in range(2)))
+        return _joined([_shaped(trial, k) for trial in trials])
+
+    first = tried("sides", len(sides), lambda _: Views.broadcast(distance, np.repeat(sides, each)))
+    mean_square = np.nanmean(first.error_m**2, axis=1)
+    found = float(sides[int(np.nanargmax(mean_square))])
+    worst = tried("worst", 1, lambda _: Views.broadcast(distance, np.full(_FRESH * each, found)))
+    anywhere = tried(
+        "anywhere",
+        1,
+        lambda rng: Views.broadcast(
+            rng.uniform(near, far, _ANYWHERE * each), rng.uniform(0.0, period, _ANYWHERE * each)
+        ),
+    )
+    return Confirmation(first, worst, anywhere)
 
 
 def _matched(
@@ -200,7 +207,7 @@ def _matched(
 
 
 def _shaped(trial: Trial, k: int) -> Trial:
-    """Put the frames of a place into one row."""
+    """Put the frames of a side into one row."""
     return Trial(
         trial.distance_m.reshape(k, -1),
         trial.delta_rad.reshape(k, -1),
@@ -214,3 +221,38 @@ def _joined(trials: list[Trial]) -> Trial:
     """Put the classes side by side."""
     names = ("distance_m", "delta_rad", "bound_m", "error_m", "class_right")
     return Trial(*(np.concatenate([getattr(trial, name) for trial in trials], axis=1) for name in names))
+
+
+def confirm_design(
+    design: Design, n: int, *, workers: int | None = None, progress: Progress | None = None
+) -> tuple[Confirmation, Confirmation]:
+    """Match simulated frames of a design and of the catalogue.
+
+    Parameters
+    ----------
+    design : Design
+    n : int
+        Filtered frames at every side.
+    workers : int, optional
+        Threads; None: one for each processor.
+    progress : callable (done, total), optional
+
+    Returns
+    -------
+    (Confirmation, Confirmation)
+    """
+    sets = (("result", design.result), ("catalogue", design.catalogue))
+    step = counter(progress, 3 * sum(len(scored.specs) for _, scored in sets))
+    new, known = (
+        confirm(
+            scored,
+            design.search.sensor,
+            design.plan,
+            n,
+            purpose=f"design {name}",
+            workers=workers or os.cpu_count() or 1,
+            progress=step,
+        )
+        for name, scored in sets
+    )
+    return new, known

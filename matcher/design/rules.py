@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.landmarks import Box, LandmarkSpec, Sphere
@@ -54,11 +55,11 @@ class Check:
         return f"{self.rule}: {self.value:.4g} {self.unit}, must be {sign} {self.limit:.4g} {self.unit}"
 
 
-def upper_outline(upper: Upper) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def upper_outline(upper: Upper) -> NDArray[np.float64]:
     """Return the profile (r, z) of an upper part, (k, 2), a sphere's in steps of 2°."""
     if isinstance(upper, Sphere):
         turn = np.linspace(-math.pi / 2, math.pi / 2, 91)
-        return upper.radius_m * np.c_[np.cos(turn), 1 + np.sin(turn)]
+        return np.asarray(upper.radius_m * np.c_[np.cos(turn), 1 + np.sin(turn)])
     return np.array(outline(upper))
 
 
@@ -173,7 +174,8 @@ class Room:
             if least > most:
                 raise UsageError(
                     f"{where}: rule 'edges resolvable' asks for {what}: {least:.3f} m, {count:g} pixels of"
-                    f" {pixel:.4f} m at {far:g} m; rules 'in view' at {near:g} m and 'extents' leave {max(most, 0):.3f} m"
+                    f" {pixel:.4f} m at {far:g} m; rules 'in view' at {near:g} m and 'extents' leave"
+                    f" {max(most, 0):.3f} m"
                 )
 
     def checks(self, spec: LandmarkSpec) -> list[Check]:

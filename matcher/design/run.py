@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 
 from phasemark import UsageError
 from phasemark.landmarks import LandmarkSpec, catalog
 from phasemark.landmarks.spec import Upper
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.rules import Check, upper_size
-from phasemark.matcher.design.search import Candidate, Design, Progress, Search
+from phasemark.matcher.design.search import Candidate, Design, Progress, Search, counter
 from phasemark.matcher.design.shapes import box_of, sample_boxes
 
 _USUAL_REFINEMENT = 600
@@ -39,7 +38,7 @@ def run_design(plan: DesignPlan, *, workers: int | None = None, progress: Progre
         The sensor file cannot be read.
     """
     search = Search(plan, workers or os.cpu_count() or 1)
-    step = _counter(progress, plan.search.boxes + plan.search.uppers + _USUAL_REFINEMENT)
+    step = counter(progress, plan.search.boxes + plan.search.uppers + _USUAL_REFINEMENT)
     search.look_at_uppers(step)
     found: list[Candidate] = []
     for steps in sample_boxes(plan, search.room, search.lattice):
@@ -86,15 +85,3 @@ def _what_fails(plan: DesignPlan, found: list[Candidate]) -> str:
 
 def _missed_by(check: Check) -> float:
     return check.value if check.at_most else -check.value
-
-
-def _counter(progress: Progress | None, total: int) -> Callable[[], None]:
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, max(total, done))
-
-    return step

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark import UsageError
-from phasemark.landmarks import Box, LandmarkSpec, build_mesh
+from phasemark.landmarks import Box, LandmarkSpec
 from phasemark.landmarks.spec import Upper
 from phasemark.matcher.design.bound import RangeBound, box_alone, range_bound
 from phasemark.matcher.design.plan import DesignPlan
@@ -28,7 +27,7 @@ from phasemark.matcher.design.separation import (
     turn_distance,
     upper_appearance,
 )
-from phasemark.matcher.design.shapes import Lattice, box_of, neighbours, sample_boxes, sample_uppers
+from phasemark.matcher.design.shapes import Lattice, box_of, neighbours, sample_uppers
 from phasemark.render import Sensor
 
 Progress = Callable[[int, int], None]
@@ -36,6 +35,7 @@ Progress = Callable[[int, int], None]
 _BOX_MOVES = (8, 4, 2, 1)
 _UPPER_MOVES = (16, 8, 4, 2, 1)
 _ROUNDS = 3
+_FINER = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,11 +255,19 @@ class Search:
         return tuple(uppers)
 
     def score(self, specs: Sequence[LandmarkSpec]) -> Scored:
-        """Score landmarks that share a box, with every rule."""
+        """Score landmarks that share a box, with every rule; the bound four times as finely as the search took it."""
         box = specs[0].box
-        bound = self.bound(box)
+        bound = range_bound(
+            box_alone(box, self.plan),
+            self.sensor,
+            self.plan,
+            distance_m=_finer(self.plan.sampled_distance_m),
+            delta_rad=_finer(self.plan.sampled_delta_rad(specs[0].symmetry)),
+            workers=self.workers,
+        )
+        information = self.bound(box).distance_information
         seen = {s.name: upper_appearance(s.upper, self.sensor, self.plan) for s in specs if s.upper is not None}
-        distances = ClassDistances.between(list(seen.values())).least(bound.distance_information)
+        distances = ClassDistances.between(list(seen.values())).least(information)
         turn = self.turn(box)
         checks = {}
         for k, spec in enumerate(specs):
@@ -271,6 +279,10 @@ class Search:
                 Check("pixels on the upper part, far end", upper_pixels(seen[spec.name]), least, "px", False),
             )
         return Scored(tuple(specs), bound, distances, turn, checks)
+
+
+def _finer(grid: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.linspace(grid[0], grid[-1], _FINER * (len(grid) - 1) + 1)
 
 
 def upper_pixels(seen: Appearance) -> int:
@@ -319,3 +331,16 @@ class Design:
             if not front or candidate.class_distance > front[-1].class_distance:
                 front.append(candidate)
         return front
+
+
+def counter(progress: Progress | None, total: int) -> Callable[[], None]:
+    """Return what counts one step and reports it; the total grows where it was reckoned too small."""
+    done = 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, max(total, done))
+
+    return step

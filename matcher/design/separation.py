@@ -141,8 +141,11 @@ class ClassDistances:
     def row(one: Appearance, others: Sequence[Appearance]) -> tuple[NDArray[np.float64], ...]:
         """Compare frames of one part with images of others, (m, n) each."""
         other = Appearance(
-            *(np.stack([getattr(o, name) for o in others]) for name in ("range_m", "weight", "slope", "coverage")),
-            one.sensor,
+            range_m=np.stack([o.range_m for o in others]),
+            weight=np.stack([o.weight for o in others]),
+            slope=np.stack([o.slope for o in others]),
+            coverage=np.stack([o.coverage for o in others]),
+            sensor=one.sensor,
         )
         cost, gradient, information = one.imitated_by(other)
         return cost, gradient[..., 0], information[..., 0, 0]
@@ -179,7 +182,7 @@ def most_apart(distance: NDArray[np.float64], n: int) -> NDArray[np.int64]:
     if m <= n:
         return np.arange(m)
     finite = np.where(np.isfinite(distance), distance, -np.inf)
-    chosen = sorted(np.unravel_index(int(finite.argmax()), finite.shape))[:n]
+    chosen = sorted(int(k) for k in np.unravel_index(int(finite.argmax()), finite.shape))[:n]
     while len(chosen) < n:
         nearest = distance[:, chosen].min(axis=1)
         nearest[chosen] = -np.inf
