@@ -47,8 +47,8 @@ class Check:
     def passes(self) -> bool:
         """Whether the rule is kept."""
         if self.at_most:
-            return self.value <= self.limit + _ROUNDING_M
-        return self.value >= self.limit - _ROUNDING_M
+            return bool(self.value <= self.limit + _ROUNDING_M)
+        return bool(self.value >= self.limit - _ROUNDING_M)
 
     def __str__(self) -> str:
         sign = "at most" if self.at_most else "at least"

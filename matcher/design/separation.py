@@ -24,8 +24,8 @@ from phasemark.matcher.likelihood import counts
 from phasemark.render import Renderer, Sensor, Views, phasor_to_range_m, predicted_range_std, wrap_difference_m
 
 _STEP_M = 1e-4
-_TURN_BIAS_RAD = np.radians(np.arange(-30.0, 31.0, 3.0))
-_TURN_SHIFT_M = np.arange(-0.06, 0.061, 0.01)
+_TURN_BIAS_RAD = np.radians(np.arange(-30.0, 31.0, 6.0))
+_TURN_SHIFT_M = np.arange(-0.06, 0.061, 0.015)
 _TURN_SIDES = 7
 _GAUSS_NEWTON_STEPS = 4
 
@@ -208,8 +208,9 @@ def _least_mutual(distance: NDArray[np.float64], chosen: Sequence[int]) -> float
 def turn_distance(box: Box, sensor: Sensor, plan: DesignPlan) -> float:
     """Return d between a box at the far end and itself about a quarter-turn on, at the worst of some sides.
 
-    The imitation is sought over distance and side: on a grid, then by Gauss–Newton. Infinite for a square box, which
-    has no other side to be taken for.
+    The imitation is sought over distance and side: on a grid, then by Gauss–Newton. Ranges alone cannot tell a narrow
+    face from a wide one that is a little farther on, as long as both reach into the same pixels. Infinite for a square
+    box, which has no other side to be taken for.
     """
     if box.length_m == box.width_m:
         return math.inf
@@ -225,6 +226,8 @@ def turn_distance(box: Box, sensor: Sensor, plan: DesignPlan) -> float:
         others = Appearance.of(renderer, views, (), rows, plan.n_frames)
         best = int(_one(truth, k).imitated_by(others)[0].argmin())
         place[k] = views.distance_m[best], views.delta_rad[best]
+    turned = sides + math.pi / 2
+    bounds = [np.c_[np.full(_TURN_SIDES, far + _TURN_SHIFT_M[end]), turned + _TURN_BIAS_RAD[end]] for end in (0, -1)]
     least = np.full(_TURN_SIDES, np.inf)
     for _ in range(_GAUSS_NEWTON_STEPS):
         views = Views.broadcast(place[:, 0], place[:, 1])
@@ -232,7 +235,7 @@ def turn_distance(box: Box, sensor: Sensor, plan: DesignPlan) -> float:
         cost, gradient, information = truth.imitated_by(other)
         least = np.minimum(least, cost)
         place = place + np.einsum("nij,nj->ni", np.linalg.pinv(information), gradient)
-        place[:, 0] = np.clip(place[:, 0], far - 0.1, far + 0.1)
+        place = np.clip(place, *bounds)  # a step too long would end at the truth itself
     return float(np.sqrt(least.min()))
 
 
