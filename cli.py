@@ -43,6 +43,7 @@ phasemark renders, banks and matches what a low-resolution time-of-flight camera
 Start with
   phasemark demo                    the paper's experiment, with a report, in about a minute
   phasemark landmark list           the landmarks of the catalogue
+  phasemark landmark design         landmarks for a camera and a range of your own, with drawings
   phasemark render --class cylinder --distance 1.0 --delta 30 --wall 4 -o frame.png
   phasemark bank build -o bank.h5   a bank of model images to match your frames against
   phasemark match bank.h5 measured.csv --unit m --quantity range

@@ -502,7 +502,9 @@ def test_the_files_say_what_the_design_is(design, confirmed, tmp_path):
     assert float(chosen["worst_position_bound_m"]) == pytest.approx(design.chosen.bound.worst_m, rel=1e-8)
     assert chosen["on_front"] == "1"
     facts = json.loads((tmp_path / "design.json").read_text())
+    table = facts.pop("pareto")
     assert facts == json.loads(json.dumps(summary(design, confirmed)))
+    assert [row["broken_rules"] for row in table] == [row["broken_rules"] for row in rows]
     assert facts["confirmation"]["worst_rmse_factor"]["low"] < facts["confirmation"]["worst_rmse_factor"]["value"]
     for name in ("pareto.png", "bound.png"):
         assert np.asarray(Image.open(tmp_path / name).convert("L")).std() > 10
@@ -521,7 +523,8 @@ def test_a_sensor_from_a_file_travels_with_the_landmarks(design, tmp_path):
 def test_the_command_writes_and_refuses_to_overwrite(tmp_path, capsys):
     file = tmp_path / "plan.toml"
     file.write_text(
-        "n_classes = 1\nsymmetry = 4\n[sampling]\ndistances = 2\ndelta_step_deg = 15\n[search]\nboxes = 8\nuppers = 8\nstep_mm = 5\n"
+        "n_classes = 1\nsymmetry = 4\n[sampling]\ndistances = 2\ndelta_step_deg = 15\n"
+        "[search]\nboxes = 8\nuppers = 8\nstep_mm = 5\n"
     )
     out = tmp_path / "out"
     arguments = ["landmark", "design", str(file), "--out", str(out), "--confirm", "0", "--workers", "1"]

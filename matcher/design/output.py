@@ -220,6 +220,11 @@ def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+def _plain(value: object) -> object:
+    """Return None for a number that JSON does not have."""
+    return _finite(value) if isinstance(value, float) else value
+
+
 def mesh_stl(spec: LandmarkSpec) -> bytes:
     """Return a landmark as STL in millimetres, as workshops and printers expect it."""
     mesh = build_mesh(spec, tolerance_m=_MESH_TOLERANCE_M)
@@ -249,11 +254,13 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
     """
     near, far = design.plan.distance_m
     notes = [f"for {Path(design.plan.sensor).stem}, {near:g} … {far:g} m"]
-    facts = json.dumps(summary(design, confirmed), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    table = [{key: _plain(value) for key, value in row.items()} for row in pareto_rows(design)]
+    facts = {**summary(design, confirmed), "pareto": table}
+    text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     contents = [
         landmarks_toml(design).encode(),
         pareto_csv(design).encode(),
-        facts.encode(),
+        text.encode(),
         figure_png(pareto_picture(design)),
         figure_png(bound_picture(design, confirmed)),
     ]
