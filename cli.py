@@ -394,9 +394,10 @@ def _landmark_design(
 def _echo_design(facts: Mapping[str, Any]) -> None:
     """Print a design beside the catalogue."""
 
-    def within(interval: Mapping[str, float], scale: float, digits: int) -> str:
-        value, low, high = (f"{scale * interval[key]:.{digits}f}" for key in ("value", "low", "high"))
-        return f"{value} [{low}, {high}]"
+    def within(interval: Mapping[str, float | None], scale: float, digits: int) -> str:
+        numbers = [interval[key] for key in ("value", "low", "high")]
+        value, low, high = ("" if number is None else f"{scale * number:.{digits}f}" for number in numbers)
+        return f"{value} [{low}, {high}]" if value else "nothing found"
 
     sets = [facts["result"], facts["catalogue"]]
     rows = [
@@ -411,8 +412,8 @@ def _echo_design(facts: Mapping[str, Any]) -> None:
     if confirmation:
         tried = [confirmation["result"], confirmation["catalogue"]]
         for title, key in (("worst side", "worst"), ("anywhere", "anywhere")):
-            label = f"r.m.s. error, {title}, N = {tried[0][key]['n']} (mm)"
-            rows.append((label, *(within(one[key]["rmse_m"], 1000, 1) for one in tried)))
+            found = (f"{within(one[key]['rmse_m'], 1000, 1)}, N = {one[key]['n']}" for one in tried)
+            rows.append((f"r.m.s. error, {title} (mm)", *found))
         rows.append(("r.m.s. error / bound, all sides", *(within(one["rmse_over_bound"], 1, 3) for one in tried)))
         rows.append(("class errors, all sides (%)", *(within(one["class_errors"], 100, 2) for one in tried)))
     _echo_table(("", "new set", "catalogue"), rows)

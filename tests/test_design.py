@@ -85,6 +85,15 @@ def test_the_shipped_plan_is_the_default():
     assert DesignPlan(**tomllib.loads(example_design())) == DesignPlan()
 
 
+def test_the_schema_knows_every_key_of_the_shipped_plan():
+    schema = DesignPlan.model_json_schema()
+    for key, value in tomllib.loads(example_design()).items():
+        part = schema["properties"][key]
+        if isinstance(value, dict):
+            named = schema["$defs"][part["$ref"].split("/")[-1]] if "$ref" in part else part
+            assert set(value) == set(named["properties"])
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

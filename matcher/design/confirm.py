@@ -166,8 +166,11 @@ def confirm(
         return _joined([_shaped(trial, k) for trial in trials])
 
     first = tried("sides", len(sides), lambda _: Views.broadcast(distance, np.repeat(sides, each)))
-    mean_square = np.nanmean(first.error_m**2, axis=1)
-    found = float(sides[int(np.nanargmax(mean_square))])
+    seen = np.isfinite(first.error_m)
+    mean_square = np.square(first.error_m, where=seen, out=np.zeros(seen.shape)).sum(axis=1) / np.maximum(
+        seen.sum(axis=1), 1
+    )
+    found = float(sides[int(mean_square.argmax())])
     worst = tried("worst", 1, lambda _: Views.broadcast(distance, np.full(_FRESH * each, found)))
     anywhere = tried(
         "anywhere",

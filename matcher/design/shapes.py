@@ -86,7 +86,7 @@ def sample_uppers(plan: DesignPlan, room: Room, lattice: Lattice) -> list[Upper]
         elif kind < 0.4:
             uppers[Sphere(radius_m=min(radius, half))] = None
         else:
-            radii = [lattice.metres(_between(lattice, 0.0, most_r, share)) for share in shares]
+            radii = [lattice.metres(_between(lattice, lattice.metres(1), most_r, share)) for share in shares]
             thinnest = lattice.metres(lattice.ceil(_THINNEST_SHARE * max(radii)))
             uppers[profile_of([max(r, thinnest) for r in radii], half)] = None
     return list(uppers)
