@@ -1,9 +1,9 @@
 """Whether the bound keeps its word: simulated noisy frames, matched, for a design and for the catalogue.
 
 Each set is seen at the distance of its worst bound from sides over half a period, the worst one among them; then, with
-fresh frames, from the side that turned out worst; and at random places over the whole range. Frames are captured,
-filtered and matched by maximum likelihood against the set's own bank, so errors are those of the whole program; the
-angle's error is taken modulo the box's symmetry.
+fresh frames, from the side that turned out worst (three are looked at again before it is named); and at random places
+over the whole range. Frames are captured, filtered and matched by maximum likelihood against the set's own bank, so
+errors are those of the whole program; the angle's error is taken modulo the box's symmetry.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from phasemark.matcher.trials import Conditions, noisy_frames
 from phasemark.render import Renderer, Sensor, Views
 
 SIDE_STEP_DEG = 3.75
-_FRESH, _ANYWHERE = 4, 4
+_CONTENDERS, _AGAIN, _FRESH, _ANYWHERE = 3, 4, 12, 4
+"""How many of the worst sides are looked at again, and how many times `n` frames that, the worst and anywhere take."""
 _BANK_STEPS = 150
 _BANK_STEP_M = 0.01
 _FRAMES_AT_ONCE = 200
@@ -84,7 +85,7 @@ class Confirmation:
     sides : Trial
         At the distance of the worst bound; the last of the k sides is that of the worst bound.
     worst : Trial
-        Fresh frames from the one of these sides where the root mean square error was largest; k = 1.
+        Fresh frames from the one of these sides where the root mean square error is largest; k = 1.
     anywhere : Trial
         Random distances over the range, random sides; k = 1.
     """
@@ -129,7 +130,8 @@ def confirm(
     plan : DesignPlan
         Its seed, range and number of frames count.
     n : int
-        Filtered frames at every side, four times as many at the worst one and anywhere; spread evenly over the classes.
+        Filtered frames at every side, twelve times as many at the worst one and four times as many anywhere; spread
+        evenly over the classes.
     purpose : str
         Keeps the random streams of two sets apart.
     workers : int
@@ -166,11 +168,12 @@ def confirm(
         return _joined([_shaped(trial, k) for trial in trials])
 
     first = tried("sides", len(sides), lambda _: Views.broadcast(distance, np.repeat(sides, each)))
-    seen = np.isfinite(first.error_m)
-    mean_square = np.square(first.error_m, where=seen, out=np.zeros(seen.shape)).sum(axis=1) / np.maximum(
-        seen.sum(axis=1), 1
+    contenders = np.argsort(-_mean_square(first.error_m), kind="stable")[:_CONTENDERS]
+    again = tried(
+        "again", _CONTENDERS, lambda _: Views.broadcast(distance, np.repeat(sides[contenders], _AGAIN * each))
     )
-    found = float(sides[int(mean_square.argmax())])
+    pooled = np.concatenate([first.error_m[contenders], again.error_m], axis=1)
+    found = float(sides[contenders[int(_mean_square(pooled).argmax())]])
     worst = tried("worst", 1, lambda _: Views.broadcast(distance, np.full(_FRESH * each, found)))
     anywhere = tried(
         "anywhere",
@@ -180,6 +183,13 @@ def confirm(
         ),
     )
     return Confirmation(first, worst, anywhere)
+
+
+def _mean_square(error: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean square of the finite errors of each side; 0 where nothing was found."""
+    seen = np.isfinite(error)
+    squares = np.where(seen, error, 0.0) ** 2
+    return np.asarray(squares.sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
 
 
 def _matched(
@@ -245,7 +255,7 @@ def confirm_design(
     (Confirmation, Confirmation)
     """
     sets = (("result", design.result), ("catalogue", design.catalogue))
-    step = counter(progress, 3 * sum(len(scored.specs) for _, scored in sets))
+    step = counter(progress, 4 * sum(len(scored.specs) for _, scored in sets))
     new, known = (
         confirm(
             scored,
