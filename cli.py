@@ -43,6 +43,7 @@ phasemark renders, banks and matches what a low-resolution time-of-flight camera
 Start with
   phasemark demo                    the paper's experiment, with a report, in about a minute
   phasemark landmark list           the landmarks of the catalogue
+  phasemark landmark design         landmarks for a camera and a range of your own, with drawings
   phasemark render --class cylinder --distance 1.0 --delta 30 --wall 4 -o frame.png
   phasemark bank build -o bank.h5   a bank of model images to match your frames against
   phasemark match bank.h5 measured.csv --unit m --quantity range
@@ -333,6 +334,98 @@ def _landmark_export(
 
     _, mesh = _load_landmark(name, None, "z", "file", from_catalog=True)
     typer.echo(write_atomically(out, export_mesh(mesh, out.suffix.removeprefix(".")), force=force))
+
+
+@_landmark_app.command("design")
+def _landmark_design(
+    plan_file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[PLAN]", help="A plan (.toml); without it four landmarks for the PMD camera."),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder for landmarks, tables, pictures and drawings.")
+    ] = Path("out/design"),
+    confirm_frames: Annotated[
+        int,
+        typer.Option("--confirm", metavar="N", min=0, help="Simulated frame sets to match from every side; 0: none."),
+    ] = 100,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, max=2**64 - 1, help="Replaces the plan's root of all random numbers.")
+    ] = None,
+    example: Annotated[bool, typer.Option("--example", help="Print the default plan, and do nothing else.")] = False,
+    workers: _Workers = None,
+    as_json: _Json = False,
+    force: _Force = False,
+) -> None:
+    """Design a set of landmarks for a camera and a working range, and confirm what it gains by simulated frames."""
+    from phasemark.matcher.design import (
+        confirm_design,
+        default_design,
+        example_design,
+        load_design_plan,
+        output_names,
+        run_design,
+        summary,
+        write_design,
+    )
+
+    if example:
+        typer.echo(example_design(), nl=False)
+        return
+    plan = default_design() if plan_file is None else load_design_plan(plan_file)
+    if seed is not None:
+        plan = plan.model_copy(update={"seed": seed})
+    _refuse_existing([out / name for name in output_names(plan)], force)
+    _make_folder(out)
+    with _Progress("searching") as progress:
+        design = run_design(plan, workers=workers, progress=progress)
+    confirmed = None
+    if confirm_frames:
+        with _Progress("matching simulated frames") as progress:
+            confirmed = confirm_design(design, confirm_frames, workers=workers, progress=progress)
+    files = write_design(design, confirmed, out, force=force)
+    facts = summary(design, confirmed)
+    if as_json:
+        _echo_json({"files": [str(path) for path in files], **facts})
+        return
+    _echo_design(facts)
+    for path in files:
+        typer.echo(path)
+
+
+def _echo_design(facts: Mapping[str, Any]) -> None:
+    """Print a design beside the catalogue."""
+
+    def within(interval: Mapping[str, float | None], scale: float, digits: int) -> str:
+        numbers = [interval[key] for key in ("value", "low", "high")]
+        value, low, high = ("" if number is None else f"{scale * number:.{digits}f}" for number in numbers)
+        return f"{value} [{low}, {high}]" if value else "nothing found"
+
+    sets = [facts["result"], facts["catalogue"]]
+    rows = [
+        ("box (mm)", *(" × ".join(f"{1000 * side:g}" for side in one["landmarks"][0]["box"].values()) for one in sets)),
+        ("looks the same every", *(f"{360 / one['symmetry']:g}°" for one in sets)),
+        ("worst position bound (mm)", *(f"{1000 * one['worst_position_bound_m']:.1f}" for one in sets)),
+        ("median position bound (mm)", *(f"{1000 * one['median_position_bound_m']:.1f}" for one in sets)),
+        ("least d between classes", *(_number(one["least_class_distance"]) for one in sets)),
+        ("least d from itself turned", *(_number(one["turn_distance"]) for one in sets)),
+    ]
+    confirmation = facts["confirmation"]
+    if confirmation:
+        tried = [confirmation["result"], confirmation["catalogue"]]
+        for title, key in (("worst side", "worst"), ("anywhere", "anywhere")):
+            found = (f"{within(one[key]['rmse_m'], 1000, 1)}, N = {one[key]['n']}" for one in tried)
+            rows.append((f"r.m.s. error, {title} (mm)", *found))
+        rows.append(("r.m.s. error / bound, all sides", *(within(one["rmse_over_bound"], 1, 3) for one in tried)))
+        rows.append(("class errors, all sides (%)", *(within(one["class_errors"], 100, 2) for one in tried)))
+    _echo_table(("", "new set", "catalogue"), rows)
+    typer.echo(f"worst position bound {facts['bound_factor']:.2f} times lower than the catalogue's")
+    if confirmation:
+        typer.echo(f"worst r.m.s. error {within(confirmation['worst_rmse_factor'], 1, 2)} times lower, 95 % interval")
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.1f}"
 
 
 @_landmark_app.command("check")

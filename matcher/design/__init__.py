@@ -1,0 +1,64 @@
+"""Which landmark to build: searched for a camera and a working range, drawn, and confirmed by simulated frames."""
+
+from phasemark.matcher.design.bound import RangeBound, range_bound
+from phasemark.matcher.design.confirm import Confirmation, Trial, confirm, confirm_design, ratio
+from phasemark.matcher.design.drawing import drawing_svg
+from phasemark.matcher.design.output import (
+    landmarks_toml,
+    mesh_stl,
+    output_names,
+    pareto_csv,
+    pareto_rows,
+    summary,
+    write_design,
+)
+from phasemark.matcher.design.picture import bound_picture, pareto_picture
+from phasemark.matcher.design.plan import (
+    DesignPlan,
+    LimitsPlan,
+    SamplingPlan,
+    SearchPlan,
+    default_design,
+    example_design,
+    load_design_plan,
+)
+from phasemark.matcher.design.rules import Check, Room
+from phasemark.matcher.design.run import run_design
+from phasemark.matcher.design.search import Candidate, Design, Scored
+from phasemark.matcher.design.separation import ClassDistances, most_apart, turn_distance
+
+__all__ = [
+    "Candidate",
+    "Check",
+    "ClassDistances",
+    "Confirmation",
+    "Design",
+    "DesignPlan",
+    "LimitsPlan",
+    "RangeBound",
+    "Room",
+    "SamplingPlan",
+    "Scored",
+    "SearchPlan",
+    "Trial",
+    "bound_picture",
+    "confirm",
+    "confirm_design",
+    "default_design",
+    "drawing_svg",
+    "example_design",
+    "landmarks_toml",
+    "load_design_plan",
+    "mesh_stl",
+    "most_apart",
+    "output_names",
+    "pareto_csv",
+    "pareto_picture",
+    "pareto_rows",
+    "range_bound",
+    "ratio",
+    "run_design",
+    "summary",
+    "turn_distance",
+    "write_design",
+]

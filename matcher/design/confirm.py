@@ -1,0 +1,271 @@
+"""Whether the bound keeps its word: simulated noisy frames, matched, for a design and for the catalogue.
+
+Each set is seen at the distance of its worst bound from sides over half a period, the worst one among them; then, with
+fresh frames, from the side that turned out worst (three are looked at again before it is named); and at random places
+over the whole range. Frames are captured, filtered and matched by maximum likelihood against the set's own bank, so
+errors are those of the whole program; the angle's error is taken modulo the box's symmetry.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.data import BankPlan, build_bank, parse_grid
+from phasemark.data.seeds import stream
+from phasemark.landmarks import build_mesh
+from phasemark.matcher.bounds import Estimate, cramer_rao, efficiency, share
+from phasemark.matcher.design.plan import DesignPlan
+from phasemark.matcher.design.search import Design, Progress, Scored, counter
+from phasemark.matcher.matcher import Matcher
+from phasemark.matcher.trials import Conditions, noisy_frames
+from phasemark.render import Renderer, Sensor, Views
+
+SIDE_STEP_DEG = 3.75
+_CONTENDERS, _AGAIN, _FRESH, _ANYWHERE = 3, 4, 12, 4
+"""How many of the worst sides are looked at again, and how many times `n` frames that, the worst and anywhere take."""
+_BANK_STEPS = 150
+_BANK_STEP_M = 0.01
+_FRAMES_AT_ONCE = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """Filtered frames, matched; (k, n) arrays: k sides, n frames from each.
+
+    Parameters
+    ----------
+    distance_m, delta_rad : (k, n) float64
+        The truth.
+    bound_m : (k, n) float64
+        Position bound at the truth, the root of the trace of its covariance.
+    error_m : float64
+        Distance of the lens from where it is; NaN where no landmark was found.
+    class_right : bool
+    """
+
+    distance_m: NDArray[np.float64]
+    delta_rad: NDArray[np.float64]
+    bound_m: NDArray[np.float64]
+    error_m: NDArray[np.float64]
+    class_right: NDArray[np.bool_]
+
+    @property
+    def class_errors(self) -> Estimate:
+        """Share of frames whose class was not found."""
+        return share(int((~self.class_right).sum()), self.class_right.size)
+
+    @property
+    def missed(self) -> Estimate:
+        """Share of frames in which no landmark was found; they have no position error."""
+        return share(int(np.isnan(self.error_m).sum()), self.error_m.size)
+
+    @property
+    def efficiency(self) -> Estimate:
+        """√mean(error² / bound²), 1 at the bound."""
+        found = np.isfinite(self.error_m)
+        return efficiency(self.error_m[found], self.bound_m[found])
+
+    def rmse(self, k: int) -> Estimate:
+        """Return the root mean square error at one place, metres."""
+        return root_mean_square(self.error_m[k])
+
+
+@dataclass(frozen=True, eq=False)
+class Confirmation:
+    """What a set of landmarks gave.
+
+    Parameters
+    ----------
+    sides : Trial
+        At the distance of the worst bound; the last of the k sides is that of the worst bound.
+    worst : Trial
+        Fresh frames from the one of these sides where the root mean square error is largest; k = 1.
+    anywhere : Trial
+        Random distances over the range, random sides; k = 1.
+    """
+
+    sides: Trial
+    worst: Trial
+    anywhere: Trial
+
+
+def root_mean_square(error: NDArray[np.float64]) -> Estimate:
+    """Return √mean(e²) of the finite errors with its 95 % interval."""
+    found = error[np.isfinite(error)]
+    return efficiency(found, np.ones(len(found))) if len(found) > 1 else Estimate(math.nan, 0.0, math.inf)
+
+
+def ratio(above: Estimate, below: Estimate) -> Estimate:
+    """Return a quotient of independent positive numbers with its 95 % interval, from their relative errors."""
+
+    def relative(one: Estimate) -> float:
+        return (one.high - one.low) / (2 * one.value)
+
+    value, spread = above.value / below.value, math.hypot(relative(above), relative(below))
+    return Estimate(value, value * math.exp(-spread), value * math.exp(spread))
+
+
+def confirm(
+    scored: Scored,
+    sensor: Sensor,
+    plan: DesignPlan,
+    n: int,
+    *,
+    purpose: str,
+    workers: int = 1,
+    progress: Callable[[], None] = lambda: None,
+) -> Confirmation:
+    """Match simulated frames of a set of landmarks.
+
+    Parameters
+    ----------
+    scored : Scored
+    sensor : Sensor
+    plan : DesignPlan
+        Its seed, range and number of frames count.
+    n : int
+        Filtered frames at every side, twelve times as many at the worst one and four times as many anywhere; spread
+        evenly over the classes.
+    purpose : str
+        Keeps the random streams of two sets apart.
+    workers : int
+        Threads.
+    progress : callable
+        Called after each class of each part.
+
+    Returns
+    -------
+    Confirmation
+    """
+    near, far = plan.distance_m
+    step = max(_BANK_STEP_M, (far - near) / _BANK_STEPS)
+    bank_plan = BankPlan(
+        landmarks=scored.specs,
+        sensor=plan.sensor,
+        sensor_overrides=plan.sensor_overrides,
+        distance_m=tuple(parse_grid(f"{0.9 * near:.4f}:{1.1 * far:.4f}:{step:.4f}", "distance_m").tolist()),
+    )
+    matcher = Matcher(build_bank(bank_plan, workers=workers), method="refine", workers=workers)
+    period = scored.specs[0].delta_period_rad
+    distance, side = scored.bound.worst_view
+    steps = round(math.degrees(period / 2) / SIDE_STEP_DEG)
+    sides = np.append(np.linspace(0.0, period / 2, steps + 1), side)
+    each = max(1, math.ceil(n / len(scored.specs)))
+    renderers = {s.name: Renderer(build_mesh(s), sensor, albedo=s.albedo) for s in scored.specs}
+
+    def tried(part: str, k: int, views: Callable[[np.random.Generator], Views]) -> Trial:
+        trials = []
+        for index, (name, renderer) in enumerate(renderers.items()):
+            places, frames = (stream(plan.seed, f"{purpose} {part} {what}", index) for what in ("places", "frames"))
+            trials.append(_matched(matcher, renderer, name, views(places), plan, period, frames, workers))
+            progress()
+        return _joined([_shaped(trial, k) for trial in trials])
+
+    first = tried("sides", len(sides), lambda _: Views.broadcast(distance, np.repeat(sides, each)))
+    contenders = np.argsort(-_mean_square(first.error_m), kind="stable")[:_CONTENDERS]
+    again = tried(
+        "again", _CONTENDERS, lambda _: Views.broadcast(distance, np.repeat(sides[contenders], _AGAIN * each))
+    )
+    pooled = np.concatenate([first.error_m[contenders], again.error_m], axis=1)
+    found = float(sides[contenders[int(_mean_square(pooled).argmax())]])
+    worst = tried("worst", 1, lambda _: Views.broadcast(distance, np.full(_FRESH * each, found)))
+    anywhere = tried(
+        "anywhere",
+        1,
+        lambda rng: Views.broadcast(
+            rng.uniform(near, far, _ANYWHERE * each), rng.uniform(0.0, period, _ANYWHERE * each)
+        ),
+    )
+    return Confirmation(first, worst, anywhere)
+
+
+def _mean_square(error: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean square of the finite errors of each side; 0 where nothing was found."""
+    seen = np.isfinite(error)
+    squares = np.where(seen, error, 0.0) ** 2
+    return np.asarray(squares.sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
+
+
+def _matched(
+    matcher: Matcher,
+    renderer: Renderer,
+    name: str,
+    views: Views,
+    plan: DesignPlan,
+    period: float,
+    rng: np.random.Generator,
+    workers: int,
+) -> Trial:
+    conditions = Conditions(n_frames=plan.n_frames)
+    error, right = np.empty(len(views)), np.empty(len(views), np.bool_)
+    for start in range(0, len(views), _FRAMES_AT_ONCE):
+        part = slice(start, min(start + _FRAMES_AT_ONCE, len(views)))
+        some = views[part]
+        matches = matcher.match(noisy_frames(renderer, renderer.sensor, some, conditions, rng, workers=workers))
+        turn = matches.delta_rad - some.delta_rad
+        turn = turn - period * np.round(turn / period)
+        # the lens from where it is: D and D' at an angle of the error in δ
+        across = 2 * np.sqrt(matches.distance_m * some.distance_m) * np.sin(turn / 2)
+        error[part] = np.hypot(matches.distance_m - some.distance_m, across)
+        right[part] = matches.class_name == name
+    covariance = cramer_rao(renderer, views, n_frames=plan.n_frames, pixels="lower", workers=workers).covariance
+    bound = np.sqrt(covariance[:, 0, 0] + views.distance_m**2 * covariance[:, 1, 1])
+    return Trial(views.distance_m, views.delta_rad, bound, error, right)
+
+
+def _shaped(trial: Trial, k: int) -> Trial:
+    """Put the frames of a side into one row."""
+    return Trial(
+        trial.distance_m.reshape(k, -1),
+        trial.delta_rad.reshape(k, -1),
+        trial.bound_m.reshape(k, -1),
+        trial.error_m.reshape(k, -1),
+        trial.class_right.reshape(k, -1),
+    )
+
+
+def _joined(trials: list[Trial]) -> Trial:
+    """Put the classes side by side."""
+    names = ("distance_m", "delta_rad", "bound_m", "error_m", "class_right")
+    return Trial(*(np.concatenate([getattr(trial, name) for trial in trials], axis=1) for name in names))
+
+
+def confirm_design(
+    design: Design, n: int, *, workers: int | None = None, progress: Progress | None = None
+) -> tuple[Confirmation, Confirmation]:
+    """Match simulated frames of a design and of the catalogue.
+
+    Parameters
+    ----------
+    design : Design
+    n : int
+        Filtered frames at every side.
+    workers : int, optional
+        Threads; None: one for each processor.
+    progress : callable (done, total), optional
+
+    Returns
+    -------
+    (Confirmation, Confirmation)
+    """
+    sets = (("result", design.result), ("catalogue", design.catalogue))
+    step = counter(progress, 4 * sum(len(scored.specs) for _, scored in sets))
+    new, known = (
+        confirm(
+            scored,
+            design.search.sensor,
+            design.plan,
+            n,
+            purpose=f"design {name}",
+            workers=workers or os.cpu_count() or 1,
+            progress=step,
+        )
+        for name, scored in sets
+    )
+    return new, known

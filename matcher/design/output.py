@@ -1,0 +1,272 @@
+"""What a design leaves behind: landmarks other commands take, tables, pictures, meshes and drawings."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import trimesh
+
+from phasemark.data import write_atomically
+from phasemark.data.page import figure_png
+from phasemark.landmarks import LandmarkSpec, build_mesh, export_mesh
+from phasemark.matcher.bounds import Estimate, confusion_probability
+from phasemark.matcher.design.bound import RangeBound
+from phasemark.matcher.design.confirm import Confirmation, ratio
+from phasemark.matcher.design.drawing import drawing_svg
+from phasemark.matcher.design.picture import bound_picture, pareto_picture
+from phasemark.matcher.design.plan import DesignPlan
+from phasemark.matcher.design.search import Design, Scored
+
+Confirmed = tuple[Confirmation, Confirmation]
+"""Of the result and of the catalogue."""
+
+_MESH_TOLERANCE_M = 1e-5
+
+
+def output_names(plan: DesignPlan) -> list[str]:
+    """Return the files that :func:`write_design` writes."""
+    marks = [f"mark-{k + 1}.{suffix}" for k in range(plan.n_classes) for suffix in ("stl", "svg")]
+    return ["landmarks.toml", "pareto.csv", "design.json", "pareto.png", "bound.png", *marks]
+
+
+def landmarks_toml(design: Design) -> str:
+    """Return the set as the plan of a bank: ``phasemark bank build landmarks.toml`` takes it."""
+    lines = ["# Landmarks found by `phasemark landmark design`; the plan of a bank of them.", ""]
+    plan = design.plan
+    lines.append(f"sensor = {json.dumps(_sensor_reference(plan))}")
+    lines += [f"distance_m = {json.dumps(f'{0.9 * plan.distance_m[0]:.3g}:{1.1 * plan.distance_m[1]:.3g}:0.01')}", ""]
+    overrides = _sensor_overrides(design)
+    if overrides:
+        lines += ["[sensor_overrides]", *(f"{key} = {json.dumps(value)}" for key, value in overrides.items()), ""]
+    for spec in design.result.specs:
+        table = spec.model_dump(mode="json", exclude_none=True)
+        lines += ["[[landmarks]]", f"name = {json.dumps(spec.name)}", f"albedo = {spec.albedo!r}"]
+        for part in ("box", "upper"):
+            lines += [f"[landmarks.{part}]", *(f"{key} = {json.dumps(value)}" for key, value in table[part].items())]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _sensor_reference(plan: DesignPlan) -> str:
+    return "pmd-16x16" if plan.sensor.endswith(".toml") or "/" in plan.sensor else plan.sensor
+
+
+def _sensor_overrides(design: Design) -> Mapping[str, Any]:
+    """Return what the sensor's name does not say: everything, if it is a file that may move."""
+    plan = design.plan
+    if _sensor_reference(plan) == plan.sensor:
+        return plan.sensor_overrides
+    return design.search.sensor.model_dump(mode="json", exclude_none=True)
+
+
+def pareto_rows(design: Design) -> list[dict[str, Any]]:
+    """Return one row a box: dimensions, bounds, distances, the rules it breaks; best first, the catalogue last."""
+    front = set(map(id, design.front()))
+    rows = []
+    for candidate in sorted(design.candidates, key=lambda c: (not c.feasible, c.bound.worst_m)):
+        rows.append(
+            {
+                "box": "chosen" if candidate is design.chosen else "refined" if candidate.refined else "tried",
+                **_box_row(candidate.box.model_dump(), candidate.symmetry, candidate.bound),
+                "class_distance": candidate.class_distance,
+                "turn_distance": candidate.turn_distance,
+                "on_front": id(candidate) in front,
+                "broken_rules": "; ".join(check.rule for check in candidate.checks if not check.passes),
+            }
+        )
+    known = design.catalogue
+    broken = dict.fromkeys(c.rule for checks in known.checks.values() for c in checks if not c.passes)
+    rows.append(
+        {
+            "box": "catalogue",
+            **_box_row(known.specs[0].box.model_dump(), known.symmetry, design.search.bound(known.specs[0].box)),
+            "class_distance": known.class_distance,
+            "turn_distance": known.turn_distance,
+            "on_front": False,
+            "broken_rules": "; ".join(broken),
+        }
+    )
+    return rows
+
+
+def _box_row(box: Mapping[str, float], symmetry: int, bound: RangeBound) -> dict[str, Any]:
+    return {**box, "symmetry": symmetry, **_bound_facts(bound)}
+
+
+def _bound_facts(bound: RangeBound) -> dict[str, float]:
+    return {
+        "worst_position_bound_m": bound.worst_m,
+        "median_position_bound_m": bound.median_m,
+        "worst_distance_bound_m": float(bound.distance_std_m.max()),
+        "worst_delta_bound_deg": math.degrees(float(bound.delta_std_rad.max())),
+        "at_distance_m": bound.worst_view[0],
+        "at_delta_deg": math.degrees(bound.worst_view[1]),
+    }
+
+
+def pareto_csv(design: Design) -> str:
+    """Return :func:`pareto_rows` as a table; what is infinite is left empty."""
+    rows = pareto_rows(design)
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
+    return buffer.getvalue()
+
+
+def _cell(value: object) -> object:
+    if isinstance(value, bool):
+        return int(value)
+    if isinstance(value, float):
+        return f"{value:.9g}" if math.isfinite(value) else ""
+    return value
+
+
+def summary(design: Design, confirmed: Confirmed | None) -> dict[str, Any]:
+    """Return the figures of a design as plain numbers, for JSON; None where there is nothing to tell."""
+    facts: dict[str, Any] = {
+        "bound": "Cramér–Rao, lower pixels, ranges, (D, δ) free, no background; the root of the trace of the position's"
+        " covariance",
+        "bound_factor": design.factor,
+        "result": _scored_facts(design.result),
+        "catalogue": _scored_facts(design.catalogue),
+        "confirmation": None,
+        "plan": design.plan.model_dump(mode="json"),
+    }
+    if confirmed is not None:
+        new, known = confirmed
+        facts["confirmation"] = {
+            "frames_averaged": design.plan.n_frames,
+            "result": _confirmation_facts(new),
+            "catalogue": _confirmation_facts(known),
+            "worst_rmse_factor": _interval(ratio(known.worst.rmse(0), new.worst.rmse(0))),
+            "rmse_factor_at_the_worst_bounds": _interval(ratio(known.sides.rmse(-1), new.sides.rmse(-1))),
+        }
+    return facts
+
+
+def _scored_facts(scored: Scored) -> dict[str, Any]:
+    rows = scored.class_distances
+    names = [spec.name for spec in scored.specs]
+    return {
+        "landmarks": [spec.model_dump(mode="json") for spec in scored.specs],
+        "symmetry": scored.symmetry,
+        **_bound_facts(scored.bound),
+        "least_class_distance": _finite(scored.class_distance),
+        "class_distances": {a: {b: _finite(rows[i, j]) for j, b in enumerate(names)} for i, a in enumerate(names)},
+        "confusion_bound": {
+            a: float(confusion_probability([rows[i, j] ** 2 for j in range(len(names)) if j != i]))
+            for i, a in enumerate(names)
+        },
+        "turn_distance": _finite(scored.turn_distance),
+        "rules": {
+            name: [
+                {
+                    "rule": check.rule,
+                    "value": _finite(check.value),
+                    "at_most" if check.at_most else "at_least": check.limit,
+                    "unit": check.unit,
+                    "kept": check.passes,
+                }
+                for check in checks
+            ]
+            for name, checks in scored.checks.items()
+        },
+    }
+
+
+def _confirmation_facts(confirmation: Confirmation) -> dict[str, Any]:
+    sides, worst, anywhere = confirmation.sides, confirmation.worst, confirmation.anywhere
+    return {
+        "distance_m": float(sides.distance_m[0, 0]),
+        "sides": [
+            {
+                "delta_deg": math.degrees(float(sides.delta_rad[k, 0])),
+                "bound_m": float(sides.bound_m[k, 0]),
+                "rmse_m": _interval(sides.rmse(k)),
+            }
+            for k in range(len(sides.error_m))
+        ],
+        "n_per_side": sides.error_m.shape[1],
+        "worst": {
+            "delta_deg": math.degrees(float(worst.delta_rad[0, 0])),
+            "n": worst.error_m.size,
+            "bound_m": float(worst.bound_m[0, 0]),
+            "rmse_m": _interval(worst.rmse(0)),
+        },
+        "anywhere": {
+            "n": anywhere.error_m.size,
+            "rmse_m": _interval(anywhere.rmse(0)),
+            "rmse_over_bound": _interval(anywhere.efficiency),
+            "class_errors": _interval(anywhere.class_errors),
+        },
+        "rmse_over_bound": _interval(sides.efficiency),
+        "class_errors": _interval(sides.class_errors),
+        "missed": _interval(sides.missed),
+    }
+
+
+def _interval(estimate: Estimate) -> dict[str, float | None]:
+    return {"value": _finite(estimate.value), "low": _finite(estimate.low), "high": _finite(estimate.high)}
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _plain(value: object) -> object:
+    """Return None for a number that JSON does not have."""
+    return _finite(value) if isinstance(value, float) else value
+
+
+def mesh_stl(spec: LandmarkSpec) -> bytes:
+    """Return a landmark as STL in millimetres, as workshops and printers expect it."""
+    mesh = build_mesh(spec, tolerance_m=_MESH_TOLERANCE_M)
+    return export_mesh(trimesh.Trimesh(mesh.vertices * 1000, mesh.faces, process=False), "stl")
+
+
+def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, force: bool = False) -> list[Path]:
+    """Write :func:`output_names` into a folder that exists.
+
+    Parameters
+    ----------
+    design : Design
+    confirmed : (Confirmation, Confirmation), optional
+        Of the result and of the catalogue.
+    folder : Path
+    force : bool
+        Whether existing files may be replaced.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    OutputExistsError, StorageError
+        A file cannot be written.
+    """
+    near, far = design.plan.distance_m
+    notes = [f"for {Path(design.plan.sensor).stem}, {near:g} … {far:g} m"]
+    table = [{key: _plain(value) for key, value in row.items()} for row in pareto_rows(design)]
+    facts = {**summary(design, confirmed), "pareto": table}
+    text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    contents = [
+        landmarks_toml(design).encode(),
+        pareto_csv(design).encode(),
+        text.encode(),
+        figure_png(pareto_picture(design)),
+        figure_png(bound_picture(design, confirmed)),
+    ]
+    for spec in design.result.specs:
+        contents += [mesh_stl(spec), drawing_svg(spec, notes).encode()]
+    names = output_names(design.plan)
+    return [
+        write_atomically(folder / name, content, force=force) for name, content in zip(names, contents, strict=True)
+    ]

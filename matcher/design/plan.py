@@ -1,0 +1,221 @@
+"""What a landmark is designed for: camera, working range, limits and effort, as a TOML file or in code."""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from phasemark import UsageError
+from phasemark.data import BankPlan
+from phasemark.data.plan import PlanModel, factored_refusal, read_toml
+from phasemark.render import Sensor
+
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_AtLeastZero = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class LimitsPlan(PlanModel):
+    """What every landmark has to keep.
+
+    Parameters
+    ----------
+    extents_m : (x, y, z)
+        Largest extents of the whole landmark.
+    fit : {"axis", "whole"}
+        How "fits the view at the near end" is measured: in the plane of the landmark's axis, the field of view that
+        PHYSICS section 5 quotes; or for every point, nearest corners included.
+    least_lower_px, least_upper_px : int
+        Pixels at the far end that one frame measures to 0.1 rad, on the box and on the part above it.
+    least_box_edge_px, least_upper_edge_px : float
+        Narrowest side of the box, and width and height of the part above it, in pixels at the far end.
+    most_phase_std_rad : float
+        Phase noise of one frame at the far end on a surface that slants by 60°.
+    least_class_distance : float
+        Least noncentrality d between two classes over the range.
+    least_turn_distance : float
+        Least noncentrality d between a box that is not square and itself a quarter-turn on.
+    """
+
+    extents_m: tuple[_Positive, _Positive, _Positive] = (0.30, 0.30, 0.30)
+    fit: Literal["axis", "whole"] = "axis"
+    least_lower_px: Annotated[int, Field(ge=1)] = 9
+    least_upper_px: Annotated[int, Field(ge=1)] = 4
+    least_box_edge_px: _Positive = 2.0
+    least_upper_edge_px: _Positive = 1.0
+    most_phase_std_rad: _Positive = 0.1
+    least_class_distance: _AtLeastZero = 6.0
+    least_turn_distance: _AtLeastZero = 6.0
+
+
+class SamplingPlan(PlanModel):
+    """Where bounds are taken.
+
+    Parameters
+    ----------
+    distances : int
+        Evenly over the working range, both ends included.
+    delta_step_deg : float
+        Step in δ, over half of the box's period: the other half is its mirror image.
+    """
+
+    distances: Annotated[int, Field(ge=2, le=200)] = 7
+    delta_step_deg: Annotated[float, Field(gt=0, le=15)] = 2.0
+
+
+class SearchPlan(PlanModel):
+    """How hard to look.
+
+    Parameters
+    ----------
+    boxes, uppers : int
+        Boxes, and parts above them, that are tried before the best are refined.
+    step_mm : float
+        Dimensions are multiples of this.
+    """
+
+    boxes: Annotated[int, Field(ge=8, le=10_000)] = 128
+    uppers: Annotated[int, Field(ge=8, le=2_000)] = 160
+    step_mm: Annotated[float, Field(gt=0, le=50)] = 1.0
+
+
+class DesignPlan(PlanModel):
+    """A set of landmarks to be designed (section 4.1 of the paper).
+
+    Parameters
+    ----------
+    sensor : str
+        A preset's name, or a sensor file (with a ``/`` or ending in ``.toml``).
+    sensor_overrides : mapping
+        Fields of the sensor that replace those of `sensor`.
+    distance_m : (near, far)
+        Working range.
+    n_classes : int
+        How many landmarks that are told apart.
+    n_frames : int
+        Frames averaged for one measurement.
+    albedo : float
+    symmetry : {"any", 2, 4}
+        From how many sides the box may look the same; 4 is a square box.
+    seed : int
+        Root of all random numbers.
+    limits : LimitsPlan
+    sampling : SamplingPlan
+    search : SearchPlan
+
+    Raises
+    ------
+    UsageError
+        With one line that names the key, its value and what would be right.
+
+    Examples
+    --------
+    >>> DesignPlan(n_classes=2).distance_m
+    (0.8, 2.0)
+    """
+
+    sensor: str = "pmd-16x16"
+    sensor_overrides: dict[str, Any] = Field(default_factory=dict)
+    distance_m: tuple[_Positive, _Positive] = (0.8, 2.0)
+    n_classes: Annotated[int, Field(ge=1, le=12)] = 4
+    n_frames: Annotated[int, Field(ge=1, le=10_000)] = 50
+    albedo: Annotated[float, Field(gt=0, le=1)] = 0.8
+    symmetry: Literal["any", 2, 4] = "any"
+    seed: Annotated[int, Field(ge=0, lt=2**64)] = 2005
+    limits: LimitsPlan = LimitsPlan()
+    sampling: SamplingPlan = SamplingPlan()
+    search: SearchPlan = SearchPlan()
+
+    @model_validator(mode="after")
+    def _lengths_are_plausible(self) -> Self:
+        near, far = self.distance_m
+        if near >= far:
+            raise UsageError(f"'distance_m' must be (near, far), got {self.distance_m}")
+        if max(self.limits.extents_m) > far:
+            shown = " × ".join(f"{value:g}" for value in self.limits.extents_m)
+            as_mm = " × ".join(f"{value / 1000:g}" for value in self.limits.extents_m)
+            raise UsageError(
+                f"'limits.extents_m' must not exceed the far end of 'distance_m', {far:g} m, got {shown} m;"
+                f" if that was in millimetres, write {as_mm}"
+            )
+        if self.search.step_mm > 50 * min(self.limits.extents_m):
+            raise UsageError(
+                f"'search.step_mm' must be at most a twentieth of the least extent,"
+                f" {50 * min(self.limits.extents_m):g} mm, got {self.search.step_mm:g}"
+            )
+        return self
+
+    def build_sensor(self) -> Sensor:
+        """Return the sensor, overrides applied.
+
+        Raises
+        ------
+        UsageError
+            The sensor is unknown, a field is wrong, or its image does not split into lower and upper pixels.
+        InputFileError
+            The sensor file cannot be read.
+        """
+        bank = BankPlan(classes=("cylinder",), sensor=self.sensor, sensor_overrides=self.sensor_overrides).resolve()
+        sensor = bank.build_sensor()
+        if sensor.kind == "direct":
+            raise UsageError(f"'sensor' must measure phases, got '{self.sensor}', a direct time-of-flight device")
+        reason = factored_refusal(bank)
+        if reason is not None:
+            raise UsageError(f"'sensor' must show the box on its lower and the upper part on its upper rows: {reason}")
+        return sensor
+
+    @property
+    def sampled_distance_m(self) -> NDArray[np.float64]:
+        """Distances at which bounds are taken."""
+        return np.linspace(*self.distance_m, self.sampling.distances)
+
+    def sampled_delta_rad(self, symmetry: int) -> NDArray[np.float64]:
+        """Sides at which bounds are taken, half a period of a box."""
+        half = math.pi / symmetry
+        return np.linspace(0.0, half, math.ceil(math.degrees(half) / self.sampling.delta_step_deg - 1e-9) + 1)
+
+
+def load_design_plan(path: str | os.PathLike[str]) -> DesignPlan:
+    """Read the plan of a design from a TOML file; a sensor file it names is relative to its folder.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    DesignPlan
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read or is not TOML.
+    UsageError
+        With one line that names the file, the key, the value and what would be right.
+    """
+    path = Path(path)
+    table = read_toml(path)
+    sensor = table.get("sensor")
+    if isinstance(sensor, str) and (sensor.endswith(".toml") or "/" in sensor):
+        table["sensor"] = str(path.parent / sensor)
+    try:
+        return DesignPlan(**table)
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
+
+
+def example_design() -> str:
+    """Return the text of the shipped plan."""
+    return (files("phasemark.matcher") / "plans" / "design.toml").read_text(encoding="utf-8")
+
+
+def default_design() -> DesignPlan:
+    """Return the shipped plan."""
+    return DesignPlan(**tomllib.loads(example_design()))

@@ -1,0 +1,245 @@
+"""How far landmarks look apart: noncentralities between classes, and between a box and itself turned.
+
+The noncentrality d is the whitened distance between two noise-free frames, over everything that could make one imitate
+the other (PHYSICS section 7): two classes are confused with probability Q(d/2), see
+:func:`~phasemark.matcher.bounds.confusion_probability`. Pixels where one returns and the other cannot, or must and does
+not, count with the matcher's own penalty.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.landmarks import Box, LandmarkSpec, build_mesh
+from phasemark.landmarks.spec import Upper
+from phasemark.matcher.coarse import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE
+from phasemark.matcher.design.bound import SEARCH_TOLERANCE_M, box_alone
+from phasemark.matcher.design.plan import DesignPlan
+from phasemark.matcher.likelihood import counts
+from phasemark.render import Renderer, Sensor, Views, phasor_to_range_m, predicted_range_std, wrap_difference_m
+
+_STEP_M = 1e-4
+_TURN_BIAS_RAD = np.radians(np.arange(-30.0, 31.0, 6.0))
+_TURN_SHIFT_M = np.arange(-0.06, 0.061, 0.015)
+_TURN_SIDES = 7
+_GAUSS_NEWTON_STEPS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Appearance:
+    """Noise-free images as the matcher weighs them; (n, pixels) arrays.
+
+    Parameters
+    ----------
+    range_m : float64
+    weight : float64
+        1/σ² of the filtered range, m⁻²; 0 where one frame does not measure it to 0.1 rad.
+    slope : (n, p, pixels) float64
+        Of the range by the parameters that may differ.
+    coverage : float64
+    sensor : Sensor
+    """
+
+    range_m: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    coverage: NDArray[np.float64]
+    sensor: Sensor
+
+    @classmethod
+    def of(
+        cls, renderer: Renderer, views: Views, parameters: Sequence[str], rows: tuple[int, int], n_frames: int
+    ) -> Appearance:
+        """Render some rows of views."""
+        sensor = renderer.sensor
+        n = len(views)
+
+        def phasors(moved: Views) -> NDArray[np.complex128]:
+            return renderer.render_views(moved, rows=rows).phasor.reshape(n, -1)
+
+        image = renderer.render_views(views, rows=rows)
+        s = image.phasor.reshape(n, -1)
+        seen = counts(s, image.intensity.reshape(n, -1), sensor) & (s != 0)
+        std = predicted_range_std(np.abs(s), image.intensity.reshape(n, -1), sensor)
+        slopes = []
+        for name in parameters:
+            columns = {key: getattr(views, key) for key in ("distance_m", "delta_rad", "bearing_rad", "height_m")}
+            ends = [phasors(Views(**{**columns, name: columns[name] + side * _STEP_M})) for side in (1, -1)]
+            turn = (ends[0] - ends[1]) / (2 * _STEP_M)
+            power = np.where(s != 0, np.abs(s) ** 2, 1.0)
+            slopes.append(sensor.metres_per_radian * (s.conj() * turn).imag / power)
+        return cls(
+            np.where(s != 0, phasor_to_range_m(np.where(s != 0, s, 1.0), sensor), 0.0),
+            np.divide(n_frames, std**2, out=np.zeros(std.shape), where=seen),
+            np.stack(slopes, axis=1) if slopes else np.zeros((n, 0, s.shape[1])),
+            image.coverage.reshape(n, -1),
+            sensor,
+        )
+
+    def imitated_by(self, other: Appearance) -> tuple[NDArray[np.float64], ...]:
+        """Compare with images of another landmark; shapes broadcast over the views.
+
+        Returns
+        -------
+        cost, gradient, information
+            Whitened squared distance with penalties, (n,); Jᵀ W r (n, p) and Jᵀ W J (n, p, p) by the other's
+            parameters.
+        """
+        returned = self.weight > 0
+        may, must = other.coverage >= MAY_RETURN_COVERAGE, other.coverage > MUST_RETURN_COVERAGE
+        weight = np.where(may, self.weight, 0.0)
+        residual = wrap_difference_m(self.range_m - other.range_m, self.sensor)
+        penalty = DISAGREEMENT * ((returned & ~may) | (~returned & must)).sum(axis=-1)
+        cost = (weight * residual**2).sum(axis=-1) + penalty
+        weighted = weight[..., None, :] * other.slope
+        gradient = (weighted * residual[..., None, :]).sum(axis=-1)
+        return cost, gradient, weighted @ np.swapaxes(other.slope, -1, -2)
+
+
+def upper_appearance(upper: Upper, sensor: Sensor, plan: DesignPlan) -> Appearance:
+    """Return what the upper rows see of a part at the sampled distances; its slope is by D."""
+    side = 2 * max(plan.limits.extents_m)
+    stand = Box(length_m=side, width_m=side, height_m=side)  # below the upper rows: not built, not seen
+    spec = LandmarkSpec(name="upper", box=stand, upper=upper, albedo=plan.albedo)
+    mesh = build_mesh(spec, part="upper", tolerance_m=SEARCH_TOLERANCE_M)
+    renderer = Renderer(mesh, sensor, albedo=plan.albedo)
+    views = Views.broadcast(plan.sampled_distance_m)
+    return Appearance.of(renderer, views, ("distance_m",), (0, sensor.rows // 2), plan.n_frames)
+
+
+@dataclass(frozen=True, eq=False)
+class ClassDistances:
+    """Squared noncentralities between upper parts, before it is known what the box says of D; (m, m, n) arrays.
+
+    With the information I about D from the lower pixels, the view that imitates best is shifted by ε = g / (I + h), and
+    d² = c − g² / (I + h).
+
+    Parameters
+    ----------
+    cost, gradient, information : (m, m, n) float64
+        c, g and h of frames of the first as the second, at n distances.
+    """
+
+    cost: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    information: NDArray[np.float64]
+
+    @classmethod
+    def between(cls, seen: Sequence[Appearance]) -> ClassDistances:
+        """Compare all parts with one another."""
+        if not seen:
+            return cls(*(np.zeros((0, 0, 0)) for _ in range(3)))
+        rows = [cls.row(one, seen) for one in seen]
+        return cls(*(np.stack(parts) for parts in zip(*rows, strict=True)))
+
+    @staticmethod
+    def row(one: Appearance, others: Sequence[Appearance]) -> tuple[NDArray[np.float64], ...]:
+        """Compare frames of one part with images of others, (m, n) each."""
+        other = Appearance(
+            range_m=np.stack([o.range_m for o in others]),
+            weight=np.stack([o.weight for o in others]),
+            slope=np.stack([o.slope for o in others]),
+            coverage=np.stack([o.coverage for o in others]),
+            sensor=one.sensor,
+        )
+        cost, gradient, information = one.imitated_by(other)
+        return cost, gradient[..., 0], information[..., 0, 0]
+
+    def least(self, distance_information: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return d at the worst distance and in the worse direction, (m, m), infinite on the diagonal.
+
+        Parameters
+        ----------
+        distance_information : (n,) float64
+            I, m⁻².
+        """
+        squared = (self.cost - self.gradient**2 / (distance_information + self.information)).min(axis=-1)
+        squared = np.minimum(squared, squared.T)
+        np.fill_diagonal(squared, np.inf)
+        return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
+
+
+def most_apart(distance: NDArray[np.float64], n: int) -> NDArray[np.int64]:
+    """Choose n items whose least mutual distance is large: the best pair, the farthest next, then exchanges.
+
+    Parameters
+    ----------
+    distance : (m, m) float64
+        Symmetric, infinite on the diagonal.
+    n : int
+
+    Returns
+    -------
+    (n,) int64
+        Ascending; fewer if there are fewer.
+    """
+    m = len(distance)
+    if m <= n:
+        return np.arange(m)
+    finite = np.where(np.isfinite(distance), distance, -np.inf)
+    chosen = sorted(int(k) for k in np.unravel_index(int(finite.argmax()), finite.shape))[:n]
+    while len(chosen) < n:
+        nearest = distance[:, chosen].min(axis=1)
+        nearest[chosen] = -np.inf
+        chosen.append(int(nearest.argmax()))
+    best = _least_mutual(distance, chosen)
+    improved = True
+    while improved:
+        improved = False
+        for k in range(n):
+            others = chosen[:k] + chosen[k + 1 :]
+            nearest = distance[:, others].min(axis=1) if others else np.full(m, np.inf)
+            nearest[others] = -np.inf
+            value = min(float(nearest.max()), _least_mutual(distance, others))
+            if value > best * (1 + 1e-12):
+                chosen[k], best, improved = int(nearest.argmax()), value, True
+    return np.array(sorted(chosen), np.int64)
+
+
+def _least_mutual(distance: NDArray[np.float64], chosen: Sequence[int]) -> float:
+    return float(distance[np.ix_(chosen, chosen)].min()) if len(chosen) > 1 else math.inf
+
+
+def turn_distance(box: Box, sensor: Sensor, plan: DesignPlan) -> float:
+    """Return d between a box at the far end and itself about a quarter-turn on, at the worst of some sides.
+
+    The imitation is sought over distance and side: on a grid, then by Gauss–Newton. Ranges alone cannot tell a narrow
+    face from a wide one that is a little farther on, as long as both reach into the same pixels. Infinite for a square
+    box, which has no other side to be taken for.
+    """
+    if box.length_m == box.width_m:
+        return math.inf
+    renderer = Renderer(build_mesh(box_alone(box, plan)), sensor, albedo=plan.albedo)
+    rows = (sensor.rows // 2, sensor.rows)
+    far = plan.distance_m[1]
+    sides = np.linspace(0.0, math.pi / 2, _TURN_SIDES)
+    truth = Appearance.of(renderer, Views.broadcast(far, sides), (), rows, plan.n_frames)
+    shift, turn = (grid.ravel() for grid in np.meshgrid(_TURN_SHIFT_M, _TURN_BIAS_RAD, indexing="ij"))
+    place = np.empty((_TURN_SIDES, 2))
+    for k, side in enumerate(sides):
+        views = Views.broadcast(far + shift, side + math.pi / 2 + turn)
+        others = Appearance.of(renderer, views, (), rows, plan.n_frames)
+        best = int(_one(truth, k).imitated_by(others)[0].argmin())
+        place[k] = views.distance_m[best], views.delta_rad[best]
+    turned = sides + math.pi / 2
+    bounds = [np.c_[np.full(_TURN_SIDES, far + _TURN_SHIFT_M[end]), turned + _TURN_BIAS_RAD[end]] for end in (0, -1)]
+    least = np.full(_TURN_SIDES, np.inf)
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        views = Views.broadcast(place[:, 0], place[:, 1])
+        other = Appearance.of(renderer, views, ("distance_m", "delta_rad"), rows, plan.n_frames)
+        cost, gradient, information = truth.imitated_by(other)
+        least = np.minimum(least, cost)
+        place = place + np.einsum("nij,nj->ni", np.linalg.pinv(information), gradient)
+        place = np.clip(place, *bounds)  # a step too long would end at the truth itself
+    return float(np.sqrt(least.min()))
+
+
+def _one(seen: Appearance, k: int) -> Appearance:
+    """Return one view, to be broadcast against others."""
+    part = slice(k, k + 1)
+    return Appearance(seen.range_m[part], seen.weight[part], seen.slope[part], seen.coverage[part], seen.sensor)
