@@ -29,14 +29,16 @@ _OUTLINE_STD = np.array([3.0, 3.0, 3.0, 3.0, 0.7, 0.7])
 """How far each may be from where it was thought to be, in natural units: only the registration leans on it."""
 _OUTLINE_NOISE = 0.2
 """Of a pixel: how much of it the model says returns, against whether it did."""
-_RETURNS_FROM = 0.3
-"""Coverage that is enough for a return; below, the chance of one is taken to rise evenly."""
+_RETURNS_FROM, _PREVAILS_FROM = 0.2, 0.6
+"""Coverage that is enough for a return, and for one from the landmark if something stands behind; below, the chance of
+it is taken to rise evenly."""
 _TRIED = np.array([-3.0, -1.5, 0.0, 1.5, 3.0])
 """Pitches and bearings, degrees, from which the registration may start: a pixel apart."""
+_BESIDE = 0.02
+"""Share of pixels with a return from elsewhere, above which something stands behind."""
 _OUTLINE_STEPS = 6
 _OUTLINE_WIDTH = 0.2
 """Half width of its differences, natural units: a seventh of a pixel."""
-_POSES_TRIED = 12
 _NEARBY_M = 0.1
 """A return so much farther from the landmark than its own size is something else."""
 _CLEAR = 1.5
@@ -130,7 +132,7 @@ class Fit:
     def start(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Move a mounting to where outlines agree (see :func:`register`), and set the albedo to the mean brightness."""
         theta = register(self.model, self.evidence, theta, [name for name in _OUTLINE if name in self.free])
-        if "albedo" in self.free:
+        if "albedo" in self.free and self.evidence.on == "phasors":
             images = self.model.images(theta, self._no_shift)
             use = self.pixels(theta, images, cautious=True)
             measured = np.abs(self.evidence.value[use]).sum()
@@ -207,14 +209,12 @@ class Fit:
     def _whitened(
         self, slope: NDArray[np.complex128], images: Images, use: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
-        """Return whitened slopes, (K, parameters, residuals)."""
+        """Return whitened slopes, (K, parameters, residuals), of what the model's own say."""
         evidence = self.evidence
         root = np.sqrt(np.where(use, evidence.weight, 0.0))[:, None]
         if evidence.on == "ranges":
-            there = use & (images.phasor != 0)
-            s, root = np.where(there, images.phasor, 1.0)[:, None], np.where(there[:, None], root, 0.0)
-            change = evidence.sensor.metres_per_radian * (s.conj() * slope).imag / np.abs(s) ** 2
-            return np.asarray(change * root)
+            seen = np.where((images.phasor != 0)[:, None], root, 0.0)
+            return np.asarray(evidence.sensor.metres_per_radian * slope.imag * seen)
         return np.concatenate([slope.real * root, slope.imag * root], axis=2)
 
     def _sums(
@@ -226,7 +226,7 @@ class Fit:
         width: NDArray[np.float64] | None = None,
     ) -> _Sums:
         q = self.factor.shape[2]
-        slope, of_pose = self.model.slopes(theta, self._shift(u), self.free, of_poses=q > 0, width=width)
+        slope, of_pose = self.model.slopes(theta, self._shift(u), self.free, self.evidence.on, of_poses=q > 0, width=width)
         rows = self._whitened(slope, images, use)
         residual = self._residual(images, use)
         own_rows = np.zeros((len(rows), 0, rows.shape[2]))
@@ -308,12 +308,13 @@ def register(
     known = seen.returned | seen.not_returned
     if not (known & ~seen.returned).any() and (target[known] == 1).all():
         known = np.ones_like(known)  # nothing was told apart: what is missing returned nothing
+    enough = _PREVAILS_FROM if (seen.returned & ~near).mean() > _BESIDE else _RETURNS_FROM
     columns = np.array([NAMES.index(name) for name in free])
     scale = SCALE[columns]
     prior = np.array([_OUTLINE_STD[_OUTLINE.index(name)] for name in free])
 
     def difference(at: NDArray[np.float64]) -> NDArray[np.float64]:
-        returns = np.minimum(model.coverage(at) / _RETURNS_FROM, 1.0)
+        returns = np.minimum(model.coverage(at) / enough, 1.0)
         return np.asarray(np.where(known, target - returns, 0.0) / _OUTLINE_NOISE)
 
     def cost(at: NDArray[np.float64]) -> float:

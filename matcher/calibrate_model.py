@@ -8,7 +8,7 @@ brightness of the landmark (albedo).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -17,6 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark.matcher.calibrate_poses import KnownPoses
+from phasemark.matcher.likelihood import Quantity
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 
 
@@ -152,7 +153,7 @@ class Images:
         Range offset and albedo in it.
     intensity, coverage : float64
     alone : complex128
-        Phasor of the landmark without what stands behind it.
+        Phasor of the landmark without what stands behind it, if it was needed; else all of it.
     """
 
     phasor: NDArray[np.complex128]
@@ -215,7 +216,15 @@ class CalibrationModel:
         """Distance of the landmark's farthest point from its origin."""
         return self._renderer.topology.radius_m
 
-    def images(self, theta: NDArray[np.float64], shift: NDArray[np.float64]) -> Images:
+    @property
+    def radius_m(self) -> float:
+        """Distance of the landmark's farthest point from its axis."""
+        vertices = self._renderer.topology.vertices
+        return float(np.hypot(vertices[:, 0], vertices[:, 1]).max())
+
+    def images(
+        self, theta: NDArray[np.float64], shift: NDArray[np.float64], *, need_alone: bool = False
+    ) -> Images:
         """Render all poses.
 
         Parameters
@@ -224,12 +233,14 @@ class CalibrationModel:
             The mounting.
         shift : (K, 3) float64
             What is added to the poses, :data:`POSE`.
+        need_alone : bool
+            Whether the landmark alone is wanted even where nothing else is made of it.
         """
         mounting = Mounting.of_vector(theta)
         image = self._render(mounting, self._views(mounting, shift))
         alone = image
         brighter = mounting.albedo / self._albedo - 1
-        if self.has_background and brighter:
+        if self.has_background and (brighter or need_alone):
             alone = self._render(mounting, self._views(mounting, shift), alone=True)
         turn = self._turn(mounting, image)
         k = len(self.poses)
@@ -246,11 +257,15 @@ class CalibrationModel:
         theta: NDArray[np.float64],
         shift: NDArray[np.float64],
         free: Sequence[str],
+        on: Quantity,
         *,
         of_poses: bool = False,
         width: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return how the phasors change, by central differences.
+        """Return how the images change, by central differences.
+
+        On ranges the difference is one of phases, not of phasors: a pixel that an edge is just leaving has hardly any
+        light at one end, and its range is as smooth as any other.
 
         Parameters
         ----------
@@ -258,6 +273,7 @@ class CalibrationModel:
             As for :meth:`images`.
         free : sequence of str
             Parameters.
+        on : {"ranges", "phasors"}
         of_poses : bool
             Whether the poses are uncertain too.
         width : (8,) float64, optional
@@ -266,53 +282,56 @@ class CalibrationModel:
         Returns
         -------
         (K, p, pixels) complex128
-            By each of `free`.
+            Change of the phasor by each of `free`; on ranges that of its logarithm, i times the phase, 0 where nothing
+            is seen at either end.
         (K, 3, pixels) complex128
             By :data:`POSE`; (K, 0, pixels) without `of_poses`.
         """
         half = np.full(len(NAMES), STEP) if width is None else np.maximum(width, STEP)
 
-        def difference(name: str | None, column: int | None) -> Callable[[], NDArray[np.complex128]]:
-            def run() -> NDArray[np.complex128]:
-                ends, sides = [], []
-                for side in (1.0, -1.0):
-                    moved, shifted = theta.copy(), shift.copy()
-                    if name is not None:
-                        moved[NAMES.index(name)] += side * half[NAMES.index(name)]
-                        sides.append(moved[NAMES.index(name)])
-                    if column is not None:
-                        shifted[:, column] += side * STEP
-                    ends.append(self.images(moved, shifted).phasor)
-                span = sides[0] - sides[1] if name is not None else 2 * STEP
-                return np.asarray((ends[0] - ends[1]) / span)
+        def moved(name: str | None, column: int, side: float) -> NDArray[np.complex128]:
+            there, shifted = theta.copy(), shift.copy()
+            if name is None:
+                shifted[:, column] += side * STEP
+            else:
+                there[column] += side * half[column]
+            return self.images(there, shifted).phasor
 
-            return run
+        def difference(job: tuple[str | None, int]) -> NDArray[np.complex128]:
+            name, column = job
+            span = 2 * (STEP if name is None else half[column])
+            high, low = moved(name, column, 1.0), moved(name, column, -1.0)
+            if on == "phasors":
+                return np.asarray((high - low) / span)
+            return np.asarray(1j * np.angle(high * low.conj()) / span)
 
-        rendered = [name for name in free if name not in ("range_offset", "albedo")]
-        jobs = [difference(name, None) for name in rendered]
+        rendered = [name for name in free if name != "range_offset" and (name != "albedo" or on == "ranges")]
         columns = [] if not of_poses else [0, 1] if "bearing" in rendered else [0, 1, 2]
-        jobs += [difference(None, column) for column in columns]
+        jobs: list[tuple[str | None, int]] = [(name, NAMES.index(name)) for name in rendered]
+        jobs += [(None, column) for column in columns]
         with ThreadPoolExecutor(self.workers) as pool:
-            found = list(pool.map(lambda job: job(), jobs))
+            found = list(pool.map(difference, jobs))
         by_name = dict(zip(rendered, found, strict=False))
         by_pose = found[len(rendered) :]
         if of_poses and "bearing" in rendered:
             by_pose.append(by_name["bearing"])
         if set(free) - set(rendered):
-            image = self.images(theta, shift)
-            by_name["range_offset"] = 1j * image.phasor / self.sensor.metres_per_radian
-            alone = image.alone
-            if self.has_background and theta[-1] == self._albedo:  # then `images` had no need of it
-                mounting = Mounting.of_vector(theta)
-                bare = self._render(mounting, self._views(mounting, shift), alone=True)
-                alone = (self._turn(mounting, bare) * bare.phasor).reshape(alone.shape)
-            by_name["albedo"] = alone / theta[-1]
+            image = self.images(theta, shift, need_alone=on == "phasors" and "albedo" in free)
+            later = 1.0 if on == "ranges" else image.phasor
+            by_name["range_offset"] = np.broadcast_to(1j * later / self.sensor.metres_per_radian, image.phasor.shape)
+            by_name.setdefault("albedo", image.alone / theta[-1])
         k, pixels = len(self.poses), self.sensor.rows * self.sensor.cols
         empty = np.zeros((k, 0, pixels), np.complex128)
         return (
             np.stack([by_name[name] for name in free], axis=1) if free else empty,
             np.stack(by_pose, axis=1) if of_poses else empty,
         )
+
+    def coverage(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the share of each pixel that sees the landmark, (K, pixels)."""
+        mounting = Mounting.of_vector(theta)
+        views = self._views(mounting, np.zeros((len(self.poses), 3)))
+        return self._render(mounting, views, alone=True).coverage.reshape(len(views), -1)
 
     def _turn(self, mounting: Mounting, image: PhasorImages) -> NDArray[np.complex128]:
         """Return what turns rendered phasors into those that this program got from the camera, (1 or K, rows, cols).
@@ -325,12 +344,6 @@ class CalibrationModel:
             return turn
         longer = image.sensor.axis_cosine() / self._axis_cosine - 1
         return np.asarray(turn * np.exp(1j * np.nan_to_num(image.range_m) * longer / scale))
-
-    def coverage(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the share of each pixel that sees the landmark, (K, pixels)."""
-        mounting = Mounting.of_vector(theta)
-        views = self._views(mounting, np.zeros((len(self.poses), 3)))
-        return self._render(mounting, views, alone=True).coverage.reshape(len(views), -1)
 
     def _views(self, mounting: Mounting, shift: NDArray[np.float64]) -> Views:
         poses = self.poses

@@ -23,6 +23,8 @@ COLUMNS = (
     " x_m,y_m,heading_deg of the lens; optional height_m, wall_m, frames"
 )
 """What a file of poses may have, in words."""
+POSE_UNITS = (("distance_mm", 1e3), ("delta_deg", math.degrees(1)), ("bearing_deg", math.degrees(1)))
+"""How the errors of a pose are told."""
 _FARTHEST_M = 20.0
 
 
