@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.matcher.calibrate_fit import Fit, Solution, inverse
-from phasemark.matcher.calibrate_model import NAMES, PARAMETERS, SCALE, CalibrationModel, Mounting
+from phasemark.matcher.calibrate_model import NAMES, PARAMETERS, CalibrationModel, Mounting
 from phasemark.matcher.calibrate_notes import advice, named, observability_notes, odd_pose_notes
 from phasemark.matcher.calibrate_poses import KnownPoses, PoseStd
 from phasemark.matcher.estimator import MIN_RETURNS, p_values_of
-from phasemark.matcher.filters import FilteredFrames
+from phasemark.matcher.filters import FilteredFrames, PixelState, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood import Evidence, Quantity
-from phasemark.render import Background, Sensor, wrap_difference_m
+from phasemark.render import Background, Frames, Sensor, wrap_difference_m
 from phasemark.render.sensor_file import rounded
 
 FEWEST_POSES = 3
@@ -38,7 +38,14 @@ _POSES_FOR_SANDWICH = 3
 _FAR_RETURNS = 0.02
 """Share of pixels that may return where the model has nothing, before something is taken to stand there."""
 _OUT_OF_VIEW_RAD = math.radians(5.0)
-_UNITS = {0.001: "1000 times", 0.01: "100 times", 0.1: "10 times", 10.0: "10 times", 100.0: "100 times", 1000.0: "1000 times"}
+_UNITS = {
+    0.001: "1000 times",
+    0.01: "100 times",
+    0.1: "10 times",
+    10.0: "10 times",
+    100.0: "100 times",
+    1000.0: "1000 times",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,12 +136,49 @@ def check_names(names: Sequence[str], what: str) -> tuple[str, ...]:
     return tuple(name for name in NAMES if name in spelled)
 
 
+def filter_poses(frames: Sequence[Frames], on: Quantity | Literal["auto"] = "auto") -> FilteredFrames:
+    """Filter the frames of each pose: the mean phasor where phasors will be compared, else the Kalman filter.
+
+    Parameters
+    ----------
+    frames : sequence of Frames
+        One position each, of one camera; they may differ in number.
+    on : {"auto", "ranges", "phasors"}
+        As for :func:`calibrate`.
+
+    Returns
+    -------
+    FilteredFrames
+        As many positions.
+    """
+    lit = all(one.amplitude_e is not None and one.intensity_e is not None for one in frames)
+    coherent = on == "phasors" or (on == "auto" and lit and frames[0].sensor.kind == "phase")
+    parts = [phasor_mean(one) if coherent else kalman_filter(one) for one in frames]
+
+    def joined(name: str) -> NDArray[np.float64] | None:
+        arrays = [getattr(part, name) for part in parts]
+        return None if any(array is None for array in arrays) else np.concatenate(arrays)
+
+    first = parts[0]
+    return FilteredFrames(
+        np.concatenate([part.range_m for part in parts]),
+        np.concatenate([part.std_m for part in parts]),
+        joined("amplitude_e"),
+        joined("intensity_e"),
+        np.concatenate([part.state for part in parts]),
+        np.concatenate([part.n_effective for part in parts]),
+        first.sensor,
+        any(part.std_from_scatter for part in parts),
+    )
+
+
 def calibrate(
     mesh: trimesh.Trimesh,
     frames: FilteredFrames,
     poses: KnownPoses,
     *,
     free: Sequence[str] | None = None,
+    fixed: Sequence[str] = (),
     start: Mounting | None = None,
     albedo: float = 0.8,
     on: Quantity | Literal["auto"] = "auto",
@@ -161,6 +205,8 @@ def calibrate(
     free : sequence of str, optional
         What to estimate, :data:`NAMES`; None: all of it. On ranges the albedo is told only by pixels that mix the
         landmark with a background of known albedo, and left out where there is none.
+    fixed : sequence of str
+        What of that to leave as it is.
     start : Mounting, optional
         Where it is thought to be and what stays as it is; None: what the sensor states, straight ahead.
     albedo : float
@@ -197,6 +243,8 @@ def calibrate(
     lit = quantity == "phasors" or background is not None or poses.wall_m is not None
     if free is None and not lit:
         names = tuple(name for name in names if name != "albedo")
+    kept = check_names(fixed, "'fixed'")
+    names = tuple(name for name in names if name not in kept)
     _check(frames, poses, names, lit)
     evidence = Evidence.from_frames(frames, quantity)
     assumed = start or Mounting.of_sensor(sensor, albedo)
@@ -221,7 +269,9 @@ def calibrate(
 
 def _check(frames: FilteredFrames, poses: KnownPoses, names: tuple[str, ...], lit: bool) -> None:
     if len(frames) != len(poses):
-        raise UsageError(f"there are {len(poses)} poses, but frames of {len(frames)} positions: each pose needs its own")
+        raise UsageError(
+            f"there are {len(poses)} poses, but frames of {len(frames)} positions: each pose needs its own"
+        )
     if not names:
         raise UsageError("nothing is free: there is nothing to calibrate")
     if "albedo" in names and not lit:
@@ -232,7 +282,7 @@ def _check(frames: FilteredFrames, poses: KnownPoses, names: tuple[str, ...], li
             f"too few poses: {len(poses)}, but {named(names)} take at least {needed}; ten or more at several distances"
             " and sides are better"
         )
-    returned = (frames.state == 0).reshape(len(frames), -1).sum(axis=1)
+    returned = (frames.state == PixelState.RETURN).reshape(len(frames), -1).sum(axis=1)
     if returned.min() < MIN_RETURNS:
         k = int(returned.argmin())
         raise UsageError(f"{poses.where(k)}: {returned[k]} pixels returned: was the landmark in view?")
@@ -282,7 +332,9 @@ def _returns_beside(model: CalibrationModel, evidence: Evidence, assumed: Mounti
 def _check_pixels(use: NDArray[np.bool_], poses: KnownPoses, evidence: Evidence) -> None:
     counted = use.sum(axis=1)
     if counted.sum() == 0 or (counted == 0).all():
-        raise UsageError("no pixel sees the landmark and returns something: do poses, landmark and frames belong together?")
+        raise UsageError(
+            "no pixel sees the landmark and returns something: do poses, landmark and frames belong together?"
+        )
     empty = np.flatnonzero(counted == 0)
     if empty.size > len(poses) / 2:
         raise UsageError(
@@ -346,8 +398,8 @@ def _concluded(
     mounting = Mounting.of_vector(solution.theta)
     if mounting.albedo > 1 and "albedo" in fit.free:
         notes.append(
-            f"An albedo of {mounting.albedo:.3g} cannot be: signal_e of the sensor is too low, or the amplitudes are not"
-            " in electrons. Only their product was measured."
+            f"An albedo of {mounting.albedo:.3g} cannot be: signal_e of the sensor is too low, or the amplitudes are"
+            " not in electrons. Only their product was measured."
         )
     shape = (len(poses), sensor.rows, sensor.cols)
     before = model.images(assumed.vector, np.zeros((len(poses), 3)))

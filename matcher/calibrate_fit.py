@@ -206,9 +206,7 @@ class Fit:
         difference = (evidence.value - images.phasor) * root
         return np.concatenate([difference.real, difference.imag], axis=1)
 
-    def _whitened(
-        self, slope: NDArray[np.complex128], images: Images, use: NDArray[np.bool_]
-    ) -> NDArray[np.float64]:
+    def _whitened(self, slope: NDArray[np.complex128], images: Images, use: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return whitened slopes, (K, parameters, residuals), of what the model's own say."""
         evidence = self.evidence
         root = np.sqrt(np.where(use, evidence.weight, 0.0))[:, None]
@@ -226,7 +224,9 @@ class Fit:
         width: NDArray[np.float64] | None = None,
     ) -> _Sums:
         q = self.factor.shape[2]
-        slope, of_pose = self.model.slopes(theta, self._shift(u), self.free, self.evidence.on, of_poses=q > 0, width=width)
+        slope, of_pose = self.model.slopes(
+            theta, self._shift(u), self.free, self.evidence.on, of_poses=q > 0, width=width
+        )
         rows = self._whitened(slope, images, use)
         residual = self._residual(images, use)
         own_rows = np.zeros((len(rows), 0, rows.shape[2]))
@@ -253,10 +253,14 @@ class Fit:
             matrix = matrix + damping * np.diag(np.maximum(np.diag(matrix), 1e-12))
             step = self.scale * np.linalg.lstsq(matrix, self.scale * sums.gradient, rcond=1e-14)[0]
             step /= max(1.0, float(np.abs(step / self.scale).max()) / _LONGEST)
-            own_step = np.linalg.solve(sums.own, (sums.own_gradient - np.einsum("kpq,p->kq", sums.cross, step))[..., None])
+            own_step = np.linalg.solve(
+                sums.own, (sums.own_gradient - np.einsum("kpq,p->kq", sums.cross, step))[..., None]
+            )
             promise = float(sums.gradient @ step)
             if u.size:
-                promise += float((sums.own_gradient * np.linalg.solve(sums.own, sums.own_gradient[..., None])[..., 0]).sum())
+                promise += float(
+                    (sums.own_gradient * np.linalg.solve(sums.own, sums.own_gradient[..., None])[..., 0]).sum()
+                )
             if promise < _SETTLED:
                 break
             moved = theta.copy()

@@ -1,8 +1,8 @@
 """What a camera would see from known positions, for any mounting: the model that a calibration moves.
 
-The mounting is eight numbers, :class:`Mounting`. Four of them turn or widen the camera itself (pitch, roll and both half
-angles), two move the landmark in its image (height and bearing), one delays the light (range offset) and one is the
-brightness of the landmark (albedo).
+The mounting is eight numbers, :class:`Mounting`. Four of them turn or widen the camera itself (pitch, roll and both
+half angles), two move the landmark in its image (height and bearing), one delays the light (range offset) and one is
+the brightness of the landmark (albedo).
 """
 
 from __future__ import annotations
@@ -222,9 +222,7 @@ class CalibrationModel:
         vertices = self._renderer.topology.vertices
         return float(np.hypot(vertices[:, 0], vertices[:, 1]).max())
 
-    def images(
-        self, theta: NDArray[np.float64], shift: NDArray[np.float64], *, need_alone: bool = False
-    ) -> Images:
+    def images(self, theta: NDArray[np.float64], shift: NDArray[np.float64], *, need_alone: bool = False) -> Images:
         """Render all poses.
 
         Parameters

@@ -51,7 +51,9 @@ def advice(names: Sequence[str], poses: KnownPoses) -> str:
         where = f"{near:.3g} m" if far - near < 5e-3 else f"{near:.3g} to {far:.3g} m"
         hints.append(f"all are at one distance ({where}): add some 1.5 times as far or more")
     if set(names) & _BY_BEARING and np.ptp(poses.bearing_rad) < _BEARINGS_RAD:
-        hints.append("all have the landmark at one place between left and right: add some with a bearing of a few degrees")
+        hints.append(
+            "all have the landmark at one place between left and right: add some with a bearing of a few degrees"
+        )
     if not hints:
         hints.append("add poses at other distances and sides, and with the landmark off the image's middle")
     fixed = " or ".join(f"--fix {name}" for name in names[:2])
@@ -83,7 +85,9 @@ def observability_notes(
     ]
     for name in poor:
         parameter = PARAMETERS[name]
-        value = f"± {parameter.shown * std[free.index(name)]:.2g}{' ' if parameter.unit == 'mm' else ''}{parameter.unit}"
+        value = (
+            f"± {parameter.shown * std[free.index(name)]:.2g}{' ' if parameter.unit == 'mm' else ''}{parameter.unit}"
+        )
         others = [b if a == name else a for a, b, _ in pairs if name in (a, b)]
         trades = f", for it trades with the {named(others)}" if others else ""
         notes.append(f"The {TITLES[name]} is poorly known, {value}{trades}: {advice([name, *others], poses)}.")
@@ -93,13 +97,14 @@ def observability_notes(
             names = [name for name in group if name in free]
             if len(names) > 1 and group[0] in names and not told & set(names):
                 notes.append(
-                    f"The {named(names)} are told apart only because the landmark's shape and brightness are taken to be"
-                    f" exact: {advice(names, poses)}."
+                    f"The {named(names)} are told apart only because the landmark's shape and brightness are taken to"
+                    f" be exact: {advice(names, poses)}."
                 )
     for a, b, rho in pairs:
         if a not in poor and b not in poor:
             notes.append(
-                f"The {TITLES[a]} and the {TITLES[b]} trade for one another (correlation {rho:.3f}): {advice([a, b], poses)}."
+                f"The {TITLES[a]} and the {TITLES[b]} trade for one another (correlation {rho:.3f}):"
+                f" {advice([a, b], poses)}."
             )
     return notes
 

@@ -96,8 +96,11 @@ class KnownPoses:
         height_m: NDArray[np.float64] | Sequence[float] | float = 0.0,
     ) -> KnownPoses:
         """Take distances and angles; scalars hold for all poses."""
-        arrays = np.broadcast_arrays(*(np.asarray(v, np.float64) for v in (distance_m, delta_rad, bearing_rad, height_m)))
-        return cls(*(np.array(values, np.float64).ravel() for values in arrays))
+        arrays = np.broadcast_arrays(
+            *(np.asarray(v, np.float64) for v in (distance_m, delta_rad, bearing_rad, height_m))
+        )
+        distance, delta, bearing, height = (np.array(values, np.float64).ravel() for values in arrays)
+        return cls(distance, delta, bearing, height)
 
     @classmethod
     def cartesian(

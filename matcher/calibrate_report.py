@@ -22,7 +22,7 @@ USES = {
     "albedo": "of the landmark: 'albedo' in a plan",
 }
 """Where the numbers go that a sensor file has no place for."""
-_SIGMAS = 5.0
+_SIGMAS, _BINS = 5.0, 50
 
 
 def calibration_toml(found: Calibration, *, base_name: str) -> str:
@@ -139,7 +139,12 @@ def _draw_poses(axes: Any, found: Calibration) -> None:
     low, high = (np.sqrt(stats.chi2.ppf(q, count) / count) for q in (0.025, 0.975))
     axes.vlines(x, low, high, color="0.85", lw=5, label="95 % of poses, if noise is all")
     points = axes.scatter(
-        x, size[told][order], c=np.degrees(found.poses.bearing_rad[told][order]), cmap="coolwarm", edgecolor="0.3", zorder=3
+        x,
+        size[told][order],
+        c=np.degrees(found.poses.bearing_rad[told][order]),
+        cmap="coolwarm",
+        edgecolor="0.3",
+        zorder=3,
     )
     axes.figure.colorbar(points, ax=axes, label="bearing (°)")
     axes.set(xlabel="distance (m)", ylabel="r.m.s. residual of a pose (σ)", title="poses")
@@ -155,9 +160,13 @@ def _draw_density(axes: Any, found: Calibration) -> None:
     beyond = 1 - len(inside) / max(len(sigma), 1)
     if len(inside):
         axes.hist(
-            inside, bins=50, range=(-_SIGMAS, _SIGMAS), weights=np.full(len(inside), 5 / _SIGMAS / len(sigma)), color="#9ecae1",
+            inside,
+            bins=_BINS,
+            range=(-_SIGMAS, _SIGMAS),
+            weights=np.full(len(inside), _BINS / (2 * _SIGMAS) / len(sigma)),
+            color="#9ecae1",
             label=f"{len(sigma)} range residuals, {100 * beyond:.2g} % beyond {_SIGMAS:g} σ",
-        )  # fmt: skip
+        )
     x = np.linspace(-_SIGMAS, _SIGMAS, 201)
     axes.plot(x, stats.norm.pdf(x), color="0.3", lw=1, label="normal law")
     axes.set(xlabel="residual of a filtered range (σ)", ylabel="density", title="pixels")
