@@ -937,14 +937,14 @@ def _calibrate(
     ] = 0.0,
     albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmark, likewise.")] = None,
     position_std: Annotated[
-        float, typer.Option("--position-std", metavar="M", help="How well the places of the lens are known.")
-    ] = 0.0,
+        float | None, typer.Option("--position-std", metavar="M", help="How well the places of the lens are known.")
+    ] = None,
     heading_std: Annotated[
-        float, typer.Option("--heading-std", metavar="DEG", help="How well the camera's headings are known.")
-    ] = 0.0,
+        float | None, typer.Option("--heading-std", metavar="DEG", help="How well the camera's headings are known.")
+    ] = None,
     delta_std: Annotated[
-        float, typer.Option("--delta-std", metavar="DEG", help="How well the landmark is turned to its side.")
-    ] = 0.0,
+        float | None, typer.Option("--delta-std", metavar="DEG", help="How well the landmark is turned to its side.")
+    ] = None,
     landmark_xy: Annotated[
         tuple[float, float], typer.Option("--landmark-xy", metavar="X Y", help="Where it stands, for x_m,y_m.")
     ] = (0.0, 0.0),
@@ -990,6 +990,9 @@ def _calibrate(
     _refuse_existing([out, picture], force)
     background = _background(wall, floor)
     mesh, base, base_name = _calibration_target(landmark, class_name, sensor)
+    stds = None
+    if (position_std, heading_std, delta_std) != (None, None, None):
+        stds = PoseStd(position_std or 0.0, math.radians(heading_std or 0.0), math.radians(delta_std or 0.0))
     known = read_poses(poses, landmark_xy_m=landmark_xy, landmark_yaw_rad=math.radians(landmark_yaw))
     measured = [
         read_frames(
@@ -1022,7 +1025,7 @@ def _calibrate(
         start=replace(Mounting.of_sensor(base, bright), height_m=height, bearing_rad=math.radians(bearing)),
         on=on,  # type: ignore[arg-type]  # calibrate says what is right
         background=background,
-        pose_std=PoseStd(position_std, math.radians(heading_std), math.radians(delta_std)),
+        pose_std=stds,
         reports_z=quantity == "z" or None,
         workers=workers or min(processors(), 4),
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,9 @@ from phasemark import UsageError
 from phasemark.matcher.calibrate_fit import Fit, Solution, inverse
 from phasemark.matcher.calibrate_model import NAMES, PARAMETERS, CalibrationModel, Mounting
 from phasemark.matcher.calibrate_notes import advice, named, observability_notes, odd_pose_notes
+from phasemark.matcher.calibrate_pose_errors import estimate_pose_std
 from phasemark.matcher.calibrate_poses import KnownPoses, PoseStd
+from phasemark.matcher.coarse import assumed_std_m
 from phasemark.matcher.estimator import MIN_RETURNS, p_values_of
 from phasemark.matcher.filters import FilteredFrames, PixelState, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood import Evidence, Quantity
@@ -33,6 +35,11 @@ _FALSE_ALARM = 0.01
 """A fit whose χ² is exceeded with less than this probability does not fit."""
 _UNKNOWN = 5.0
 """Natural units (1°, 1 cm, 0.1): what is known worse than to so many is not observable."""
+_POSES_FOR_ERRORS = 6
+"""Fewer poses do not tell the size of their errors."""
+_ROUNDS = 2
+_FRAMES_FOR_SCATTER = 10
+"""Frames without amplitudes of one pose from which their scatter is a better judge of noise than the noise law."""
 _POSES_FOR_SANDWICH = 3
 """Poses for each free parameter from which their own scatter tells the covariance."""
 _FAR_RETURNS = 0.02
@@ -76,8 +83,8 @@ class Calibration:
         Share of each pose in χ², and how many residuals it is made of.
     residual_m, residual_before_m : (K, rows, cols) float64
         Measured less modelled range with the mounting found and with the one assumed; NaN where a pixel does not count.
-    residual_sigma : (K, rows, cols) float64
-        `residual_m` in standard deviations of the filtered range.
+    range_std_m : (K, rows, cols) float64
+        Standard deviation of the filtered range; NaN where a pixel does not count.
     notes : tuple of str
         Sentences on what is not observable, what does not fit, and what to do.
     """
@@ -99,7 +106,7 @@ class Calibration:
     pose_residuals: NDArray[np.int64]
     residual_m: NDArray[np.float64]
     residual_before_m: NDArray[np.float64]
-    residual_sigma: NDArray[np.float64]
+    range_std_m: NDArray[np.float64]
     notes: tuple[str, ...]
 
     def value(self, name: str) -> float:
@@ -154,6 +161,9 @@ def filter_poses(frames: Sequence[Frames], on: Quantity | Literal["auto"] = "aut
     lit = all(one.amplitude_e is not None and one.intensity_e is not None for one in frames)
     coherent = on == "phasors" or (on == "auto" and lit and frames[0].sensor.kind == "phase")
     parts = [phasor_mean(one) if coherent else kalman_filter(one) for one in frames]
+    parts = [
+        _with_known_noise(part) if one.n_frames < _FRAMES_FOR_SCATTER else part for part, one in zip(parts, frames)
+    ]
 
     def joined(name: str) -> NDArray[np.float64] | None:
         arrays = [getattr(part, name) for part in parts]
@@ -170,6 +180,15 @@ def filter_poses(frames: Sequence[Frames], on: Quantity | Literal["auto"] = "aut
         first.sensor,
         any(part.std_from_scatter for part in parts),
     )
+
+
+def _with_known_noise(frames: FilteredFrames) -> FilteredFrames:
+    """Replace noise that few frames told by their scatter by what the camera's law says of a surface of albedo 0.8."""
+    if not frames.std_from_scatter:
+        return frames
+    law = assumed_std_m(np.nan_to_num(frames.range_m, nan=1.0), frames.sensor)
+    std = np.where(frames.n_effective > 0, law / np.sqrt(np.maximum(frames.n_effective, 1.0)), np.nan)
+    return replace(frames, std_m=std, std_from_scatter=False)
 
 
 def calibrate(
@@ -217,7 +236,8 @@ def calibrate(
         What stands behind; a pose's own `wall_m` replaces its wall. Without one, where more than a few pixels return
         beside the landmark, only those that see nothing else count.
     pose_std : PoseStd, optional
-        How well the poses are known; None: exactly. Then their errors are estimated too.
+        How well the poses are known; then their errors are estimated too. None: they are taken as exact, and if
+        then the residuals are more than noise, the sizes of their errors are estimated as well.
     reports_z : bool, optional
         Whether the camera measures z, from which its ranges were made with the half angles it is thought to have; None:
         what the sensor says of itself.
@@ -254,8 +274,8 @@ def calibrate(
     )
     _check_view(model, evidence, assumed)
     edges = model.has_background or not _returns_beside(model, evidence, assumed)
-    certain = pose_std is None or pose_std.exact
-    fit = Fit(model, evidence, names, None if certain or pose_std is None else pose_std.factor(poses), edges=edges)
+    exact = pose_std is None or pose_std.exact
+    fit = Fit(model, evidence, names, None if exact or pose_std is None else pose_std.factor(poses), edges=edges)
     theta = fit.start(assumed.vector)
     images = model.images(theta, np.zeros((len(poses), 3)))
     use = fit.pixels(theta, images, cautious=True)
@@ -264,7 +284,14 @@ def calibrate(
     _check_observable(at_start, fit, poses)
     solution = fit.solve(theta, use)
     _check_observable(solution, fit, poses)
-    return _concluded(fit, solution, frames, assumed, edges=edges, certain=certain)
+    estimated = None
+    if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and _fit_probability(fit, solution, frames) < _FALSE_ALARM:
+        for _ in range(_ROUNDS):
+            estimated = estimate_pose_std(fit.blocks(solution, PoseStd(1.0, 1.0, 1.0).factor(poses)))
+            fit = Fit(model, evidence, names, estimated.factor(poses), edges=edges)
+            solution = fit.solve(solution.theta, solution.use)
+        _check_observable(solution, fit, poses)
+    return _concluded(fit, solution, frames, assumed, edges, estimated)
 
 
 def _check(frames: FilteredFrames, poses: KnownPoses, names: tuple[str, ...], lit: bool) -> None:
@@ -355,16 +382,30 @@ def _check_observable(solution: Solution, fit: Fit, poses: KnownPoses) -> None:
     raise UsageError(f"{named(names)} {together} from these poses: {advice(names, poses)}")
 
 
+def _degrees_of_freedom(fit: Fit, solution: Solution) -> int:
+    return int(solution.use.sum()) * fit.evidence.per_pixel - len(fit.free)
+
+
+def _fit_probability(fit: Fit, solution: Solution, frames: FilteredFrames) -> float:
+    """Return the probability of a larger χ²."""
+    dof = np.array([_degrees_of_freedom(fit, solution)])
+    return float(p_values_of(np.array([solution.cost]), dof, frames, np.array([0]))[0])
+
+
 def _concluded(
-    fit: Fit, solution: Solution, frames: FilteredFrames, assumed: Mounting, *, edges: bool, certain: bool
+    fit: Fit,
+    solution: Solution,
+    frames: FilteredFrames,
+    assumed: Mounting,
+    edges: bool,
+    estimated: PoseStd | None,
 ) -> Calibration:
+    """Take stock; `estimated` is what the residuals said of the poses, if they were asked."""
     model, evidence = fit.model, fit.evidence
     poses, sensor = model.poses, frames.sensor
-    counted = np.repeat(solution.use, evidence.per_pixel, axis=0).reshape(len(poses), -1)
-    pose_residuals = counted.sum(axis=1).astype(np.int64)
+    pose_residuals = solution.use.sum(axis=1) * evidence.per_pixel
     pose_chi2 = (solution.residual**2).sum(axis=1)
-    dof = int(pose_residuals.sum()) - len(fit.free)
-    p_value = float(p_values_of(np.array([solution.cost]), np.array([dof]), frames, np.array([0]))[0])
+    dof, p_value = _degrees_of_freedom(fit, solution), _fit_probability(fit, solution, frames)
     covariance = inverse(solution.information, fit.scale)
     expected, source = float(max(dof, 1)), "the noise law"
     if frames.std_from_scatter:
@@ -373,6 +414,13 @@ def _concluded(
         covariance = covariance * nu / (nu - 4)
         expected, source = expected * nu / (nu - 2), "the scatter of the frames"
     notes: list[str] = []
+    if estimated is not None:
+        notes.append(
+            "With exact poses the residuals are more than noise. The poses were taken to be uncertain, by what the"
+            f" residuals say: {1e3 * estimated.position_m:.2g} mm in place, {math.degrees(estimated.heading_rad):.2g}°"
+            f" in heading, {math.degrees(estimated.delta_rad):.2g}° in δ (state yours with --position-std,"
+            " --heading-std and --delta-std)."
+        )
     if dof > 0 and p_value < _FALSE_ALARM:
         excess = solution.cost / expected
         if len(poses) >= _POSES_FOR_SANDWICH * len(fit.free):
@@ -382,8 +430,10 @@ def _concluded(
         else:
             covariance = covariance * excess
             source += f", scaled by χ² = {excess:.3g} for each degree of freedom, for the residuals are more than noise"
-        hint = "are the poses exact? --position-std, --heading-std and --delta-std say how well they are known"
-        notes.append(f"The model does not fit: χ² is {excess:.3g} times what noise leaves (p = {p_value:.2g}); {hint}.")
+        notes.append(
+            f"The model does not fit: χ² is {excess:.3g} times what noise leaves (p = {p_value:.2g}): are landmark,"
+            " background and units right, and are the poses as exact as stated?"
+        )
         notes += odd_pose_notes(poses, pose_chi2 / np.maximum(pose_residuals, 1))
     if not edges:
         notes.append(
@@ -405,7 +455,6 @@ def _concluded(
     before = model.images(assumed.vector, np.zeros((len(poses), 3)))
     after = evidence.sensor.metres_per_radian * np.angle(evidence.value * solution.images.phasor.conj())
     thought = evidence.sensor.metres_per_radian * np.angle(evidence.value * before.phasor.conj())
-    std = frames.std_m.reshape(len(poses), -1)
     return Calibration(
         sensor=_mounted(sensor, mounting, fit.free),
         base=sensor,
@@ -424,7 +473,7 @@ def _concluded(
         pose_residuals=pose_residuals,
         residual_m=np.where(solution.use, after, np.nan).reshape(shape),
         residual_before_m=np.where(solution.use & (before.phasor != 0), thought, np.nan).reshape(shape),
-        residual_sigma=np.where(solution.use, after / np.where(std > 0, std, np.nan), np.nan).reshape(shape),
+        range_std_m=np.where(solution.use, np.maximum(evidence.seen.weight, 1e-300) ** -0.5, np.nan).reshape(shape),
         notes=tuple(notes),
     )
 

@@ -87,6 +87,25 @@ class Solution:
 
 
 @dataclass(frozen=True, eq=False)
+class Blocks:
+    """A linearised problem, whitened; R residuals a pose.
+
+    Parameters
+    ----------
+    residual : (K, R) float64
+        Without any errors of the poses.
+    mounting : (K, p, R) float64
+        Slopes by the free parameters, natural units.
+    pose : (K, 4, R) float64
+        Slopes by errors of unit size.
+    """
+
+    residual: NDArray[np.float64]
+    mounting: NDArray[np.float64]
+    pose: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
 class _Sums:
     """Normal equations with the poses eliminated."""
 
@@ -190,6 +209,21 @@ class Fit:
         sums = self._sums(theta, u, images, use, width=std)
         cost = float((residual**2).sum() + (u**2).sum())
         return Solution(theta, shift, images, use, residual, cost, sums.information, sums.scatter)
+
+    def blocks(self, solution: Solution, unit: NDArray[np.float64]) -> Blocks:
+        """Linearise about a solution.
+
+        Parameters
+        ----------
+        solution : Solution
+        unit : (K, 3, 4) float64
+            How (D, δ, b) of each pose change with errors of unit size.
+        """
+        slope, of_pose = self.model.slopes(solution.theta, solution.shift, self.free, self.evidence.on, of_poses=True)
+        rows = self._whitened(slope, solution.images, solution.use)
+        own = self._whitened(of_pose, solution.images, solution.use)
+        without = solution.residual + np.einsum("kir,ki->kr", own, solution.shift)
+        return Blocks(without, rows * self.scale[:, None], np.einsum("kij,kir->kjr", unit, own))
 
     def _shift(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.einsum("kij,kj->ki", self.factor, u))

@@ -115,12 +115,15 @@ def residual_picture(found: Calibration) -> Figure:
     """
     figure = Figure(figsize=(11.6, 9.2), layout="constrained")
     (before, after), (by_pose, density) = figure.subplots(2, 2)
-    for axes, residual, title in (
-        (before, found.residual_before_m, "mounting as assumed"),
-        (after, found.residual_m, "mounting as calibrated"),
+    means = [_mean_of_pixels(one, found.range_std_m) for one in (found.residual_before_m, found.residual_m)]
+    span_mm = max(1e3 * float(np.nanpercentile(np.abs(means), 90)), 1.0)
+    for axes, mean, residual, title in (
+        (before, means[0], found.residual_before_m, "mounting as assumed"),
+        (after, means[1], found.residual_m, "mounting as calibrated"),
     ):
-        draw_difference(axes, _mean_of_pixels(residual))
-        axes.set_title(f"{title}: r.m.s. {_rms_mm(residual) or 0:.3g} mm\nmean over poses of measured − model")
+        draw_difference(axes, mean, span_mm=span_mm)
+        rms = np.sqrt(np.nanmean((residual / found.range_std_m) ** 2))
+        axes.set_title(f"{title}: r.m.s. {rms:.3g} σ\nweighted mean over poses of measured − model")
     _draw_poses(by_pose, found)
     _draw_density(density, found)
     verdict = f"χ² = {found.chi2:.0f}, {found.dof} degrees of freedom, p = {found.p_value:.2g}"
@@ -155,7 +158,8 @@ def _draw_poses(axes: Any, found: Calibration) -> None:
 
 def _draw_density(axes: Any, found: Calibration) -> None:
     """Draw the density of the range residuals in standard deviations beside the normal law."""
-    sigma = found.residual_sigma[np.isfinite(found.residual_sigma)]
+    sigma = found.residual_m / found.range_std_m
+    sigma = sigma[np.isfinite(sigma)]
     inside = sigma[np.abs(sigma) < _SIGMAS]
     beyond = 1 - len(inside) / max(len(sigma), 1)
     if len(inside):
@@ -170,16 +174,17 @@ def _draw_density(axes: Any, found: Calibration) -> None:
     x = np.linspace(-_SIGMAS, _SIGMAS, 201)
     axes.plot(x, stats.norm.pdf(x), color="0.3", lw=1, label="normal law")
     axes.set(xlabel="residual of a filtered range (σ)", ylabel="density", title="pixels")
+    axes.set_ylim(0, 0.55)
     axes.legend(frameon=False, fontsize="small", loc="upper left")
     axes.grid(alpha=0.3)
 
 
-def _mean_of_pixels(residual_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return each pixel's mean over the poses in which it counts, NaN where there is none."""
-    there = np.isfinite(residual_m)
-    count = there.sum(axis=0)
-    total = np.where(there, residual_m, 0.0).sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+def _mean_of_pixels(residual_m: NDArray[np.float64], std_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return each pixel's mean over the poses in which it counts, weighted by 1/σ²; NaN where there is none."""
+    there = np.isfinite(residual_m) & np.isfinite(std_m)
+    weight = np.where(there, 1 / np.where(there, std_m, 1.0) ** 2, 0.0)
+    total = (weight * np.where(there, residual_m, 0.0)).sum(axis=0)
+    return np.where(there.any(axis=0), total / np.maximum(weight.sum(axis=0), 1e-300), np.nan)
 
 
 def _rms_mm(residual_m: NDArray[np.float64]) -> float | None:
