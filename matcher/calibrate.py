@@ -33,7 +33,7 @@ FEWEST_POSES = 3
 """Unless fewer numbers than that are free."""
 _FALSE_ALARM = 0.01
 """A fit whose χ² is exceeded with less than this probability does not fit."""
-_UNKNOWN = 5.0
+_UNKNOWN = 3.0
 """Natural units (1°, 1 cm, 0.1): what is known worse than to so many is not observable."""
 _POSES_FOR_ERRORS = 6
 """Fewer poses do not tell the size of their errors."""
@@ -162,7 +162,8 @@ def filter_poses(frames: Sequence[Frames], on: Quantity | Literal["auto"] = "aut
     coherent = on == "phasors" or (on == "auto" and lit and frames[0].sensor.kind == "phase")
     parts = [phasor_mean(one) if coherent else kalman_filter(one) for one in frames]
     parts = [
-        _with_known_noise(part) if one.n_frames < _FRAMES_FOR_SCATTER else part for part, one in zip(parts, frames)
+        _with_known_noise(part) if one.n_frames < _FRAMES_FOR_SCATTER else part
+        for part, one in zip(parts, frames, strict=True)
     ]
 
     def joined(name: str) -> NDArray[np.float64] | None:
@@ -328,12 +329,12 @@ def _check_view(model: CalibrationModel, evidence: Evidence, assumed: Mounting) 
             f" the optical axis, and the image ends at {math.degrees(assumed.half_angle_h_rad):.1f}°; are heading and"
             " bearing in degrees, counter-clockwise?"
         )
-    inside = np.flatnonzero(poses.distance_m <= model.radius_m + 1e-3)
+    inside = np.flatnonzero(model.lens_within())
     if inside.size:
         k = int(inside[0])
         raise UsageError(
-            f"{poses.where(k)}: the lens would be in the landmark: 'distance_m' must be above {model.radius_m:.3g} m,"
-            f" got {poses.distance_m[k]:g}"
+            f"{poses.where(k)}: the lens would be in the landmark, {poses.distance_m[k]:g} m from its axis: distances"
+            " are in metres, from lens to axis"
         )
     nearest = np.array([np.percentile(r[m], 10) for r, m in zip(seen.range_m, seen.returned, strict=True)])
     away = np.abs(wrap_difference_m(seen.range_m - poses.distance_m[:, None], evidence.sensor))

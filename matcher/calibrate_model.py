@@ -216,11 +216,12 @@ class CalibrationModel:
         """Distance of the landmark's farthest point from its origin."""
         return self._renderer.topology.radius_m
 
-    @property
-    def radius_m(self) -> float:
-        """Distance of the landmark's farthest point from its axis."""
-        vertices = self._renderer.topology.vertices
-        return float(np.hypot(vertices[:, 0], vertices[:, 1]).max())
+    def lens_within(self) -> NDArray[np.bool_]:
+        """Return from which poses the lens would stand in the landmark's foot print, (K,)."""
+        vertices = self._renderer.topology.vertices[:, :2]
+        distance, delta = self.poses.distance_m[:, None], self.poses.delta_rad
+        lens = -distance * np.column_stack([np.cos(delta), np.sin(delta)])
+        return np.asarray(((lens > vertices.min(axis=0)) & (lens < vertices.max(axis=0))).all(axis=1))
 
     def images(self, theta: NDArray[np.float64], shift: NDArray[np.float64], *, need_alone: bool = False) -> Images:
         """Render all poses.

@@ -21,10 +21,10 @@ from scipy import optimize
 from phasemark.matcher.calibrate_fit import Blocks
 from phasemark.matcher.calibrate_poses import PoseStd
 
-_START = (1e-3, math.radians(0.1), math.radians(0.1))
-_MOST = (0.1, math.radians(5.0), math.radians(5.0))
-_LEAST = (1e-6, 1e-6, 1e-6)
-"""Metres and radians: nothing is measured better."""
+_START = (2e-4, math.radians(0.02), math.radians(0.02))
+"""Where one of three descents begins; the others from 7 and 55 times as much."""
+_LEAST, _MOST = (1e-6, 1e-6, 1e-6), (0.1, math.radians(10.0), math.radians(10.0))
+"""Metres and radians: nothing is measured better, and nobody would call worse a known pose."""
 
 
 def estimate_pose_std(blocks: Blocks) -> PoseStd:
@@ -47,8 +47,7 @@ def estimate_pose_std(blocks: Blocks) -> PoseStd:
     natural = np.sqrt(np.maximum(np.einsum("kaa->a", aa), 1e-300))
 
     def minus_two_log(log_size: NDArray[np.float64]) -> float:
-        size = np.exp(np.clip(log_size, np.log(_LEAST), np.log(_MOST)))
-        s = size[[0, 0, 1, 2]]
+        s = np.exp(log_size)[[0, 0, 1, 2]]
         middle = np.eye(4) + s[:, None] * bb * s
         half = ab * s
         sbr = br * s
@@ -61,8 +60,16 @@ def estimate_pose_std(blocks: Blocks) -> PoseStd:
         )
         return float(np.linalg.slogdet(middle)[1].sum() + np.linalg.slogdet(h_unit)[1] - explained)
 
-    found = optimize.minimize(
-        minus_two_log, np.log(_START), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02}
-    )
-    position, heading, delta = np.exp(np.clip(found.x, np.log(_LEAST), np.log(_MOST))).tolist()
-    return PoseStd(position, heading, delta)
+    bounds = list(zip(np.log(_LEAST), np.log(_MOST), strict=True))
+    found = [
+        optimize.minimize(
+            minus_two_log,
+            np.log(_START) + side,
+            method="Nelder-Mead",
+            bounds=bounds,
+            options={"xatol": 0.02, "fatol": 0.02},
+        )
+        for side in (0.0, 2.0, 4.0)
+    ]
+    best = min(found, key=lambda one: float(one.fun))
+    return PoseStd(*np.exp(best.x).tolist())
