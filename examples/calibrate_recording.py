@@ -2,12 +2,13 @@
 
 ``python examples/calibrate_recording.py panel.csv --out out/calibration``
 
-The CSV is that of ``examples/real_recording.py``. Every second frame with enough of the panel calibrates: its pose is known
-from motion capture, and the zones that see the panel are found by a plane. The others are compared with what the
+The CSV is that of ``examples/real_recording.py``. Every second frame with enough of the panel calibrates: its pose is
+known from motion capture, and the zones that see the panel are found by a plane. The others are compared with what the
 sensor should have measured there, mounted as assumed and as calibrated.
 
-A wide panel tells pitch, roll, bearing, field of view and range offset of a sensor, if it is seen from several distances
-and under several angles. It does not tell the height: the panel looks the same from everywhere along it.
+A wide panel seen under several angles tells pitch, roll, bearing, horizontal field of view and range offset. It does not
+tell the height, for it looks the same from everywhere along it, nor, upright, the vertical field of view: all of a
+column's zones have one z.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from real_recording import THICKNESS_M, VALID_STATUS, find_plane, read_recording, zone_rays
+from real_recording import THICKNESS_M, find_plane, read_recording, zone_rays
 
 from phasemark import PhasemarkError
 from phasemark.matcher import Calibration, KnownPoses, calibrate, filter_poses
@@ -68,7 +69,8 @@ def describe(title: str, residual: NDArray[np.float64]) -> str:
     pattern = np.nanmean(with_data, axis=0)
     return (
         f"{title}: r.m.s. {1e3 * np.sqrt(np.nanmean(residual**2)):.1f} mm,"
-        f" mean {1e3 * np.nanmean(residual):.1f} mm, r.m.s. of the zones' means {1e3 * np.sqrt(np.mean(pattern**2)):.1f} mm"
+        f" mean {1e3 * np.nanmean(residual):.1f} mm,"
+        f" r.m.s. of the zones' means {1e3 * np.sqrt(np.mean(pattern**2)):.1f} mm"
     )
 
 

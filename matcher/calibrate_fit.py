@@ -394,7 +394,7 @@ def inverse(information: NDArray[np.float64], scale: NDArray[np.float64]) -> NDA
         Natural units, for the sake of rounding.
     """
     scaled = information * np.outer(scale, scale)
-    root = np.sqrt(np.maximum(np.diag(scaled), 1e-300))
+    root = np.sqrt(np.maximum(np.diag(scaled), 1e-20))
     values, vectors = np.linalg.eigh(scaled / np.outer(root, root))
     unit = vectors / np.where(values > 1e-12, np.sqrt(np.maximum(values, 1e-300)), 1e-8)
     covariance = (unit @ unit.T) / np.outer(root, root)

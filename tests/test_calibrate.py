@@ -37,9 +37,7 @@ def some_mounting(rng, albedo=None):
 
 
 def some_poses(rng, n):
-    return KnownPoses.polar(
-        rng.uniform(0.8, 1.8, n), rng.uniform(0, 2 * math.pi, n), rng.uniform(-4, 4, n) * DEGREE
-    )
+    return KnownPoses.polar(rng.uniform(0.8, 1.8, n), rng.uniform(0, 2 * math.pi, n), rng.uniform(-4, 4, n) * DEGREE)
 
 
 def take(mounting, poses, rng, *, sensor=PMD, background=None, n_frames=50, light=True):
@@ -86,32 +84,32 @@ def trial(seed, n_poses=8, *, on="phasors", background=None, light=True, uncerta
 
 @pytest.fixture(scope="module")
 def phasor_trials():
-    return [trial(seed) for seed in range(8)]
+    return [trial(seed, 6) for seed in range(4)]
 
 
 def test_true_mountings_lie_within_their_ellipses_on_phasors(phasor_trials):
-    # the sum of 8 NEES of 8 numbers is χ²(64); 99.9 % corrected for the 3 such tests of this file
+    # the sum of 4 NEES of 8 numbers is χ²(32); 99.9 % corrected for the 3 such tests of this file
     total = sum(value for value, _ in phasor_trials)
-    assert stats.chi2.ppf(1e-3 / 6, 64) < total < stats.chi2.ppf(1 - 1e-3 / 6, 64)
+    assert stats.chi2.ppf(1e-3 / 6, 32) < total < stats.chi2.ppf(1 - 1e-3 / 6, 32)
 
 
 def test_the_fit_itself_passes_its_test(phasor_trials):
     for _, found in phasor_trials:
-        assert found.p_value > 1e-3 / 8  # 99.9 % over the trials
+        assert found.p_value > 1e-3 / 4  # 99.9 % over the trials
 
 
 def test_true_mountings_lie_within_their_ellipses_on_ranges_without_amplitudes():
-    values = [trial(seed, on="ranges", light=False)[0] for seed in range(20, 26)]
-    assert stats.chi2.ppf(1e-3 / 6, 42) < sum(values) < stats.chi2.ppf(1 - 1e-3 / 6, 42)
+    values = [trial(seed, on="ranges", light=False)[0] for seed in range(20, 23)]
+    assert stats.chi2.ppf(1e-3 / 6, 21) < sum(values) < stats.chi2.ppf(1 - 1e-3 / 6, 21)
 
 
 def test_errors_of_the_poses_are_estimated_and_widen_the_covariance():
-    trials = [trial(seed, 16, uncertain=True) for seed in range(40, 43)]
-    # 16 poses tell the errors' sizes to about a fifth, so NEES has wider tails than χ²: twice the upper end
-    assert stats.chi2.ppf(1e-3 / 6, 24) < sum(value for value, _ in trials) < 2 * stats.chi2.ppf(1 - 1e-3 / 6, 24)
+    trials = [trial(seed, 14, uncertain=True) for seed in range(40, 42)]
+    # 14 poses tell the errors' sizes to about a fifth, so NEES has wider tails than χ²: twice the upper end
+    assert stats.chi2.ppf(1e-3 / 6, 16) < sum(value for value, _ in trials) < 2 * stats.chi2.ppf(1 - 1e-3 / 6, 16)
     for _, found in trials:
         assert any("poses were taken to be uncertain" in note for note in found.notes)
-        assert found.std("bearing") > 0.02 * DEGREE  # 0.2° over 16 poses, where noise alone leaves 1e-4°
+        assert found.std("bearing") > 0.02 * DEGREE  # 0.2° over 14 poses, where noise alone leaves 1e-4°
 
 
 def test_a_wall_behind_tells_the_albedo_from_ranges():
@@ -152,9 +150,9 @@ def test_slopes_by_offset_and_albedo_are_those_of_the_closed_form():
     np.testing.assert_allclose(slope[0, 1, lit] / phasor[0, lit], 1 / 0.8, rtol=1e-12)
 
 
-def test_what_is_fixed_stays_and_the_rest_is_better_known(phasor_trials):
+def test_what_is_not_free_stays(phasor_trials):
     _, free = phasor_trials[0]
-    _, found = trial(0, free=("pitch", "height"))
+    _, found = trial(0, 3, free=("pitch", "height"))
     assert found.free == ("pitch", "height")
     assert found.mounting.roll_rad == 0.0
     assert found.sensor.half_angle_h_deg == PMD.half_angle_h_deg
@@ -314,7 +312,9 @@ def test_the_command_writes_a_sensor_that_every_other_command_takes(folder, tmp_
         assert abs(one["value"] - true) < 4.5 * one["std"]  # 99.9 % over 8 numbers is 3.8
         if parameter.field is not None:
             scale = parameter.shown if parameter.unit == "°" else 1.0
-            assert getattr(sensor, parameter.field) == pytest.approx(getattr(truth, parameter.attribute) * scale, abs=0.01)
+            assert getattr(sensor, parameter.field) == pytest.approx(
+                getattr(truth, parameter.attribute) * scale, abs=0.01
+            )
     assert (tmp_path / "cam.png").read_bytes().startswith(b"\x89PNG")
     assert main(["sensor", "show", str(tmp_path / "cam.toml")]) == 0
     bank = ["bank", "build", "--full", "--class", "cylinder", "--sensor", str(tmp_path / "cam.toml"), "--distance",
