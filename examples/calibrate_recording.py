@@ -6,8 +6,8 @@ The CSV is that of ``examples/real_recording.py``. Every second frame with enoug
 known from motion capture, and the zones that see the panel are found by a plane. The others are compared with what the
 sensor should have measured there, mounted as assumed and as calibrated.
 
-A wide panel seen under several angles tells pitch, roll, bearing, horizontal field of view and range offset. It does not
-tell the height, for it looks the same from everywhere along it, nor, upright, the vertical field of view: all of a
+A wide panel seen under several angles tells pitch, roll, bearing, horizontal field of view and range offset. It does
+not tell the height, for it looks the same from everywhere along it, nor, upright, the vertical field of view: all of a
 column's zones have one z.
 """
 

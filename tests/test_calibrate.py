@@ -1,4 +1,4 @@
-"""Calibration of a mounting: truth recovered from simulated recordings with honest errors, and what is said when not."""
+"""Calibration of a mounting: truth recovered from simulated recordings and what is said when not."""
 
 import json
 import math
@@ -288,7 +288,7 @@ def folder(tmp_path_factory):
     write = {"fmt": "%.9f", "delimiter": ",", "header": header, "comments": ""}
     np.savetxt(folder / "poses.csv", rows, **write)
     np.savetxt(folder / "seven.csv", rows[:7], **write)
-    np.savetxt(folder / "aside.csv", rows + [0, 0, 60], **write)
+    np.savetxt(folder / "aside.csv", rows + np.array([0, 0, 60]), **write)
     np.savetxt(folder / "inside.csv", rows * [0.1, 1, 1], **write)
     return folder, truth
 
@@ -360,7 +360,7 @@ def test_the_command_says_in_one_line_what_is_wrong(folder, tmp_path, capsys, op
 def test_two_poses_are_too_few():
     poses = KnownPoses.polar([0.9, 1.2], [0.1, 0.4])
     frames = take(Mounting.of_sensor(PMD, 0.8), poses, np.random.default_rng(3), n_frames=10)
-    with pytest.raises(UsageError, match="too few poses: 2, but .* take at least 3"):
+    with pytest.raises(UsageError, match=r"too few poses: 2, but .* take at least 3"):
         calibrate(MESH, filtered(frames), poses)
     found = calibrate(MESH, filtered(frames), poses, free=("range_offset",))  # one number takes no more
     assert abs(found.value("range_offset")) < 4 * found.std("range_offset")
