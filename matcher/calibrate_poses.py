@@ -220,6 +220,15 @@ def read_poses(
     place = tuple(f"{path}, line {number}" for number, _ in lines[1:])
     values = {name: np.array(column) for name, column in columns.items()}
     zero = np.zeros(len(place))
+    distances = values.get("distance_m")
+    if distances is None:
+        distances = np.hypot(values["x_m"] - landmark_xy_m[0], values["y_m"] - landmark_xy_m[1])
+    for where, distance in zip(place, distances, strict=True):
+        if not 0 < distance < _FARTHEST_M:
+            raise InputFileError(
+                f"{where}: the lens is {distance:g} m from the landmark, must be more than 0 and less than"
+                f" {_FARTHEST_M:g} m: the columns are in metres"
+            )
     if is_polar:
         bearing = np.radians(values.get("bearing_deg", zero))
         seen = KnownPoses.polar(values["distance_m"], np.radians(values["delta_deg"]), bearing)
@@ -231,12 +240,6 @@ def read_poses(
             landmark_xy_m=landmark_xy_m,
             landmark_yaw_rad=landmark_yaw_rad,
         )
-    for where, distance in zip(place, seen.distance_m, strict=True):
-        if not 0 < distance < _FARTHEST_M:
-            raise InputFileError(
-                f"{where}: the lens is {distance:g} m from the landmark, must be more than 0 and less than"
-                f" {_FARTHEST_M:g} m: the columns are in metres"
-            )
     frames = None
     if "frames" in values:
         frames = values["frames"].astype(np.int64)
