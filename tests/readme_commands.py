@@ -180,8 +180,8 @@ def _write_workshop(path: Path) -> None:
     image = Renderer(build_mesh(catalog()["cylinder"]), sensor).render(distance, np.radians(delta), np.radians(bearing))
     frames = capture(image, sensor, rng=np.random.default_rng(1), n_frames=20)
     ranges = np.where(frames.valid, frames.range_m, np.nan).reshape(1, -1, 16, 16)
-    light = {"amplitude": frames.amplitude_e.reshape(ranges.shape), "intensity": frames.intensity_e.reshape(ranges.shape)}
-    np.savez(path, range=ranges, **light, unit="m", quantity="range")
+    amplitude, intensity = (values.reshape(ranges.shape) for values in (frames.amplitude_e, frames.intensity_e))
+    np.savez(path, range=ranges, amplitude=amplitude, intensity=intensity, unit="m", quantity="range")
 
 
 GIVEN: dict[str, Callable[[Path], None]] = {
