@@ -15,6 +15,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
     from phasemark.data import Bank, BankPlan, FramePlan
     from phasemark.landmarks import LandmarkSpec
-    from phasemark.matcher import FilteredFrames, LandmarkMap, Match, Matches, RobotPose
+    from phasemark.matcher import Calibration, FilteredFrames, LandmarkMap, Match, Matches, RobotPose
     from phasemark.render import Background, Estimate, Sensor
 
 __all__ = ["app", "main"]
@@ -48,6 +49,7 @@ Start with
   phasemark bank build -o bank.h5   a bank of model images to match your frames against
   phasemark match bank.h5 measured.csv --unit m --quantity range
   phasemark sensor fit frames.npz --distance 1.0 -o mycam.toml    a camera of your own, from frames of a flat board
+  phasemark calibrate cylinder frames.npz --poses poses.csv -o mounted.toml    how your camera is mounted
   phasemark drive                   a robot on a tour of 20 m, corrected at four landmarks
   phasemark --help                  all commands; COMMAND --help explains one
 """
@@ -998,6 +1000,194 @@ def _match(
     _echo_matches(answers)
     for path in plots:
         typer.echo(path)
+
+
+@app.command("calibrate")
+def _calibrate(
+    landmark: Annotated[str, typer.Argument(metavar="BANK|CLASS", help="A bank, or a class of the catalogue.")],
+    frames: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FRAMES...", help="Measured frames: a file for each pose, or one of them all, in order."
+        ),
+    ],
+    poses: Annotated[
+        Path,
+        typer.Option(
+            "--poses", metavar="CSV", help="Columns distance_m,delta_deg[,bearing_deg] or x_m,y_m,heading_deg."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
+    class_name: Annotated[str | None, typer.Option("--class", help="Which class of a bank that has several.")] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option("--sensor", metavar="NAME|FILE", help="The camera as it is thought to be; a bank has its own."),
+    ] = None,
+    free: Annotated[
+        str | None, typer.Option("--free", metavar="NAMES", help="Estimate these alone, e.g. pitch,roll,height.")
+    ] = None,
+    fix: Annotated[
+        str | None, typer.Option("--fix", metavar="NAMES", help="Leave these as they are, e.g. fov.")
+    ] = None,
+    height: Annotated[
+        float, typer.Option("--height", metavar="M", help="Landmark's origin above the lens, as it is thought to be.")
+    ] = 0.0,
+    bearing: Annotated[
+        float, typer.Option("--bearing", metavar="DEG", help="Where the camera sees it if 0 is stated, likewise.")
+    ] = 0.0,
+    albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmark, likewise.")] = None,
+    position_std: Annotated[
+        float | None, typer.Option("--position-std", metavar="M", help="How well the places of the lens are known.")
+    ] = None,
+    heading_std: Annotated[
+        float | None, typer.Option("--heading-std", metavar="DEG", help="How well the camera's headings are known.")
+    ] = None,
+    delta_std: Annotated[
+        float | None, typer.Option("--delta-std", metavar="DEG", help="How well the landmark is turned to its side.")
+    ] = None,
+    landmark_xy: Annotated[
+        tuple[float, float], typer.Option("--landmark-xy", metavar="X Y", help="Where it stands, for x_m,y_m.")
+    ] = (0.0, 0.0),
+    landmark_yaw: Annotated[float, typer.Option("--landmark-yaw", metavar="DEG", help="Heading of its x' axis.")] = 0.0,
+    on: Annotated[str, typer.Option("--on", help="auto, ranges, or phasors: amplitudes too.")] = "auto",
+    wall: _Wall = None,
+    floor: _Floor = None,
+    unit: _FramesUnit = None,
+    quantity: _Quantity = None,
+    invalid_means: Annotated[
+        str, typer.Option("--invalid-means", help="What an invalid pixel stands for: missing or no-return.")
+    ] = "missing",
+    valid_status: _ValidStatus = None,
+    flip_h: _FlipH = False,
+    flip_v: _FlipV = False,
+    rotate: _Rotate = 0,
+    plot: Annotated[
+        Path | None,
+        typer.Option("--plot", help="The picture of the residuals, .png; beside the sensor file otherwise."),
+    ] = None,
+    workers: _Workers = None,
+    as_json: _Json = False,
+    force: _Force = False,
+) -> None:
+    """Find how a camera is mounted from frames of a landmark taken at known positions.
+
+    Pitch, roll, height, bearing, field of view, range offset and, from amplitudes, the landmark's albedo: --free and
+    --fix take pitch, roll, height, bearing, half_angle_h, half_angle_v (both: fov), range_offset and albedo.
+    """
+    import io as bytes_io
+
+    from phasemark.data import read_frames, write_atomically
+    from phasemark.data.executor import processors
+    from phasemark.matcher import PoseStd, calibrate, filter_poses, frames_of_poses, read_poses
+    from phasemark.matcher.calibrate_model import Mounting
+    from phasemark.matcher.calibrate_report import calibration_dict, calibration_toml, residual_picture
+
+    if out.suffix.lower() != ".toml":
+        raise UsageError(f"the sensor must be a .toml file, got '{out}'")
+    picture = plot or out.with_suffix(".png")
+    if picture.suffix.lower() != ".png":
+        raise UsageError(f"the picture must be a .png file, got '{picture}'")
+    _refuse_existing([out, picture], force)
+    background = _background(wall, floor)
+    mesh, base, base_name = _calibration_target(landmark, class_name, sensor)
+    stds = None
+    if (position_std, heading_std, delta_std) != (None, None, None):
+        stds = PoseStd(position_std or 0.0, math.radians(heading_std or 0.0), math.radians(delta_std or 0.0))
+    known = read_poses(poses, landmark_xy_m=landmark_xy, landmark_yaw_rad=math.radians(landmark_yaw))
+    measured = [
+        read_frames(
+            path,
+            sensor=base,
+            unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
+            quantity=quantity,  # type: ignore[arg-type]
+            invalid_means=invalid_means,  # type: ignore[arg-type]
+            valid_status=valid_status,
+            flip_h=flip_h,
+            flip_v=flip_v,
+            rotate=rotate,
+            untrusted=True,
+        )
+        for path in frames
+    ]
+    filtered = filter_poses(
+        frames_of_poses(measured, known),
+        on,  # type: ignore[arg-type]  # calibrate says what is right
+    )
+    bright = float(mesh.metadata.get("albedo", 0.8)) if albedo is None else albedo
+    if not 0 < bright <= 1:
+        raise UsageError(f"--albedo must be in (0, 1], got {bright:g}")
+    found = calibrate(
+        mesh,
+        filtered,
+        known,
+        free=None if free is None else _names(free),
+        fixed=() if fix is None else _names(fix),
+        start=replace(Mounting.of_sensor(base, bright), height_m=height, bearing_rad=math.radians(bearing)),
+        on=on,  # type: ignore[arg-type]  # calibrate says what is right
+        background=background,
+        pose_std=stds,
+        reports_z=quantity == "z" or None,
+        workers=workers or min(processors(), 4),
+    )
+    buffer = bytes_io.BytesIO()
+    residual_picture(found).savefig(buffer, format="png", dpi=100)
+    write_atomically(picture, buffer.getvalue(), force=force)
+    write_atomically(out, calibration_toml(found, base_name=base_name).encode(), force=force)
+    if as_json:
+        _echo_json({"file": str(out), "picture": str(picture), **calibration_dict(found)})
+        return
+    _echo_calibration(found)
+    typer.echo(out)
+    typer.echo(picture)
+
+
+def _names(text: str) -> list[str]:
+    """Split names at commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _calibration_target(landmark: str, class_name: str | None, sensor: str | None) -> tuple[Trimesh, Sensor, str]:
+    """Return the mesh of a landmark, and the camera as it is thought to be with its name."""
+    from phasemark.data import open_bank
+    from phasemark.landmarks import catalog
+
+    path = Path(landmark)
+    if landmark in catalog() or not (path.suffix or path.exists()):
+        if class_name is not None:
+            raise UsageError("--class belongs to a bank: give the class in its place")
+        name = sensor or "pmd-16x16"
+        return _load_landmark(landmark, None, "z", "file", from_catalog=True)[1], _load_sensor(name), name
+    with open_bank(path, untrusted=True) as bank:
+        if class_name is None and len(bank.classes) > 1:
+            raise UsageError(f"{landmark} has {', '.join(bank.classes)}: say with --class which one was recorded")
+        mesh = bank.mesh(class_name or bank.classes[0])
+        return (mesh, bank.sensor, landmark) if sensor is None else (mesh, _load_sensor(sensor), sensor)
+
+
+def _echo_calibration(found: Calibration) -> None:
+    """Print every number with its standard deviation and use, their correlations, the test of the fit and notes."""
+    from phasemark.matcher.calibrate_model import NAMES, PARAMETERS
+    from phasemark.matcher.calibrate_report import USES, shown, shown_std
+
+    rows = []
+    for name in NAMES:
+        parameter = PARAMETERS[name]
+        use = USES.get(name) or f"{parameter.field} of the sensor"
+        rows.append((name, shown(found, name), shown_std(found, name), parameter.unit, use))
+    _echo_table(("", "value", "±", "", "where it goes"), rows)
+    if len(found.free) > 1:
+        typer.echo("\ncorrelation")
+        _echo_table(
+            ("", *found.free),
+            (
+                (name, *(f"{value:.2f}" for value in row))
+                for name, row in zip(found.free, found.correlation, strict=True)
+            ),
+        )
+    typer.echo(f"\nχ² = {found.chi2:.6g}, {found.dof} degrees of freedom, p = {found.p_value:.3g}")
+    typer.echo(f"standard deviations from {found.covariance_from}")
+    for note in found.notes:
+        typer.echo(f"note: {note}")
 
 
 @app.command("demo")

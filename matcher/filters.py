@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -94,6 +94,14 @@ class FilteredFrames:
             self.sensor,
             self.std_from_scatter,
         )
+
+    def without_offset(self) -> FilteredFrames:
+        """Return the frames with the sensor's range offset taken off, of the same sensor without one."""
+        offset = self.sensor.range_offset_m
+        if offset == 0:
+            return self
+        corrected = wrap_range_m(self.range_m - offset, self.sensor)
+        return replace(self, range_m=corrected, sensor=self.sensor.with_(range_offset_m=0.0))
 
 
 def kalman_step(

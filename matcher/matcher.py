@@ -141,7 +141,7 @@ class Matcher:
         Parameters
         ----------
         frames : FilteredFrames
-            n positions.
+            n positions. The range offset that their sensor states is taken off: a bank has none.
 
         Returns
         -------
@@ -156,6 +156,7 @@ class Matcher:
         difference = frames.sensor.optics_difference(self.bank.sensor)
         if difference is not None:
             raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
+        frames = frames.without_offset()
         if self._likelihood is not None:
             return Matches(self._likelihood.match(frames))
         matches: list[Match] = []

@@ -81,6 +81,7 @@ def match_picture(
     -------
     matplotlib.figure.Figure
     """
+    frames = frames.without_offset()
     measured = frames.range_m[index]
     model = np.full_like(measured, np.nan)
     if math.isfinite(match.distance_m):

@@ -7,7 +7,6 @@ electrons themselves. :func:`fit_sensor` says of every number whether it was mea
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ from phasemark.render.frames import Frames
 from phasemark.render.noise import exact_phase_moments
 from phasemark.render.phasor import wrap_difference_m
 from phasemark.render.sensor import Sensor
+from phasemark.render.sensor_file import rounded, sensor_toml
 
 AmplitudeUnit = Literal["electrons", "arbitrary"]
 
@@ -51,7 +51,6 @@ _SINE: dict[str, Any] = {
     "reference_pulse": (),
 }
 _DELAY_STEP_RAD = 1e-4
-_DIGITS = 7  # of a number in a sensor file
 
 _Float = NDArray[np.float64]
 
@@ -124,26 +123,11 @@ class SensorFit:
         base_name : str
             What the camera is called that gave all that was not measured.
         """
-        fields = self.sensor.model_dump(mode="json")
-        lines = ["# Fitted to measured flat-field frames by phasemark sensor fit."]
-        lines += [f"# {note}" for note in self.notes]
-        for title, names in Sensor.field_groups().items():
-            own = [
-                name
-                for name in names
-                if name in self.estimates
-                or (fields[name] is not None and fields[name] != _plain_default(name))
-                or Sensor.model_fields[name].is_required()
-            ]
-            if own:
-                lines += ["", f"# {title}"]
-            for name in own:
-                estimate = self.estimates.get(name)
-                comment = f"assumed: as in {base_name}" if estimate is None else estimate.comment
-                if name == "modulation" and "harmonics" in self.estimates:
-                    comment = "the harmonics were measured"
-                lines.append(f"{name} = {json.dumps(fields[name])}  # {comment}")
-        return "\n".join(lines) + "\n"
+        comments = {name: estimate.comment for name, estimate in self.estimates.items()}
+        if "harmonics" in comments:
+            comments["modulation"] = "the harmonics were measured"
+        header = ("Fitted to measured flat-field frames by phasemark sensor fit.", *self.notes)
+        return sensor_toml(self.sensor, comments, header=header, otherwise=f"assumed: as in {base_name}")
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain numbers, lists and strings, for JSON; None where there is no number."""
@@ -161,18 +145,6 @@ class SensorFit:
                 [float(value) if math.isfinite(value) else None for value in row] for row in self.pixel_offset_m
             ],
         }
-
-
-def _rounded(value: Any) -> Any:
-    """Round the floats of a field to the digits of a sensor file."""
-    if isinstance(value, tuple):
-        return tuple(_rounded(one) for one in value)
-    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
-
-
-def _plain_default(name: str) -> object:
-    default = Sensor.model_fields[name].default
-    return list(default) if isinstance(default, tuple) else default
 
 
 def fit_sensor(
@@ -263,7 +235,7 @@ def fit_sensor(
         offset, offset_error = data.pattern(changes)
     changes |= _pattern_fields(data, base, offset, offset_error * widening, odd, estimates)
     changes |= _fit_noise(data, base, amplitude_unit, estimates, notes)
-    fields = {**base.model_dump(), **{name: _rounded(value) for name, value in changes.items()}}
+    fields = {**base.model_dump(), **{name: rounded(value) for name, value in changes.items()}}
     if base.kind == "phase":
         fields["contrast"] = _possible_contrast(fields, estimates, notes)
     sensor = Sensor(**fields)

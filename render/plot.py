@@ -99,21 +99,23 @@ def draw_range(
     return image
 
 
-def draw_difference(axes: Axes, difference_m: NDArray[np.float64]) -> AxesImage:
+def draw_difference(axes: Axes, difference_m: NDArray[np.float64], *, span_mm: float | None = None) -> AxesImage:
     """Draw a difference of ranges into axes of a larger figure, in millimetres.
 
     Parameters
     ----------
     axes : matplotlib.axes.Axes
     difference_m : (rows, cols) ndarray
-        Metres; what is NaN stays grey. Nine tenths of the pixels lie within the colour bar.
+        Metres; what is NaN stays grey.
+    span_mm : float, optional
+        What the colour bar ends at, to both sides; None: nine tenths of the pixels lie within it.
 
     Returns
     -------
     matplotlib.image.AxesImage
     """
     known = 1e3 * np.abs(difference_m[np.isfinite(difference_m)])
-    span = max(float(np.percentile(known, 90)) if known.size else 1.0, 1.0)
+    span = max(float(np.percentile(known, 90)) if known.size else 1.0, 1.0) if span_mm is None else span_mm
     axes.set_facecolor("#d0d0d0")
     image = _draw_pixels(axes, 1e3 * difference_m, cmap="RdBu", vmin=-span, vmax=span)
     _colour_bar(axes, image, "difference (mm)")

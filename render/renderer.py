@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -132,11 +133,20 @@ class Renderer:
         self.topology = MeshTopology.empty() if mesh is None else MeshTopology.from_mesh(unite_shells(mesh))
         self._orders = np.array([1, *harmonics], dtype=np.int64)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
-        tan_h, tan_v = sensor.tan_half_angles
-        scale = (sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v))
-        self._camera = np.array([*scale, *sensor.centre_px, sensor.rows, sensor.cols, *sensor.fill_factor], float)
+        self._camera = _camera(sensor)
         self.untrusted_pixels = 0
         """How many pixels, of all rendered so far, had too many edges to be split exactly."""
+
+    def seen_by(self, sensor: Sensor) -> Renderer:
+        """Return a renderer of the same landmark for another camera, which shares all that belongs to the mesh.
+
+        Parameters
+        ----------
+        sensor : Sensor
+        """
+        other = copy.copy(self)
+        other.sensor, other._camera, other.untrusted_pixels = sensor, _camera(sensor), 0
+        return other
 
     def render(
         self,
@@ -407,6 +417,13 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
             )
+
+
+def _camera(sensor: Sensor) -> NDArray[np.float64]:
+    """Return a camera's intrinsic numbers as the kernels take them."""
+    tan_h, tan_v = sensor.tan_half_angles
+    scale = (sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v))
+    return np.array([*scale, *sensor.centre_px, sensor.rows, sensor.cols, *sensor.fill_factor], float)
 
 
 class _Sums:

@@ -159,10 +159,37 @@ def _write_board(path: Path) -> None:
     np.savez(path, **arrays, unit="m", quantity="range")
 
 
+_WORKSHOP_POSES = [(0.8 + 0.2 * (k % 4), 40.0 * k, 4.0 * (k % 3 - 1)) for k in range(8)]
+
+
+def _write_poses(path: Path) -> None:
+    """Write where a camera stood before a cylinder on a workshop's floor: distance, side, bearing."""
+    lines = [f"{distance:.3f},{delta:.1f},{bearing:.1f}" for distance, delta, bearing in _WORKSHOP_POSES]
+    path.write_text("\n".join(["distance_m,delta_deg,bearing_deg", *lines, ""]), encoding="utf-8")
+
+
+def _write_workshop(path: Path) -> None:
+    """Write 20 frames from each of those poses, of a camera that looks 1° down, in a row: 160 frames."""
+    import numpy as np
+
+    from phasemark.landmarks import build_mesh, catalog
+    from phasemark.render import Renderer, capture, preset
+
+    distance, delta, bearing = np.array(_WORKSHOP_POSES).T
+    sensor = preset("pmd-16x16").with_(pitch_deg=1.0, range_offset_m=0.01)
+    image = Renderer(build_mesh(catalog()["cylinder"]), sensor).render(distance, np.radians(delta), np.radians(bearing))
+    frames = capture(image, sensor, rng=np.random.default_rng(1), n_frames=20)
+    ranges = np.where(frames.valid, frames.range_m, np.nan).reshape(1, -1, 16, 16)
+    amplitude, intensity = (values.reshape(ranges.shape) for values in (frames.amplitude_e, frames.intensity_e))
+    np.savez(path, range=ranges, amplitude=amplitude, intensity=intensity, unit="m", quantity="range")
+
+
 GIVEN: dict[str, Callable[[Path], None]] = {
     "board_1m.npz": _write_board,
     "board_2m.npz": _write_board,
     "board_3m.npz": _write_board,
     "measured.csv": _write_measured,
     "my_part.stl": _write_part,
+    "poses.csv": _write_poses,
+    "workshop.npz": _write_workshop,
 }

@@ -1,0 +1,486 @@
+"""How a camera is really mounted: calibration from frames of a landmark taken at known positions.
+
+:func:`calibrate` finds the mounting (pitch, roll, height, bearing, field of view, range offset and, from amplitudes,
+the landmark's albedo) under which filtered frames are most likely, with its covariance, a test of the fit, and
+sentences on what these poses cannot tell.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.matcher.calibrate_fit import Fit, Solution, inverse
+from phasemark.matcher.calibrate_model import NAMES, PARAMETERS, CalibrationModel, Mounting
+from phasemark.matcher.calibrate_notes import advice, named, observability_notes, odd_pose_notes
+from phasemark.matcher.calibrate_pose_errors import estimate_pose_std
+from phasemark.matcher.calibrate_poses import KnownPoses, PoseStd
+from phasemark.matcher.coarse import assumed_std_m
+from phasemark.matcher.estimator import MIN_RETURNS, p_values_of
+from phasemark.matcher.filters import FilteredFrames, PixelState, kalman_filter, phasor_mean
+from phasemark.matcher.likelihood import Evidence, Quantity
+from phasemark.render import Background, Frames, Sensor, wrap_difference_m
+from phasemark.render.sensor_file import rounded
+
+FEWEST_POSES = 3
+"""Unless fewer numbers than that are free."""
+_FALSE_ALARM = 0.01
+"""A fit whose χ² is exceeded with less than this probability does not fit."""
+_UNKNOWN = 3.0
+"""Natural units (1°, 1 cm, 0.1): what is known worse than to so many is not observable."""
+_POSES_FOR_ERRORS = 6
+"""Fewer poses do not tell the size of their errors."""
+_ROUNDS = 2
+_FRAMES_FOR_SCATTER = 10
+"""Frames without amplitudes of one pose from which their scatter is a better judge of noise than the noise law."""
+_POSES_FOR_SANDWICH = 3
+"""Poses for each free parameter from which their own scatter tells the covariance."""
+_FAR_RETURNS = 0.02
+"""Share of pixels that may return where the model has nothing, before something is taken to stand there."""
+_OUT_OF_VIEW_RAD = math.radians(5.0)
+_UNITS = {
+    0.001: "1000 times",
+    0.01: "100 times",
+    0.1: "10 times",
+    10.0: "10 times",
+    100.0: "100 times",
+    1000.0: "1000 times",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """How a camera is mounted, and how well that is known.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        The camera with what was found; fields that were not free are as they were.
+    base : Sensor
+        The camera as it was thought to be.
+    mounting, assumed : Mounting
+        What was found, and what it was thought to be.
+    free : tuple of str
+        Names of what was estimated (:data:`NAMES`); the other numbers of `mounting` are assumptions.
+    covariance : (p, p) float64
+        In the order of `free`; radians, metres.
+    covariance_from : str
+        What it was made of, in words.
+    chi2, dof, p_value : float, int, float
+        Test of the fit.
+    on : {"ranges", "phasors"}
+    poses : KnownPoses
+    pose_shift : (K, 3) float64
+        Estimated errors of the poses in D, δ and b; zero where poses are taken as exact.
+    pose_chi2, pose_residuals : (K,) float64, (K,) int64
+        Share of each pose in χ², and how many residuals it is made of.
+    residual_m, residual_before_m : (K, rows, cols) float64
+        Measured less modelled range with the mounting found and with the one assumed; NaN where a pixel does not count.
+    range_std_m : (K, rows, cols) float64
+        Standard deviation of the filtered range; NaN where a pixel does not count.
+    notes : tuple of str
+        Sentences on what is not observable, what does not fit, and what to do.
+    """
+
+    sensor: Sensor
+    base: Sensor
+    mounting: Mounting
+    assumed: Mounting
+    free: tuple[str, ...]
+    covariance: NDArray[np.float64]
+    covariance_from: str
+    chi2: float
+    dof: int
+    p_value: float
+    on: Quantity
+    poses: KnownPoses
+    pose_shift: NDArray[np.float64]
+    pose_chi2: NDArray[np.float64]
+    pose_residuals: NDArray[np.int64]
+    residual_m: NDArray[np.float64]
+    residual_before_m: NDArray[np.float64]
+    range_std_m: NDArray[np.float64]
+    notes: tuple[str, ...]
+
+    def value(self, name: str) -> float:
+        """Return one number of the mounting, radians, metres or albedo."""
+        return float(getattr(self.mounting, PARAMETERS[name].attribute))
+
+    def std(self, name: str) -> float:
+        """Return its standard deviation; 0 if it was not free."""
+        if name not in self.free:
+            return 0.0
+        k = self.free.index(name)
+        return math.sqrt(float(self.covariance[k, k]))
+
+    @property
+    def correlation(self) -> NDArray[np.float64]:
+        """Correlation matrix of what was free, (p, p)."""
+        root = np.sqrt(np.diag(self.covariance))
+        return np.asarray(self.covariance / np.outer(root, root))
+
+
+def check_names(names: Sequence[str], what: str) -> tuple[str, ...]:
+    """Return names of parameters in their order; ``fov`` stands for both half angles.
+
+    Raises
+    ------
+    UsageError
+        A name is unknown.
+    """
+    spelled: set[str] = set()
+    for name in names:
+        spelled |= {"half_angle_h", "half_angle_v"} if name == "fov" else {name}
+        if name != "fov" and name not in NAMES:
+            raise UsageError(f"{what} must be among {', '.join(NAMES)} and fov (both half angles), got {name!r}")
+    return tuple(name for name in NAMES if name in spelled)
+
+
+def filter_poses(frames: Sequence[Frames], on: Quantity | Literal["auto"] = "auto") -> FilteredFrames:
+    """Filter the frames of each pose: the mean phasor where phasors will be compared, else the Kalman filter.
+
+    Parameters
+    ----------
+    frames : sequence of Frames
+        One position each, of one camera; they may differ in number.
+    on : {"auto", "ranges", "phasors"}
+        As for :func:`calibrate`.
+
+    Returns
+    -------
+    FilteredFrames
+        As many positions.
+    """
+    lit = all(one.amplitude_e is not None and one.intensity_e is not None for one in frames)
+    coherent = on == "phasors" or (on == "auto" and lit and frames[0].sensor.kind == "phase")
+    parts = [phasor_mean(one) if coherent else kalman_filter(one) for one in frames]
+    parts = [
+        _with_known_noise(part) if one.n_frames < _FRAMES_FOR_SCATTER else part
+        for part, one in zip(parts, frames, strict=True)
+    ]
+
+    def joined(name: str) -> NDArray[np.float64] | None:
+        arrays = [getattr(part, name) for part in parts]
+        return None if any(array is None for array in arrays) else np.concatenate(arrays)
+
+    first = parts[0]
+    return FilteredFrames(
+        np.concatenate([part.range_m for part in parts]),
+        np.concatenate([part.std_m for part in parts]),
+        joined("amplitude_e"),
+        joined("intensity_e"),
+        np.concatenate([part.state for part in parts]),
+        np.concatenate([part.n_effective for part in parts]),
+        first.sensor,
+        any(part.std_from_scatter for part in parts),
+    )
+
+
+def _with_known_noise(frames: FilteredFrames) -> FilteredFrames:
+    """Replace noise that few frames told by their scatter by what the camera's law says of a surface of albedo 0.8."""
+    if not frames.std_from_scatter:
+        return frames
+    law = assumed_std_m(np.nan_to_num(frames.range_m, nan=1.0), frames.sensor)
+    std = np.where(frames.n_effective > 0, law / np.sqrt(np.maximum(frames.n_effective, 1.0)), np.nan)
+    return replace(frames, std_m=std, std_from_scatter=False)
+
+
+def calibrate(
+    mesh: trimesh.Trimesh,
+    frames: FilteredFrames,
+    poses: KnownPoses,
+    *,
+    free: Sequence[str] | None = None,
+    fixed: Sequence[str] = (),
+    start: Mounting | None = None,
+    albedo: float = 0.8,
+    on: Quantity | Literal["auto"] = "auto",
+    background: Background | None = None,
+    pose_std: PoseStd | None = None,
+    reports_z: bool | None = None,
+    workers: int = 1,
+) -> Calibration:
+    """Estimate how a camera is mounted, by maximum likelihood.
+
+    With y the filtered ranges of all poses, or the phasors z, and f the rendered ones, the residuals are those of
+    matching (PHYSICS section 7) with the variance of the noise law; what moves is not the view, which is known, but the
+    camera. The covariance is the inverse of Jᵀ Σ⁻¹ J with slopes over the standard deviations found. Where χ² says that
+    the residuals are more than noise, it is the sandwich over poses, or, if there are few of them, is scaled by χ².
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        The landmark.
+    frames : FilteredFrames
+        One for each pose; their sensor is the camera as it is thought to be. For phasors best from
+        :func:`~phasemark.matcher.phasor_mean`.
+    poses : KnownPoses
+    free : sequence of str, optional
+        What to estimate, :data:`NAMES`; None: all of it. On ranges the albedo is told only by pixels that mix the
+        landmark with a background of known albedo, and left out where there is none.
+    fixed : sequence of str
+        What of that to leave as it is.
+    start : Mounting, optional
+        Where it is thought to be and what stays as it is; None: what the sensor states, straight ahead.
+    albedo : float
+        Of the landmark, as it is thought to be.
+    on : {"auto", "ranges", "phasors"}
+        "auto": phasors where the frames have amplitude and intensity.
+    background : Background, optional
+        What stands behind; a pose's own `wall_m` replaces its wall. Without one, where more than a few pixels return
+        beside the landmark, only those that see nothing else count.
+    pose_std : PoseStd, optional
+        How well the poses are known; then their errors are estimated too. None: they are taken as exact, and if
+        then the residuals are more than noise, the sizes of their errors are estimated as well.
+    reports_z : bool, optional
+        Whether the camera measures z, from which its ranges were made with the half angles it is thought to have; None:
+        what the sensor says of itself.
+    workers : int
+        Threads that render.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    UsageError
+        With one line: names or numbers are wrong, frames and poses do not go together, or the poses do not tell what is
+        free.
+    """
+    sensor = frames.sensor
+    has_light = frames.amplitude_e is not None and frames.intensity_e is not None and sensor.kind == "phase"
+    if on not in ("auto", "ranges", "phasors"):
+        raise UsageError(f"'on' must be auto, ranges or phasors, got {on!r}")
+    quantity: Quantity = ("phasors" if has_light else "ranges") if on == "auto" else on
+    names = NAMES if free is None else check_names(free, "'free'")
+    lit = quantity == "phasors" or background is not None or poses.wall_m is not None
+    if free is None and not lit:
+        names = tuple(name for name in names if name != "albedo")
+    kept = check_names(fixed, "'fixed'")
+    names = tuple(name for name in names if name not in kept)
+    _check(frames, poses, names, lit)
+    evidence = Evidence.from_frames(frames, quantity)
+    assumed = start or Mounting.of_sensor(sensor, albedo)
+    z = sensor.quantity == "z" if reports_z is None else reports_z
+    model = CalibrationModel(
+        mesh, sensor, poses, albedo=assumed.albedo, background=background, reports_z=z, workers=workers
+    )
+    _check_view(model, evidence, assumed)
+    edges = model.has_background or not _returns_beside(model, evidence, assumed)
+    exact = pose_std is None or pose_std.exact
+    fit = Fit(model, evidence, names, None if exact or pose_std is None else pose_std.factor(poses), edges=edges)
+    theta = fit.start(assumed.vector)
+    images = model.images(theta, np.zeros((len(poses), 3)))
+    use = fit.pixels(theta, images, cautious=True)
+    _check_pixels(use, poses, evidence)
+    at_start = fit.conclude(theta, np.zeros((len(poses), fit.factor.shape[2])), use)
+    _check_observable(at_start, fit, poses)
+    solution = fit.solve(theta, use)
+    _check_observable(solution, fit, poses)
+    estimated = None
+    if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and _fit_probability(fit, solution, frames) < _FALSE_ALARM:
+        for _ in range(_ROUNDS):
+            estimated = estimate_pose_std(fit.blocks(solution, PoseStd(1.0, 1.0, 1.0).factor(poses)))
+            fit = Fit(model, evidence, names, estimated.factor(poses), edges=edges)
+            solution = fit.solve(solution.theta, solution.use)
+        _check_observable(solution, fit, poses)
+    return _concluded(fit, solution, frames, assumed, edges, estimated)
+
+
+def _check(frames: FilteredFrames, poses: KnownPoses, names: tuple[str, ...], lit: bool) -> None:
+    if len(frames) != len(poses):
+        raise UsageError(
+            f"there are {len(poses)} poses, but frames of {len(frames)} positions: each pose needs its own"
+        )
+    if not names:
+        raise UsageError("nothing is free: there is nothing to calibrate")
+    if "albedo" in names and not lit:
+        raise UsageError("the albedo takes amplitudes, or a wall or floor behind: ranges alone do not tell it")
+    needed = min(FEWEST_POSES, len(names))
+    if len(poses) < needed:
+        raise UsageError(
+            f"too few poses: {len(poses)}, but {named(names)} take at least {needed}; ten or more at several distances"
+            " and sides are better"
+        )
+    returned = (frames.state == PixelState.RETURN).reshape(len(frames), -1).sum(axis=1)
+    if returned.min() < MIN_RETURNS:
+        k = int(returned.argmin())
+        raise UsageError(f"{poses.where(k)}: {returned[k]} pixels returned: was the landmark in view?")
+
+
+def _check_view(model: CalibrationModel, evidence: Evidence, assumed: Mounting) -> None:
+    """Refuse poses from which the landmark cannot be seen, and units that cannot be right."""
+    poses, seen = model.poses, evidence.seen
+    edge = max(assumed.half_angle_h_rad, assumed.half_angle_v_rad) * math.sqrt(2) + _OUT_OF_VIEW_RAD
+    reach = np.arctan2(model.reach_m, poses.distance_m)
+    out = np.flatnonzero(np.abs(poses.bearing_rad) - reach > edge)
+    if out.size:
+        k = int(out[0])
+        raise UsageError(
+            f"{poses.where(k)}: the landmark is not in view: it stands {math.degrees(poses.bearing_rad[k]):.1f}° from"
+            f" the optical axis, and the image ends at {math.degrees(assumed.half_angle_h_rad):.1f}°; are heading and"
+            " bearing in degrees, counter-clockwise?"
+        )
+    inside = np.flatnonzero(model.lens_within())
+    if inside.size:
+        k = int(inside[0])
+        raise UsageError(
+            f"{poses.where(k)}: the lens would be in the landmark, {poses.distance_m[k]:g} m from its axis: distances"
+            " are in metres, from lens to axis"
+        )
+    nearest = np.array([np.percentile(r[m], 10) for r, m in zip(seen.range_m, seen.returned, strict=True)])
+    away = np.abs(wrap_difference_m(seen.range_m - poses.distance_m[:, None], evidence.sensor))
+    hit = (seen.returned & (away < model.reach_m + 0.3)).any(axis=1)
+    if hit.mean() < 0.5:
+        ratio = float(np.median(nearest / poses.distance_m))
+        unit = next((text for factor, text in _UNITS.items() if 0.6 < ratio / factor < 1.6), None)
+        hint = f", about {unit} {'more' if ratio > 1 else 'less'}: are both in the units stated?" if unit else ""
+        k = int(np.flatnonzero(~hit)[0])
+        raise UsageError(
+            f"{poses.where(k)}: the landmark should be {poses.distance_m[k]:.3g} m away, but the nearest returns are"
+            f" {nearest[k]:.3g} m away{hint}"
+        )
+
+
+def _returns_beside(model: CalibrationModel, evidence: Evidence, assumed: Mounting) -> bool:
+    """Whether much returns that is not near the landmark, though nothing is said to stand behind it."""
+    seen = evidence.seen
+    away = np.abs(wrap_difference_m(seen.range_m - model.poses.distance_m[:, None], evidence.sensor))
+    return bool((seen.returned & (away > model.reach_m + 0.3)).mean() > _FAR_RETURNS)
+
+
+def _check_pixels(use: NDArray[np.bool_], poses: KnownPoses, evidence: Evidence) -> None:
+    counted = use.sum(axis=1)
+    if counted.sum() == 0 or (counted == 0).all():
+        raise UsageError(
+            "no pixel sees the landmark and returns something: do poses, landmark and frames belong together?"
+        )
+    empty = np.flatnonzero(counted == 0)
+    if empty.size > len(poses) / 2:
+        raise UsageError(
+            f"{poses.where(int(empty[0]))}: no pixel sees the landmark alone and returns something, nor at"
+            f" {empty.size - 1} other poses: is the landmark in view, and is a wall or floor behind it stated?"
+        )
+
+
+def _check_observable(solution: Solution, fit: Fit, poses: KnownPoses) -> None:
+    covariance = inverse(solution.information, fit.scale)
+    scaled = covariance / np.outer(fit.scale, fit.scale)
+    values, vectors = np.linalg.eigh(scaled)
+    if not math.sqrt(float(values[-1])) > _UNKNOWN:
+        return
+    weak = np.abs(vectors[:, -1])
+    names = [name for name, share in zip(fit.free, weak, strict=True) if share > 0.3 * weak.max()]
+    together = "cannot be told apart" if len(names) > 1 else "cannot be told"
+    raise UsageError(f"{named(names)} {together} from these poses: {advice(names, poses)}")
+
+
+def _degrees_of_freedom(fit: Fit, solution: Solution) -> int:
+    return int(solution.use.sum()) * fit.evidence.per_pixel - len(fit.free)
+
+
+def _fit_probability(fit: Fit, solution: Solution, frames: FilteredFrames) -> float:
+    """Return the probability of a larger χ²."""
+    dof = np.array([_degrees_of_freedom(fit, solution)])
+    return float(p_values_of(np.array([solution.cost]), dof, frames, np.array([0]))[0])
+
+
+def _concluded(
+    fit: Fit,
+    solution: Solution,
+    frames: FilteredFrames,
+    assumed: Mounting,
+    edges: bool,
+    estimated: PoseStd | None,
+) -> Calibration:
+    """Take stock; `estimated` is what the residuals said of the poses, if they were asked."""
+    model, evidence = fit.model, fit.evidence
+    poses, sensor = model.poses, frames.sensor
+    pose_residuals = solution.use.sum(axis=1) * evidence.per_pixel
+    pose_chi2 = (solution.residual**2).sum(axis=1)
+    dof, p_value = _degrees_of_freedom(fit, solution), _fit_probability(fit, solution, frames)
+    covariance = inverse(solution.information, fit.scale)
+    expected, source = float(max(dof, 1)), "the noise law"
+    if frames.std_from_scatter:
+        # weights that were estimated from ν + 1 frames are too large in the mean by ν / (ν − 2), and scatter themselves
+        nu = max(float(np.median(frames.n_effective.reshape(len(poses), -1)[solution.use])) - 1, 5.0)
+        covariance = covariance * nu / (nu - 4)
+        expected, source = expected * nu / (nu - 2), "the scatter of the frames"
+    notes: list[str] = []
+    if estimated is not None:
+        notes.append(
+            "With exact poses the residuals are more than noise. The poses were taken to be uncertain, by what the"
+            f" residuals say: {1e3 * estimated.position_m:.2g} mm in place, {math.degrees(estimated.heading_rad):.2g}°"
+            f" in heading, {math.degrees(estimated.delta_rad):.2g}° in δ (state yours with --position-std,"
+            " --heading-std and --delta-std)."
+        )
+    if dof > 0 and p_value < _FALSE_ALARM:
+        excess = solution.cost / expected
+        if len(poses) >= _POSES_FOR_SANDWICH * len(fit.free):
+            plain = inverse(solution.information, fit.scale)
+            covariance = plain @ solution.scatter @ plain * len(poses) / (len(poses) - len(fit.free))
+            source = "the scatter of the poses (sandwich), for the residuals are more than noise"
+        else:
+            covariance = covariance * excess
+            source += f", scaled by χ² = {excess:.3g} for each degree of freedom, for the residuals are more than noise"
+        notes.append(
+            f"The model does not fit: χ² is {excess:.3g} times what noise leaves (p = {p_value:.2g}): are landmark,"
+            " background and units right, and are the poses as exact as stated?"
+        )
+        notes += odd_pose_notes(poses, pose_chi2 / np.maximum(pose_residuals, 1))
+    if not edges:
+        notes.append(
+            "Something returns beside the landmark and no --wall, --floor or wall_m says what: pixels at the landmark's"
+            " edges were left out, which tell most."
+        )
+    unseen = int((pose_residuals == 0).sum())
+    if unseen:
+        k = int(np.flatnonzero(pose_residuals == 0)[0])
+        notes.append(f"{unseen} of {len(poses)} poses tell nothing: no pixel counts, first at {poses.where(k)}.")
+    notes += observability_notes(fit.free, covariance, fit.scale, poses)
+    mounting = Mounting.of_vector(solution.theta)
+    if mounting.albedo > 1 and "albedo" in fit.free:
+        notes.append(
+            f"An albedo of {mounting.albedo:.3g} cannot be: signal_e of the sensor is too low, or the amplitudes are"
+            " not in electrons. Only their product was measured."
+        )
+    shape = (len(poses), sensor.rows, sensor.cols)
+    before = model.images(assumed.vector, np.zeros((len(poses), 3)))
+    after = evidence.sensor.metres_per_radian * np.angle(evidence.value * solution.images.phasor.conj())
+    thought = evidence.sensor.metres_per_radian * np.angle(evidence.value * before.phasor.conj())
+    return Calibration(
+        sensor=_mounted(sensor, mounting, fit.free),
+        base=sensor,
+        mounting=mounting,
+        assumed=assumed,
+        free=fit.free,
+        covariance=covariance,
+        covariance_from=source,
+        chi2=solution.cost,
+        dof=dof,
+        p_value=p_value,
+        on=evidence.on,
+        poses=poses,
+        pose_shift=solution.shift,
+        pose_chi2=pose_chi2,
+        pose_residuals=pose_residuals,
+        residual_m=np.where(solution.use, after, np.nan).reshape(shape),
+        residual_before_m=np.where(solution.use & (before.phasor != 0), thought, np.nan).reshape(shape),
+        range_std_m=np.where(solution.use, np.maximum(evidence.seen.weight, 1e-300) ** -0.5, np.nan).reshape(shape),
+        notes=tuple(notes),
+    )
+
+
+def _mounted(sensor: Sensor, mounting: Mounting, free: Sequence[str]) -> Sensor:
+    """Return a sensor with the fields that were estimated, to the digits of a sensor file."""
+    there = mounting.on(sensor)
+    fields = [PARAMETERS[name].field for name in free]
+    return sensor.with_(**{field: rounded(getattr(there, field)) for field in fields if field is not None})

@@ -1,0 +1,52 @@
+"""A sensor as a TOML file, every number with a comment that says where it comes from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from phasemark.render.sensor import Sensor
+
+_DIGITS = 7  # of a number in a sensor file
+
+
+def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence[str], otherwise: str) -> str:
+    """Return a sensor as the text of a file that :meth:`Sensor.from_toml` reads.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    comments : mapping of str to str
+        What stands behind a field; such a field is written even where it has its default.
+    header : sequence of str
+        Lines of comment at the top.
+    otherwise : str
+        What stands behind the other fields.
+    """
+    fields = sensor.model_dump(mode="json")
+    lines = [f"# {line}" for line in header]
+    for title, names in Sensor.field_groups().items():
+        own = [
+            name
+            for name in names
+            if name in comments
+            or (fields[name] is not None and fields[name] != _plain_default(name))
+            or Sensor.model_fields[name].is_required()
+        ]
+        if own:
+            lines += ["", f"# {title}"]
+        lines += [f"{name} = {json.dumps(fields[name])}  # {comments.get(name, otherwise)}" for name in own]
+    return "\n".join(lines) + "\n"
+
+
+def rounded(value: Any) -> Any:
+    """Round the floats of a field to the digits of a sensor file."""
+    if isinstance(value, tuple):
+        return tuple(rounded(one) for one in value)
+    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
+
+
+def _plain_default(name: str) -> object:
+    default = Sensor.model_fields[name].default
+    return list(default) if isinstance(default, tuple) else default

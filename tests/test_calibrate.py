@@ -1,0 +1,383 @@
+"""Calibration of a mounting: truth recovered from simulated recordings and what is said when not."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from phasemark import InputFileError, UsageError
+from phasemark.cli import main
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.matcher import KnownPoses, Mounting, PoseStd, calibrate, filter_poses, frames_of_poses, read_poses
+from phasemark.matcher.calibrate_model import NAMES, PARAMETERS, CalibrationModel
+from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, preset
+
+PMD = preset("pmd-16x16")
+MESH = build_mesh(catalog()["cylinder"])
+DEGREE = math.radians(1.0)
+ERRORS = PoseStd(2e-3, 0.2 * DEGREE, 0.3 * DEGREE)
+
+
+def some_mounting(rng, albedo=None):
+    return Mounting(
+        pitch_rad=rng.uniform(-2, 2) * DEGREE,
+        roll_rad=rng.uniform(-2, 2) * DEGREE,
+        height_m=rng.uniform(-0.03, 0.03),
+        bearing_rad=rng.uniform(-2, 2) * DEGREE,
+        half_angle_h_rad=rng.uniform(10.6, 11.4) * DEGREE,
+        half_angle_v_rad=rng.uniform(10.6, 11.4) * DEGREE,
+        range_offset_m=rng.uniform(-0.05, 0.05),
+        albedo=rng.uniform(0.5, 0.95) if albedo is None else albedo,
+    )
+
+
+def some_poses(rng, n):
+    return KnownPoses.polar(rng.uniform(0.8, 1.8, n), rng.uniform(0, 2 * math.pi, n), rng.uniform(-4, 4, n) * DEGREE)
+
+
+def take(mounting, poses, rng, *, sensor=PMD, background=None, n_frames=50, light=True):
+    """Frames of a camera mounted so, labelled with the sensor as it is thought to be."""
+    there = mounting.on(sensor)
+    views = Views(
+        poses.distance_m, poses.delta_rad, poses.bearing_rad + mounting.bearing_rad, poses.height_m + mounting.height_m
+    )
+    image = Renderer(MESH, there, albedo=mounting.albedo).render_views(views, background=background)
+    frames = capture(image, there, rng=rng, n_frames=n_frames)
+    return Frames(
+        frames.range_m,
+        frames.amplitude_e if light else None,
+        frames.intensity_e if light else None,
+        flags=frames.flags,
+        sensor=sensor,
+    )
+
+
+def filtered(frames, on="auto"):
+    return filter_poses([frames[k : k + 1] for k in range(len(frames))], on)
+
+
+def nees(found, truth):
+    columns = [NAMES.index(name) for name in found.free]
+    error = (found.mounting.vector - truth.vector)[columns]
+    return float(error @ np.linalg.solve(found.covariance, error))
+
+
+def trial(seed, n_poses=8, *, on="phasors", background=None, light=True, uncertain=False, free=None):
+    """Calibrate one simulated recording; return its NEES and what was found."""
+    rng = np.random.default_rng([2026, seed])
+    truth, stated = some_mounting(rng, albedo=None if on == "phasors" else 0.8), some_poses(rng, n_poses)
+    poses = stated
+    if uncertain:
+        error = np.einsum("kij,kj->ki", ERRORS.factor(stated), rng.standard_normal((n_poses, 4)))
+        poses = KnownPoses.polar(
+            stated.distance_m + error[:, 0], stated.delta_rad + error[:, 1], stated.bearing_rad + error[:, 2]
+        )
+    frames = take(truth, poses, rng, background=background, light=light)
+    found = calibrate(MESH, filtered(frames, on), stated, on=on, background=background, free=free)
+    return nees(found, truth), found
+
+
+@pytest.fixture(scope="module")
+def phasor_trials():
+    return [trial(seed, 6) for seed in range(4)]
+
+
+def test_true_mountings_lie_within_their_ellipses_on_phasors(phasor_trials):
+    # the sum of 4 NEES of 8 numbers is χ²(32); 99.9 % corrected for the 3 such tests of this file
+    total = sum(value for value, _ in phasor_trials)
+    assert stats.chi2.ppf(1e-3 / 6, 32) < total < stats.chi2.ppf(1 - 1e-3 / 6, 32)
+
+
+def test_the_fit_itself_passes_its_test(phasor_trials):
+    for _, found in phasor_trials:
+        assert found.p_value > 1e-3 / 4  # 99.9 % over the trials
+
+
+def test_true_mountings_lie_within_their_ellipses_on_ranges_without_amplitudes():
+    values = [trial(seed, on="ranges", light=False)[0] for seed in range(20, 23)]
+    assert stats.chi2.ppf(1e-3 / 6, 21) < sum(values) < stats.chi2.ppf(1 - 1e-3 / 6, 21)
+
+
+def test_errors_of_the_poses_are_estimated_and_widen_the_covariance():
+    value, found = trial(40, 12, uncertain=True)
+    # 12 poses tell the errors' sizes to about a fifth, so NEES has wider tails than χ²: twice the upper end
+    assert stats.chi2.ppf(1e-3 / 6, 8) < value < 2 * stats.chi2.ppf(1 - 1e-3 / 6, 8)
+    assert any("poses were taken to be uncertain" in note for note in found.notes)
+    assert found.std("bearing") > 0.02 * DEGREE  # 0.2° over 12 poses, where noise alone leaves 1e-4°
+
+
+def test_a_wall_behind_tells_the_albedo_from_ranges():
+    value, found = trial(60, on="ranges", background=Background(wall_m=3.0))
+    assert found.free == NAMES
+    assert value < stats.chi2.ppf(0.999, 8)
+
+
+def test_an_unknown_background_leaves_the_edges_out_and_says_so():
+    rng = np.random.default_rng(61)
+    truth, poses = some_mounting(rng, 0.8), some_poses(rng, 8)
+    frames = take(truth, poses, rng, background=Background(wall_m=3.0))
+    found = calibrate(MESH, filtered(frames, "ranges"), poses, on="ranges")
+    assert nees(found, truth) < stats.chi2.ppf(0.999, 7)
+    assert any("edges were left out" in note for note in found.notes)
+
+
+def test_a_camera_that_reports_z_is_calibrated_in_z():
+    """Ranges were made of z with half angles that are wrong by half a degree."""
+    rng = np.random.default_rng(62)
+    truth, poses = some_mounting(rng, 0.8), some_poses(rng, 8)
+    frames = take(truth, poses, rng, light=False)
+    z_m = frames.range_m * truth.on(PMD).axis_cosine()
+    frames = Frames(z_m / PMD.axis_cosine(), flags=frames.flags, sensor=PMD)
+    found = calibrate(MESH, filtered(frames), poses, reports_z=True)
+    assert nees(found, truth) < stats.chi2.ppf(0.999, 7)
+
+
+def test_slopes_by_offset_and_albedo_are_those_of_the_closed_form():
+    """S ∝ ρ · exp(4πi f offset / c): the logarithmic slopes are 1/ρ and i · 4πf/c."""
+    poses = KnownPoses.polar([1.0], [0.3])
+    model = CalibrationModel(MESH, PMD, poses, albedo=0.8)
+    theta, shift = Mounting.of_sensor(PMD, 0.8).vector, np.zeros((1, 3))
+    phasor = model.images(theta, shift).phasor
+    slope, _ = model.slopes(theta, shift, ("range_offset", "albedo"), "phasors")
+    lit = phasor[0] != 0
+    np.testing.assert_allclose(slope[0, 0, lit] / phasor[0, lit], 1j / PMD.metres_per_radian, rtol=1e-12)
+    np.testing.assert_allclose(slope[0, 1, lit] / phasor[0, lit], 1 / 0.8, rtol=1e-12)
+
+
+def test_what_is_not_free_stays(phasor_trials):
+    _, free = phasor_trials[0]
+    _, found = trial(0, 3, free=("pitch", "height"))
+    assert found.free == ("pitch", "height")
+    assert found.mounting.roll_rad == 0.0
+    assert found.sensor.half_angle_h_deg == PMD.half_angle_h_deg
+    assert set(free.free) == set(NAMES)
+
+
+def test_poses_at_one_distance_are_told_what_trades():
+    rng = np.random.default_rng(63)
+    poses = KnownPoses.polar(np.full(6, 1.0), np.arange(6) * 60 * DEGREE)
+    found = calibrate(MESH, filtered(take(some_mounting(rng), poses, rng)), poses)
+    notes = " ".join(found.notes)
+    assert "pitch and the height trade" in notes
+    assert "all are at one distance (1 m)" in notes
+    assert abs(found.correlation[NAMES.index("pitch"), NAMES.index("height")]) > 0.95
+
+
+def test_a_plain_board_does_not_tell_a_height_and_is_refused():
+    """A wide wall looks the same from every height."""
+    import trimesh
+
+    board = trimesh.creation.box((0.01, 4.0, 4.0))
+    poses = KnownPoses.polar([0.8, 1.0, 1.2, 1.4], [0.0, 0.3, -0.3, 0.1])
+    image = Renderer(board, PMD).render_views(Views.broadcast(poses.distance_m, poses.delta_rad))
+    frames = capture(image, PMD, rng=np.random.default_rng(1), n_frames=20)
+    with pytest.raises(UsageError, match=r"height cannot be told from these poses: .* --fix height"):
+        calibrate(board, filtered(frames), poses, free=("pitch", "height"))
+
+
+def test_a_wrong_pose_is_named():
+    """Five centimetres off in one of seven poses, the others right and said to be exact."""
+    poses = KnownPoses.polar(np.linspace(1.0, 1.3, 7), np.linspace(0.1, 1.2, 7))
+    frames = take(Mounting.of_sensor(PMD, 0.8), poses, np.random.default_rng(64))
+    moved = replace(poses, distance_m=poses.distance_m + 0.05 * (np.arange(7) == 2))
+    free = ("pitch", "range_offset", "bearing")
+    found = calibrate(MESH, filtered(frames, "ranges"), moved, on="ranges", free=free, pose_std=PoseStd())
+    assert found.p_value < 1e-6
+    assert any("does not fit" in note for note in found.notes)
+    assert any("pose 2 " in note for note in found.notes)
+    assert "scaled by χ²" in found.covariance_from
+
+
+def test_cartesian_poses_are_the_inverse_of_the_robot_equations():
+    """PHYSICS section 8, equations (11) and (12)."""
+    rng = np.random.default_rng(5)
+    d, delta, b = rng.uniform(0.5, 2, 20), rng.uniform(0, 2 * math.pi, 20), rng.uniform(-0.3, 0.3, 20)
+    psi, landmark = 0.4, (2.0, -1.0)
+    x = landmark[0] + d * np.cos(np.pi + delta + psi)
+    y = landmark[1] + d * np.sin(np.pi + delta + psi)
+    poses = KnownPoses.cartesian(x, y, psi + delta - b, landmark_xy_m=landmark, landmark_yaw_rad=psi)
+    np.testing.assert_allclose(poses.distance_m, d, rtol=1e-12)
+    np.testing.assert_allclose(np.cos(poses.delta_rad - delta), 1, rtol=1e-12)
+    np.testing.assert_allclose(poses.bearing_rad, b, atol=1e-12)
+
+
+def test_pose_errors_are_those_of_moved_lenses_and_turned_cameras():
+    """The factor is the derivative of (D, δ, b) by steps of the lens along and across, heading, and landmark."""
+    step = 1e-6
+
+    def seen(x, y, heading):
+        poses = KnownPoses.cartesian(np.array([x]), np.array([y]), np.array([heading]))
+        return np.array([poses.distance_m[0], poses.delta_rad[0], poses.bearing_rad[0]])
+
+    at = seen(-1.5, 0.0, 0.1)
+    moves = [seen(-1.5 - step, 0.0, 0.1) - at, seen(-1.5, -step, 0.1) - at, seen(-1.5, 0.0, 0.1 - step) - at]
+    factor = PoseStd(1.0, 1.0, 1.0).factor(KnownPoses.polar([1.5], [0.0]))[0]
+    moves[1][1] = math.remainder(moves[1][1], 2 * math.pi)
+    np.testing.assert_allclose(np.array(moves).T / step, factor[:, :3], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("", "is empty; its columns must be either distance_m,delta_deg"),
+        ("distance_m,delta_deg\n", "has a header and no poses"),
+        ("1.0,30\n", "no column 'x_m'; its columns must be"),
+        ("distance_m,delta\n1,30\n", "no column 'delta_deg'"),
+        ("distance_m,delta_deg,tilt\n1,30,0\n", "unknown column 'tilt'"),
+        ("distance_m,delta_deg\n1,30\n1.2\n", "line 3: 1 values, must have 2"),
+        ("distance_m,delta_deg\n1,nan\n", "line 2: 'delta_deg' must be a finite number, got nan"),
+        ("distance_m,delta_deg\n1,left\n", "line 2: 'delta_deg' must be a number, got 'left'"),
+        ("distance_m,delta_deg\n120,30\n", "line 2: the lens is 120 m from the landmark"),
+        ("distance_m,delta_deg\n-1,30\n", "line 2: the lens is -1 m from the landmark"),
+        ("distance_m,delta_deg,frames\n1,30,2.5\n", "line 2: 'frames' must be a number of frames, got 2.5"),
+    ],
+)
+def test_a_file_of_poses_that_is_none_is_refused_in_one_line(tmp_path, text, part):
+    path = tmp_path / "poses.csv"
+    path.write_text(text)
+    with pytest.raises(InputFileError) as refused:
+        read_poses(path)
+    assert part in str(refused.value)
+    assert str(path) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_semicolons_and_decimal_commas_are_read(tmp_path):
+    (tmp_path / "poses.csv").write_text("# measured on Monday\ndistance_m;delta_deg;frames\n1,25;30;50\n\n0,9;-15;20\n")
+    poses = read_poses(tmp_path / "poses.csv")
+    np.testing.assert_allclose(poses.distance_m, [1.25, 0.9])
+    np.testing.assert_allclose(poses.delta_rad, [30 * DEGREE, -15 * DEGREE])
+    assert poses.frames.tolist() == [50, 20]
+    assert poses.where(1).endswith("line 5")
+
+
+def test_frames_of_one_file_go_to_the_poses_in_turn():
+    ranges = np.arange(70.0).reshape(1, 70, 1, 1) + 1 + np.zeros((1, 70, 16, 16))
+    frames = Frames(ranges, sensor=PMD)
+    poses = KnownPoses.polar([1.0, 1.2], [0.0, 0.1])
+    assert [one.n_frames for one in frames_of_poses([frames], poses)] == [35, 35]
+    shares = frames_of_poses([frames], replace(poses, frames=np.array([50, 20])))
+    assert [float(one.range_m[0, 0, 0, 0]) for one in shares] == [1.0, 51.0]
+    with pytest.raises(UsageError, match="claim 71 frames in all, but there are 70"):
+        frames_of_poses([frames], replace(poses, frames=np.array([50, 21])))
+    with pytest.raises(UsageError, match="70 frames cannot be shared among 3 poses alike"):
+        frames_of_poses([frames], KnownPoses.polar([1.0, 1.2, 1.4], 0.0))
+    with pytest.raises(UsageError, match="3 poses, but frames of 2 positions"):
+        frames_of_poses([frames, frames], KnownPoses.polar([1.0, 1.2, 1.4], 0.0))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder with a recording from 8 poses, and the mounting it was made with."""
+    folder = tmp_path_factory.mktemp("calibrate")
+    rng = np.random.default_rng(70)
+    truth, poses = some_mounting(rng), some_poses(rng, 8)
+    frames = take(truth, poses, rng)
+    np.savez(
+        folder / "frames.npz", range=frames.range_m, amplitude=frames.amplitude_e, intensity=frames.intensity_e,
+        unit="m", quantity="range",
+    )  # fmt: skip
+    np.savez(folder / "metres_as_mm.npz", range=frames.range_m / 1e3, unit="m", quantity="range")
+    rows = np.column_stack([poses.distance_m, np.degrees(poses.delta_rad), np.degrees(poses.bearing_rad)])
+    header = "distance_m,delta_deg,bearing_deg"
+    write = {"fmt": "%.9f", "delimiter": ",", "header": header, "comments": ""}
+    np.savetxt(folder / "poses.csv", rows, **write)
+    np.savetxt(folder / "seven.csv", rows[:7], **write)
+    np.savetxt(folder / "aside.csv", rows + np.array([0, 0, 60]), **write)
+    np.savetxt(folder / "inside.csv", rows * [0.1, 1, 1], **write)
+    return folder, truth
+
+
+def command(folder, tmp_path, *more, frames="frames.npz", poses="poses.csv", landmark="cylinder"):
+    return main(
+        ["calibrate", landmark, str(folder / frames), "--poses", str(folder / poses), "-o", str(tmp_path / "cam.toml"),
+         *map(str, more)]
+    )  # fmt: skip
+
+
+def test_the_command_writes_a_sensor_that_every_other_command_takes(folder, tmp_path, capsys):
+    path, truth = folder
+    assert command(path, tmp_path, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    sensor = Sensor.from_toml(tmp_path / "cam.toml")
+    assert sensor == Sensor(**answer["sensor"])
+    for name in NAMES:
+        one, parameter = answer["parameters"][name], PARAMETERS[name]
+        true = parameter.shown * getattr(truth, parameter.attribute)
+        assert abs(one["value"] - true) < 4.5 * one["std"]  # 99.9 % over 8 numbers is 3.8
+        if parameter.field is not None:
+            scale = parameter.shown if parameter.unit == "°" else 1.0
+            assert getattr(sensor, parameter.field) == pytest.approx(
+                getattr(truth, parameter.attribute) * scale, abs=0.01
+            )
+    assert (tmp_path / "cam.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["sensor", "show", str(tmp_path / "cam.toml")]) == 0
+    bank = ["bank", "build", "--full", "--class", "cylinder", "--sensor", str(tmp_path / "cam.toml"), "--distance",
+            "0.9:1.1:0.1", "--delta", "0:180:45", "-o", str(tmp_path / "bank.h5")]  # fmt: skip
+    assert main(bank) == 0
+    assert command(path, tmp_path) == 4  # it exists
+    capsys.readouterr()
+    assert command(path, tmp_path, "--force", "--fix", "fov,albedo", landmark=str(tmp_path / "bank.h5")) == 0
+    printed = capsys.readouterr().out
+    assert "half_angle_h" in printed
+    assert "fixed" in printed
+    assert printed.splitlines()[-1] == str(tmp_path / "cam.png")
+
+
+@pytest.mark.parametrize(
+    ("options", "more", "code", "part"),
+    [
+        ({"poses": "seven.csv"}, [], 2, "7 poses, but frames of 8 positions"),
+        ({"poses": "nothing.csv"}, [], 3, "cannot be read"),
+        ({"poses": "aside.csv"}, [], 2, "line 2: the landmark is not in view"),
+        ({"poses": "inside.csv"}, [], 2, "the lens would be in the landmark"),
+        ({"frames": "metres_as_mm.npz"}, [], 2, "about 1000 times less: are both in the units stated?"),
+        ({"landmark": "pyramid"}, [], 2, "unknown class 'pyramid'"),
+        ({}, ["--free", "pitch,tilt"], 2, "'free' must be among pitch, roll"),
+        ({}, ["--free", "pitch", "--fix", "pitch"], 2, "nothing is free"),
+        ({}, ["--on", "ranges", "--free", "albedo"], 2, "takes amplitudes"),
+        ({}, ["--on", "sound"], 2, "'on' must be auto, ranges or phasors"),
+        ({}, ["--position-std", "-1"], 2, "'position_m' must be a standard deviation"),
+        ({}, ["--albedo", "2"], 2, "--albedo must be in (0, 1]"),
+        ({}, ["--class", "cone"], 2, "--class belongs to a bank"),
+        ({}, ["--plot", "x.pdf"], 2, "must be a .png file"),
+        ({}, ["--wall", "0.5"], 2, "wall"),
+    ],
+)
+def test_the_command_says_in_one_line_what_is_wrong(folder, tmp_path, capsys, options, more, code, part):
+    assert command(folder[0], tmp_path, *more, **options) == code
+    error = capsys.readouterr().err.splitlines()
+    assert part in error[-1]
+    assert error[-1].startswith("error: ")
+    assert not (tmp_path / "cam.toml").exists()
+
+
+def test_two_poses_are_too_few():
+    poses = KnownPoses.polar([0.9, 1.2], [0.1, 0.4])
+    frames = take(Mounting.of_sensor(PMD, 0.8), poses, np.random.default_rng(3), n_frames=10)
+    with pytest.raises(UsageError, match=r"too few poses: 2, but .* take at least 3"):
+        calibrate(MESH, filtered(frames), poses)
+    found = calibrate(MESH, filtered(frames), poses, free=("range_offset",))  # one number takes no more
+    assert abs(found.value("range_offset")) < 4 * found.std("range_offset")
+
+
+def test_an_empty_pose_is_named():
+    poses = KnownPoses.polar([0.9, 1.2, 1.4], [0.1, 0.4, 0.9])
+    frames = take(Mounting.of_sensor(PMD, 0.8), poses, np.random.default_rng(3), n_frames=10, light=False)
+    empty = Frames(np.where(np.arange(3)[:, None, None, None] == 1, np.nan, frames.range_m), sensor=PMD)
+    with pytest.raises(UsageError, match="pose 1: 0 pixels returned: was the landmark in view"):
+        calibrate(MESH, filtered(empty), poses)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("on", ["ranges", "phasors"])
+def test_95_percent_ellipses_hold_the_truth_in_93_to_97_percent_of_500_runs(on):
+    values = [trial(1000 + seed, 12, on=on) for seed in range(500)]
+    inside = sum(value <= stats.chi2.ppf(0.95, len(found.free)) for value, found in values)
+    print(f"{on}: {inside} of 500 true mountings within their 95 % ellipsoid")
+    interval = stats.binomtest(inside, 500).proportion_ci(0.999, method="exact")
+    assert interval.low <= 0.97
+    assert interval.high >= 0.93
