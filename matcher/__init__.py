@@ -17,11 +17,13 @@ from phasemark.matcher.filters import (
     kalman,
     kalman_filter,
     kalman_step,
+    noise_free,
     phasor_mean,
 )
 from phasemark.matcher.landmark_map import LandmarkMap, MappedLandmark, Placement, load_map
 from phasemark.matcher.match import Candidate, Match, Matches
 from phasemark.matcher.matcher import Matcher, background_image
+from phasemark.matcher.population import GridLoss, SpacingLoss, grid_loss
 from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
 from phasemark.matcher.surroundings import Surroundings, estimate_surroundings
 from phasemark.matcher.trials import Conditions, Trials, TrialSummary, run_trials
@@ -33,6 +35,7 @@ __all__ = [
     "Conditions",
     "Estimate",
     "FilteredFrames",
+    "GridLoss",
     "LandmarkMap",
     "MappedLandmark",
     "Match",
@@ -42,6 +45,7 @@ __all__ = [
     "PixelState",
     "Placement",
     "RobotPose",
+    "SpacingLoss",
     "Surroundings",
     "TrialSummary",
     "Trials",
@@ -52,11 +56,13 @@ __all__ = [
     "cramer_rao",
     "efficiency",
     "estimate_surroundings",
+    "grid_loss",
     "kalman",
     "kalman_filter",
     "kalman_step",
     "load_map",
     "nees",
+    "noise_free",
     "phasor_mean",
     "robot_poses",
     "run_trials",
