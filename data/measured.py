@@ -35,6 +35,7 @@ METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 QUANTITIES = ("range", "z")
 
 _FIELDS = ("range", "amplitude", "intensity", "status", "valid")
+_NUMBERS = ("range", "amplitude", "intensity")
 _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
 _NOT_A_NUMBER = ("", "nan")
@@ -147,7 +148,9 @@ def read_frames(
             raise UsageError(f"{path}: has 'status': say with --valid-status which of its values mark a valid pixel")
         valid &= np.isin(arrays["status"], list(valid_status))
     arrays = {name: _upright(values, flip_h, flip_v, rotate) for name, values in arrays.items()}
-    range_m = arrays["range"].astype(np.float64) * unit_scale
+    with np.errstate(invalid="ignore", over="ignore"):  # what becomes NaN or infinite is invalid
+        numbers = {name: arrays[name].astype(np.float64) for name in _NUMBERS if name in arrays}
+        range_m = numbers["range"] * unit_scale
     if settled_quantity == "z":
         range_m = range_m / sensor.axis_cosine()
     valid = _upright(valid, flip_h, flip_v, rotate) & np.isfinite(range_m)
@@ -155,8 +158,8 @@ def read_frames(
     try:
         return Frames(
             range_m,
-            arrays.get("amplitude"),
-            arrays.get("intensity"),
+            numbers.get("amplitude"),
+            numbers.get("intensity"),
             valid,
             sensor=sensor,
             invalid_means=invalid_means,
