@@ -122,7 +122,7 @@ def check_mutants(folder, n, seed):
     files = make_good_files(good)
     rng = np.random.default_rng(seed)
     runs, refused, longest = 0, 0, 0.0
-    for kind, k in ((kind, k) for kind in n for k in range(n[kind])):
+    for kind, k in [(each, k) for each, count in n.items() for k in range(count)]:
         path = folder / f"mutant{files[kind].suffix}"
         write_mutant(files[kind], path, rng)
         first, *others = COMMANDS[kind]
