@@ -2,8 +2,8 @@
 
 usage: full_disks.py FOLDER
 
-FOLDER/disk must be a tmpfs that this process may remount. Each command runs in a fork of this process, which ends as a
-program does; the process itself has run each once, so that nothing has to be loaded. Prints for each command how many of its runs found the disk full.
+FOLDER/disk must be a tmpfs that this process may remount. Each command runs once in this process, and then in forks of
+it, which have nothing to load and end as a program does. Prints for each command how many runs found the disk full.
 """
 
 import os
@@ -26,7 +26,6 @@ def commands(folder):
     plan, frames, out = folder / "plan.toml", folder / "frames.h5", folder / "disk" / "out"
     build = ["frames", "build", plan, "--shard-size", "7"]
     yield "frames build", [*build, "-o", out], True
-    yield "frames build --scheduler", [*build, "--scheduler", "local:1", "-o", out], True
     yield "frames build --shard", [*build, "--shard", "1/2", "-o", out], True
     yield "frames merge", ["frames", "merge", folder / "part1", folder / "part2", "-o", out], True
     grid = ["--class", "cone", "--distance", "0.9:1:0.02", "--delta", "0:180:10"]

@@ -2,8 +2,7 @@
 
 usage: random_kills.py FOLDER VIEWS RUNS SEED
 
-Each run is a fork of this process, which has the program loaded, compiled code too, and no threads left: no time is lost
-on starting it.
+Each run is a fork of this process, which has all of the program loaded, and no threads left.
 Prints in how many runs the kill came before, during and after the file was made.
 """
 

@@ -394,3 +394,21 @@ def test_a_distribution_knows_its_bounds():
     assert Distribution(normal=(1, 2)).lowest == -np.inf
     assert Distribution(normal=(1, 2), within=(0, 3)).highest == 3
     assert Distribution(fixed=2).highest == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("range", np.inf, r"'range' must be NaN or in 0 … 14\.99 m, got inf"),
+        ("range_mixed", -1.0, r"'range_mixed' must be NaN or in 0 … 14\.99 m, got -1"),
+        ("amplitude", np.nan, "'amplitude' must be finite, got nan"),
+        ("intensity", 1e38, r"'intensity' must be finite, got 1e\+38"),
+    ],
+)
+def test_values_that_no_run_writes_are_refused_when_they_are_read(frames_file, tmp_path, name, value, message):
+    path = tmp_path / "frames.h5"
+    path.write_bytes(frames_file.read_bytes())
+    with h5py.File(path, "r+") as file:
+        file[name][0, 8, 8] = value
+    with open_frames(path) as frames, pytest.raises(InputFileError, match=message):
+        frames[0]
