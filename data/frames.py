@@ -126,7 +126,7 @@ class FrameSet:
         return np.asarray(dataset[...])
 
     def _read_truth(self, file: h5py.File, n: int) -> dict[str, NDArray[Any]]:
-        truth = {
+        truth: dict[str, NDArray[Any]] = {
             "class_index": self._column(file, "landmark_class", n).astype(np.int64),
             "split_index": self._column(file, "split", n).astype(np.int64),
         }

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import os
+import re
 import tokenize
 import warnings
 import zipfile
@@ -36,6 +37,7 @@ QUANTITIES = ("range", "z")
 
 _FIELDS = ("range", "amplitude", "intensity", "status", "valid")
 _NUMBERS = ("range", "amplitude", "intensity")
+_STATED = re.compile(r"\b(unit|quantity)=(\S+)")
 _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
 _NOT_A_NUMBER = ("", "nan")
@@ -72,7 +74,8 @@ def read_frames(
 
     *CSV*: one frame a line, row by row from the top left pixel. Values are separated by semicolons (then decimal
     commas are understood too), tabs, commas or blanks, the first of these that occurs. A first line without a number
-    is a header; empty lines and those that start with ``#`` are skipped; an empty cell and ``nan`` are invalid pixels.
+    is a header; empty lines and those that start with ``#`` are skipped, but such a first line may state ``unit=…`` and
+    ``quantity=…``; an empty cell and ``nan`` are invalid pixels.
     *NPY*: the ranges. *NPZ*: ``range`` and optionally ``amplitude``, ``intensity`` (electrons per phase image),
     ``status``, ``valid`` (0: invalid), ``unit`` and ``quantity``. *HDF5*: the same arrays as datasets, with the
     attributes ``units`` and ``quantity`` on ``range``. *PNG*, one or a folder of them in the order of their names: 16
@@ -271,7 +274,8 @@ def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None
             return _read_pngs(path)
         if start.startswith(b"\x89HDF"):
             return _read_hdf5(path, untrusted)
-        return _Raw({"range": _parse_csv(path.read_bytes(), shape, path)}, flat=True)
+        values, stated = _parse_csv(path.read_bytes(), shape, path)
+        return _Raw({"range": values}, stated, flat=True)
     except PhasemarkError:
         raise
     except MemoryError:
@@ -342,8 +346,8 @@ def _read_hdf5(path: Path, untrusted: bool) -> _Raw:
         return _Raw({name: np.asarray(dataset[...]) for name, dataset in datasets.items()}, stated)
 
 
-def _parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> NDArray[np.float64]:
-    """Return (frames, rows · cols) values of a text file."""
+def _parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> tuple[NDArray[np.float64], dict[str, str]]:
+    """Return (frames, rows · cols) values of a text file, and what a comment in its first line says of them."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -376,7 +380,8 @@ def _parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> NDArray[np
         frames.append(frame)
     if not frames:
         raise InputFileError(f"{path}: holds no frames")
-    return np.array(frames)
+    first = text.partition("\n")[0]
+    return np.array(frames), dict(_STATED.findall(first)) if first.startswith("#") else {}
 
 
 def _cells(line: str, separator: str | None) -> list[str]:

@@ -41,7 +41,7 @@ def exported(frames, tmp_path, to, quantity=None):
     ("to", "options", "tolerance_m"),
     [
         ("npz", {}, 1e-6),  # float32 of z, below 2 m
-        ("csv", {"unit": "m"}, 1e-8),  # nine digits
+        ("csv", {}, 1e-8),  # nine digits
         ("png16", {}, 2e-4),  # half of 15 m / 65535
         ("rosbag", {}, 1e-6),
     ],
@@ -53,8 +53,6 @@ def test_frames_come_back_as_ranges(frames, tmp_path, to, options, tolerance_m, 
         path, options = exported(frames, tmp_path, to), {"topic": topic}
     else:
         path = exported(frames, tmp_path, to, quantity)
-    if to == "csv":
-        options = {**options, "quantity": quantity}
     back = read_frames(path, sensor=SENSOR, **options)
     expected = frames[:]["range_m"]
     np.testing.assert_array_equal(np.isnan(back.range_m[0]), np.isnan(expected))
@@ -71,6 +69,10 @@ def test_range_and_z_are_told_apart(frames, tmp_path):
         exported(frames, tmp_path, "bop", "range")
     with pytest.raises(UsageError, match=r"but .* says z"):
         read_frames(tmp_path / "z", sensor=SENSOR, quantity="range")
+    table = exported(frames, tmp_path, "csv", "z")
+    for wrong in ({"quantity": "range"}, {"unit": "cm"}):
+        with pytest.raises(UsageError, match=rf"--{next(iter(wrong))} is .*, but .* says (z|m)"):
+            read_frames(table, sensor=SENSOR, **wrong)
 
 
 def test_an_image_states_its_quantity_and_scale(frames, tmp_path):
