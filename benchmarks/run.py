@@ -24,6 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matching import matching
+from tolerance import tolerance
 
 from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.landmarks import build_mesh, catalog
@@ -423,6 +425,8 @@ SECTIONS: dict[str, tuple[str, Callable[[], Table]]] = {
     "million": ("A frame set of a million frames", million),
     "capture": ("Capturing noisy frames", capturing),
     "chain": ("Capture, filters, matching", chain),
+    "matching": ("Errors over the Cramér–Rao bound", partial(matching, SENSOR, SEED)),
+    "tolerance": ("In a world that is not the model's", partial(tolerance, SENSOR, SEED)),
 }
 
 

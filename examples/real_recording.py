@@ -4,8 +4,8 @@
 
 The CSV has one frame a line, with a header: ``mm_0 … mm_63`` (z distances of 8 × 8 zones, row by row from the top),
 ``status_0 … status_63`` (5: valid), and of a motion-capture system ``panel_x_m`` (how far the panel's plane is from the
-sensor along its normal) and ``yaw_deg`` (heading, 0: facing the panel, counter-clockwise). ETH Zürich's data set
-Matrix_ToF_Drones has recordings of this kind.
+sensor along its normal) and ``yaw_deg`` (heading, 0: facing the panel, counter-clockwise). An empty cell is a missing
+value. ETH Zürich's data set Matrix_ToF_Drones has recordings of this kind.
 
 Each frame by itself gives the panel's distance D along the optical axis and the side δ it is seen from. Zones that see
 the floor or miss the panel are told apart by a plane: seen by a pinhole, a plane's 1/z is linear over the image.
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ from phasemark.render import Frames, Renderer, Sensor, preset
 VALID_STATUS = 5
 FEWEST_ZONES = 16
 """A quarter of the zones has to lie on the panel."""
+FEWEST_INSIDE = 8
+"""Where fewer would be left without the zones at the sides, those are kept."""
 NEAREST_M = 0.2
 """Nearer returns are the floor or the sensor's own cover."""
 TOLERANCE_M = 0.015
@@ -69,25 +72,25 @@ def read_recording(path: Path, sensor: Sensor) -> Recording:
         "status": [f"status_{i}" for i in range(zones)],
         "truth": ["panel_x_m", "yaw_deg"],
     }
+    table: dict[str, list[list[float]]] = {group: [] for group in names}
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
-        missing = [name for group in names.values() for name in group if name not in (reader.fieldnames or ())]
-        if missing:
-            raise ValueError(
-                f"{path}: no column {missing[0]!r}; needed are {', '.join(g[0] for g in names.values())} …"
-            )
-        table: dict[str, list[list[float]]] = {group: [] for group in names}
-        for line in reader:
-            for group, columns in names.items():
-                try:
-                    table[group].append([float(line[name]) for name in columns])
-                except (TypeError, ValueError):
-                    raise ValueError(f"{path}, line {reader.line_num}: a value is missing or not a number") from None
+        try:
+            missing = [name for group in names.values() for name in group if name not in (reader.fieldnames or ())]
+            if missing:
+                raise ValueError(
+                    f"{path}: no column {missing[0]!r}; needed are {', '.join(g[0] for g in names.values())} …"
+                )
+            for line in reader:
+                for group, columns in names.items():
+                    table[group].append([_number(path, reader.line_num, name, line[name]) for name in columns])
+        except (csv.Error, UnicodeDecodeError) as error:
+            raise ValueError(f"{path}, after line {reader.line_num}: not a text table ({error})") from None
     if not table["mm"]:
         raise ValueError(f"{path}: no frames")
     shape = (-1, sensor.rows, sensor.cols)
     millimetres = np.array(table["mm"]).reshape(shape)
-    status = np.array(table["status"], int).reshape(shape)
+    status = np.nan_to_num(np.array(table["status"])).astype(int).reshape(shape)
     truth = np.array(table["truth"])
     with tempfile.TemporaryDirectory() as folder:
         arrays = Path(folder) / "recording.npz"
@@ -95,6 +98,15 @@ def read_recording(path: Path, sensor: Sensor) -> Recording:
         frames = read_frames(arrays, sensor=sensor, unit="mm", quantity="z", valid_status=[VALID_STATUS])
     z_m = np.where(status == VALID_STATUS, millimetres / 1e3, np.nan)
     return Recording(z_m, frames, truth[:, 0], np.radians(truth[:, 1]))
+
+
+def _number(path: Path, line: int, name: str, text: str | None) -> float:
+    """Read one value of the table; NaN where there is none."""
+    try:
+        value = float(text or "nan")
+    except ValueError:
+        raise ValueError(f"{path}, line {line}: {name} must be a number, got {text!r}") from None
+    return value if math.isfinite(value) else math.nan
 
 
 def zone_rays(sensor: Sensor) -> NDArray[np.float64]:
@@ -150,6 +162,17 @@ def find_plane(
     return plane, on_panel
 
 
+def inside(on_panel: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.bool_]:
+    """Leave out zones of a frame that may see past a side of the panel: those with a neighbour that is not on it.
+
+    A zone that sees both is a little too far or too near, and at the side, where it tilts the plane most.
+    """
+    grid = on_panel.reshape(sensor.rows, sensor.cols)
+    beside = np.pad(grid, ((0, 0), (1, 1)), constant_values=True)
+    kept = grid & beside[:, :-2] & beside[:, 2:]
+    return (kept if kept.sum() >= FEWEST_INSIDE else grid).ravel()
+
+
 def panel_width(planes: NDArray[np.float64], on_panel: NDArray[np.bool_], rays: NDArray[np.float64]) -> float:
     """Return how wide the panel is at least: what zones on it span, to both sides of the axis it is hit at (m)."""
     points = rays / (planes @ rays.T)[..., None]
@@ -184,7 +207,8 @@ def match(
     width = panel_width(planes, on_panel, rays)
     renderer = Renderer(trimesh.creation.box((THICKNESS_M, width, width)), sensor)
     measured = recording.frames.range_m[0].reshape(len(recording.z_m), -1)[index]
-    weight = np.where(on_panel & np.isfinite(measured), 1.0, 0.0)
+    used = np.array([inside(frame, sensor) for frame in on_panel])
+    weight = np.where(used & np.isfinite(measured), 1.0, 0.0)
     view = np.column_stack([1 / planes[:, 0] + THICKNESS_M / 2, np.arctan2(planes[:, 1], planes[:, 0])])
     view[:, 1] *= -1
 
@@ -263,11 +287,16 @@ def main() -> int:
     error_m = distance - recording.distance_m[index]
     turn = view[:, 1] - recording.yaw_rad[index]
     error_deg = np.degrees(np.angle(np.exp(1j * turn)))
-    offset = np.median(error_m)
+    known = np.isfinite(error_m) & np.isfinite(error_deg)
     print(f"{len(index)} of {len(recording.z_m)} frames show the panel, {width:.2f} m wide or more")
+    print(arguments.out / "estimates.png")
+    if not known.any():
+        print("no frame of these has a truth to compare with")
+        return 0
+    error_m, error_deg = error_m[known], error_deg[known]
+    offset = np.median(error_m)
     print(f"distance: median error {1e3 * offset:.1f} mm, MAD {1e3 * np.median(np.abs(error_m - offset)):.1f} mm")
     print(f"side: median error {np.median(error_deg):.2f}°, r.m.s. {np.sqrt(np.mean(error_deg**2)):.2f}°")
-    print(arguments.out / "estimates.png")
     return 0
 
 

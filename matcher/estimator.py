@@ -22,7 +22,7 @@ from phasemark.matcher.match import Candidate, Match
 from phasemark.matcher.models import VIEW, BankModel, ImageModel, RenderedModel
 from phasemark.matcher.refine import SCALE, Fits, Settings, refine
 from phasemark.matcher.surroundings import NEAREST_WALL_M, estimate_surroundings, without_background
-from phasemark.render import Background, PhasorImages, Renderer, wrap_difference_m
+from phasemark.render import Background, PhasorImages, Renderer, phasor_to_range_m, wrap_difference_m
 
 Pixels = Literal["all", "lower"]
 MIN_RETURNS = 3
@@ -36,6 +36,8 @@ _DOUBTFUL, _HOPELESS = 0.05, 1e-3
 _BESIDE_RAD = math.radians(1.0)
 """Side peaks of the likelihood before a background are about so far away (PHYSICS section 7)."""
 _BESIDE_AGAIN_RAD = tuple(math.radians(side) for side in (-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0))
+_CLOSE_BY_RAD = tuple(math.radians(side) for side in (-0.7, -0.28, -0.12, 0.12, 0.28, 0.7))
+"""And others, of narrower edges, so far."""
 _FINE, _COARSE = (0.011, math.radians(1.1)), (0.022, math.radians(2.2))
 """Widest grids, metres and radians, on which interpolation is at the bound, and on which it shows the way."""
 _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
@@ -48,6 +50,8 @@ _MOST_REFINED = 3
 _SHORT_STEP = 0.1
 """Longest step after a scout, in natural units: it comes within about so much."""
 _FRAMES_AT_ONCE = 256
+_TRIMMINGS, _ODD, _ODD_SIGMA = 3, 3.0, 5.0
+"""How often a robust search starts again without the returns that fit worst, and which: by the median, and in σ."""
 
 
 def check_free(free: Sequence[str]) -> tuple[str, ...]:
@@ -178,12 +182,12 @@ class MaximumLikelihood:
         n_modes = _MODES if background is None else _MODES_BEFORE_BACKGROUND
         all_classes = evidence.on == "phasors"
 
-        def doubtful(fits: Fits) -> NDArray[np.int64]:
+        def doubtful(fits: Fits, *, hopeless: bool = False) -> NDArray[np.int64]:
             """Return the frames whose best fit is worse than good ones are; on ranges, if it beats a bare scene."""
             best = _best_of_frame(fits)
             limit = stats.chi2.isf(_DOUBTFUL if side_peaks else _HOPELESS, np.maximum(fits.dof[best], 1))
             cost, frame = fits.cost[best], fits.frame[best]
-            hope = cost < bare[frame] if evidence.on == "ranges" else True
+            hope = cost < bare[frame] if evidence.on == "ranges" and not hopeless else True
             return np.asarray(frame[(cost > limit) & hope])
 
         starts = search.starts(_some(seen, enough), n_modes, all_classes=all_classes)
@@ -198,7 +202,32 @@ class MaximumLikelihood:
             starts = search.starts(_some(seen, poor), n_modes, all_classes=all_classes)
             direct = _Models(models.final, None)
             fits.append(self._fit(direct, evidence, poor, starts, (-_BESIDE_RAD, _BESIDE_RAD), behind))
+        if self._huber is not None:
+            for _ in range(_TRIMMINGS):
+                poor = doubtful(Fits.joined(fits), hopeless=True)
+                if not poor.size:
+                    break
+                assert models.final is not None
+                kept = self._trimmed(models.final, evidence, Fits.joined(fits), poor, seen)
+                starts = search.starts(kept, n_modes, all_classes=all_classes)
+                fits.append(self._fit(models, evidence, poor, starts, sides, behind))
         return Fits.joined(fits)
+
+    def _trimmed(
+        self, model: ImageModel, evidence: Evidence, fits: Fits, which: NDArray[np.int64], seen: Observation
+    ) -> Observation:
+        """Return some frames without the returns that are farthest from their best fits, and from the bulk of them."""
+        best = _best_of_frame(fits)
+        best = best[np.searchsorted(fits.frame[best], which)]
+        phasor = model.images(fits.class_index[best], np.ascontiguousarray(fits.view[best]), ()).phasor
+        few = _some(seen, which)
+        size = np.sqrt(few.weight) * np.abs(
+            wrap_difference_m(few.range_m - phasor_to_range_m(phasor, evidence.sensor), evidence.sensor)
+        )
+        compared = few.returned & np.isfinite(size)
+        middle = np.nanmedian(np.where(compared, size, np.nan), axis=1, keepdims=True)
+        odd = compared & (size > np.maximum(_ODD * middle, _ODD_SIGMA))
+        return Observation(few.range_m, np.where(odd, 0.0, few.weight), few.returned & ~odd, few.not_returned & ~odd)
 
     def _is_doubtful(self, fits: Fits) -> bool:
         """Return whether the best fit of one frame is worse than good ones are."""
@@ -257,7 +286,8 @@ class MaximumLikelihood:
         again = fits[np.array(chosen, np.int64)]
         if patient:
             again = _spread(again)
-        close = replace(settings, longest_step=_SHORT_STEP)
+        side_peaks = evidence.on == "phasors" or behind is not None
+        close = replace(settings, longest_step=_SHORT_STEP, look_beside_rad=_CLOSE_BY_RAD if side_peaks else ())
         final = refine(models.final, evidence, again.frame, again.class_index, again.view, close)
         rest = np.setdiff1d(order, likely)
         others = fits[rest]
@@ -283,7 +313,7 @@ class MaximumLikelihood:
         more = refine(model, evidence, frame[~first], class_index[~first], view[~first], settings, limit, roughly=True)
         fits = Fits.joined([fits, more])
         likely = fits.cost < _least_of_frame(fits, n)[fits.frame] + margin
-        better = fits[likely]
+        better = fits[self._distinct_of_frames(fits, np.flatnonzero(likely))]
         better = refine(model, evidence, better.frame, better.class_index, better.view, settings)
         return Fits.joined([better, fits[~likely]])
 
@@ -345,7 +375,7 @@ class MaximumLikelihood:
         kept = self._distinct(fits, own)
         best = kept[0]
         c = int(fits.class_index[best])
-        is_landmark = bool(fits.cost[best] < bare)
+        is_landmark = bool(fits.capped[best] < bare)
         covariance = fits.covariance[best]
         known = bool(np.isfinite(covariance).all())
         none_cost = min(bare, float(doubt[best]))
@@ -388,6 +418,12 @@ class MaximumLikelihood:
             weak_direction=weak,
             background=background,
         )
+
+    def _distinct_of_frames(self, fits: Fits, which: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return those of some fits that came to places of their own, the best at each."""
+        which = which[np.lexsort((fits.cost[which], fits.frame[which]))]
+        borders = np.flatnonzero(np.diff(fits.frame[which])) + 1
+        return np.array([k for own in np.split(which, borders) for k in self._distinct(fits, own)], np.int64)
 
     def _distinct(self, fits: Fits, own: NDArray[np.int64]) -> list[int]:
         """Return fits, best first, without those that came to the same place."""
@@ -450,7 +486,8 @@ def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.floa
     sure = counts(behind.phasor, behind.intensity, sensor).reshape(-1)
     residual = wrap_difference_m(np.where(lit & seen.returned, seen.range_m - np.where(lit, model, 0.0), 0.0), sensor)
     wrong = (seen.returned & ~lit) | (seen.not_returned & sure)
-    return np.asarray((seen.weight * residual**2).sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
+    squared = np.minimum(seen.weight * residual**2, DISAGREEMENT)
+    return np.asarray(squared.sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
 
 
 def p_values_of(

@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.coarse import Observation
+from phasemark.matcher.coarse import DISAGREEMENT, Observation
 from phasemark.matcher.filters import FilteredFrames
 from phasemark.render import Sensor, predicted_range_std
 from phasemark.render.noise import phase_image_variance
@@ -118,7 +118,10 @@ class Sums:
     Parameters
     ----------
     cost : (m,) float64
-        Whitened squared residual; with Huber's loss twice that loss.
+        Whitened squared residual; with a robust loss twice that loss.
+    capped : (m,) float64
+        The same with no residual adding more than :data:`~phasemark.matcher.coarse.DISAGREEMENT`, what one costs that
+        nothing explains.
     gradient : (m, p) float64
         Jᵀ W r.
     information : (m, p, p) float64
@@ -128,6 +131,7 @@ class Sums:
     """
 
     cost: NDArray[np.float64]
+    capped: NDArray[np.float64]
     gradient: NDArray[np.float64]
     information: NDArray[np.float64]
     scatter: NDArray[np.float64]
@@ -154,29 +158,36 @@ def gauss_newton_sums(
     use : (m, pixels) bool
         Which pixels count.
     huber : float, optional
-        Residual, in σ, from which the loss grows linearly; None: squares throughout.
+        Residual, in σ, from which the loss grows linearly, until it costs what one costs that nothing explains; from
+        there it stays, and the pixel no longer counts. None: squares throughout.
     """
     m, p = slope.shape[:2]
-    cost, gradient = np.empty(m), np.empty((m, p))
+    cost, capped, gradient = np.empty(m), np.empty(m), np.empty((m, p))
     information, scatter = np.empty((m, p, p)), np.empty((m, p, p))
     kernel = _sum_ranges if evidence.on == "ranges" else _sum_phasors
     kernel(
         phasor, slope, evidence.value, evidence.weight, frame, use, evidence.sensor.metres_per_radian,
-        np.inf if huber is None else huber, cost, gradient, information, scatter,
+        np.inf if huber is None else huber, cost, capped, gradient, information, scatter,
     )  # fmt: skip
-    return Sums(cost, gradient, information, scatter)
+    return Sums(cost, capped, gradient, information, scatter)
 
 
 @njit(cache=True, nogil=True)
-def _add(residual, row, weight, huber, k, cost, gradient, information, scatter):  # type: ignore[no-untyped-def]
+def _add(residual, row, weight, huber, k, cost, capped, gradient, information, scatter):  # type: ignore[no-untyped-def]
     """Add one residual with its row of the Jacobian to the sums of model k."""
     p = len(row)
     size = abs(residual) * np.sqrt(weight)
     if size > huber:
-        cost[k] += huber * (2 * size - huber)
+        loss = huber * (2 * size - huber)
+        if loss >= DISAGREEMENT:
+            cost[k] += DISAGREEMENT
+            capped[k] += DISAGREEMENT
+            return
         weight *= huber / size  # as iterated least squares has it: the sum stays positive
     else:
-        cost[k] += size * size
+        loss = size * size
+    cost[k] += loss
+    capped[k] += min(loss, DISAGREEMENT)
     bounded = weight * residual
     for a in range(p):
         gradient[k, a] += bounded * row[a]
@@ -188,11 +199,11 @@ def _add(residual, row, weight, huber, k, cost, gradient, information, scatter):
 
 @njit(cache=True, nogil=True)
 def _sum_ranges(  # type: ignore[no-untyped-def]
-    phasor, slope, value, weight, frame, use, metres_per_radian, huber, cost, gradient, information, scatter
+    phasor, slope, value, weight, frame, use, metres_per_radian, huber, cost, capped, gradient, information, scatter
 ):
     m, p, pixels = slope.shape
     row = np.empty(p)
-    cost[:], gradient[:], information[:], scatter[:] = 0.0, 0.0, 0.0, 0.0
+    cost[:], capped[:], gradient[:], information[:], scatter[:] = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(m):
         f = frame[k]
         for q in range(pixels):
@@ -206,16 +217,16 @@ def _sum_ranges(  # type: ignore[no-untyped-def]
             for a in range(p):
                 d = slope[k, a, q]
                 row[a] = metres_per_radian * (s.real * d.imag - s.imag * d.real) / size
-            _add(residual, row, w, huber, k, cost, gradient, information, scatter)
+            _add(residual, row, w, huber, k, cost, capped, gradient, information, scatter)
 
 
 @njit(cache=True, nogil=True)
 def _sum_phasors(  # type: ignore[no-untyped-def]
-    phasor, slope, value, weight, frame, use, metres_per_radian, huber, cost, gradient, information, scatter
+    phasor, slope, value, weight, frame, use, metres_per_radian, huber, cost, capped, gradient, information, scatter
 ):
     m, p, pixels = slope.shape
     row = np.empty(p)
-    cost[:], gradient[:], information[:], scatter[:] = 0.0, 0.0, 0.0, 0.0
+    cost[:], capped[:], gradient[:], information[:], scatter[:] = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(m):
         f = frame[k]
         for q in range(pixels):
@@ -225,7 +236,7 @@ def _sum_phasors(  # type: ignore[no-untyped-def]
             difference = value[f, q] - phasor[k, q]
             for a in range(p):
                 row[a] = slope[k, a, q].real
-            _add(difference.real, row, w, huber, k, cost, gradient, information, scatter)
+            _add(difference.real, row, w, huber, k, cost, capped, gradient, information, scatter)
             for a in range(p):
                 row[a] = slope[k, a, q].imag
-            _add(difference.imag, row, w, huber, k, cost, gradient, information, scatter)
+            _add(difference.imag, row, w, huber, k, cost, capped, gradient, information, scatter)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -54,10 +54,21 @@ class ModelImages:
 
 
 class ImageModel(Protocol):
-    """What the refinement asks of a model."""
+    """What the refinement asks of a model.
+
+    Parameters
+    ----------
+    slopes_are_free : bool
+        Whether slopes cost no more than images.
+    """
+
+    slopes_are_free: bool
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Return the images of views (m, 4), columns :data:`VIEW`, of a class each."""
+
+    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
+        """Return images of views that differ from those of `before` in δ alone, with the slopes of `before`."""
 
     def reach(
         self,
@@ -97,6 +108,8 @@ class BankModel:
         Whether to distrust pixels whose brightness has a kink nearby: those that an edge enters or leaves, or a crease
         between faces, within two steps of the grid.
     """
+
+    slopes_are_free = True
 
     def __init__(self, bank: Bank, behind: PhasorImages | None = None, *, smooth_only: bool = False) -> None:
         self._sensor = bank.sensor
@@ -162,6 +175,10 @@ class BankModel:
     ) -> None:
         """Return None: what is interpolated is smooth."""
 
+    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
+        """Interpolate anew."""
+        return replace(self.images(class_index, view, ()), slope=before.slope)
+
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels are smooth enough."""
         if not self._smooth_only:
@@ -218,6 +235,8 @@ class RenderedModel:
         Threads that render.
     """
 
+    slopes_are_free = False
+
     def __init__(self, bank: Bank, background: Background | None = None, workers: int = 1) -> None:
         self.sensor: Sensor = bank.sensor
         self.background = background
@@ -269,6 +288,17 @@ class RenderedModel:
                 there = self._render(c, moved, rows).phasor.reshape(len(of), -1)
                 slope[of, k, first:] = (there - phasor[of, first:]) / width[:, None]
         return ModelImages(phasor, slope, intensity, coverage)
+
+    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
+        """Render the rows that δ changes."""
+        phasor, intensity, coverage = before.phasor.copy(), before.intensity.copy(), before.coverage.copy()
+        rows, first = self._changing_rows("delta_rad", view)
+        for c in np.unique(class_index):
+            of = np.flatnonzero(class_index == c)
+            image = self._render(c, view[of], rows)
+            for values, new in ((phasor, image.phasor), (intensity, image.intensity), (coverage, image.coverage)):
+                values[of, first:] = new.reshape(len(of), -1)
+        return ModelImages(phasor, before.slope, intensity, coverage)
 
     def wide_slopes(
         self,

@@ -27,6 +27,16 @@ _SETTLED = 1e-4
 _ROUGH = 0.1
 _CLOSE = 30.0
 """Where a step promises less than this, slopes have settled: five σ, over which they hardly change."""
+_PROMISING = 20.0
+"""What a view beside a solution may cost more, and still lead to a better one."""
+_HOPELESS = 1000.0
+"""A first view whose cost is above the limit by more is not worth its slopes."""
+_KINK = 0.05
+"""Slopes at one point may be those of a kink narrower than this, in natural units, which says nothing of the rest."""
+_LESS = 0.5
+"""And at most this share of what a parabola costs there."""
+_CLOSE_CALL = 50.0
+"""A fit whose cost is above its frame's best by more will not become the best."""
 _OPTIMISM = 3.0
 """A fit gives up where even so many times the promised decrease would not save it."""
 
@@ -42,9 +52,11 @@ class Settings:
     pixels : (pixels,) bool
         Which pixels place the landmark; all of them tell its class.
     huber : float, optional
-        Residual, in σ, from which the loss grows linearly.
+        Residual, in σ, from which the loss grows linearly, and soon no more.
     background : PhasorImages' phasor (pixels,) complex128, optional
         What stands behind, without the landmark; on phasors the albedo does not scale it.
+    look_beside_rad : tuple of float
+        How far to either side of a solution δ is tried once more; there may be a lower minimum behind a kink.
     longest_step : float
         No step is longer, in natural units of 1 cm and 1°. Near a solution it should be short: where an edge crosses
         a pixel's border, slopes jump, and those of one side may lead far away on the other.
@@ -54,6 +66,7 @@ class Settings:
     pixels: NDArray[np.bool_]
     huber: float | None = None
     background: NDArray[np.complex128] | None = None
+    look_beside_rad: tuple[float, ...] = ()
     longest_step: float = 3.0
 
 
@@ -70,6 +83,8 @@ class Fits:
     cost : float64
         Whitened squared residual of all pixels that count, and :data:`~phasemark.matcher.coarse.DISAGREEMENT` for each
         pixel whose return or lack of it no view nearby explains.
+    capped : float64
+        The same with no residual adding more than that: what to compare with a scene that explains nothing.
     dof : int64
         Residuals in it, less the parameters fitted.
     covariance : (m, p, p) float64
@@ -83,6 +98,7 @@ class Fits:
     view: NDArray[np.float64]
     albedo: NDArray[np.float64]
     cost: NDArray[np.float64]
+    capped: NDArray[np.float64]
     dof: NDArray[np.int64]
     covariance: NDArray[np.float64]
     information: NDArray[np.float64]
@@ -137,6 +153,8 @@ def refine(
     state = problem.descend(state, _ROUGH if roughly else _SETTLED)
     if roughly:
         return problem.conclude(state, look_around=False)
+    if settings.look_beside_rad:
+        state = problem.look_beside(state)
     use = problem.pixels_at(state.images, state.theta)
     changed = np.flatnonzero((use != state.use).any(axis=1))
     if changed.size:
@@ -194,10 +212,24 @@ class _Problem:
     def start(self, view: NDArray[np.float64]) -> _State:
         """Look at the first views: which pixels count, and how bright the landmark is."""
         theta = np.column_stack([self._clipped(view.copy()), np.ones(len(view))])
-        images = self.model.images(self.class_index, np.ascontiguousarray(theta[:, :4]), self.settings.free)
+        images = self._images(theta)
         if self.with_albedo:
             theta[:, 4] = self._brightness(images)
         return self._summed(theta, self.pixels_at(images, theta), self._scaled(images, theta))
+
+    def _images(self, theta: NDArray[np.float64]) -> ModelImages:
+        """Return first images; slopes are 0 where no step is likely to lead below the limit."""
+        view, free = np.ascontiguousarray(theta[:, :4]), self.settings.free
+        if not np.isfinite(self.limit).any() or self.with_albedo or self.model.slopes_are_free:
+            return self.model.images(self.class_index, view, free)
+        images = self.model.images(self.class_index, view, ())
+        images = replace(images, slope=np.zeros((len(view), len(free), images.phasor.shape[1]), np.complex128))
+        cost = self._summed(theta, self.pixels_at(images, theta), images).sums.cost
+        hopeful = np.flatnonzero(cost < self.limit + _HOPELESS)
+        if hopeful.size:
+            with_slopes = self.model.images(self.class_index[hopeful], np.ascontiguousarray(view[hopeful]), free)
+            images.slope[hopeful] = with_slopes.slope
+        return images
 
     def state(
         self, theta: NDArray[np.float64], use: NDArray[np.bool_], slope: NDArray[np.complex128] | None = None
@@ -266,13 +298,71 @@ class _Problem:
             active = active[stays & (damping[active] < 1e5)]
         return state
 
+    def look_beside(self, state: _State) -> _State:
+        """Try δ a little to either side, the other parameters following, and descend from where that is promising."""
+        sides = np.array(self.settings.look_beside_rad)
+        near = self._near_best(state, 0.0)
+        if not near.size:
+            return state
+        source = np.repeat(near, len(sides))
+        theta = state.theta[source]
+        turn = VIEW.index("delta_rad")
+        theta[:, turn] += np.tile(sides, len(near))
+        there = self.some(source).turned(state, source, theta)
+        d = int(np.flatnonzero(self.columns == turn)[0])
+        others = np.flatnonzero(self.columns != turn)
+        unit = self.scale[others]
+        information = there.sums.information[:, others[:, None], others] * np.outer(unit, unit)
+        gradient = there.sums.gradient[:, others] * unit
+        step = np.einsum("mpq,mq->mp", np.linalg.pinv(information, hermitian=True), gradient)
+        more = (there.sums.cost - np.einsum("mp,mp->m", gradient, step)).reshape(len(near), -1)
+        more -= state.sums.cost[near, None]
+        # one minimum alone would cost so much more at the sides; what is far below that has another one near it
+        alone = sides**2 / np.einsum("mpp->mp", self._covariance(state.sums))[near, d][:, None]
+        best = np.argmin(more - _LESS * alone, axis=1)
+        most = np.minimum(_PROMISING, _LESS * np.take_along_axis(alone, best[:, None], axis=1)[:, 0])
+        chosen = np.flatnonzero(np.take_along_axis(more, best[:, None], axis=1)[:, 0] < most)
+        if not chosen.size:
+            return state
+        which, at = near[chosen], chosen * len(sides) + best[chosen]
+        theta = theta[at]
+        theta[:, self.columns[others]] += step[at] * unit
+        theta[:, :4] = self._clipped(theta[:, :4])
+        some = self.some(which)
+        found = some.descend(some.state(theta, state.use[which]), _SETTLED)
+        better = np.flatnonzero(found.sums.cost < state.sums.cost[which])
+        return state.updated(which[better], _picked(found, better))
+
+    def turned(self, states: _State, source: NDArray[np.integer], theta: NDArray[np.float64]) -> _State:
+        """Return states that differ from `source` in δ alone, with the slopes from there."""
+        before = ModelImages(**{name: values[source] for name, values in vars(states.images).items()})
+        if self.with_albedo:  # what the model makes is as bright as the bank has it
+            before = replace(before, phasor=before.phasor - (theta[:, 4:] - 1) * before.slope[:, -1])
+        images = self.model.turned(self.class_index, np.ascontiguousarray(theta[:, :4]), before)
+        if self.with_albedo:
+            images = replace(self._scaled(replace(images, slope=images.slope[:, :-1]), theta), slope=before.slope)
+        return self._summed(theta, states.use[source], images)
+
+    def _near_best(self, state: _State, margin: float) -> NDArray[np.intp]:
+        """Return the candidates that may be their frame's best, up to some cost above it; with none the best alone."""
+        cost = state.sums.cost
+        order = np.lexsort((cost, self.frame))
+        first = order[np.flatnonzero(np.diff(self.frame[order], prepend=-1))]
+        if margin == 0:
+            return np.sort(first[cost[first] <= self.limit[first]])
+        least = np.full(len(self.evidence.weight), np.inf)
+        least[self.frame[first]] = cost[first]
+        return np.flatnonzero((cost <= self.limit) & (cost <= least[self.frame] + margin))
+
     def conclude(self, state: _State, *, look_around: bool = True) -> Fits:
         """Take stock of the solutions."""
         settings, evidence = self.settings, self.evidence
         p = len(settings.free)
         covariance = self._covariance(state.sums)
         # where it does not matter any more, what is nearby is not looked at
-        near = np.flatnonzero((state.sums.cost <= self.limit) & look_around)
+        # before a background the cost is final here; otherwise pixels that nothing explains may still change it
+        margin = _CLOSE_CALL if settings.background is None else 0.0
+        near = self._near_best(state, margin) if look_around else np.empty(0, np.intp)
         if near.size:
             there = self.some(near)
             slope = there.slopes_around(state, near, self._std(covariance[near]))
@@ -284,27 +374,14 @@ class _Problem:
                 covariance[near] = self._covariance(sums)
         information = _inverse(covariance / np.outer(self.scale[:p], self.scale[:p]), 1 / self.scale[:p])
         all_pixels = np.ones_like(settings.pixels)
-        cost = state.sums.cost
+        sums = state.sums
         if not settings.pixels.all():
-            cost = gauss_newton_sums(
+            sums = gauss_newton_sums(
                 state.images.phasor, state.images.slope, evidence, self.frame, state.use & all_pixels, settings.huber
-            ).cost
+            )
         fitted = state.use & (evidence.weight[self.frame] > 0)
-        low, high = state.images.coverage.copy(), state.images.coverage.copy()
-        if near.size and settings.background is None:
-            std = self._std(covariance[near])
-            around = self.model.reach(self.class_index[near], state.theta[near, :4], settings.free, std)
-            low[near], high[near] = np.minimum(low[near], around[0]), np.maximum(high[near], around[1])
+        wrong = self._wrong(state, near, covariance, ~fitted)
         returned = evidence.seen.returned[self.frame]
-        absent = evidence.seen.not_returned[self.frame]
-        if settings.background is None:
-            lost = returned & (high < MAY_RETURN_COVERAGE)
-            missed = absent & (low > MUST_RETURN_COVERAGE)
-        else:
-            lost = np.zeros_like(returned)
-            missed = absent & state.use
-        # a kink nearby excuses a pixel where it keeps it from being compared
-        wrong = (lost | missed) & ~fitted & self.model.trusted(self.class_index, state.theta[:, :4])
         n_wrong = wrong.sum(axis=1)
         # a return that is neither compared nor wrong costs what a pixel costs on average: a model that counts fewer
         # pixels is not better for it
@@ -315,11 +392,37 @@ class _Problem:
             class_index=self.class_index,
             view=state.theta[:, :4],
             albedo=state.theta[:, 4],
-            cost=cost + DISAGREEMENT * n_wrong + n_open,
+            cost=sums.cost + DISAGREEMENT * n_wrong + n_open,
+            capped=sums.capped + DISAGREEMENT * n_wrong + n_open,
             dof=np.maximum(n_residuals - len(self.columns), 0),
             covariance=covariance,
             information=information,
         )
+
+    def _wrong(
+        self, state: _State, near: NDArray[np.intp], covariance: NDArray[np.float64], among: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Return which of some pixels return, or do not, as no view within three standard deviations explains."""
+        seen = self.evidence.seen
+        returned, absent = seen.returned[self.frame], seen.not_returned[self.frame]
+        # a kink nearby excuses a pixel where it keeps it from being compared
+        among = among & self.model.trusted(self.class_index, state.theta[:, :4])
+        if self.settings.background is not None:
+            return np.asarray(absent & state.use & among)
+
+        def disagree(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
+            lost = returned & (high < MAY_RETURN_COVERAGE)
+            return np.asarray((lost | (absent & (low > MUST_RETURN_COVERAGE))) & among)
+
+        low, high = state.images.coverage.copy(), state.images.coverage.copy()
+        wrong = disagree(low, high)
+        near = near[wrong[near].any(axis=1)]
+        if near.size:
+            view = np.ascontiguousarray(state.theta[near, :4])
+            around = self.model.reach(self.class_index[near], view, self.settings.free, self._std(covariance[near]))
+            low[near], high[near] = np.minimum(low[near], around[0]), np.maximum(high[near], around[1])
+            wrong = disagree(low, high)
+        return wrong
 
     def _covariance(self, sums: Sums) -> NDArray[np.float64]:
         """Return the covariance of the view, (m, p, p): inverse information, or the sandwich."""
@@ -344,7 +447,8 @@ class _Problem:
         None where the model is smooth.
         """
         view = np.ascontiguousarray(state.theta[which, :4])
-        slope = self.model.wide_slopes(self.class_index, view, self.settings.free, 0.5 * std)
+        step = np.maximum(0.5 * std, _KINK * self.scale[: std.shape[1]])
+        slope = self.model.wide_slopes(self.class_index, view, self.settings.free, step)
         if slope is None or not self.with_albedo:
             return slope
         return np.concatenate([slope * state.theta[which, 4:, None], state.images.slope[which, -1:]], axis=1)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from phasemark.matcher.bounds import Estimate, covers, cramer_rao, efficiency, mean_of, nees, share
 from phasemark.matcher.filters import FilteredFrames, kalman_filter, phasor_mean
@@ -112,11 +113,19 @@ class Trials:
 
     @property
     def outlier(self) -> NDArray[np.bool_]:
-        """Errors beyond 5 σ of the bound or of the matcher's own covariance, or no view at all, (n,)."""
+        """Errors beyond 5 σ of the bound, or of the matcher's own covariance in any direction, or no view, (n,)."""
+        with np.errstate(invalid="ignore"):
+            own = np.abs(self.error) > OUTLIER_SIGMA * np.sqrt(np.einsum("npp->np", self.covariance))
+            limit = stats.chi2.isf(2 * stats.norm.sf(OUTLIER_SIGMA), len(self.free))
+            improbable = nees(self.error, self.covariance) > limit
+        return np.asarray(self.astray | own.any(axis=1) | improbable)
+
+    @property
+    def astray(self) -> NDArray[np.bool_]:
+        """Errors beyond 5 σ of the bound, or no view at all, (n,)."""
         with np.errstate(invalid="ignore"):
             far = np.abs(self.scaled) > OUTLIER_SIGMA
-            own = np.abs(self.error) > OUTLIER_SIGMA * np.sqrt(np.einsum("npp->np", self.covariance))
-        return np.asarray((far | own).any(axis=1) | ~self.usable)
+        return np.asarray(far.any(axis=1) | ~self.usable)
 
     @classmethod
     def joined(cls, parts: Sequence[Trials]) -> Trials:
@@ -145,6 +154,7 @@ class Trials:
             nees=mean_of(nees(self.error[known], self.covariance[known]) / len(self.free)),
             coverage=share(int(covers(self.error[known], self.covariance[known]).sum()), int(known.sum())),
             outliers=share(int((~inner).sum()), len(self)),
+            astray=share(int(self.astray.sum()), len(self)),
             class_errors=share(int((self.found != self.class_name).sum()), len(self)),
             accepted=share(int(self.accepted.sum()), len(self)),
         )
@@ -189,7 +199,8 @@ class TrialSummary:
         Mean eᵀP⁻¹e over the number of parameters.
     coverage : Estimate
         Share of errors inside the 95 % ellipsoid.
-    outliers, class_errors, accepted : Estimate
+    outliers, astray, class_errors, accepted : Estimate
+        Shares; outliers are beyond 5 σ of the bound or of the match's own covariance, astray beyond those of the bound.
     """
 
     n: int
@@ -199,6 +210,7 @@ class TrialSummary:
     nees: Estimate
     coverage: Estimate
     outliers: Estimate
+    astray: Estimate
     class_errors: Estimate
     accepted: Estimate
 
@@ -212,6 +224,7 @@ class TrialSummary:
             ("NEES / p", str(self.nees)),
             ("95 % coverage", str(self.coverage)),
             ("outliers", str(self.outliers)),
+            ("beyond 5 σ of the bound", str(self.astray)),
             ("class errors", str(self.class_errors)),
             ("accepted", str(self.accepted)),
         ]

@@ -31,7 +31,7 @@ def zone_distances(distance, yaw):
     return zones(light * range_m) / zones(light) / np.sqrt(1 + centre[:, None] ** 2 + centre**2)
 
 
-def write_recording(path, distance_m, yaw_deg, rng, edge=6):
+def write_recording(path, distance_m, yaw_deg, rng, edge=6, mixed_m=0.0):
     """Write what zones see of a wide panel, a floor in the lowest two rows, and what is past the panel."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -39,6 +39,8 @@ def write_recording(path, distance_m, yaw_deg, rng, edge=6):
         writer.writerow(["panel_x_m", "yaw_deg", *(f"mm_{i}" for i in zones), *(f"status_{i}" for i in zones)])
         for distance, yaw in zip(distance_m, np.radians(yaw_deg), strict=True):
             z = zone_distances(distance, yaw) + NOISE_M * rng.standard_normal((8, 8))
+            if mixed_m:  # the last column on the panel sees past it a little
+                z[:, edge - 1] += mixed_m
             status = np.full((8, 8), 5)
             z[6:] = 0.03
             z[:, edge:] = 1.9 + 0.3 * rng.random((8, 8 - edge))
@@ -71,6 +73,36 @@ def test_a_panel_is_followed_before_a_floor_and_a_room(tmp_path, edge):
     assert np.median(np.abs(d - distance[index])) < 0.003
     assert 0.8 < np.median(chi2) < 1.2
     assert (tmp_path / "out" / "estimates.png").stat().st_size > 10_000
+
+
+def test_zones_that_see_past_the_side_of_the_panel_do_not_tilt_it(tmp_path):
+    rng = np.random.default_rng(9)
+    n = 40
+    distance, yaw = rng.uniform(0.6, 0.8, n), rng.uniform(-15, 15, n)
+    write_recording(tmp_path / "panel.csv", distance, yaw, rng, edge=5, mixed_m=0.012)
+    done = run(tmp_path / "panel.csv", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    frame, _, _, delta, delta_std, _ = np.loadtxt(tmp_path / "out" / "estimates.csv", delimiter=",", skiprows=1).T
+    error = delta - yaw[frame.astype(int)]
+    # a column 12 mm too far, if it counted, would turn a plane over five columns of some 7 cm by 2 to 3°
+    assert abs(np.mean(error)) < 3.3 * np.sqrt(np.mean(delta_std**2) / len(frame)) + 0.3
+
+
+def test_missing_values_are_left_out(tmp_path):
+    path = tmp_path / "panel.csv"
+    write_recording(path, [0.7, 0.7, 0.7], [0.0, 5.0, 10.0], np.random.default_rng(1))
+    with path.open(newline="") as file:
+        rows = list(csv.reader(file))
+    for line, column, value in ((1, "yaw_deg", "nan"), (2, "status_5", "inf"), (2, "mm_4", ""), (3, "status_9", "")):
+        rows[line][rows[0].index(column)] = value
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    done = run(path, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "nan" not in done.stdout
+    estimates = np.loadtxt(tmp_path / "out" / "estimates.csv", delimiter=",", skiprows=1)
+    assert estimates.shape == (3, 6)
+    assert np.isfinite(estimates).all()
 
 
 @pytest.mark.parametrize(

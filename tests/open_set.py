@@ -1,0 +1,74 @@
+"""What no matcher should take for a landmark it knows: other shapes, and frames that were damaged."""
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from phasemark.matcher import FilteredFrames, PixelState, kalman_filter
+from phasemark.render import Frames, predicted_range_std
+
+
+def strangers():
+    """Return meshes of upper parts that are in no catalogue, on the catalogue's box."""
+    box = trimesh.creation.box((0.24, 0.16, 0.15))
+    box.apply_translation((0, 0, -0.075))
+
+    def block(x, y, bottom, top):
+        mesh = trimesh.creation.box((x, y, top - bottom))
+        mesh.apply_translation((0, 0, (top + bottom) / 2))
+        return mesh
+
+    corners = [[x * 0.075, y * 0.075, 0] for x in (-1, 1) for y in (-1, 1)]
+    uppers = {
+        "cube": block(0.13, 0.13, 0, 0.15),
+        "slab": block(0.05, 0.14, 0, 0.15),
+        "table": trimesh.boolean.union([block(0.06, 0.06, 0, 0.1), block(0.14, 0.14, 0.1, 0.15)], engine="manifold"),
+        "pyramid": trimesh.convex.convex_hull(np.array([*corners, [0, 0, 0.15]])),
+    }
+    return {name: trimesh.boolean.union([box, upper], engine="manifold") for name, upper in uppers.items()}
+
+
+def noise_free(images):
+    """Return what 50 frames without their noise give, with its size."""
+    sensor = images.sensor
+    std = predicted_range_std(images.amplitude, images.intensity, sensor)
+    returned = std <= 0.1 * sensor.metres_per_radian
+    return FilteredFrames(
+        range_m=np.where(returned, images.range_m, np.nan),
+        std_m=np.where(returned, std / math.sqrt(50), np.nan),
+        amplitude_e=None,
+        intensity_e=None,
+        state=np.where(returned, PixelState.RETURN, PixelState.NO_RETURN).astype(np.uint8),
+        n_effective=np.where(returned, 50.0, 0.0),
+        sensor=sensor,
+    )
+
+
+DAMAGE = {
+    "damaged": hnp.arrays(bool, (16, 16)),
+    "value": st.sampled_from([np.nan, np.inf, -np.inf, 1e300, -1e300, -1.0, 0.0, 1e-300, 14.99, 1e18]),
+    "distance_m": st.floats(0.8, 1.6),
+    "share_kept": st.sampled_from([0.0, 0.01, 0.5, 1.0]),
+    "meaning": st.sampled_from(["missing", "no-return"]),
+    "seed": st.integers(0, 2**32 - 1),
+}
+"""How a frame may be damaged: which pixels, to what, and what is left of the rest."""
+
+
+def check_damaged(matchers, renderer, damaged, value, distance_m, share_kept, meaning, seed):
+    """Assert that a damaged frame gets an answer, and never a view that is not a number."""
+    clean = renderer.render(distance_m, 0.4).range_m[0]
+    rng = np.random.default_rng(seed)
+    ranges = np.where(damaged, value, clean + rng.normal(0, 0.02, (5, 16, 16)))
+    ranges = np.where(rng.random((16, 16)) < share_kept, ranges, np.nan)
+    frames = kalman_filter(Frames(ranges, sensor=renderer.sensor, invalid_means=meaning))
+    for matcher in matchers:
+        match = matcher.match(frames)[0]
+        figures = [match.distance_m, match.delta_rad, match.bearing_rad, match.height_m, match.chi2, match.p_value]
+        assert match.class_name is None or np.isfinite(figures).all()
+        assert not match.accepted or np.isfinite(match.covariance).all()
+        assert sum(match.class_probability.values()) == pytest.approx(1)
