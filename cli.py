@@ -611,12 +611,14 @@ def _bank_verify(
     as_json: _Json = False,
 ) -> None:
     """Check a bank: checksum, schema, values, random images rendered again; and what its grid's spacing costs."""
-    from phasemark.data import grid_loss, open_bank, verify_bank
+    from phasemark.data import open_bank, verify_bank
 
     report = verify_bank(bank, sample=sample, seed=seed)
     if population is not None:
+        from phasemark.matcher import grid_loss
+
         with open_bank(bank, untrusted=True) as opened:
-            loss = grid_loss(opened, population, seed=seed)
+            loss = grid_loss(opened, population, seed=seed).as_dict()
         report |= {key: float(f"{value:.3g}") if isinstance(value, float) else value for key, value in loss.items()}
     _echo_json(report) if as_json else _echo_facts(report)
 

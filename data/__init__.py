@@ -12,7 +12,6 @@ from phasemark.data.jobs import build_part, estimate, merge_parts, parse_part
 from phasemark.data.measured import read_frames, write_measured
 from phasemark.data.plan import BankPlan, MeshPlan, load_plan, read_plan
 from phasemark.data.plan_kinds import PLAN_KINDS, check_plan, plan_example, plan_schema
-from phasemark.data.population import grid_loss
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.store import read_checksum, verify_checksum, write_atomically, write_checksum
 from phasemark.data.verify import verify_bank, verify_frames
@@ -34,7 +33,6 @@ __all__ = [
     "estimate",
     "export_frames",
     "format_grid",
-    "grid_loss",
     "is_frame_set",
     "load_plan",
     "merge_parts",

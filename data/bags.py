@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark import InputFileError, UsageError
+from phasemark import InputFileError, PhasemarkError, UsageError
 
 Z_TOPIC = "/camera/depth/image_rect"
 RANGE_TOPIC = "/camera/range/image"
@@ -47,6 +47,15 @@ def read_rosbag(path: Path, topic: str | None) -> tuple[dict[str, NDArray[Any]],
         It is no bag, or has no such images.
     """
     store = ros_types()
+    try:
+        return _read(path, topic, store)
+    except PhasemarkError:
+        raise
+    except Exception as error:  # whatever a damaged bag makes YAML, SQLite, MCAP and the messages' decoder say
+        raise InputFileError(f"{path}: damaged, or no ROS 2 bag ({' '.join(str(error).split())[:300]})") from None
+
+
+def _read(path: Path, topic: str | None, store: Any) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     from rosbags.rosbag2 import Reader
 
     images: list[NDArray[Any]] = []

@@ -158,9 +158,10 @@ class BankJob:
         """Images of each slab."""
         return [len(slab.views) for slab in self._slabs]
 
-    def angled_images(self) -> list[ImagesOf]:
-        """Return what makes images that depend on the angle: of each class of a full bank, or of the lower parts."""
-        return [slab.images_of for slab in self._slabs if "delta" in VIEW_DIMS[slab.group]]
+    def whole_images(self) -> list[ImagesOf]:
+        """Return what makes whole images of each class, whatever parts the bank holds."""
+        rows = (0, self.sensor.rows)
+        return [_images_of(self.plan, self.sensor, landmark, "both", rows) for landmark in self.landmarks]
 
     def identity(self) -> dict[str, Any]:
         """Return all that the bank's bytes depend on."""

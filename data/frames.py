@@ -38,6 +38,9 @@ VIEW_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
 }
 """Dimensions, type, units and long name of the large datasets."""
 
+_MOST = 1e12
+"""More electrons than any pixel holds."""
+
 _TRUTH = ("distance", "delta", "bearing", "height", "albedo", "wall", "floor")
 
 Sample = dict[str, Any]
@@ -123,7 +126,10 @@ class FrameSet:
         return np.asarray(dataset[...])
 
     def _read_truth(self, file: h5py.File, n: int) -> dict[str, NDArray[Any]]:
-        truth = {"class_index": self._column(file, "landmark_class", n), "split_index": self._column(file, "split", n)}
+        truth: dict[str, NDArray[Any]] = {
+            "class_index": self._column(file, "landmark_class", n).astype(np.int64),
+            "split_index": self._column(file, "split", n).astype(np.int64),
+        }
         for name, count in (("class_index", len(self.classes)), ("split_index", len(self.splits))):
             if truth[name].min() < 0 or truth[name].max() >= count:
                 raise InputFileError(f"{self.path}: '{name}' has numbers outside 0 … {count - 1}")
@@ -131,6 +137,8 @@ class FrameSet:
             values = self._column(file, name, n).astype(np.float64)
             if name not in ("wall", "floor") and not np.isfinite(values).all():
                 raise InputFileError(f"{self.path}: '{name}' must be finite")
+            if name == "distance" and not (values > 0).all():
+                raise InputFileError(f"{self.path}: 'distance' must be positive, got {values.min():g}")
             if name in ("delta", "bearing"):
                 truth[f"{name}_rad"] = np.deg2rad(values)
             else:
@@ -197,7 +205,7 @@ class FrameSet:
         views = self.view_index[numbers]
         sample: Sample = {}
         for name in self._fields:
-            sample[_key(name)] = self._take(name, numbers if name in FRAME_FIELDS else views)
+            sample[_key(name)] = self._checked(name, self._take(name, numbers if name in FRAME_FIELDS else views))
         sample["view"] = views
         sample["class_name"] = np.array(self.classes, dtype=object)[self.truth["class_index"][views]]
         for name, values in self.truth.items():
@@ -205,6 +213,19 @@ class FrameSet:
         if not one:
             return sample
         return {key: values[0] if values.ndim > 1 else values[:1].tolist()[0] for key, values in sample.items()}
+
+    def _checked(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
+        """Refuse values that no run writes, as soon as they are read: other programs would take them for measured."""
+        if values.dtype.kind != "f":
+            return values
+        if name.startswith("range"):
+            wrong = (values < 0) | (values > self.sensor.unambiguous_range_m * (1 + 1e-6))  # float32 may round up
+            limits = f"NaN or in 0 … {self.sensor.unambiguous_range_m:.4g} m"
+        else:
+            wrong, limits = ~(np.abs(values) < _MOST), "finite"
+        if wrong.any():
+            raise InputFileError(f"{self.path}: '{name}' must be {limits}, got {values[wrong][0]:g}")
+        return values
 
     def _take(self, name: str, numbers: NDArray[np.integer]) -> NDArray[Any]:
         """Read some rows of a dataset, in the order asked for."""

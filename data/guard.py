@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import resource
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -29,7 +30,10 @@ FREE_BYTES = 1 << 24
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
 
 _MEMORY_BYTES = 1 << 30  # address space, most of it never touched: what a bare interpreter with NumPy maps
-_SECONDS = 3.0
+_SECONDS = 3
+"""Processor time for small files: what else the machine does is no fault of the file."""
+_PATIENCE = 10
+"""How many times that a child may take in all, before a disk or a pipe that does not answer is given up."""
 _BYTES_PER_SECOND = 1 << 26
 _BLOCK_BYTES = 1 << 22
 _SOFT, _EXTERNAL, _HARD = h5py.h5l.TYPE_SOFT, h5py.h5l.TYPE_EXTERNAL, h5py.h5l.TYPE_HARD
@@ -178,7 +182,7 @@ def first_reading(path: str | os.PathLike[str]) -> str | None:
     str or None
         What the file contains and may not, or how reading it ended.
     """
-    seconds = _SECONDS + os.path.getsize(path) / _BYTES_PER_SECOND
+    seconds = _SECONDS + os.path.getsize(path) // _BYTES_PER_SECOND
     environment = {
         **{key: value for key, value in os.environ.items() if not key.startswith("HDF5_")},
         "HDF5_PLUGIN_PRELOAD": "::",
@@ -189,20 +193,27 @@ def first_reading(path: str | os.PathLike[str]) -> str | None:
     command = [sys.executable, "-P", os.path.abspath(__file__), os.path.abspath(path), str(seconds)]
     try:
         child = subprocess.run(
-            command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds, check=False
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_PATIENCE * seconds,
+            check=False,
         )
     except subprocess.TimeoutExpired:
-        return f"cannot be read within {seconds:.0f} s"
+        return f"cannot be read within {_PATIENCE * seconds} s"
     if child.returncode == 0:
         return None
     if child.returncode == 3:
         return " ".join(child.stdout.decode("utf-8", "replace").split())[:300]
+    if child.returncode == -signal.SIGXCPU:
+        return f"takes more than {seconds} s of processor time to read"
     return "crashes HDF5, or needs more memory than such a file should"
 
 
-def _main(path: str, seconds: float) -> int:
+def _main(path: str, seconds: int) -> int:
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
-    resource.setrlimit(resource.RLIMIT_CPU, (int(seconds) - 1, int(seconds) - 1))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
@@ -219,4 +230,4 @@ def _main(path: str, seconds: float) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(_main(sys.argv[1], float(sys.argv[2])))
+    sys.exit(_main(sys.argv[1], int(sys.argv[2])))

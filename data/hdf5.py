@@ -59,9 +59,13 @@ def open_hdf5(path: Path, what: str, *, untrusted: bool = False) -> h5py.File:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn whatever a damaged file makes h5py, json or pydantic say into one line."""
+    """Turn whatever a damaged file makes h5py, json or pydantic say into one line.
+
+    Numbers that do not survive a change of type become infinite or NaN without a warning: whoever reads checks them.
+    """
     try:
-        yield
+        with np.errstate(invalid="ignore", over="ignore"):
+            yield
     except UsageError as error:
         raise InputFileError(f"{path}: damaged ({error})") from None
     except PhasemarkError:

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import os
+import re
 import tokenize
 import warnings
 import zipfile
@@ -35,6 +36,8 @@ METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 QUANTITIES = ("range", "z")
 
 _FIELDS = ("range", "amplitude", "intensity", "status", "valid")
+_NUMBERS = ("range", "amplitude", "intensity")
+_STATED = re.compile(r"\b(unit|quantity)=(\S+)")
 _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
 _NOT_A_NUMBER = ("", "nan")
@@ -71,7 +74,8 @@ def read_frames(
 
     *CSV*: one frame a line, row by row from the top left pixel. Values are separated by semicolons (then decimal
     commas are understood too), tabs, commas or blanks, the first of these that occurs. A first line without a number
-    is a header; empty lines and those that start with ``#`` are skipped; an empty cell and ``nan`` are invalid pixels.
+    is a header; empty lines and those that start with ``#`` are skipped, but such a first line may state ``unit=…`` and
+    ``quantity=…``; an empty cell and ``nan`` are invalid pixels.
     *NPY*: the ranges. *NPZ*: ``range`` and optionally ``amplitude``, ``intensity`` (electrons per phase image),
     ``status``, ``valid`` (0: invalid), ``unit`` and ``quantity``. *HDF5*: the same arrays as datasets, with the
     attributes ``units`` and ``quantity`` on ``range``. *PNG*, one or a folder of them in the order of their names: 16
@@ -147,7 +151,9 @@ def read_frames(
             raise UsageError(f"{path}: has 'status': say with --valid-status which of its values mark a valid pixel")
         valid &= np.isin(arrays["status"], list(valid_status))
     arrays = {name: _upright(values, flip_h, flip_v, rotate) for name, values in arrays.items()}
-    range_m = arrays["range"].astype(np.float64) * unit_scale
+    with np.errstate(invalid="ignore", over="ignore"):  # what becomes NaN or infinite is invalid
+        numbers = {name: arrays[name].astype(np.float64) for name in _NUMBERS if name in arrays}
+        range_m = numbers["range"] * unit_scale
     if settled_quantity == "z":
         range_m = range_m / sensor.axis_cosine()
     valid = _upright(valid, flip_h, flip_v, rotate) & np.isfinite(range_m)
@@ -155,8 +161,8 @@ def read_frames(
     try:
         return Frames(
             range_m,
-            arrays.get("amplitude"),
-            arrays.get("intensity"),
+            numbers.get("amplitude"),
+            numbers.get("intensity"),
             valid,
             sensor=sensor,
             invalid_means=invalid_means,
@@ -268,7 +274,8 @@ def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None
             return _read_pngs(path)
         if start.startswith(b"\x89HDF"):
             return _read_hdf5(path, untrusted)
-        return _Raw({"range": _parse_csv(path.read_bytes(), shape, path)}, flat=True)
+        values, stated = _parse_csv(path.read_bytes(), shape, path)
+        return _Raw({"range": values}, stated, flat=True)
     except PhasemarkError:
         raise
     except MemoryError:
@@ -339,8 +346,8 @@ def _read_hdf5(path: Path, untrusted: bool) -> _Raw:
         return _Raw({name: np.asarray(dataset[...]) for name, dataset in datasets.items()}, stated)
 
 
-def _parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> NDArray[np.float64]:
-    """Return (frames, rows · cols) values of a text file."""
+def _parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> tuple[NDArray[np.float64], dict[str, str]]:
+    """Return (frames, rows · cols) values of a text file, and what a comment in its first line says of them."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -373,7 +380,8 @@ def _parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> NDArray[np
         frames.append(frame)
     if not frames:
         raise InputFileError(f"{path}: holds no frames")
-    return np.array(frames)
+    first = text.partition("\n")[0]
+    return np.array(frames), dict(_STATED.findall(first)) if first.startswith("#") else {}
 
 
 def _cells(line: str, separator: str | None) -> list[str]:

@@ -20,11 +20,13 @@ from phasemark.matcher.filters import (
     kalman,
     kalman_filter,
     kalman_step,
+    noise_free,
     phasor_mean,
 )
 from phasemark.matcher.landmark_map import LandmarkMap, MappedLandmark, Placement, load_map
 from phasemark.matcher.match import Candidate, Match, Matches
 from phasemark.matcher.matcher import Matcher, background_image
+from phasemark.matcher.population import GridLoss, SpacingLoss, grid_loss
 from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
 from phasemark.matcher.surroundings import Surroundings, estimate_surroundings
 from phasemark.matcher.sweep import read_sweep, run_sweep
@@ -46,6 +48,7 @@ __all__ = [
     "Difference",
     "Estimate",
     "FilteredFrames",
+    "GridLoss",
     "KnownPoses",
     "LandmarkMap",
     "MappedLandmark",
@@ -59,6 +62,7 @@ __all__ = [
     "Placement",
     "PoseStd",
     "RobotPose",
+    "SpacingLoss",
     "Surroundings",
     "SweepPlan",
     "SweepTrials",
@@ -75,12 +79,14 @@ __all__ = [
     "estimate_surroundings",
     "filter_poses",
     "frames_of_poses",
+    "grid_loss",
     "kalman",
     "kalman_filter",
     "kalman_step",
     "load_map",
     "load_sweep",
     "nees",
+    "noise_free",
     "phasor_mean",
     "read_poses",
     "read_sweep",

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
 from phasemark.render.frames import Flag, Frames
-from phasemark.render.noise import measured_range_std
-from phasemark.render.phasor import phasor_to_range_m, wrap_difference_m, wrap_range_m
+from phasemark.render.noise import measured_range_std, predicted_range_std
+from phasemark.render.phasor import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
 from phasemark.render.sensor import Sensor
 
 
@@ -102,6 +102,38 @@ class FilteredFrames:
             return self
         corrected = wrap_range_m(self.range_m - offset, self.sensor)
         return replace(self, range_m=corrected, sensor=self.sensor.with_(range_offset_m=0.0))
+
+
+def noise_free(images: PhasorImages, n_frames: float) -> FilteredFrames:
+    """Return what filtering so many frames would give if their noise had no effect: exact ranges, honest variances.
+
+    A pixel returns where the noise law says that most single frames pass the sensor's threshold `max_phase_std_rad`.
+
+    Parameters
+    ----------
+    images : PhasorImages
+        n views.
+    n_frames : float
+        How many frames' noise `std_m` is.
+
+    Returns
+    -------
+    FilteredFrames
+        `std_m` is the noise law's (PHYSICS section 4) over √n_frames.
+    """
+    sensor = images.sensor
+    std = predicted_range_std(images.amplitude, images.intensity, sensor)
+    limit = math.inf if sensor.max_phase_std_rad is None else sensor.max_phase_std_rad * sensor.metres_per_radian
+    returned = (images.amplitude > 0) & (std <= limit)
+    return FilteredFrames(
+        range_m=np.where(returned, images.range_m, np.nan),
+        std_m=np.where(returned, std / math.sqrt(n_frames), np.nan),
+        amplitude_e=None,
+        intensity_e=None,
+        state=np.where(returned, PixelState.RETURN, PixelState.NO_RETURN).astype(np.uint8),
+        n_effective=np.where(returned, float(n_frames), 0.0),
+        sensor=sensor,
+    )
 
 
 def kalman_step(

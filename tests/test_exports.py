@@ -41,7 +41,7 @@ def exported(frames, tmp_path, to, quantity=None):
     ("to", "options", "tolerance_m"),
     [
         ("npz", {}, 1e-6),  # float32 of z, below 2 m
-        ("csv", {"unit": "m"}, 1e-8),  # nine digits
+        ("csv", {}, 1e-8),  # nine digits
         ("png16", {}, 2e-4),  # half of 15 m / 65535
         ("rosbag", {}, 1e-6),
     ],
@@ -53,8 +53,6 @@ def test_frames_come_back_as_ranges(frames, tmp_path, to, options, tolerance_m, 
         path, options = exported(frames, tmp_path, to), {"topic": topic}
     else:
         path = exported(frames, tmp_path, to, quantity)
-    if to == "csv":
-        options = {**options, "quantity": quantity}
     back = read_frames(path, sensor=SENSOR, **options)
     expected = frames[:]["range_m"]
     np.testing.assert_array_equal(np.isnan(back.range_m[0]), np.isnan(expected))
@@ -71,6 +69,10 @@ def test_range_and_z_are_told_apart(frames, tmp_path):
         exported(frames, tmp_path, "bop", "range")
     with pytest.raises(UsageError, match=r"but .* says z"):
         read_frames(tmp_path / "z", sensor=SENSOR, quantity="range")
+    table = exported(frames, tmp_path, "csv", "z")
+    for wrong in ({"quantity": "range"}, {"unit": "cm"}):
+        with pytest.raises(UsageError, match=rf"--{next(iter(wrong))} is .*, but .* says (z|m)"):
+            read_frames(table, sensor=SENSOR, **wrong)
 
 
 def test_an_image_states_its_quantity_and_scale(frames, tmp_path):
@@ -163,6 +165,83 @@ def test_a_bop_model_is_in_millimetres_about_its_centre_and_knows_its_symmetry(f
     turned = model.vertices @ np.reshape(turn, (4, 4))[:3, :3].T + np.reshape(turn, (4, 4))[:3, 3]
     distance = np.linalg.norm(turned[:, None] - model.vertices[None, :400], axis=2).min(axis=0)
     assert np.median(distance) < 1.0  # mm: the turned box has its corners where it had them
+
+
+def load_json(path):
+    """Load JSON as bop_toolkit does: keys that are numbers become numbers."""
+
+    def with_numbers(pairs):
+        return {int(key) if key.lstrip("-").isdigit() else key: value for key, value in pairs.items()}
+
+    return json.loads(path.read_text(), object_hook=with_numbers)
+
+
+def load_bop_ply(path):
+    """Load a model by bop_toolkit's rules: ASCII, four types, a vertex or three indices a line; strict in all of it."""
+    lines = path.read_text("ascii").splitlines()
+    assert lines[:2] == ["ply", "format ascii 1.0"]
+    header = lines[: lines.index("end_header")]
+    words = [line.split() for line in header if line.startswith(("element", "property"))]
+    assert [word[1] for word in words if word[0] == "element"] == ["vertex", "face"]
+    n_vertices, n_faces = (int(word[2]) for word in words if word[0] == "element")
+    first_face = next(k for k, word in enumerate(words) if word[:2] == ["element", "face"])
+    properties = words[1:first_face]
+    assert {word[1] for word in properties} <= {"float", "double", "int", "uchar"}
+    assert [word[2] for word in properties[:6]] == ["x", "y", "z", "nx", "ny", "nz"]
+    (of_faces,) = words[first_face + 1 :]
+    assert of_faces[:2] == ["property", "list"]
+    assert {of_faces[2], of_faces[3]} <= {"uchar", "int"}
+    assert of_faces[4] in ("vertex_indices", "vertex_index")
+    body = [line.split() for line in lines[len(header) + 1 :] if line]
+    assert len(body) == n_vertices + n_faces
+    vertices = np.array([line[:6] for line in body[:n_vertices]], float)
+    faces = np.array(body[n_vertices:], int)
+    assert (faces[:, 0] == 3).all()
+    return vertices[:, :3], vertices[:, 3:], faces[:, 1:4]
+
+
+def test_bop_files_load_as_the_toolkit_loads_them(frames, tmp_path):
+    folder = exported(frames, tmp_path, "bop")
+    camera = load_json(folder / "camera.json")
+    assert set(camera) >= {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}
+    infos = load_json(folder / "models" / "models_info.json")
+    assert sorted(infos) == [1, 2]  # object numbers count from 1
+    for number, info in infos.items():
+        points, normals, faces = load_bop_ply(folder / "models" / f"obj_{number:06d}.ply")
+        assert faces.max() < len(points)
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
+        for k, axis in enumerate("xyz"):
+            np.testing.assert_allclose(points[:, k].min(), info[f"min_{axis}"], atol=1e-3)
+            np.testing.assert_allclose(np.ptp(points[:, k]), info[f"size_{axis}"], atol=1e-3)
+        for turn in info.get("symmetries_discrete", []):
+            np.testing.assert_allclose(np.reshape(turn, (4, 4))[3], [0, 0, 0, 1])
+    for kind in ("train", "test"):
+        scenes = [entry for entry in (folder / kind).iterdir() if entry.name.isdigit()]
+        assert scenes
+        for scene in scenes:
+            cameras, truths, facts = (load_json(scene / f"scene_{name}.json") for name in ("camera", "gt", "gt_info"))
+            assert set(cameras) == set(truths) == set(facts)
+            for image, of_objects in truths.items():
+                assert np.array(cameras[image]["cam_K"], float).reshape(3, 3)[2].tolist() == [0, 0, 1]
+                with Image.open(scene / "depth" / f"{image:06d}.png") as picture:
+                    assert picture.mode == "I;16"
+                    depth_mm = np.asarray(picture).astype(np.float32) * float(cameras[image]["depth_scale"])
+                with Image.open(scene / "gray" / f"{image:06d}.png") as picture:
+                    assert (picture.mode, picture.size) == ("L", (camera["width"], camera["height"]))
+                for number, truth in enumerate(of_objects):
+                    np.array(truth["cam_R_m2c"], float).reshape(3, 3)
+                    np.array(truth["cam_t_m2c"], float).reshape(3, 1)
+                    assert truth["obj_id"] in infos
+                    fact = facts[image][number]
+                    for name in ("mask", "mask_visib"):
+                        with Image.open(scene / name / f"{image:06d}_{number:06d}.png") as picture:
+                            assert picture.mode == "L"
+                            mask = np.asarray(picture) > 0
+                    assert fact["px_count_valid"] == (mask & (depth_mm > 0)).sum()
+                    assert fact["visib_fract"] == fact["px_count_visib"] / fact["px_count_all"] == 1
+    for target in load_json(folder / "test_targets_bop19.json"):
+        truths = load_json(folder / "test" / f"{target['scene_id']:06d}" / "scene_gt.json")
+        assert [truth["obj_id"] for truth in truths[target["im_id"]]] == [target["obj_id"]]
 
 
 def test_the_bag_is_a_ros_2_bag_with_labelled_quantities(frames, tmp_path):

@@ -57,7 +57,7 @@ def test_a_newer_version_is_refused_by_its_number(tmp_path, golden, read):
         read(path)
 
 
-def test_netcdf4_and_h5dump_read_the_files():
+def test_netcdf4_reads_the_files():
     netcdf4 = pytest.importorskip("netCDF4")
     with netcdf4.Dataset(FRAMES) as file, open_frames(FRAMES) as frames:
         assert file["range"].dimensions == ("frame", "row", "col")
@@ -65,9 +65,25 @@ def test_netcdf4_and_h5dump_read_the_files():
         np.testing.assert_array_equal(np.ma.filled(file["range"][:], np.nan), frames[:]["range_m"])
     with netcdf4.Dataset(BANK) as file:
         assert file["lower/phasor"].dimensions == ("distance", "delta", "frequency", "row", "col", "iq")
-    if shutil.which("h5dump"):
-        done = subprocess.run(["h5dump", "-H", FRAMES], capture_output=True, text=True, check=True)
-        assert 'DATASET "range"' in done.stdout
+
+
+@pytest.mark.skipif(shutil.which("h5dump") is None, reason="HDF5's own tools are not installed")
+@pytest.mark.parametrize(
+    ("golden", "name", "kind"),
+    [(FRAMES, "range", "f4"), (FRAMES, "flags", "u1"), (FRAMES, "distance", "f8"), (BANK, "lower/phasor", "f4")],
+)
+def test_h5dump_reads_values_dimensions_and_units(tmp_path, golden, name, kind):
+    values = tmp_path / "values"
+    command = ["h5dump", "-d", f"/{name}", "-b", "LE", "-o", values, golden]
+    subprocess.run(command, capture_output=True, check=True)
+    with h5py.File(golden) as file:
+        dataset = file[name]
+        np.testing.assert_array_equal(np.fromfile(values, f"<{kind}").reshape(dataset.shape), dataset[...])
+        shape, units = dataset.shape, dataset.attrs["units"]
+    said = subprocess.run(["h5dump", "-A", "-d", f"/{name}", golden], capture_output=True, text=True, check=True).stdout
+    assert f"SIMPLE {{ ( {', '.join(map(str, shape))} )" in said
+    assert "DIMENSION_LIST" in said
+    assert f'"{units}"' in said
 
 
 @pytest.mark.parametrize("kind", KINDS)

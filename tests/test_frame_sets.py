@@ -19,7 +19,6 @@ from phasemark.data import (
     build_frames,
     build_part,
     estimate,
-    grid_loss,
     merge_parts,
     open_frames,
     parse_part,
@@ -382,22 +381,6 @@ def test_verify_renders_a_bank_again(tmp_path):
         verify_bank(path, sample=100)
 
 
-def test_the_loss_of_a_grid_follows_from_its_spacing(tmp_path):
-    steps = {}
-    for name, distance, delta in (("coarse", "0.9:1.1:0.02", "0:90:2"), ("fine", "0.9:1.1:0.01", "0:90:1")):
-        with build_bank(BankPlan(classes=["cone"], distance_m=distance, delta_deg=delta), tmp_path / name) as bank:
-            steps[name] = grid_loss(bank, 300, seed=1)
-    coarse, fine = steps["coarse"], steps["fine"]
-    # a uniform error within half a step has an r.m.s. of step / √12; distance and δ are coupled, which adds to both
-    assert 0.02 / np.sqrt(12) * 0.9 < coarse["distance_rms_m"] < 0.02 / np.sqrt(12) * 1.5
-    assert 2 / np.sqrt(12) * 0.9 < coarse["delta_rms_deg"] < 2 / np.sqrt(12) * 4
-    # half the step costs a quarter of χ², as far as the phasors are smooth
-    assert 2.5 < coarse["chi2_median"] / fine["chi2_median"] < 6
-    assert coarse["mismatch_99"] > fine["mismatch_99"] > fine["mismatch_median"] > 0
-    # the Fisher information is the sensor's and the landmark's, not the grid's
-    assert coarse["suggested_distance_m"] == pytest.approx(fine["suggested_distance_m"], rel=0.1)
-
-
 def test_a_file_of_a_newer_version_names_it(frames_file, tmp_path):
     path = tmp_path / "frames.h5"
     path.write_bytes(frames_file.read_bytes())
@@ -411,3 +394,21 @@ def test_a_distribution_knows_its_bounds():
     assert Distribution(normal=(1, 2)).lowest == -np.inf
     assert Distribution(normal=(1, 2), within=(0, 3)).highest == 3
     assert Distribution(fixed=2).highest == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("range", np.inf, r"'range' must be NaN or in 0 … 14\.99 m, got inf"),
+        ("range_mixed", -1.0, r"'range_mixed' must be NaN or in 0 … 14\.99 m, got -1"),
+        ("amplitude", np.nan, "'amplitude' must be finite, got nan"),
+        ("intensity", 1e38, r"'intensity' must be finite, got 1e\+38"),
+    ],
+)
+def test_values_that_no_run_writes_are_refused_when_they_are_read(frames_file, tmp_path, name, value, message):
+    path = tmp_path / "frames.h5"
+    path.write_bytes(frames_file.read_bytes())
+    with h5py.File(path, "r+") as file:
+        file[name][0, 8, 8] = value
+    with open_frames(path) as frames, pytest.raises(InputFileError, match=message):
+        frames[0]

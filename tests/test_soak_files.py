@@ -76,6 +76,21 @@ def test_a_full_disk_of_ten_sizes_is_an_error_without_debris(tmp_path, size_kb):
         subprocess.run(["umount", disk], check=True)
 
 
+def test_every_command_that_writes_survives_disks_of_ten_sizes(tmp_path):
+    (tmp_path / "disk").mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", tmp_path / "disk"]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("mounting a small disk needs privileges")
+    try:
+        done = subprocess.run(
+            [sys.executable, HERE / "full_disks.py", tmp_path], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+        print(done.stdout)
+    finally:
+        subprocess.run(["umount", tmp_path / "disk"], check=True)
+
+
 @pytest.mark.parametrize("spare_kb", [0, 2000])
 def test_a_disk_that_fills_while_a_file_is_made_ends_the_run_or_leaves_it_alone(tmp_path, spare_kb):
     """The space is claimed at the start, so only manifest and checksum can still fail."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark import StorageError
 from phasemark.data.bags import AMPLITUDE_TOPIC, INFO_TOPIC, RANGE_TOPIC, Z_TOPIC, ros_types
 from phasemark.data.export.samples import CAM2OPTICAL, blocks, pinhole, quaternion
 from phasemark.data.frames import FrameSet
 from phasemark.data.measured import Quantity
 from phasemark.render import Views
+
+NAME = "frames"
+"""What the file in a bag's folder is called."""
 
 _OPTICAL, _CAMERA, _LANDMARK = "camera_optical_frame", "camera_link", "landmark"
 _VIEW = ("distance_m", "delta_rad", "bearing_rad", "height_m")
@@ -24,8 +29,18 @@ def write_rosbag(frames: FrameSet, folder: Path, quantity: Quantity) -> None:
     store = ros_types()
     from rosbags.rosbag2 import Writer
 
-    folder.rmdir()  # the writer makes it
-    with Writer(folder, version=8) as writer:
+    bag = folder / NAME  # the writer makes this folder, and names the file in it after it
+    try:
+        _write(frames, store, Writer(bag, version=8))
+    except sqlite3.Error as error:
+        raise StorageError(f"{folder.parent}: cannot write the bag ({error})") from None
+    for entry in list(bag.iterdir()):
+        entry.rename(folder / entry.name)
+    bag.rmdir()
+
+
+def _write(frames: FrameSet, store: Any, bag: Any) -> None:
+    with bag as writer:
         topics = {
             Z_TOPIC: "sensor_msgs/msg/Image",
             RANGE_TOPIC: "sensor_msgs/msg/Image",
@@ -57,9 +72,7 @@ def _messages(frames: FrameSet, store: Any) -> Iterator[tuple[str, int, Any]]:
             if "amplitude_e" in sample:
                 yield AMPLITUDE_TOPIC, time_ns, _image(types, header, sample["amplitude_e"][k])
             yield INFO_TOPIC, time_ns, _camera_info(types, header, frames)
-            view = Views.broadcast(
-                *(sample[name][k] for name in ("distance_m", "delta_rad", "bearing_rad", "height_m"))
-            )
+            view = Views.broadcast(*(sample[name][k] for name in _VIEW))
             rotation, translation = view.landmark2cam()
             landmark = f"{_LANDMARK}_{sample['class_name'][k]}"
             pose = _transform(types, time_ns, _CAMERA, landmark, rotation[0], translation[0])
