@@ -28,9 +28,6 @@ OUT = Path(__file__).parent.parent / "out"
 SWEEP_FIGURES = {
     "accuracy-distance.png": "paper/figures/rmse-distance-m.png",
     "accuracy-position.png": "paper/figures/position-in-cell.png",
-    "accuracy-noise.png": "distance-angle-noise/figures/rmse-noise-factor.png",
-    "accuracy-frames.png": "distance-angle-noise/figures/rmse-n-frames.png",
-    "accuracy-models.png": "robustness/figures/models.png",
 }
 
 

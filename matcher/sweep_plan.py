@@ -173,7 +173,7 @@ class SweepPlan(ScenePlan):
     fixed_pattern_rad : float
         Standard deviation of a unit's phase offsets.
     outlier : (metres, degrees)
-        An error beyond either is an outlier: it is counted apart from bias and RMSE.
+        An error beyond either, and beyond 5 σ of the bound, is an outlier: it is counted apart from bias and RMSE.
 
     Raises
     ------

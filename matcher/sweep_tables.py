@@ -20,6 +20,8 @@ from phasemark.matcher.sweep_plan import Condition
 
 LEVELS = (0.5, 0.9, 0.95, 0.99)
 """Probabilities of the ellipsoids whose coverage is counted."""
+_HONEST_SIGMA = 5.0
+"""An error within so many standard deviations of the bound is no outlier, however large it is."""
 _UNIT = np.array([0.01, math.pi / 180, math.pi / 180, 0.01])
 """Lengths in centimetres and angles in degrees make a condition number that means something."""
 
@@ -156,10 +158,10 @@ class SweepTrials:
         limit = np.array(
             [self.outlier[0], math.radians(self.outlier[1]), math.radians(self.outlier[1]), self.outlier[0]]
         )
-        with np.errstate(invalid="ignore"):
-            gross = answered & (np.abs(error) > limit[at]).any(axis=1)
-        inner = answered & ~gross
         std = np.sqrt(np.einsum("npp->np", bound))
+        with np.errstate(invalid="ignore"):
+            gross = answered & (np.abs(error) > np.fmax(limit[at], _HONEST_SIGMA * std)).any(axis=1)
+        inner = answered & ~gross
         bounded = np.isfinite(std).all(axis=1)
         honest = inner & np.isfinite(covariance).all(axis=(1, 2))
         squared = nees(error[honest], covariance[honest]) if honest.any() else np.empty(0)
@@ -228,7 +230,7 @@ class Cell:
     confusion_bound : float
         Mean bound on the probability of a wrong class, for a matcher that knows the world.
     outliers : Estimate
-        Share of the answered trials whose error is beyond the plan's limits.
+        Share of the answered trials whose error is beyond the plan's limits, and beyond 5 σ of the bound.
     found : dict of str to int
         How often each class was found, "none" included.
     bias, rmse : dict of str to Estimate

@@ -64,7 +64,8 @@ class Views:
         except ValueError:
             shapes = ", ".join(f"{name} {value.shape}" for name, value in zip(names, values, strict=True))
             raise UsageError(f"the views' shapes do not broadcast: {shapes}") from None
-        return cls(*(np.ascontiguousarray(array, dtype=float).ravel() for array in arrays))
+        # copies: what broadcast_arrays returns warns when its flags are read, as numba does
+        return cls(*(np.array(array, dtype=float, order="C").ravel() for array in arrays))
 
     def __len__(self) -> int:
         return len(self.distance_m)

@@ -87,6 +87,13 @@ def test_outliers_are_counted_apart():
     assert cell.rmse["distance_m"].value < 0.005 < cell.rmse_with_outliers["distance_m"].value
 
 
+def test_an_error_that_the_bound_explains_is_no_outlier():
+    trials = linear_sweep(100, np.random.default_rng(6))
+    trials.estimate[:7, 0, 0] += 0.3
+    trials.bound[:, :, 0, 0] = 0.1**2
+    assert trials.cells()[0].outliers.value == 0
+
+
 def test_wilson_solves_its_quadratic():
     z = stats.norm.ppf(0.975)
     for k, n in ((3, 17), (50, 60)):
