@@ -1,4 +1,4 @@
-"""Every kind of plan there is: those of banks and frame sets, and those of sweeps and drives."""
+"""Every kind of plan there is: those of banks and frame sets, and those of sweeps, drives and designs."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from phasemark import InputFileError, UsageError
 from phasemark import data as files
 from phasemark.data.plan import read_toml
 from phasemark.data.plan_kinds import schema_of
+from phasemark.matcher.design import DesignPlan, example_design, load_design_plan
 from phasemark.matcher.drive import DrivePlan, example_drive, load_drive_plan
 from phasemark.matcher.sweep_plan import SweepPlan, load_sweep
 
@@ -35,6 +36,9 @@ def _example_sweep() -> str:
 _KINDS = {
     "sweep": _Kind(SweepPlan, _example_sweep, lambda path: load_sweep(path).resolve(), frozenset({"axes", "methods"})),
     "drive": _Kind(DrivePlan, example_drive, load_drive_plan, frozenset({"map", "path", "odometry"})),
+    "design": _Kind(
+        DesignPlan, example_design, load_design_plan, frozenset({"n_classes", "limits", "sampling", "search"})
+    ),
 }
 KINDS = (*files.PLAN_KINDS, *_KINDS)
 """Names of all kinds."""
@@ -45,7 +49,7 @@ def plan_example(kind: str) -> str:
 
     Parameters
     ----------
-    kind : {"bank", "frames", "sweep", "drive"}
+    kind : {"bank", "frames", "sweep", "drive", "design"}
 
     Returns
     -------
@@ -65,7 +69,7 @@ def plan_schema(kind: str) -> dict[str, Any]:
 
     Parameters
     ----------
-    kind : {"bank", "frames", "sweep", "drive"}
+    kind : {"bank", "frames", "sweep", "drive", "design"}
 
     Returns
     -------
