@@ -107,6 +107,15 @@ def read_plan_of(folder: str | os.PathLike[str]) -> SweepPlan:
 def read_sweep(folder: str | os.PathLike[str]) -> tuple[SweepPlan, SweepTrials]:
     """Read the trials of a finished sweep, or as many rounds of it as are finished.
 
+    Parameters
+    ----------
+    folder : path-like
+
+    Returns
+    -------
+    plan : SweepPlan
+    trials : SweepTrials
+
     Raises
     ------
     InputFileError

@@ -48,6 +48,14 @@ def compare_cells(first: Sequence[Cell], second: Sequence[Cell]) -> tuple[Differ
     Root mean squares are compared by the logarithm with standard errors from their intervals, shares by the pooled
     two-sample z-test; both take the sweeps for independent, which is on the safe side where they share their seed.
 
+    Parameters
+    ----------
+    first, second : sequence of Cell
+
+    Returns
+    -------
+    tuple of Difference
+
     Raises
     ------
     UsageError

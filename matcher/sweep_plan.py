@@ -313,6 +313,14 @@ class SweepPlan(ScenePlan):
 def load_sweep(name_or_file: str | os.PathLike[str]) -> SweepPlan:
     """Return a shipped plan, or read one from a TOML file.
 
+    Parameters
+    ----------
+    name_or_file : str or path-like
+
+    Returns
+    -------
+    SweepPlan
+
     Raises
     ------
     InputFileError

@@ -129,4 +129,5 @@ def test_star_varies_each_axis_alone_and_sobol_stays_inside():
 def test_shipped_plans_are_plans():
     for name in SHIPPED_SWEEPS:
         assert load_sweep(name).name == name
-    assert len(load_sweep("paper").conditions()) == 36
+    # 4 classes and 2 strangers, at 3 distances and 3 angles
+    assert len(load_sweep("paper").conditions()) == 36 + 18
