@@ -1258,6 +1258,7 @@ def _sweep_run(
 
     loaded = load_sweep(plan)
     changes: dict[str, Any] = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
+    sys.path.append(str(Path.cwd()))  # a matcher of one's own lies here; an installed program does not look here itself
     if matcher is not None:
         changes["methods"] = (*loaded.methods, Method(name=matcher, method=matcher))
     with _Progress("trials") as progress:

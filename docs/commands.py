@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import typer
 
 from phasemark.cli import app
 
 PAGE = Path(__file__).parent / "commands.md"
+TYPES = {str: "TEXT", int: "INTEGER", float: "NUMBER", Path: "PATH"}
 INTRODUCTION = """\
 # Every command
 
-Generated from the program by `python docs/commands.py`; do not edit. `phasemark COMMAND --help` prints the same for one command,
-and [the tour by task](../README.md) shows them at work. Results go to standard output, messages and progress to standard
-error; [exit codes](../README.md#when-something-is-wrong) say what went wrong.
+Generated from the program by `python docs/commands.py`; do not edit. `phasemark COMMAND --help` prints the same for one
+command, and [the tour by task](../README.md) shows them at work. Results go to standard output, messages and progress to
+standard error; [exit codes](../README.md#when-something-is-wrong) say what went wrong.
+
+`phasemark` alone says what to do first, `phasemark --version` prints the version, and `phasemark --install-completion` teaches
+commands and options to bash, zsh, fish or PowerShell (`--show-completion` prints what it would install).
 """
 
 
@@ -34,10 +38,16 @@ def cell(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
 
 
+def kind(option: Any) -> str:
+    """Return what an option takes, a repeatable one what it takes each time."""
+    annotation = option.type_descriptor.annotation
+    return TYPES[next(iter(get_args(annotation)), annotation)]
+
+
 def option_row(option: Any) -> str:
     """Return one line of the table of options."""
     names = ", ".join(f"`{name}`" for name in (*option.opts, *option.secondary_opts))
-    takes = "" if option.is_flag else f" `{cell(option.metavar or option.type.name.upper())}`"
+    takes = "" if option.is_flag else f" `{cell(option.metavar or kind(option))}`"
     if option.required:
         default = "required"
     elif option.is_flag or option.default in (None, [], ()) or callable(option.default):
