@@ -147,8 +147,8 @@ def _sensor_list(as_json: _Json = False) -> None:
                 name,
                 f"{sensor.rows} × {sensor.cols}",
                 f"{2 * sensor.half_angle_v_deg:g}° × {2 * sensor.half_angle_h_deg:g}°",
-                f"{sensor.modulation_hz / 1e6:g} MHz",
-                f"{sensor.unambiguous_range_m:.3f} m",
+                "direct" if sensor.kind == "direct" else f"{sensor.modulation_hz / 1e6:g} MHz",
+                "" if sensor.kind == "direct" else f"{sensor.unambiguous_range_m:.3f} m",
             )
             for name, sensor in sensors.items()
         ),
@@ -460,8 +460,10 @@ def _landmark_check(
 
 @app.command("render")
 def _render(
-    distance: Annotated[float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png; the data go beside it as .npz.")],
+    distance: Annotated[
+        float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")
+    ] = 1.0,
     delta: Annotated[float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen.")] = 0.0,
     bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
     height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the optical axis.")] = 0.0,
