@@ -32,7 +32,8 @@ class Painter:
     def __init__(self, mesh, sensor, *, albedo, harmonics=()):
         self.sensor, self.harmonics, self.mark = sensor, harmonics, mesh_mark(mesh)
 
-    def render_views(self, views, *, rows):
+    def render_views(self, views, *, rows, variant):
+        assert variant == "exact"
         row, col = np.mgrid[rows[0] : rows[1], : self.sensor.cols]
         shape = (len(views), *row.shape)
         intensity = np.broadcast_to(paint(views.distance_m, views.delta_rad, row, col, self.mark), shape)
@@ -236,7 +237,7 @@ def test_the_planar_model_fills_the_same_schema(layout):
 
 def test_the_planar_model_refuses_mesh_files(painted):
     part = {"name": "part", "path": "part.stl", "unit": "mm"}
-    with pytest.raises(UsageError, match="'model' must be 'ray' for 'part'"):
+    with pytest.raises(UsageError, match="'model' must be 'ray' or 'hard' for 'part'"):
         build_bank(BankPlan(meshes=[part], model="planar", layout="full", **GRID))
 
 

@@ -97,7 +97,7 @@ def test_a_plan_file_sets_every_key(tmp_path):
     ("text", "reason"),
     [
         ("colour = 1", "unknown key 'colour'"),
-        ("model = 'wave'", "'model' must be 'ray' or 'planar', got 'wave'"),
+        ("model = 'wave'", "'model' must be 'ray', 'hard' or 'planar', got 'wave'"),
         ("layout = 1", "'layout' must be 'factored' or 'full', got 1"),
         ("distance_m = '1:2:0'", "'distance_m' must have a positive STEP, got '1:2:0'"),
         ("distance_m = '0:2:1'", "'distance_m' must be positive throughout, got 0.0"),
