@@ -83,9 +83,9 @@ def read_frames(
     bag* (its folder): images of 32FC1, metres, or 16UC1, millimetres; 0 is invalid. Arrays are (frames, rows, cols),
     (n, frames, rows, cols), or (rows, cols) for a single frame.
 
-    A range that is not finite is invalid, and so is a 0, by which most sensors mean that they have no reading. So is one
-    that no such camera can measure, negative or beyond c / 2f, and a warning tells how many there are; if it is most of
-    the others, unit or sensor are wrong, which is an error.
+    A range that is not finite is invalid, and so is a 0, by which most sensors mean that they have no reading. So is
+    one that no such camera can measure, negative or beyond c / 2f, and a warning tells how many there are; if it is
+    most of the others, unit or sensor are wrong, which is an error.
 
     Parameters
     ----------

@@ -185,7 +185,7 @@ def _write_workshop(path: Path) -> None:
 
 
 def _write_recording(path: Path) -> None:
-    """Write 12 frames of the cylinder at 0.7 m from 30° by 8 × 8 zones, whole millimetres along the axis, 0: no reading."""
+    """Write 12 frames of the cylinder at 0.7 m from 30° by 8 × 8 zones: z in millimetres, 0 if there is none."""
     import numpy as np
 
     from phasemark.landmarks import build_mesh, catalog
