@@ -185,11 +185,16 @@ class MaximumLikelihood:
         all_classes = evidence.on == "phasors"
 
         def doubtful(fits: Fits, *, hopeless: bool = False) -> NDArray[np.int64]:
-            """Return the frames whose best fit is worse than good ones are; on ranges, if it beats a bare scene."""
+            """Return the frames whose best fit is worse than good ones are, but not beyond hope.
+
+            On ranges, that is where it costs more than returns that nothing explains; before a known background every
+            fit may be a side peak.
+            """
             best = _best_of_frame(fits)
             limit = stats.chi2.isf(_DOUBTFUL if side_peaks else _HOPELESS, np.maximum(fits.dof[best], 1))
             cost, frame = fits.cost[best], fits.frame[best]
-            hope = fits.capped[best] < bare[frame] if evidence.on == "ranges" and not hopeless else True
+            certain = evidence.on == "phasors" or self.background is not None or hopeless
+            hope = True if certain else cost < bare[frame]
             return np.asarray(frame[(cost > limit) & hope])
 
         starts = search.starts(_some(seen, enough), n_modes, all_classes=all_classes)

@@ -49,8 +49,9 @@ def against_axis(cells: Sequence[Cell], axis: str, axes: Sequence[str]) -> Figur
             _with_bars(rows[1][column], x, bias, look)
             bound = tuple(median([cell.bound[parameter] * scale for cell in along[value]]) for value in x)
             bounds.setdefault(bound, []).append(method)
-        for k, (bound, methods) in enumerate(bounds.items()):
-            label_of = "Cramér–Rao bound" if len(bounds) == 1 else f"bound of {', '.join(methods)}"
+        by_size = sorted(bounds.items(), key=lambda item: -len(item[1]))
+        for k, (bound, methods) in enumerate(by_size):
+            label_of = "Cramér–Rao bound" if k == 0 else f"bound, {', '.join(methods)}"
             rows[0][column].plot(x, bound, color="black", linewidth=1.2, linestyle=(0, (1 + 2 * k, 1)), label=label_of)
         logarithmic(rows[0][column].yaxis)
         rows[0][column].set_ylabel(f"RMSE of {label} ({unit})")
@@ -61,7 +62,8 @@ def against_axis(cells: Sequence[Cell], axis: str, axes: Sequence[str]) -> Figur
                 logarithmic(row[column].xaxis, x)
             row[column].set_xlabel(AXIS_LABEL[axis])
             row[column].grid(which="both", linewidth=0.3)
-    rows[0][0].legend(fontsize=7)
+    # above the panels: with many methods it would cover what it explains
+    figure.legend(*rows[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=7)
     return figure
 
 

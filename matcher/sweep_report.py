@@ -29,9 +29,10 @@ _MOST_EXAMPLES = 8
 _SAID = {
     "class_name": "{}", "distance_m": "D = {:g} m", "delta_deg": "δ = {:g}°", "noise_factor": "{:g} times the noise",
     "n_frames": "{:g} frames", "bearing_deg": "a bearing of {:g}°", "height_m": "a height of {:g} m",
-    "pitch_deg": "a pitch of {:g}°", "albedo": "an albedo of {:g}", "wall_m": "a wall at {:g} m (0: none)",
+    "pitch_deg": "a pitch of {:g}°", "albedo": "an albedo of {:g}", "wall_m": "a wall at {:g} m",
     "wiggling": "wiggling of {:g}", "unit": "unit {:g}", "dimension_error": "dimensions off by {:g}",
 }  # fmt: skip
+_ALWAYS_SAID = ("class_name", "distance_m", "delta_deg", "noise_factor", "n_frames")
 _PARAMETERS = (("distance_m", "distance", " mm", 1e3), ("delta_rad", "angle", "°", 180 / math.pi))
 
 
@@ -132,7 +133,13 @@ def _count(cells: Sequence[Cell]) -> tuple[int, int]:
 
 def _where(cell: Cell, cells: Sequence[Cell]) -> str:
     axes = condition_axes([one.condition for one in cells])
-    values = [(name, getattr(cell.condition, name)) for name in axes]
+    first = cells[0].condition
+    # of what may be wrong with the model, only what is wrong here
+    values = [
+        (name, getattr(cell.condition, name))
+        for name in axes
+        if name in _ALWAYS_SAID or getattr(cell.condition, name) != getattr(first, name)
+    ]
     return ", ".join(_SAID[name].format(value) if name in _SAID else f"{name} = {value:g}" for name, value in values)
 
 
