@@ -57,7 +57,7 @@ def main() -> int:
         row = cell.row()
         print(
             f"{row['method']:>14}  {row['class_name']:<8}  D {row['distance_m']:.1f} m:"
-            f"  r.m.s. error {1e3 * row['rmse_distance_m']:6.2f} mm, bound {1e3 * row['bound_distance_m']:.2f} mm,"
+            f"  r.m.s. error {1e3 * row['rmse_with_outliers_distance_m']:6.2f} mm, bound {1e3 * row['bound_distance_m']:.2f} mm,"
             f" class right {100 * row['class_right']:.0f} %"
         )
     print(report)
