@@ -38,25 +38,31 @@ __all__ = ["app", "main"]
 
 _ORIGIN_HELP = "What becomes the origin: file (its own), base (centre of its foot) or center (of its bounding box)."
 
+_COMPLETION = "_PHASEMARK_COMPLETE"
+"""Set by the script that ``--install-completion`` gives to a shell."""
+
 _FIRST_STEPS = """\
 phasemark renders, banks and matches what a low-resolution time-of-flight camera sees of a 3D landmark.
 
-Start with
-  phasemark demo                    the paper's experiment, with a report, in about a minute
-  phasemark landmark list           the landmarks of the catalogue
-  phasemark landmark design         landmarks for a camera and a range of your own, with drawings
-  phasemark render --class cylinder --distance 1.0 --delta 30 --wall 4 -o frame.png
-  phasemark bank build -o bank.h5   a bank of model images to match your frames against
-  phasemark match bank.h5 measured.csv --unit m --quantity range
-  phasemark sensor fit frames.npz --distance 1.0 -o mycam.toml    a camera of your own, from frames of a flat board
-  phasemark calibrate cylinder frames.npz --poses poses.csv -o mounted.toml    how your camera is mounted
-  phasemark drive                   a robot on a tour of 20 m, corrected at four landmarks
-  phasemark --help                  all commands; COMMAND --help explains one
+First:
+  phasemark demo                                     the paper's experiment, with a report, in about a minute
+
+Then, by task:
+  choose a landmark      phasemark landmark list     or design one: phasemark landmark design
+  choose a camera        phasemark sensor list       or fit your own: phasemark sensor fit
+  see what it sees       phasemark render --class cylinder --distance 1.0 --delta 30 --wall 4 -o frame.png
+  build a bank           phasemark bank build -o bank.h5
+  match your frames      phasemark match bank.h5 measured.csv --unit m --quantity range
+  know the mounting      phasemark calibrate cylinder frames.npz --poses poses.csv -o mounted.toml
+  make labelled frames   phasemark plan example frames > frames.toml; phasemark frames build frames.toml -o frames.h5
+  know the accuracy      phasemark sweep run paper -o out/paper
+  drive a robot          phasemark drive
+
+phasemark --help lists all commands, COMMAND --help explains one, --install-completion teaches them to your shell.
 """
 
 app = typer.Typer(
     name="phasemark",
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -141,8 +147,8 @@ def _sensor_list(as_json: _Json = False) -> None:
                 name,
                 f"{sensor.rows} × {sensor.cols}",
                 f"{2 * sensor.half_angle_v_deg:g}° × {2 * sensor.half_angle_h_deg:g}°",
-                f"{sensor.modulation_hz / 1e6:g} MHz",
-                f"{sensor.unambiguous_range_m:.3f} m",
+                "direct" if sensor.kind == "direct" else f"{sensor.modulation_hz / 1e6:g} MHz",
+                "" if sensor.kind == "direct" else f"{sensor.unambiguous_range_m:.3f} m",
             )
             for name, sensor in sensors.items()
         ),
@@ -454,8 +460,10 @@ def _landmark_check(
 
 @app.command("render")
 def _render(
-    distance: Annotated[float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png; the data go beside it as .npz.")],
+    distance: Annotated[
+        float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")
+    ] = 1.0,
     delta: Annotated[float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen.")] = 0.0,
     bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
     height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the optical axis.")] = 0.0,
@@ -1252,6 +1260,7 @@ def _sweep_run(
 
     loaded = load_sweep(plan)
     changes: dict[str, Any] = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
+    sys.path.append(str(Path.cwd()))  # a matcher of one's own lies here; an installed program does not look here itself
     if matcher is not None:
         changes["methods"] = (*loaded.methods, Method(name=matcher, method=matcher))
     with _Progress("trials") as progress:
@@ -1713,6 +1722,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Python prints its traceback and exits with 1.
     """
     signal.signal(signal.SIGTERM, _terminate)
+    if arguments is None and _COMPLETION in os.environ:  # the shell asks what may follow
+        app(prog_name="phasemark")
     os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")  # before HDF5 is loaded: no file makes it load code
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without '×' or 'σ' is no reason to fail

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from phasemark import InputFileError, UsageError
 from phasemark.data.grid import format_grid
 from phasemark.data.hdf5 import check_format, dataset_of, frozen, group_of, json_attribute, open_hdf5, reading
+from phasemark.data.notebook import facts_html
 from phasemark.data.plan import BankPlan
 from phasemark.render import PhasorImages, Sensor, Views
 
@@ -218,6 +219,20 @@ class Bank:
     def close(self) -> None:
         """Close the file; arrays read before stay usable."""
         self._file.close()
+
+    def _repr_html_(self) -> str:
+        """Show in a notebook what the bank holds, open or closed."""
+        delta_deg = np.degrees(self.delta_rad)
+        return facts_html(
+            f"Bank {self.path.name}",
+            {
+                "layout": self.layout,
+                "classes": ", ".join(self.classes),
+                "D": f"{self.distance_m[0]:g} … {self.distance_m[-1]:g} m, {len(self.distance_m)} values",
+                "δ": f"{delta_deg[0]:g} … {delta_deg[-1]:g}°, {len(delta_deg)} values",
+                "sensor": f"{self.plan.sensor}, {self.sensor.rows} × {self.sensor.cols} pixels",
+            },
+        )
 
     def phasor(self, class_name: str, i: int, j: int) -> NDArray[np.complex64]:
         """Return S_1 of one model image, (rows, cols), at ``distance_m[i]`` and ``delta_rad[j]``."""

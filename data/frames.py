@@ -18,6 +18,7 @@ from phasemark import InputFileError, UsageError
 from phasemark.data.bank import read_mesh_group
 from phasemark.data.frame_plan import FramePlan
 from phasemark.data.hdf5 import check_format, dataset_of, frozen, group_of, json_attribute, open_hdf5, reading
+from phasemark.data.notebook import facts_html
 from phasemark.render import Frames, Sensor
 
 FORMAT = "phasemark-frames"
@@ -300,6 +301,21 @@ class FrameSet:
     ) -> FrameSubset:
         """Return some frames, or a split by its name, as a map-style data set."""
         return FrameSubset(self, self.split(frames) if isinstance(frames, str) else np.asarray(frames), transform)
+
+    def _repr_html_(self) -> str:
+        """Show in a notebook what the frame set holds, open or closed."""
+        distance_m = self.truth["distance_m"]
+        return facts_html(
+            f"Frame set {self.path.name}",
+            {
+                "frames": f"{len(self)}: {self.plan.frames_per_view} of each of {self.plan.views} views",
+                "classes": ", ".join(self.classes),
+                "splits": ", ".join(self.splits),
+                "D": f"{distance_m.min():.3g} … {distance_m.max():.3g} m",
+                "arrays": ", ".join(self._fields),
+                "sensor": f"{self.plan.sensor}, {self.sensor.rows} × {self.sensor.cols} pixels",
+            },
+        )
 
     def mesh(self, class_name: str) -> trimesh.Trimesh:
         """Return the mesh of a class, metres, landmark frame.

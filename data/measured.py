@@ -83,8 +83,9 @@ def read_frames(
     bag* (its folder): images of 32FC1, metres, or 16UC1, millimetres; 0 is invalid. Arrays are (frames, rows, cols),
     (n, frames, rows, cols), or (rows, cols) for a single frame.
 
-    A range that is not finite is invalid. So is one that no such camera can measure, zero or negative or beyond c / 2f,
-    and a warning tells how many there are; if it is most of them, unit or sensor are wrong, which is an error.
+    A range that is not finite is invalid, and so is a 0, by which most sensors mean that they have no reading. So is
+    one that no such camera can measure, negative or beyond c / 2f, and a warning tells how many there are; if it is
+    most of the others, unit or sensor are wrong, which is an error.
 
     Parameters
     ----------
@@ -134,6 +135,11 @@ def read_frames(
         raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
     shape = (sensor.cols, sensor.rows) if rotate in (90, 270) else (sensor.rows, sensor.cols)
     raw = _read(path, shape, untrusted, topic)
+    if unit is None and quantity is None and not raw.stated:
+        raise UsageError(
+            f"{path}: does not say its unit and quantity: give --unit {'|'.join(METRES_PER_UNIT)} and --quantity"
+            " range (along the ray)|z (along the optical axis)"
+        )
     unit_scale = METRES_PER_UNIT[_settled("unit", unit, raw, tuple(METRES_PER_UNIT), path)]
     settled_quantity = _settled("quantity", quantity, raw, QUANTITIES, path)
 
@@ -180,8 +186,11 @@ def _upright(values: NDArray[Any], flip_h: bool, flip_v: bool, rotate: int) -> N
 def _impossible(
     range_m: NDArray[np.float64], valid: NDArray[np.bool_], sensor: Sensor, path: Path
 ) -> NDArray[np.bool_]:
-    wrong = valid & ~((range_m > 0) & (range_m < sensor.unambiguous_range_m))
-    count, of = int(wrong.sum()), int(valid.sum())
+    empty = valid & (range_m == 0)  # how most sensors write that they have no reading: it says nothing of the unit
+    if valid.any() and empty.sum() == valid.sum():
+        raise InputFileError(f"{path}: every range is 0, which stands for no reading")
+    wrong = valid & ~empty & ~((range_m > 0) & (range_m < sensor.unambiguous_range_m))
+    count, of = int(wrong.sum()), int((valid & ~empty).sum())
     if count:
         place = np.argwhere(wrong)[0]
         message = (
@@ -191,7 +200,7 @@ def _impossible(
         if 2 * count > of:
             raise InputFileError(f"{message}; is --unit right?")
         warnings.warn(f"{message}; taken as invalid", UserWarning, stacklevel=3)
-    return wrong
+    return wrong | empty
 
 
 def _settled(name: str, given: str | None, raw: _Raw, known: tuple[str, ...], path: Path) -> str:

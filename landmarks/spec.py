@@ -221,3 +221,10 @@ class LandmarkSpec(_Spec):
     def delta_period_rad(self) -> float:
         """The angle modulo which δ can be known, 2π / symmetry."""
         return 2 * math.pi / self.symmetry
+
+    def _repr_png_(self) -> bytes:
+        """Show the landmark in a notebook."""
+        from phasemark.landmarks.mesh import build_mesh
+        from phasemark.landmarks.picture import mesh_picture
+
+        return mesh_picture(build_mesh(self))

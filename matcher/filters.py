@@ -103,6 +103,13 @@ class FilteredFrames:
         corrected = wrap_range_m(self.range_m - offset, self.sensor)
         return replace(self, range_m=corrected, sensor=self.sensor.with_(range_offset_m=0.0))
 
+    def _repr_png_(self) -> bytes | None:
+        """Show range and standard deviation of the first position in a notebook; nothing where there is none."""
+        from phasemark.matcher.picture import filtered_picture
+        from phasemark.render.plot import figure_png
+
+        return figure_png(filtered_picture(self)) if len(self) else None
+
 
 def noise_free(images: PhasorImages, n_frames: float) -> FilteredFrames:
     """Return what filtering so many frames would give if their noise had no effect: exact ranges, honest variances.

@@ -10,6 +10,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.data.notebook import table_html
 from phasemark.render import Background
 
 
@@ -124,6 +125,35 @@ class Match:
             "wall_m": None if self.background is None else self.background.wall_m,
         }
 
+    def _repr_html_(self) -> str:
+        """Show the match in a notebook."""
+        return table_html(_COLUMNS, [_cells(self)])
+
+
+_MOST_SHOWN = 100
+_COLUMNS = ("class", "D (m)", "δ (°)", "accepted", "p")
+
+
+def _cells(match: Match) -> tuple[str, ...]:
+    """Return a match as the cells of a table, values ± their standard deviations where there are any."""
+    if match.class_name is None:
+        return ("no landmark", "", "", "no", _number(match.p_value, ".3g"))
+    cells = []
+    for name, value, scale, form in (
+        ("distance_m", match.distance_m, 1.0, ".4f"),
+        ("delta_rad", match.delta_rad, 180 / math.pi, ".2f"),
+    ):
+        spread = ""
+        if match.covariance is not None and name in match.free:
+            k = match.free.index(name)
+            spread = f" ± {scale * math.sqrt(max(float(match.covariance[k, k]), 0.0)):{form}}"
+        cells.append(_number(scale * value, form) + spread)
+    return (match.class_name, *cells, "yes" if match.accepted else "no", _number(match.p_value, ".3g"))
+
+
+def _number(value: float, form: str) -> str:
+    return f"{value:{form}}" if math.isfinite(value) else ""
+
 
 class Matches(Sequence[Match]):
     """The matches of a batch; the fields of :class:`Match` are there as arrays too.
@@ -230,6 +260,12 @@ class Matches(Sequence[Match]):
         """Probability of each class and of "none", by name; (n,) each."""
         names = dict.fromkeys(name for match in self for name in match.class_probability)
         return {name: np.array([match.class_probability.get(name, 0.0) for match in self]) for name in names}
+
+    def _repr_html_(self) -> str:
+        """Show the matches in a notebook, the first hundred of them."""
+        caption = f"{len(self)} matches" + (f", the first {_MOST_SHOWN}" if len(self) > _MOST_SHOWN else "")
+        rows = [(k, *_cells(match)) for k, match in enumerate(self[:_MOST_SHOWN])]
+        return table_html(("position", *_COLUMNS), rows, caption=caption)
 
     def _floats(self, name: str) -> NDArray[np.float64]:
         return np.array([getattr(match, name) for match in self], dtype=np.float64)

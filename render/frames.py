@@ -163,3 +163,9 @@ class Frames:
         from phasemark.render.plot import plot_frame
 
         return plot_frame(self, index, frame)
+
+    def _repr_png_(self) -> bytes | None:
+        """Show the first frame in a notebook; nothing where there is none."""
+        from phasemark.render.plot import figure_png
+
+        return figure_png(self.plot()) if self.range_m.size else None

@@ -188,3 +188,9 @@ class PhasorImages:
         from phasemark.render.plot import plot_phasor_image
 
         return plot_phasor_image(self, index)
+
+    def _repr_png_(self) -> bytes | None:
+        """Show the first view in a notebook; nothing where there is none."""
+        from phasemark.render.plot import figure_png
+
+        return figure_png(self.plot()) if len(self) else None

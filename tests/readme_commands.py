@@ -184,12 +184,33 @@ def _write_workshop(path: Path) -> None:
     np.savez(path, range=ranges, amplitude=amplitude, intensity=intensity, unit="m", quantity="range")
 
 
+def _write_recording(path: Path) -> None:
+    """Write 12 frames of the cylinder at 0.7 m from 30° by 8 × 8 zones: z in millimetres, 0 if there is none."""
+    import numpy as np
+
+    from phasemark.landmarks import build_mesh, catalog
+    from phasemark.render import Renderer, capture, preset
+
+    sensor = preset("vl53l5cx-8x8")
+    image = Renderer(build_mesh(catalog()["cylinder"]), sensor, albedo=0.8).render(distance_m=0.7, delta_rad=np.pi / 6)
+    frames = capture(image, sensor, rng=np.random.default_rng(1), n_frames=12)
+    np.savetxt(path, np.nan_to_num(1e3 * frames.z_m).reshape(12, -1), delimiter=",", fmt="%.0f")
+
+
+def _copy_example(path: Path) -> None:
+    """Copy a file of the examples of that name."""
+    path.write_bytes((Path(__file__).parent.parent / "examples" / path.name).read_bytes())
+
+
 GIVEN: dict[str, Callable[[Path], None]] = {
     "board_1m.npz": _write_board,
     "board_2m.npz": _write_board,
     "board_3m.npz": _write_board,
     "measured.csv": _write_measured,
     "my_part.stl": _write_part,
+    "own_matcher.py": _copy_example,
+    "own_matcher.toml": _copy_example,
     "poses.csv": _write_poses,
+    "recording.csv": _write_recording,
     "workshop.npz": _write_workshop,
 }

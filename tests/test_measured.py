@@ -220,11 +220,26 @@ def test_a_missing_or_wrong_option_is_a_usage_error_that_names_it(tmp_path, opti
 def test_ranges_no_such_camera_can_measure_are_invalid_with_a_warning(tmp_path):
     path = csv_file(tmp_path, "1,2,3,4,5,6\n1,0,-3,4,15,6\n")  # c / 2f is 14.99 m
     with pytest.warns(
-        UserWarning, match=r"3 of 12 ranges .* frame 1, row 0, column 1: 0 m; taken as invalid"
+        UserWarning, match=r"2 of 11 ranges .* frame 1, row 0, column 2: -3 m; taken as invalid"
     ) as caught:
         frames = read_frames(path, sensor=SMALL, **STATED)
     assert len(caught) == 1
     assert frames.valid[0, 1].tolist() == [[True, False, False], [True, False, True]]
+
+
+def test_zeros_are_no_readings_and_say_nothing_of_the_unit(tmp_path):
+    frames = read_frames(csv_file(tmp_path, "0,0,0,0,0,6\n"), sensor=SMALL, **STATED)
+    assert frames.valid[0, 0].tolist() == [[False, False, False], [False, False, True]]
+
+
+def test_nothing_but_zeros_is_an_error(tmp_path):
+    with pytest.raises(InputFileError, match="every range is 0, which stands for no reading"):
+        read_frames(csv_file(tmp_path, "0,0,0,0,0,0\n"), sensor=SMALL, **STATED)
+
+
+def test_unit_and_quantity_are_asked_for_at_once(tmp_path):
+    with pytest.raises(UsageError, match=r"unit and quantity: give --unit m\|cm\|mm and --quantity range .*z"):
+        read_frames(csv_file(tmp_path, "1,2,3,4,5,6\n"), sensor=SMALL)
 
 
 def test_millimetres_read_as_metres_are_an_error_that_asks_for_the_unit(tmp_path):

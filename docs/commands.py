@@ -1,0 +1,94 @@
+"""Write docs/commands.md, every command with its options, from the program itself: ``python docs/commands.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import typer
+
+from phasemark.cli import app
+
+PAGE = Path(__file__).parent / "commands.md"
+TYPES = {str: "TEXT", int: "INTEGER", float: "NUMBER", Path: "PATH"}
+INTRODUCTION = """\
+# Every command
+
+Generated from the program by `python docs/commands.py`; do not edit. `phasemark COMMAND --help` prints the same for one
+command, and [the tour by task](../README.md) shows them at work. Results go to standard output, messages and progress
+to standard error; [exit codes](../README.md#when-something-is-wrong) say what went wrong.
+
+`phasemark` alone says what to do first, `phasemark --version` prints the version, and `phasemark --install-completion`
+teaches commands and options to bash, zsh, fish or PowerShell (`--show-completion` prints what it would install).
+"""
+
+
+def commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Return every command that does something, with the words that call it."""
+    if not hasattr(command, "commands"):
+        yield path, command
+        return
+    for name, inner in command.commands.items():
+        yield from commands(inner, f"{path} {name}")
+
+
+def cell(text: str) -> str:
+    """Return text as the cell of a table."""
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def kind(option: Any) -> str:
+    """Return what an option takes, a repeatable one what it takes each time."""
+    annotation = option.type_descriptor.annotation
+    return TYPES[next(iter(get_args(annotation)), annotation)]
+
+
+def option_row(option: Any) -> str:
+    """Return one line of the table of options."""
+    names = ", ".join(f"`{name}`" for name in (*option.opts, *option.secondary_opts))
+    takes = "" if option.is_flag else f" `{cell(option.metavar or kind(option))}`"
+    if option.required:
+        default = "required"
+    elif option.is_flag or option.default in (None, [], ()) or callable(option.default):
+        default = ""
+    else:
+        default = f"`{option.default}`"
+    return f"| {names}{takes} | {default} | {cell(option.help or '')} |"
+
+
+def section(path: str, command: Any) -> str:
+    """Return what the page says of one command."""
+    arguments = [one for one in command.params if one.param_type_name == "argument"]
+    options = [one for one in command.params if one.param_type_name == "option" and not one.hidden]
+    words = [one.metavar or one.name.upper() for one in arguments]
+    paragraphs = [" ".join(part.split()) for part in (command.help or "").split("\n\n")]
+    lines = [f"## {path}", "", f"    {' '.join([path, *words, '[OPTIONS]'])}", ""]
+    for paragraph in paragraphs:
+        lines += [paragraph, ""]
+    if arguments:
+        lines += ["| argument | |", "|---|---|"]
+        lines += [
+            f"| `{cell(word)}` | {cell(getattr(one, 'help', None) or '')} |"
+            for word, one in zip(words, arguments, strict=True)
+        ]
+        lines.append("")
+    if options:
+        lines += ["| option | default | |", "|---|---|---|", *map(option_row, options), ""]
+    return "\n".join(lines)
+
+
+def page() -> str:
+    """Return the whole page."""
+    found = list(commands(typer.main.get_command(app), "phasemark"))
+    index = [f"- [`{path}`](#{path.replace(' ', '-')})" for path, _ in found]
+    return "\n".join([INTRODUCTION, *index, "", *(section(path, command) for path, command in found)])
+
+
+def main() -> None:
+    """Write the page."""
+    PAGE.write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

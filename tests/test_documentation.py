@@ -1,0 +1,67 @@
+"""Pages that are made from the program are up to date, and every page can be found."""
+
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def commands():
+    return runpy.run_path(str(ROOT / "docs" / "commands.py"))
+
+
+def test_the_page_of_commands_is_what_the_program_says(commands):
+    # mend with: python docs/commands.py
+    assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8") == commands["page"]()
+
+
+def test_the_page_of_commands_has_every_command_that_help_lists(commands):
+    listed = {
+        path for path, _ in commands["commands"](commands["typer"].main.get_command(commands["app"]), "phasemark")
+    }
+    assert {"phasemark demo", "phasemark bank build", "phasemark landmark design", "phasemark calibrate"} <= listed
+    page = commands["page"]()
+    assert all(f"## {path}\n" in page for path in listed)
+
+
+def test_the_index_leads_to_every_page():
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    pages = sorted(page.name for page in (ROOT / "docs").glob("*.md") if page.name != "index.md")
+    assert [page for page in pages if f"({page})" not in index] == []
+
+
+def test_the_tutorials_explain_every_example():
+    tutorials = (ROOT / "docs" / "tutorials.md").read_text(encoding="utf-8")
+    assert [path.name for path in (ROOT / "examples").glob("*.py") if path.name not in tutorials] == []
+
+
+@pytest.mark.parametrize(("words", "found"), [("phasemark ba", "bank"), ("phasemark bank bu", "build")])
+def test_a_shell_is_told_what_may_follow(words, found):
+    environment = {
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(words.count(" ")),
+        "_PHASEMARK_COMPLETE": "complete_bash",
+        "PATH": "",
+    }
+    program = [str(Path(sys.executable).with_name("phasemark"))]
+    done = subprocess.run(program, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.split()) == (0, [found])
+
+
+def test_completion_can_be_installed(tmp_path):
+    program = [str(Path(sys.executable).with_name("phasemark")), "--show-completion", "bash"]
+    done = subprocess.run(program, capture_output=True, text=True, env={"HOME": str(tmp_path), "SHELL": "/bin/bash"})
+    assert done.returncode == 0
+    assert "_PHASEMARK_COMPLETE=complete_bash" in done.stdout
+
+
+def test_without_arguments_the_first_step_is_the_demo():
+    done = subprocess.run([Path(sys.executable).with_name("phasemark")], capture_output=True, text=True)
+    commands = [line for line in done.stdout.splitlines() if "phasemark " in line and line.startswith("  ")]
+    assert done.returncode == 0
+    assert commands[0].split()[:2] == ["phasemark", "demo"]
