@@ -77,11 +77,13 @@ class PrunedSearch:
         delta_rad: NDArray[np.float64],
         stride: tuple[int, int],
         n_starts: int = _N_STARTS,
+        reach: tuple[int, int] = (1, 1),
     ) -> None:
         self._templates = templates
         self._shape = len(distance_m), len(delta_rad)
         self._closes = closing_period(delta_rad) is not None
         self._n_starts = n_starts
+        self._reach = reach
         self._i, self._j = (np.arange(0, n, k) for n, k in zip(self._shape, stride, strict=True))
         block = np.arange(math.prod(self._shape)).reshape(self._shape)[:: stride[0], :: stride[1]].ravel()
         self._thin = [templates[first + block] for first in range(0, len(templates), math.prod(self._shape))]
@@ -99,6 +101,7 @@ class PrunedSearch:
             self._j,
             self._shape[1],
             self._closes,
+            self._reach,
             (t.about(seen), seen.weight, DISAGREEMENT * seen.returned, DISAGREEMENT * seen.not_returned),
             (t.range_m[picked], t.may_return[picked], t.must_return[picked]),
             t.sensor.unambiguous_range_m,
@@ -126,10 +129,11 @@ def thinning(distance_m: NDArray[np.float64], delta_rad: NDArray[np.float64]) ->
 
 
 @njit(cache=True, nogil=True)
-def _descend(thin, n_starts, thin_i, thin_j, n_a, closes, seen, model, period):  # type: ignore[no-untyped-def]
+def _descend(thin, n_starts, thin_i, thin_j, n_a, closes, reach, seen, model, period):  # type: ignore[no-untyped-def]
     """Return the lowest point of the grid that descents reach, and its cost, for every frame."""
     about, weight, lost, absent = seen
     range_m, may, must = model
+    reach_i, reach_j = reach
     n, n_points = len(about), len(range_m)
     n_d = n_points // n_a
     found = np.zeros(n, np.int64)
@@ -145,8 +149,8 @@ def _descend(thin, n_starts, thin_i, thin_j, n_a, closes, seen, model, period): 
             while True:
                 i, j = divmod(at, n_a)
                 centre = at
-                for ii in range(max(i - 1, 0), min(i + 2, n_d)):
-                    for dj in range(-1, 2):
+                for ii in range(max(i - reach_i, 0), min(i + reach_i + 1, n_d)):
+                    for dj in range(-reach_j, reach_j + 1):
                         jj = j + dj
                         if closes:
                             jj %= n_a
