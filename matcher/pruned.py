@@ -1,8 +1,9 @@
 """The nearest template of a regular grid without comparing all of them: a thinned grid, then descent on the full one.
 
-The whitened distance is smooth over several steps of a bank's grid, so its least value lies downhill from one of the
-lowest minima on a grid of :data:`_THIN_M` by :data:`_THIN_RAD`. From each of them the descent goes to the neighbour of
-least cost until none of the eight is lower. Every cost on the way is :meth:`Templates.exact_costs`, in float64.
+The whitened distance of a frame has few wide valleys, with ripples along δ on their floor where edges cross borders of
+pixels. A descent starts at each of the lowest minima of a thinned grid, and goes to the lowest point within reach until
+that is where it stands; its reach is longer than the ripples. Every cost on the way is that of
+:meth:`~phasemark.matcher.coarse.Templates.exact_costs`, in float64.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ from phasemark.matcher.candidates import modes
 from phasemark.matcher.coarse import DISAGREEMENT, Observation, Templates
 from phasemark.matcher.models import closing_period
 
-_THIN_M, _THIN_RAD = 0.04, math.radians(5)
-"""Spacing of the thinned grid: a fraction of the width of the valleys of the distance."""
-_N_STARTS = 4
+_THIN_M, _THIN_RAD = 0.06, math.radians(6)
+"""Spacing of the thinned grid: finer than the valleys are wide."""
+_REACH_M, _REACH_RAD = 0.01, math.radians(5)
+"""How far a descent looks to either side: further than the ripples are wide."""
+_N_STARTS = 6
 _LEAST_THINNING = 4
 """A grid that is thinned by less than this is searched whole."""
 
@@ -66,6 +69,8 @@ class PrunedSearch:
     distance_m, delta_rad : (d,), (a,) float64
     stride : (distance, δ)
         Every how many steps the thinned grid has a point.
+    reach : (distance, δ)
+        How many steps a descent looks to either side.
     n_starts : int
         From how many minima of the thinned grid a descent starts.
     """
@@ -76,8 +81,8 @@ class PrunedSearch:
         distance_m: NDArray[np.float64],
         delta_rad: NDArray[np.float64],
         stride: tuple[int, int],
+        reach: tuple[int, int],
         n_starts: int = _N_STARTS,
-        reach: tuple[int, int] = (1, 1),
     ) -> None:
         self._templates = templates
         self._shape = len(distance_m), len(delta_rad)
@@ -111,21 +116,22 @@ class PrunedSearch:
 
 def nearest_search(templates: Templates, distance_m: NDArray[np.float64], delta_rad: NDArray[np.float64]) -> Nearest:
     """Return the pruned search where the grid of each block is regular and fine, the exact one elsewhere."""
-    stride = thinning(distance_m, delta_rad)
-    if stride is None:
-        return ExactSearch(templates, len(distance_m) * len(delta_rad))
-    return PrunedSearch(templates, distance_m, delta_rad, stride)
+    steps = _regular_step(distance_m), _regular_step(delta_rad)
+    if steps[0] is not None and steps[1] is not None:
+        stride = _at_least_one(_THIN_M / steps[0]), _at_least_one(_THIN_RAD / steps[1])
+        reach = _at_least_one(_REACH_M / steps[0]), _at_least_one(_REACH_RAD / steps[1])
+        if math.prod(stride) >= _LEAST_THINNING:
+            return PrunedSearch(templates, distance_m, delta_rad, stride, reach)
+    return ExactSearch(templates, len(distance_m) * len(delta_rad))
 
 
-def thinning(distance_m: NDArray[np.float64], delta_rad: NDArray[np.float64]) -> tuple[int, int] | None:
-    """Return every how many steps of a grid the thinned one has a point; None where it would not help or mislead."""
-    strides = []
-    for values, spacing in ((distance_m, _THIN_M), (delta_rad, _THIN_RAD)):
-        step = np.diff(values)
-        if not len(step) or not np.allclose(step, step[0], rtol=1e-6, atol=0):
-            return None
-        strides.append(max(round(spacing / float(step[0])), 1))
-    return (strides[0], strides[1]) if math.prod(strides) >= _LEAST_THINNING else None
+def _regular_step(values: NDArray[np.float64]) -> float | None:
+    step = np.diff(values)
+    return float(step[0]) if len(step) and np.allclose(step, step[0], rtol=1e-6, atol=0) else None
+
+
+def _at_least_one(steps: float) -> int:
+    return max(round(steps), 1)
 
 
 @njit(cache=True, nogil=True)
