@@ -136,7 +136,9 @@ class Matcher:
             self._pose_rows, self._class_rows = (half, bank.sensor.rows), (0, half)
             self._pose = self._templates(bank.lower, self._pose_rows)
             self._class = self._templates(bank.upper, self._class_rows)
-        self._search = nearest_search(self._pose, bank.distance_m, bank.delta_rad)
+        self._search = nearest_search(
+            self._pose, bank.distance_m, bank.delta_rad, before_background=background is not None
+        )
         self._none = self._nothing()
 
     def match(self, frames: FilteredFrames) -> Matches:

@@ -23,6 +23,8 @@ _THIN_M, _THIN_RAD = 0.06, math.radians(6)
 """Spacing of the thinned grid: finer than the valleys are wide."""
 _REACH_M, _REACH_RAD = 0.01, math.radians(5)
 """How far a descent looks to either side: further than the ripples are wide."""
+_WIDE_REACH_M, _WIDE_REACH_RAD = 0.03, math.radians(12)
+"""The same before a background, where mixed pixels count and the ripples are wider."""
 _N_STARTS = 6
 _LEAST_THINNING = 4
 """A grid that is thinned by less than this is searched whole."""
@@ -114,12 +116,19 @@ class PrunedSearch:
         return found + picked.start, cost
 
 
-def nearest_search(templates: Templates, distance_m: NDArray[np.float64], delta_rad: NDArray[np.float64]) -> Nearest:
+def nearest_search(
+    templates: Templates,
+    distance_m: NDArray[np.float64],
+    delta_rad: NDArray[np.float64],
+    *,
+    before_background: bool = False,
+) -> Nearest:
     """Return the pruned search where the grid of each block is regular and fine, the exact one elsewhere."""
     steps = _regular_step(distance_m), _regular_step(delta_rad)
     if steps[0] is not None and steps[1] is not None:
         stride = _at_least_one(_THIN_M / steps[0]), _at_least_one(_THIN_RAD / steps[1])
-        reach = _at_least_one(_REACH_M / steps[0]), _at_least_one(_REACH_RAD / steps[1])
+        far = (_WIDE_REACH_M, _WIDE_REACH_RAD) if before_background else (_REACH_M, _REACH_RAD)
+        reach = _at_least_one(far[0] / steps[0]), _at_least_one(far[1] / steps[1])
         if math.prod(stride) >= _LEAST_THINNING:
             return PrunedSearch(templates, distance_m, delta_rad, stride, reach)
     return ExactSearch(templates, len(distance_m) * len(delta_rad))
