@@ -29,7 +29,10 @@ from tolerance import tolerance
 
 from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Matcher, kalman_filter, phasor_mean
+from phasemark.matcher import Conditions, FilteredFrames, Matcher, kalman_filter, phasor_mean
+from phasemark.matcher.coarse import Observation
+from phasemark.matcher.pruned import ExactSearch, nearest_search
+from phasemark.matcher.trials import noisy_frames
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, camera_unit, capture, preset
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -47,6 +50,16 @@ def median_seconds(work: Callable[[], object], runs: int = 5) -> float:
         started = time.perf_counter()
         work()
         times.append(time.perf_counter() - started)
+    return statistics.median(times)
+
+
+def processor_seconds(work: Callable[[], object], runs: int = 5) -> float:
+    """Return the median processor time of a piece of work, all threads together: other programs hardly change it."""
+    times = []
+    for _ in range(runs):
+        started = time.process_time()
+        work()
+        times.append(time.process_time() - started)
     return statistics.median(times)
 
 
@@ -232,10 +245,31 @@ def chain() -> Table:
             matcher = Matcher(opened, background=Background(wall_m=3.0))
             one = kalman_filter(frames)
             many = one[np.tile(np.arange(len(one)), 10)]
-            rows.append(("match, nearest of 25 380 + 564 images", len(many), lambda: matcher.match(many)))
-            measured = [(name, n / median_seconds(work)) for name, n, work in rows]
+            plain, several = Matcher(opened), random_frames(2000)
+            seen = Observation.from_frames(several, (SENSOR.rows // 2, SENSOR.rows))
+            pruned = nearest_search(plain._pose, opened.distance_m, opened.delta_rad)
+            exact = ExactSearch(plain._pose, len(plain._pose))
+            rows += [
+                ("nearest of 25 380 images, exact", 200, lambda: exact.nearest(seen[:200])),
+                ("nearest of 25 380 images, pruned", len(several), lambda: pruned.nearest(seen)),
+                ("match, nearest of 25 380 + 564 images", len(several), lambda: plain.match(several)),
+                ("the same before a wall", len(many), lambda: matcher.match(many)),
+            ]
+            measured = [(name, n / median_seconds(work), n / processor_seconds(work)) for name, n, work in rows]
         bank.close()
-    return {"rows": [{"stage": name, "frames/s": round(speed)} for name, speed in measured]}
+    return {
+        "rows": [
+            {"stage": name, "frames/s": round(speed), "frames per processor second": round(busy)}
+            for name, speed, busy in measured
+        ]
+    }
+
+
+def random_frames(n: int) -> FilteredFrames:
+    """Return frames of random views straight ahead, the cone's, each the mean of 50."""
+    conditions, rng = Conditions(distance_m=(0.75, 2.1)), np.random.default_rng(SEED)
+    renderer = Renderer(build_mesh(catalog()["cone"]), SENSOR, albedo=0.8)
+    return noisy_frames(renderer, SENSOR, conditions.views(n, rng, np.pi), conditions, rng)
 
 
 def capturing() -> Table:

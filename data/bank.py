@@ -341,6 +341,10 @@ def open_bank(path: str | os.PathLike[str], *, untrusted: bool = False) -> Bank:
         raise
 
 
+_FARTHEST_VERTEX_M = 1e3
+"""No landmark is so large; damage that leaves a number often is."""
+
+
 def read_mesh_group(file: h5py.File, class_name: str, path: Path) -> trimesh.Trimesh:
     """Return the mesh of a class as a bank or a frame set holds it, checked."""
     group = group_of(file, f"meshes/{class_name}", path)
@@ -353,8 +357,8 @@ def read_mesh_group(file: h5py.File, class_name: str, path: Path) -> trimesh.Tri
         raise InputFileError(f"{path}: 'delta_period_deg' of '{class_name}' must be in [1, 360], got {period_deg:g}")
     if not (vertices.ndim == faces.ndim == 2 and vertices.shape[1:] == faces.shape[1:] == (3,) and faces.size):
         raise InputFileError(f"{path}: 'meshes/{class_name}' must hold rows of three, of vertices and faces")
-    if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputFileError(f"{path}: 'meshes/{class_name}' has vertices that are not finite or not there")
+    if not (np.abs(vertices) <= _FARTHEST_VERTEX_M).all() or faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputFileError(f"{path}: 'meshes/{class_name}' has vertices that are not within 1 km, or not there")
     if part is not None and part.shape != faces.shape[:1]:
         raise InputFileError(f"{path}: 'meshes/{class_name}/part' must have one value for each face")
     return trimesh.Trimesh(

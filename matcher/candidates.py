@@ -109,7 +109,7 @@ class Search:
             by_class.append(above)
         frame, class_index, views, cost = [], [], [], []
         for f in range(n):
-            for b, i, j in _modes(best[f], n_modes, self._closes):
+            for b, i, j in modes(best[f], n_modes, self._closes):
                 if b < 0:
                     break
                 least = float(best[f, b, i, j])
@@ -179,7 +179,7 @@ class Search:
 
 
 @njit(cache=True, nogil=True)
-def _modes(cost, n_modes, closes):  # type: ignore[no-untyped-def]
+def modes(cost, n_modes, closes):  # type: ignore[no-untyped-def]
     """Return the lowest local minima of cost (bearing, D, δ), best first; −1 behind the last."""
     n_b, n_d, n_a = cost.shape
     found = np.full((n_modes, 3), -1, np.int64)

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,8 +97,6 @@ class Templates:
     may_return, must_return : (t, pixels) bool
     mean_m : (pixels,) float64
         Circular mean of the model ranges of each pixel.
-    matrix : (t, 4 · pixels) float32
-        [M, −2 M f, M f², C], what the matrix product needs.
     sensor : Sensor
     """
 
@@ -105,7 +104,6 @@ class Templates:
     may_return: NDArray[np.bool_]
     must_return: NDArray[np.bool_]
     mean_m: NDArray[np.float64]
-    matrix: NDArray[np.float32]
     sensor: Sensor
 
     @classmethod
@@ -152,15 +150,25 @@ class Templates:
         mean = phasor_to_range_m(turn.sum(axis=0), sensor)
         mean = np.where(np.isfinite(mean), mean, 0.0)
         about = np.where(may, wrap_difference_m(ranges - mean, sensor), 0.0).astype(np.float32)
-        matrix = np.concatenate([may.astype(np.float32), -2 * about, about**2, must.astype(np.float32)], axis=1)
-        return cls(about, may, must, mean, np.ascontiguousarray(matrix), sensor)
+        return cls(about, may, must, mean, sensor)
 
     def __len__(self) -> int:
         return len(self.range_m)
 
+    def __getitem__(self, index: NDArray[np.integer]) -> Templates:
+        """Return some of the templates, about the same mean."""
+        return Templates(self.range_m[index], self.may_return[index], self.must_return[index], self.mean_m, self.sensor)
+
+    @cached_property
+    def matrix(self) -> NDArray[np.float32]:
+        """[M, −2 M f, M f², C], what the matrix product needs; (t, 4 · pixels)."""
+        f = self.range_m
+        may, must = self.may_return.astype(np.float32), self.must_return.astype(np.float32)
+        return np.concatenate([may, -2 * f, f**2, must], axis=1)
+
     def costs(self, seen: Observation, subset: slice | None = None) -> NDArray[np.float32]:
         """Return the distances of n frames from all templates (or a slice of them), (n, t), to float32's accuracy."""
-        about = self._about(seen)
+        about = self.about(seen)
         query = np.concatenate(
             [
                 seen.weight * about**2 - DISAGREEMENT * seen.returned,
@@ -176,11 +184,15 @@ class Templates:
 
     def exact_costs(self, seen: Observation, frame: int, index: NDArray[np.integer]) -> NDArray[np.float64]:
         """Return the distances of one frame from some templates in float64, (t,)."""
-        residual = wrap_difference_m(self._about(seen)[frame] - self.range_m[index].astype(np.float64), self.sensor)
-        fit = seen.weight[frame] * self.may_return[index] * residual**2
-        lost = seen.returned[frame] & ~self.may_return[index]
-        absent = seen.not_returned[frame] & self.must_return[index]
-        return np.asarray((fit + DISAGREEMENT * (lost | absent)).sum(axis=1))
+        return self.costs_of_each(seen[frame : frame + 1], index[None])[0]
+
+    def costs_of_each(self, seen: Observation, index: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Return the distances of n frames from templates of their own, (n, t) as `index` is, in float64."""
+        residual = wrap_difference_m(self.about(seen)[:, None] - self.range_m[index].astype(np.float64), self.sensor)
+        fit = seen.weight[:, None] * self.may_return[index] * residual**2
+        lost = seen.returned[:, None] & ~self.may_return[index]
+        absent = seen.not_returned[:, None] & self.must_return[index]
+        return np.asarray((fit + DISAGREEMENT * (lost | absent)).sum(axis=-1))
 
     def best(self, seen: Observation, frame: int, costs: NDArray[np.float32], offset: int = 0) -> tuple[int, float]:
         """Return the nearest template of one frame and its exact distance.
@@ -194,7 +206,7 @@ class Templates:
         offset : int
             Where the slice that `costs` covers begins.
         """
-        scale = float(np.sum(seen.weight[frame] * self._about(seen[frame : frame + 1])[0] ** 2))
+        scale = float(np.sum(seen.weight[frame] * self.about(seen[frame : frame + 1])[0] ** 2))
         scale += float(np.abs(costs).min()) + DISAGREEMENT * seen.range_m.shape[1]
         near = np.flatnonzero(costs <= costs.min() + 1e-5 * scale)
         if len(near) > _RECHECKED:
@@ -203,6 +215,6 @@ class Templates:
         k = int(exact.argmin())
         return int(near[k] + offset), float(exact[k])
 
-    def _about(self, seen: Observation) -> NDArray[np.float64]:
+    def about(self, seen: Observation) -> NDArray[np.float64]:
         """Return measured ranges less the bank's mean, wrapped to ± c/4f, 0 where nothing returned."""
         return np.where(seen.returned, wrap_difference_m(seen.range_m - self.mean_m, self.sensor), 0.0)

@@ -7,9 +7,8 @@ upper pixels give the class, and the answer lies on the bank's grid. Maximum lik
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -24,6 +23,7 @@ from phasemark.matcher.filters import FilteredFrames
 from phasemark.matcher.likelihood import Quantity
 from phasemark.matcher.match import Candidate, Match, Matches
 from phasemark.matcher.models import VIEW
+from phasemark.matcher.pruned import nearest_search
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, wrap_difference_m
 
 METHODS = ("nearest", "refine")
@@ -32,14 +32,16 @@ MIN_RETURNS = 3
 _FRAMES_AT_ONCE = 128
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Found:
-    """A template on the grid: class (where the layout knows it), distance and angle indices, and its distance."""
+    """The nearest template of every class: (n, classes) arrays.
 
-    class_index: int
-    i: int
-    j: int
-    cost: float
+    `i` and `j` index distance and angle, `cost` is the distance from the frame.
+    """
+
+    i: NDArray[np.int64]
+    j: NDArray[np.int64]
+    cost: NDArray[np.float64]
 
 
 class Matcher:
@@ -134,6 +136,10 @@ class Matcher:
             self._pose_rows, self._class_rows = (half, bank.sensor.rows), (0, half)
             self._pose = self._templates(bank.lower, self._pose_rows)
             self._class = self._templates(bank.upper, self._class_rows)
+        self._search = nearest_search(
+            self._pose, bank.distance_m, bank.delta_rad, before_background=background is not None
+        )
+        self._none = self._nothing()
 
     def match(self, frames: FilteredFrames) -> Matches:
         """Match a batch of filtered frames.
@@ -169,7 +175,6 @@ class Matcher:
 
     def _match_some(self, frames: FilteredFrames) -> list[Match]:
         pose_seen = Observation.from_frames(frames, self._pose_rows)
-        found: list[list[_Found]]
         if self._class is None:
             class_seen = None
             found = self._search_full(pose_seen)
@@ -177,163 +182,145 @@ class Matcher:
             assert self._class_rows is not None
             class_seen = Observation.from_frames(frames, self._class_rows)
             found = self._search_factored(pose_seen, class_seen)
-        none_cost = self._none_cost(frames)
+        seen = Observation.from_frames(frames, (0, self.bank.sensor.rows))
+        none_cost = self._none.costs_of_each(seen, np.zeros((len(frames), 1), np.int64))[:, 0]
+        enough = pose_seen.returned.sum(axis=1) >= MIN_RETURNS
+        chi2, dof = self._goodness(pose_seen, class_seen, found)
+        p_value = p_values_of(chi2, dof, frames, np.arange(len(frames)))
+        nothing = Match(class_name=None, accepted=False, class_probability=self._probabilities(np.empty(0), 0.0))
         return [
-            self._answer(pose_seen, class_seen, frames, k, sorted(found[k], key=lambda f: f.cost), float(none_cost[k]))
+            self._answer(found, k, float(none_cost[k]), float(chi2[k]), int(dof[k]), float(p_value[k]))
+            if enough[k]
+            else nothing
             for k in range(len(frames))
         ]
 
-    def _search_factored(self, lower: Observation, upper: Observation) -> list[list[_Found]]:
+    def _search_factored(self, lower: Observation, upper: Observation) -> _Found:
         """Find the nearest lower image, then the distance of each class's upper image at that distance."""
         assert self._class is not None
-        n_distance, n_delta = len(self.bank.distance_m), len(self.bank.delta_rad)
-        found = []
-        costs = self._pose.costs(lower)
-        for k in range(len(costs)):
-            best, cost = self._pose.best(lower, k, costs[k])
-            i, j = divmod(best, n_delta)
-            at_distance = np.arange(len(self.bank.classes)) * n_distance + i
-            class_cost = self._class.exact_costs(upper, k, at_distance)
-            found.append([_Found(c, i, j, cost + float(class_cost[c])) for c in range(len(at_distance))])
-        return found
+        n_class, n_distance = len(self.bank.classes), len(self.bank.distance_m)
+        best, cost = self._search.nearest(lower)
+        i, j = np.divmod(best, len(self.bank.delta_rad))
+        costs = cost[:, None] + self._class.costs_of_each(upper, np.arange(n_class) * n_distance + i[:, None])
+        return _Found(np.repeat(i[:, None], n_class, axis=1), np.repeat(j[:, None], n_class, axis=1), costs)
 
-    def _search_full(self, seen: Observation) -> list[list[_Found]]:
+    def _search_full(self, seen: Observation) -> _Found:
         """Find the nearest image of each class."""
-        n_delta = len(self.bank.delta_rad)
-        per_class = len(self.bank.distance_m) * n_delta
-        found: list[list[_Found]] = [[] for _ in range(len(seen.range_m))]
-        for c in range(len(self.bank.classes)):
-            block = slice(c * per_class, (c + 1) * per_class)
-            costs = self._pose.costs(seen, block)
-            for k in range(len(costs)):
-                best, cost = self._pose.best(seen, k, costs[k], offset=block.start)
-                i, j = divmod(best - block.start, n_delta)
-                found[k].append(_Found(c, i, j, cost))
-        return found
+        n_class, n_distance, n_delta = len(self.bank.classes), len(self.bank.distance_m), len(self.bank.delta_rad)
+        nearest = [self._search.nearest(seen, c) for c in range(n_class)]
+        best = np.stack([found for found, _ in nearest], axis=1) - np.arange(n_class) * n_distance * n_delta
+        return _Found(*np.divmod(best, n_delta), np.stack([cost for _, cost in nearest], axis=1))
 
-    def _none_cost(self, frames: FilteredFrames) -> NDArray[np.float64]:
-        """Return the distance of each frame from a scene without a landmark, (n,)."""
-        seen = Observation.from_frames(frames, (0, self.bank.sensor.rows))
+    def _nothing(self) -> Templates:
+        """Return the one template of a scene without a landmark."""
         shape = (1, self.bank.sensor.rows, self.bank.sensor.cols)
-        empty = Templates.build(
-            np.zeros(shape, np.complex64),
-            np.zeros(shape, np.float32),
-            np.zeros(shape, np.float32),
-            self.bank.sensor,
-            self._behind,
-            (0, self.bank.sensor.rows),
+        nothing = np.zeros(shape, np.float32)
+        return Templates.build(
+            np.zeros(shape, np.complex64), nothing, nothing, self.bank.sensor, self._behind, (0, self.bank.sensor.rows)
         )
-        return np.array([empty.exact_costs(seen, k, np.array([0]))[0] for k in range(len(frames))])
 
-    def _answer(
-        self,
-        pose_seen: Observation,
-        class_seen: Observation | None,
-        frames: FilteredFrames,
-        k: int,
-        found: list[_Found],
-        none_cost: float,
-    ) -> Match:
-        """Turn the candidates of one frame, best first, into an answer."""
-        if pose_seen.returned[k].sum() < MIN_RETURNS:
-            return Match(class_name=None, accepted=False, class_probability=self._probabilities([], 0.0))
-        best = found[0]
-        chi2, dof = self._goodness(pose_seen, class_seen, k, best)
-        p_value = float(p_values_of(np.array([chi2]), np.array([dof]), frames, np.array([k]))[0])
-        is_landmark = best.cost < none_cost
-        name = self.bank.classes[best.class_index]
+    def _answer(self, found: _Found, k: int, none_cost: float, chi2: float, dof: int, p_value: float) -> Match:
+        """Turn what was found for one frame into an answer."""
+        order = np.argsort(found.cost[k], kind="stable")
         candidates = tuple(
             Candidate(
-                self.bank.classes[f.class_index],
-                float(self.bank.distance_m[f.i]),
-                float(self.bank.delta_rad[f.j]),
-                f.cost,
+                self.bank.classes[c],
+                float(self.bank.distance_m[found.i[k, c]]),
+                float(self.bank.delta_rad[found.j[k, c]]),
+                float(found.cost[k, c]),
             )
-            for f in found
+            for c in order
         )
+        best = candidates[0]
+        is_landmark = best.cost < none_cost
         return Match(
-            class_name=name if is_landmark else None,
+            class_name=best.class_name if is_landmark else None,
             accepted=bool(is_landmark and p_value >= self.false_alarm),
-            distance_m=candidates[0].distance_m,
-            delta_rad=candidates[0].delta_rad,
+            distance_m=best.distance_m,
+            delta_rad=best.delta_rad,
             chi2=chi2,
             dof=dof,
             p_value=p_value,
-            class_probability=self._probabilities(found, none_cost),
+            class_probability=self._probabilities(found.cost[k], none_cost),
             alternatives=candidates[1:] if is_landmark else candidates,
-            symmetry=self._symmetry[name],
+            symmetry=self._symmetry[best.class_name],
         )
 
-    def _probabilities(self, found: list[_Found], none_cost: float) -> dict[str, float]:
-        """Weigh classes and "none" by exp(−cost / 2), as Gaussian residuals and equal priors have it."""
-        cost = {self.bank.classes[f.class_index]: f.cost for f in found}
+    def _probabilities(self, cost: NDArray[np.float64], none_cost: float) -> dict[str, float]:
+        """Weigh classes and "none" by exp(−cost / 2), as Gaussian residuals and equal priors have it.
+
+        Without costs "none" is certain.
+        """
         names = [*self.bank.classes, "none"]
-        values = np.array([cost.get(name, math.inf) for name in self.bank.classes] + [none_cost])
+        values = np.full(len(names), np.inf)
+        values[: len(cost)], values[-1] = cost, none_cost
         weight = np.exp(-0.5 * (values - values.min()))
         return dict(zip(names, (weight / weight.sum()).tolist(), strict=True))
 
     def _goodness(
-        self, pose_seen: Observation, class_seen: Observation | None, k: int, best: _Found
-    ) -> tuple[float, int]:
-        """Return χ² and degrees of freedom of the best image, its cell's linear change taken out."""
+        self, pose_seen: Observation, class_seen: Observation | None, found: _Found
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return χ² and degrees of freedom of the best images, the linear change in a cell taken out; (n,) each."""
         n_distance, n_delta = len(self.bank.distance_m), len(self.bank.delta_rad)
-        first = best.class_index * n_distance * n_delta if class_seen is None else 0
-        low, high = max(best.i - 1, 0), min(best.i + 1, n_distance - 1)
-        left, right = (best.j - 1) % n_delta, (best.j + 1) % n_delta
-        at = first + np.array([best.i, low, high, best.i, best.i]) * n_delta
-        parts = [_Cell.of(self._pose, pose_seen, k, at + np.array([best.j, best.j, best.j, left, right]))]
+        c = np.argmin(found.cost, axis=1)
+        i, j = (np.take_along_axis(index, c[:, None], axis=1)[:, 0] for index in (found.i, found.j))
+        rows = np.stack([i, np.maximum(i - 1, 0), np.minimum(i + 1, n_distance - 1), i, i], axis=1)
+        columns = np.stack([j, j, j, (j - 1) % n_delta, (j + 1) % n_delta], axis=1)
+        block = c[:, None] if class_seen is None else np.zeros((len(c), 1), np.int64)
+        cells = _Cells.of(self._pose, pose_seen, (block * n_distance + rows) * n_delta + columns)
         if class_seen is not None:
             assert self._class is not None
-            at = best.class_index * n_distance + np.array([best.i, low, high, best.i, best.i])
-            parts.append(_Cell.of(self._class, class_seen, k, at))
-        cell = _Cell(*(np.concatenate(arrays) for arrays in zip(*(part.arrays() for part in parts), strict=True)))
-        chi2, n_fitted = cell.chi2()
-        return chi2, max(n_fitted - 2, 0)
+            cells = cells.beside(_Cells.of(self._class, class_seen, c[:, None] * n_distance + rows))
+        chi2, n_fitted = cells.chi2()
+        return chi2, np.maximum(n_fitted - 2, 0)
 
 
 @dataclass(frozen=True, eq=False)
-class _Cell:
-    """Residuals of one frame at a grid point, and how its model changes over the cell; (pixels,) arrays.
+class _Cells:
+    """Residuals of n frames at a grid point each, and how their models change over the cell; (n, pixels) arrays.
 
-    `slope` is the change of range over one step of distance and of angle, (pixels, 2); `bend` what a linear change
-    leaves over half a step; `disagrees` counts a pixel whose return the model contradicts at the grid point and at all
-    its neighbours.
+    `variance` is infinite where frame and models cannot be compared. `slope` is the change of range over one step of
+    distance and of angle, (n, pixels, 2); `bend` what a linear change leaves over half a step; `disagrees` counts a
+    pixel whose return the model contradicts at the grid point and at all its neighbours.
     """
 
     residual: NDArray[np.float64]
-    weight: NDArray[np.float64]
+    variance: NDArray[np.float64]
     slope: NDArray[np.float64]
     bend: NDArray[np.float64]
     disagrees: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, templates: Templates, seen: Observation, k: int, at: NDArray[np.integer]) -> _Cell:
-        """Look at grid points `at`: the point itself, then its neighbours in distance and in angle."""
+    def of(cls, templates: Templates, seen: Observation, at: NDArray[np.integer]) -> _Cells:
+        """Look at grid points `at`, (n, 5): the point itself, then its neighbours in distance and in angle."""
         may, must = templates.may_return[at], templates.must_return[at]
-        usable = seen.returned[k] & may.all(axis=0)
+        usable = seen.returned & may.all(axis=1)
         model = templates.range_m[at].astype(np.float64)
-        step = wrap_difference_m(model[1:] - model[0], templates.sensor)
-        residual = wrap_difference_m(seen.range_m[k] - templates.mean_m - model[0], templates.sensor)
-        slope = np.stack([step[1] - step[0], step[3] - step[2]], axis=1) / 2
-        bend = np.abs(np.stack([step[1] + step[0], step[3] + step[2]])).sum(axis=0) / 2
-        lost = seen.returned[k] & ~may.any(axis=0)
-        absent = seen.not_returned[k] & must.all(axis=0)
-        return cls(residual[usable], seen.weight[k, usable], slope[usable], bend[usable], (lost | absent))
+        step = wrap_difference_m(model[:, 1:] - model[:, :1], templates.sensor)
+        residual = wrap_difference_m(templates.about(seen) - model[:, 0], templates.sensor)
+        slope = np.stack([step[:, 1] - step[:, 0], step[:, 3] - step[:, 2]], axis=-1) / 2
+        bend = (np.abs(step[:, 1] + step[:, 0]) + np.abs(step[:, 3] + step[:, 2])) / 2
+        lost = seen.returned & ~may.any(axis=1)
+        absent = seen.not_returned & must.all(axis=1)
+        variance = np.divide(1.0, seen.weight, out=np.full(usable.shape, np.inf), where=usable)
+        return cls(residual, variance, slope, bend, lost | absent)
 
-    def arrays(self) -> tuple[NDArray[np.generic], ...]:
-        return self.residual, self.weight, self.slope, self.bend, self.disagrees
+    def beside(self, other: _Cells) -> _Cells:
+        """Add further pixels of the same frames."""
+        return _Cells(*(np.concatenate([getattr(c, f.name) for c in (self, other)], axis=1) for f in fields(self)))
 
-    def chi2(self) -> tuple[float, int]:
-        """Fit the position in the cell and return χ² with the number of pixels in it."""
-        weight = 1 / (1 / self.weight + self.bend**2)
-        root = np.sqrt(weight)
-        offset: NDArray[np.floating] = np.zeros(2)
-        if len(weight) >= MIN_RETURNS:
-            offset = np.linalg.lstsq(self.slope * root[:, None], self.residual * root, rcond=1e-9)[0]
-            offset = np.clip(offset, -0.6, 0.6)
-        left = self.residual - self.slope @ offset
-        n_disagree = int(self.disagrees.sum())
-        return float(np.sum(weight * left**2) + DISAGREEMENT * n_disagree), len(weight) + n_disagree
+    def chi2(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Fit the positions in the cells and return χ² with the number of pixels in it; (n,) each."""
+        weight = 1 / (self.variance + self.bend**2)
+        n_compared = np.isfinite(self.variance).sum(axis=1)
+        weighted = self.slope * weight[..., None]
+        # what the pixels do not tell stays 0: the least solution of the normal equations
+        inverse = np.linalg.pinv(self.slope.transpose(0, 2, 1) @ weighted, rcond=1e-12, hermitian=True)
+        offset = np.einsum("nij,npj,np->ni", inverse, weighted, self.residual, optimize=True)
+        offset = np.clip(offset, -0.6, 0.6) * (n_compared >= MIN_RETURNS)[:, None]
+        left = self.residual - np.einsum("npi,ni->np", self.slope, offset)
+        n_disagree = self.disagrees.sum(axis=1)
+        return np.sum(weight * left**2, axis=1) + DISAGREEMENT * n_disagree, n_compared + n_disagree
 
 
 def background_image(background: Background, sensor: Sensor) -> PhasorImages:

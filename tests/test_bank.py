@@ -450,7 +450,7 @@ def test_values_that_are_not_finite_are_refused_when_read(bank_file, field):
         getattr(bank.lower, field)
 
 
-@pytest.mark.parametrize(("name", "value"), [("vertices", np.nan), ("faces", -1), ("faces", 10**6)])
+@pytest.mark.parametrize(("name", "value"), [("vertices", np.nan), ("vertices", 1e60), ("faces", -1), ("faces", 10**6)])
 def test_a_damaged_mesh_is_refused_when_read(bank_file, name, value):
     with h5py.File(bank_file, "r+") as file:
         spoiled(f"meshes/cone/{name}", value)(file)
