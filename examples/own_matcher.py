@@ -36,7 +36,7 @@ def match(frames: FilteredFrames) -> list[Match]:
 
 
 def main() -> int:
-    """Judge this matcher beside the paper's and maximum likelihood, on the same noisy frames."""
+    """Judge this matcher beside the paper's, on the same noisy frames."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=10, help="trials of each condition (%(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out/own"), help="folder of the report (%(default)s)")
@@ -57,7 +57,8 @@ def main() -> int:
         row = cell.row()
         print(
             f"{row['method']:>14}  {row['class_name']:<8}  D {row['distance_m']:.1f} m:"
-            f"  r.m.s. error {1e3 * row['rmse_with_outliers_distance_m']:6.2f} mm, bound {1e3 * row['bound_distance_m']:.2f} mm,"
+            "  r.m.s. error"
+            f" {1e3 * row['rmse_with_outliers_distance_m']:6.2f} mm, bound {1e3 * row['bound_distance_m']:.2f} mm,"
             f" class right {100 * row['class_right']:.0f} %"
         )
     print(report)
