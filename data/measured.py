@@ -200,7 +200,7 @@ def _impossible(
         if 2 * count > of:
             raise InputFileError(f"{message}; is --unit right?")
         warnings.warn(f"{message}; taken as invalid", UserWarning, stacklevel=3)
-    return np.asarray(wrong | empty, dtype=np.bool_)
+    return np.asarray(wrong | empty)
 
 
 def _settled(name: str, given: str | None, raw: _Raw, known: tuple[str, ...], path: Path) -> str:
