@@ -184,7 +184,7 @@ class Templates:
 
     def exact_costs(self, seen: Observation, frame: int, index: NDArray[np.integer]) -> NDArray[np.float64]:
         """Return the distances of one frame from some templates in float64, (t,)."""
-        return self.costs_of_each(seen[frame : frame + 1], index[None])[0]
+        return np.asarray(self.costs_of_each(seen[frame : frame + 1], index[None])[0])
 
     def costs_of_each(self, seen: Observation, index: NDArray[np.integer]) -> NDArray[np.float64]:
         """Return the distances of n frames from templates of their own, (n, t) as `index` is, in float64."""
