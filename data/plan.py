@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import tomllib
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -99,7 +100,7 @@ class MeshPlan(PlanModel):
     albedo: _Albedo = 0.8
 
 
-class ScenePlan(PlanModel):
+class ScenePlan(PlanModel, ABC):
     """What a plan says of the landmarks and the camera.
 
     Parameters
@@ -122,9 +123,9 @@ class ScenePlan(PlanModel):
     sensor: str = "pmd-16x16"
     sensor_overrides: dict[str, Any] = Field(default_factory=dict)
 
+    @abstractmethod
     def resolve(self) -> Self:
         """Return the plan with every default made explicit."""
-        raise NotImplementedError
 
     def build_sensor(self) -> Sensor:
         """Return the sensor, overrides applied.
