@@ -847,7 +847,9 @@ def _merge(shards: Sequence[Path], out: Path, resume: bool, force: bool) -> None
 
 
 @_plan_app.command("example")
-def _plan_example(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank, frames, sweep or drive.")]) -> None:
+def _plan_example(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.")],
+) -> None:
     """Print a plan with comments; it can be used as it is."""
     from phasemark.matcher.plan_kinds import plan_example
 
@@ -855,7 +857,9 @@ def _plan_example(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank
 
 
 @_plan_app.command("schema")
-def _plan_schema(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank, frames, sweep or drive.")]) -> None:
+def _plan_schema(
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.")],
+) -> None:
     """Print the JSON Schema of a kind of plan, for editors and other programs."""
     from phasemark.matcher.plan_kinds import plan_schema
 
@@ -866,7 +870,7 @@ def _plan_schema(kind: Annotated[str, typer.Argument(metavar="KIND", help="bank,
 def _plan_check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A plan (.toml).")],
     kind: Annotated[
-        str | None, typer.Option("--kind", help="bank, frames, sweep or drive, if the plan leaves it open.")
+        str | None, typer.Option("--kind", help="bank, frames, sweep, drive or design, if the plan leaves it open.")
     ] = None,
     as_json: _Json = False,
 ) -> None:

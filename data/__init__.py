@@ -11,13 +11,11 @@ from phasemark.data.grid import format_grid, parse_grid
 from phasemark.data.jobs import build_part, estimate, merge_parts, parse_part
 from phasemark.data.measured import read_frames, write_measured
 from phasemark.data.plan import BankPlan, MeshPlan, load_plan, read_plan
-from phasemark.data.plan_kinds import PLAN_KINDS, check_plan, plan_example, plan_schema
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.store import read_checksum, verify_checksum, write_atomically, write_checksum
 from phasemark.data.verify import verify_bank, verify_frames
 
 __all__ = [
-    "PLAN_KINDS",
     "Bank",
     "BankGroup",
     "BankPlan",
@@ -29,7 +27,6 @@ __all__ = [
     "build_bank",
     "build_frames",
     "build_part",
-    "check_plan",
     "estimate",
     "export_frames",
     "format_grid",
@@ -41,8 +38,6 @@ __all__ = [
     "open_frames",
     "parse_grid",
     "parse_part",
-    "plan_example",
-    "plan_schema",
     "read_checksum",
     "read_frames",
     "read_plan",

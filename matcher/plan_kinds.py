@@ -1,19 +1,19 @@
-"""Every kind of plan there is: those of banks and frame sets, and those of sweeps, drives and designs."""
+"""The kinds of plan there are, whichever part of the program they belong to: examples, JSON Schemas, checks."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
 from typing import Any
 
 from pydantic import BaseModel
 
 from phasemark import InputFileError, UsageError
-from phasemark import data as files
-from phasemark.data.plan import read_toml
-from phasemark.data.plan_kinds import schema_of
+from phasemark.data.frame_plan import FramePlan
+from phasemark.data.plan import BankPlan, ScenePlan, read_plan, read_toml
 from phasemark.matcher.design import DesignPlan, example_design, load_design_plan
 from phasemark.matcher.drive import DrivePlan, example_drive, load_drive_plan
 from phasemark.matcher.sweep_plan import SweepPlan, load_sweep
@@ -29,18 +29,36 @@ class _Kind:
     keys: frozenset[str]
 
 
-def _example_sweep() -> str:
-    return resources.files("phasemark.matcher").joinpath("plans", "paper.toml").read_text(encoding="utf-8")
+def _shipped(package: str, name: str) -> Callable[[], str]:
+    return partial(resources.files(package).joinpath("plans", name).read_text, encoding="utf-8")
+
+
+def _load_scene(model: type[ScenePlan], path: str | os.PathLike[str]) -> BaseModel:
+    plan = read_plan(path, model)
+    try:
+        return plan.resolve()
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
 
 
 _KINDS = {
-    "sweep": _Kind(SweepPlan, _example_sweep, lambda path: load_sweep(path).resolve(), frozenset({"axes", "methods"})),
+    "frames": _Kind(
+        FramePlan, _shipped("phasemark.data", "frames.toml"), partial(_load_scene, FramePlan), frozenset({"views"})
+    ),
+    "sweep": _Kind(
+        SweepPlan,
+        _shipped("phasemark.matcher", "paper.toml"),
+        lambda path: load_sweep(path).resolve(),
+        frozenset({"axes", "methods"}),
+    ),
     "drive": _Kind(DrivePlan, example_drive, load_drive_plan, frozenset({"map", "path", "odometry"})),
     "design": _Kind(
         DesignPlan, example_design, load_design_plan, frozenset({"n_classes", "limits", "sampling", "search"})
     ),
+    # last, and without keys of its own: what is none of the others
+    "bank": _Kind(BankPlan, _shipped("phasemark.data", "bank.toml"), partial(_load_scene, BankPlan), frozenset()),
 }
-KINDS = (*files.PLAN_KINDS, *_KINDS)
+KINDS = ("bank", *(name for name in _KINDS if name != "bank"))
 """Names of all kinds."""
 
 
@@ -60,8 +78,7 @@ def plan_example(kind: str) -> str:
     UsageError
         There is no such kind.
     """
-    _refuse_unknown(kind)
-    return _KINDS[kind].example() if kind in _KINDS else files.plan_example(kind)
+    return _kind(kind).example()
 
 
 def plan_schema(kind: str) -> dict[str, Any]:
@@ -80,8 +97,8 @@ def plan_schema(kind: str) -> dict[str, Any]:
     UsageError
         There is no such kind.
     """
-    _refuse_unknown(kind)
-    return schema_of(kind, _KINDS[kind].model) if kind in _KINDS else files.plan_schema(kind)
+    schema = _kind(kind).model.model_json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": f"phasemark {kind} plan"}
 
 
 def check_plan(path: str | os.PathLike[str], kind: str | None = None) -> tuple[str, BaseModel]:
@@ -96,7 +113,7 @@ def check_plan(path: str | os.PathLike[str], kind: str | None = None) -> tuple[s
     Returns
     -------
     kind : str
-    plan : BankPlan, FramePlan, SweepPlan or DrivePlan
+    plan : BankPlan, FramePlan, SweepPlan, DrivePlan or DesignPlan
         The resolved plan.
 
     Raises
@@ -109,13 +126,11 @@ def check_plan(path: str | os.PathLike[str], kind: str | None = None) -> tuple[s
             keys = set(read_toml(path))
         except InputFileError:
             keys = set()  # reading it below says what is wrong
-        kind = next((name for name, one in _KINDS.items() if keys & one.keys), None)
-    if kind is None or kind in files.PLAN_KINDS:
-        return files.check_plan(path, kind)
-    _refuse_unknown(kind)
-    return kind, _KINDS[kind].load(path)
+        kind = next((name for name, one in _KINDS.items() if keys & one.keys), "bank")
+    return kind, _kind(kind).load(path)
 
 
-def _refuse_unknown(kind: str) -> None:
-    if kind not in KINDS:
-        raise UsageError(f"unknown kind of plan '{kind}': there are {', '.join(KINDS)}")
+def _kind(name: str) -> _Kind:
+    if name not in _KINDS:
+        raise UsageError(f"unknown kind of plan '{name}': there are {', '.join(KINDS)}")
+    return _KINDS[name]

@@ -16,7 +16,6 @@ from regenerate_golden import BANK, BANK_PLAN, FRAMES, FRAMES_PLAN
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
 from phasemark.data import build_bank, build_frames, open_bank, open_frames, verify_bank, verify_frames
-from phasemark.data import plan_schema as data_plan_schema
 from phasemark.matcher.plan_kinds import KINDS, check_plan, plan_example, plan_schema
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -117,7 +116,7 @@ def test_plan_commands_print_and_check(tmp_path, capsys):
     assert main(["plan", "schema", "tour"]) == 2
     assert "unknown kind of plan 'tour': there are bank, frames, sweep, drive" in capsys.readouterr().err
     with pytest.raises(UsageError, match="unknown kind of plan 'tour'"):
-        data_plan_schema("tour")
+        plan_schema("tour")
 
 
 @pytest.mark.parametrize("golden", [BANK, FRAMES], ids=["bank", "frames"])
