@@ -1,15 +1,13 @@
 """What no matcher should take for a landmark it knows: other shapes, and frames that were damaged."""
 
-import math
-
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from phasemark.matcher import FilteredFrames, PixelState, kalman_filter
-from phasemark.render import Frames, predicted_range_std
+from phasemark.matcher import kalman_filter
+from phasemark.render import Frames
 
 
 def strangers():
@@ -30,22 +28,6 @@ def strangers():
         "pyramid": trimesh.convex.convex_hull(np.array([*corners, [0, 0, 0.15]])),
     }
     return {name: trimesh.boolean.union([box, upper], engine="manifold") for name, upper in uppers.items()}
-
-
-def noise_free(images):
-    """Return what 50 frames without their noise give, with its size."""
-    sensor = images.sensor
-    std = predicted_range_std(images.amplitude, images.intensity, sensor)
-    returned = std <= 0.1 * sensor.metres_per_radian
-    return FilteredFrames(
-        range_m=np.where(returned, images.range_m, np.nan),
-        std_m=np.where(returned, std / math.sqrt(50), np.nan),
-        amplitude_e=None,
-        intensity_e=None,
-        state=np.where(returned, PixelState.RETURN, PixelState.NO_RETURN).astype(np.uint8),
-        n_effective=np.where(returned, 50.0, 0.0),
-        sensor=sensor,
-    )
 
 
 DAMAGE = {

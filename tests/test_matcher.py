@@ -9,10 +9,10 @@ import pytest
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import FilteredFrames, Matcher, Matches, PixelState, kalman_filter
+from phasemark.matcher import FilteredFrames, Matcher, Matches, PixelState, kalman_filter, noise_free
 from phasemark.matcher.coarse import DISAGREEMENT, Observation, Templates
 from phasemark.matcher.picture import match_picture, model_range_m
-from phasemark.render import Background, Frames, PhasorImages, Renderer, capture, predicted_range_std, preset
+from phasemark.render import Background, Frames, PhasorImages, Renderer, capture, preset
 
 SENSOR = preset("pmd-16x16")
 WALL = Background(wall_m=3.0)
@@ -30,21 +30,6 @@ def full_bank(tmp_path_factory):
     plan = BankPlan(classes=("cone", "post"), layout="full", distance_m="0.9:1.1:0.05", delta_deg="0:180:30")
     with build_bank(plan, tmp_path_factory.mktemp("bank") / "full.h5") as opened:
         yield opened
-
-
-def noise_free(images: PhasorImages) -> FilteredFrames:
-    """Return what an endless measurement gives: exact ranges, the noise of 50 frames, no return below the threshold."""
-    std = predicted_range_std(images.amplitude, images.intensity, images.sensor)
-    returned = std <= images.sensor.max_phase_std_rad * images.sensor.metres_per_radian
-    return FilteredFrames(
-        range_m=np.where(returned, images.range_m, np.nan),
-        std_m=np.where(returned, std / math.sqrt(50), np.nan),
-        amplitude_e=None,
-        intensity_e=None,
-        state=np.where(returned, PixelState.RETURN, PixelState.NO_RETURN).astype(np.uint8),
-        n_effective=np.where(returned, 50.0, 0.0),
-        sensor=images.sensor,
-    )
 
 
 def bank_images(bank, background):
@@ -66,7 +51,7 @@ def bank_images(bank, background):
 def test_every_noise_free_bank_entry_is_found_as_itself(which, background, request):
     bank = request.getfixturevalue(which)
     keys, images = bank_images(bank, background)
-    matches = Matcher(bank, background=background).match(noise_free(images))
+    matches = Matcher(bank, background=background).match(noise_free(images, 50))
     found = [
         (
             m.class_name,
@@ -141,7 +126,7 @@ def test_the_narrow_face_near_is_told_from_the_wide_face_far_by_what_does_not_re
     # PHYSICS section 7: at δ = 90° the near face is half the difference of the sides, 4 cm, further away; ranges alone
     # tie wherever the narrow face is seen, the width decides
     image = Renderer(build_mesh(catalog()["post"]), SENSOR).render([1.0, 0.96], [0.0, math.pi / 2])
-    matches = Matcher(bank).match(noise_free(image))
+    matches = Matcher(bank).match(noise_free(image, 50))
     np.testing.assert_allclose(matches.distance_m, [1.0, 0.96], atol=1e-9)
     np.testing.assert_allclose(matches.delta_rad, [0.0, math.pi / 2], atol=1e-9)
 
@@ -176,7 +161,7 @@ def test_too_few_returns_are_an_answer(bank, n_valid):
 
 def test_missing_pixels_say_nothing(bank):
     image = Renderer(build_mesh(catalog()["cone"]), SENSOR).render(1.0, math.radians(20))
-    full = noise_free(image)
+    full = noise_free(image, 50)
     state = full.state.copy()
     state[:, :, ::2] = PixelState.MISSING
     holes = FilteredFrames(full.range_m, full.std_m, None, None, state, full.n_effective, SENSOR)
@@ -215,7 +200,7 @@ def test_a_strange_shape_is_not_accepted(bank):
 
 def test_matches_are_a_sequence_with_the_fields_as_arrays(bank):
     _, images = bank_images(bank, None)
-    matches = Matcher(bank).match(noise_free(images)[:7])
+    matches = Matcher(bank).match(noise_free(images, 50)[:7])
     assert isinstance(matches, Matches)
     assert len(matches) == len(list(matches)) == 7
     assert matches[2:5].distance_m.tolist() == [match.distance_m for match in matches][2:5]
@@ -251,7 +236,7 @@ def test_wrong_arguments_are_refused(bank, arguments, message):
 def test_the_model_beside_a_match_is_the_bank_image_composed_with_the_background(bank):
     keys, images = bank_images(bank, WALL)
     k = keys.index(("cone", 5, 4))
-    (match,) = Matcher(bank, background=WALL).match(noise_free(images)[k])
+    (match,) = Matcher(bank, background=WALL).match(noise_free(images, 50)[k])
     model = model_range_m(bank, match, WALL)
     np.testing.assert_allclose(model, images.range_m[k], atol=1e-6)  # float32 phasors
-    assert len(match_picture(noise_free(images), match, bank, WALL, k).axes) == 6  # three panels, three colour bars
+    assert len(match_picture(noise_free(images, 50), match, bank, WALL, k).axes) == 6  # three panels, three colour bars

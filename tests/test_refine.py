@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
-from open_set import DAMAGE, check_damaged, noise_free, strangers
+from open_set import DAMAGE, check_damaged, strangers
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
+from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, noise_free
+from phasemark.matcher.likelihood import Evidence
 from phasemark.matcher.models import VIEW, BankModel, RenderedModel
+from phasemark.matcher.refine import Settings, _Problem
 from phasemark.matcher.trials import Conditions, noisy_frames, run_trials
 from phasemark.render import Background, Frames, Renderer, Views, capture, predicted_range_std, preset
 
@@ -75,7 +77,7 @@ def test_rendered_images_are_the_renderers_own_with_its_jacobian(bank, renderers
 @pytest.mark.parametrize("delta_deg", [0.003, 179.997, 0.0, 90.0, 45.3])
 def test_a_noise_free_view_is_found_exactly_over_the_seam_and_at_the_quarter_turns(bank, renderers, delta_deg):
     image = renderers["sphere"].render(1.0234, math.radians(delta_deg))
-    match = Matcher(bank, "refine").match(noise_free(image))[0]
+    match = Matcher(bank, "refine").match(noise_free(image, 50))[0]
     assert match.class_name == "sphere"
     assert match.distance_m == pytest.approx(1.0234, abs=1e-4)  # a third of the bound of 50 frames
     error = math.remainder(match.delta_rad - math.radians(delta_deg), math.pi)
@@ -87,7 +89,7 @@ def test_a_noise_free_view_is_found_exactly_over_the_seam_and_at_the_quarter_tur
 @pytest.mark.parametrize("distance_m", [0.7501, 1.6499])
 def test_views_in_the_last_cells_of_the_grid_are_found(bank, renderers, distance_m):
     image = renderers["cylinder"].render(distance_m, 0.7)
-    match = Matcher(bank, "refine").match(noise_free(image))[0]
+    match = Matcher(bank, "refine").match(noise_free(image, 50))[0]
     assert match.distance_m == pytest.approx(distance_m, abs=2e-4)
     assert match.accepted
 
@@ -174,7 +176,7 @@ def test_a_stranger_on_the_same_box_is_refused(bank, name):
     views = Views.broadcast(rng.uniform(0.8, 1.2, n), rng.uniform(0, np.pi, n))
     matcher = Matcher(bank, "refine")
     images = renderer.render_views(views)
-    noncentrality = matcher.match(noise_free(images)).chi2  # after refitting the view, of the nearest class
+    noncentrality = matcher.match(noise_free(images, 50)).chi2  # after refitting the view, of the nearest class
     far = noncentrality >= 150
     assert far.mean() > 0.95
     matches = matcher.match(kalman_filter(capture(images, SENSOR, rng=rng, n_frames=50)))
@@ -196,7 +198,7 @@ def test_a_scene_without_a_landmark_is_none(bank, background, scene):
 
 def test_a_post_in_the_way_shows_in_the_fit_and_robust_residuals_bear_it(bank, renderers):
     image = renderers["cylinder"].render(1.0, 0.6)
-    frames = noise_free(image)
+    frames = noise_free(image, 50)
     ranges = frames.range_m.copy()
     ranges[0, 9:13, 4] -= 0.15  # four pixels of the box hidden
     hidden = FilteredFrames(ranges, frames.std_m, None, None, frames.state, frames.n_effective, SENSOR)
@@ -234,6 +236,41 @@ def test_a_camera_with_unknown_offsets_still_gets_class_and_view_but_is_not_acce
     assert np.median(np.abs(matches.distance_m - views.distance_m)) < 10e-3
 
 
+@pytest.mark.parametrize("method", ["nearest", "refine"])
+def test_the_range_offset_of_a_sensor_is_taken_off(bank, method):
+    # 5 cm, seventeen times the noise of a pixel: a wrong sign would put the landmark 10 cm off
+    late = SENSOR.with_(range_offset_m=0.05)
+    image = Renderer(build_mesh(catalog()["cone"]), late, albedo=0.8).render(1.0, 0.6)
+    frames = kalman_filter(capture(image, late, rng=np.random.default_rng(3), n_frames=50))
+    assert np.nanmin(frames.range_m) > np.nanmin(image.range_m) + 0.04
+    match = Matcher(bank, method).match(frames)[0]
+    assert match.accepted
+    assert abs(match.distance_m - 1.0) < 0.01 if method == "nearest" else abs(match.distance_m - 1.0) < 2e-3
+
+
+@pytest.mark.parametrize("on", ["ranges", "phasors"])
+def test_rendering_only_the_rows_that_turn_gives_the_whole_image(bank, on):
+    dim = Renderer(build_mesh(catalog()["cone"]), SENSOR, albedo=0.5)
+    frames = noisy_frames(
+        dim, SENSOR, Views.broadcast(1.0, [0.6, 1.1]), Conditions(on=on, background=WALL), np.random.default_rng(4)
+    )
+    behind = Renderer(None, SENSOR).render(1.0, background=WALL).phasor.reshape(-1)
+    settings = Settings(VIEW[:2], np.ones(256, bool), background=behind)
+    cone, evidence = np.full(2, bank.classes.index("cone")), Evidence.from_frames(frames, on)
+    problem = _Problem(RenderedModel(bank, WALL), evidence, np.arange(2), cone, settings, np.full(2, np.inf))
+    state = problem.start(np.array([[1.0, 0.6, 0, 0], [1.0, 1.1, 0, 0]]), False)
+    theta = state.theta.copy()
+    theta[:, 1] += 0.01
+    if on == "phasors":
+        assert (np.abs(theta[:, 4] - 0.5 / 0.8) < 0.02).all()  # the factor on the bank's albedo was found
+    turned, anew = problem.turned(state, np.arange(2), theta), problem.state(theta, state.use)
+    # the facets of a solid of revolution turn too: within the renderer's budget of 1e-4
+    for name in ("phasor", "intensity", "coverage"):
+        new, whole = getattr(turned.images, name), getattr(anew.images, name)
+        assert np.abs(new - whole).max() <= 1e-4 * np.abs(whole).max()
+    np.testing.assert_allclose(turned.sums.cost, anew.sums.cost, rtol=1e-2)
+
+
 def test_lower_pixels_alone_can_give_the_view(bank, renderers):
     frames = noisy_frames(renderers["cone"], SENSOR, Views.broadcast(1.0, 0.8), Conditions(), np.random.default_rng(10))
     lower = Matcher(bank, "refine", pixels="lower").match(frames)[0]
@@ -244,7 +281,7 @@ def test_lower_pixels_alone_can_give_the_view(bank, renderers):
 
 def test_a_match_tells_weights_condition_and_weak_direction(bank, renderers):
     image = renderers["cylinder"].render(1.3, 0.5)
-    match = Matcher(bank, "refine").match(noise_free(image))[0]
+    match = Matcher(bank, "refine").match(noise_free(image, 50))[0]
     assert sum(match.class_probability.values()) == pytest.approx(1)
     assert match.class_probability["cylinder"] > 0.99
     assert {other.class_name for other in match.alternatives} >= {"cone", "sphere", "post"}

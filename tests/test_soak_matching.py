@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
-from open_set import DAMAGE, check_damaged, noise_free, strangers
+from open_set import DAMAGE, check_damaged, strangers
 from oracles import adaptive_images
 
 from phasemark.data import BankPlan, build_bank
@@ -19,6 +19,7 @@ from phasemark.matcher import (
     confusion_probability,
     cramer_rao,
     kalman_filter,
+    noise_free,
     run_trials,
     share,
 )
@@ -161,7 +162,7 @@ def test_at_most_one_stranger_in_a_hundred_is_accepted(bank, name):
     renderer = Renderer(strangers()[name], SENSOR, albedo=0.8)
     image = renderer.render_views(Views.broadcast(rng.uniform(0.8, 1.2, n), rng.uniform(0, math.pi, n)))
     matcher = Matcher(bank, "refine")
-    noncentrality = matcher.match(noise_free(image)).chi2
+    noncentrality = matcher.match(noise_free(image, 50)).chi2
     assert noncentrality.min() >= 150
     assert share(int(matcher.match(take(image, rng)).accepted.sum()), n).high <= 0.01
 
@@ -190,7 +191,7 @@ def test_classes_are_confused_no_more_than_they_must_be(bank, renderers, distanc
         views = Views.broadcast(distance_m + rng.uniform(-0.005, 0.005, n), rng.uniform(0, math.pi, n))
         image = renderer.render_views(views)
         squared = np.full((n, len(bank.classes)), np.inf)
-        for k, match in enumerate(matcher.match(noise_free(image))):
+        for k, match in enumerate(matcher.match(noise_free(image, 50))):
             for other in match.alternatives:
                 if other.class_name != name:
                     c = bank.classes.index(other.class_name)
