@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, WithJsonSchema, model_validator
 from scipy import special
-from scipy.stats import qmc
 
 from phasemark import UsageError
 from phasemark.data.plan import MeshPlan, PlanModel, ScenePlan
@@ -292,6 +291,8 @@ class FramePlan(ScenePlan):
         return np.maximum(raw, 2.0**-54)
 
     def _sobol(self, start: int, stop: int) -> dict[str, NDArray[np.float64]]:
+        from scipy.stats import qmc  # slow to import
+
         names = [
             name for name in QUANTITIES if (spread := getattr(self, name)) is not None and spread.sobol is not None
         ]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy import special
 
 from phasemark import UsageError
 from phasemark.matcher.likelihood import Quantity, counts
@@ -208,7 +208,7 @@ def confusion_probability(distance_squared: ArrayLike) -> NDArray[np.float64]:
         its views: what a matcher reports as cost on frames without noise.
     """
     d = np.sqrt(np.asarray(distance_squared, np.float64))
-    return np.asarray(stats.norm.sf(d / 2).sum(axis=-1))
+    return np.asarray(special.ndtr(-d / 2).sum(axis=-1))
 
 
 def nees(error: ArrayLike, covariance: ArrayLike) -> NDArray[np.float64]:
@@ -254,8 +254,10 @@ def share(successes: int, n: int) -> Estimate:
     """
     if n == 0:
         return Estimate(math.nan, 0.0, 1.0)
-    low, high = stats.binomtest(int(successes), n).proportion_ci(0.95, method="exact")
-    return Estimate(successes / n, float(low), float(high))
+    k, tail = int(successes), 0.025
+    low = float(special.betaincinv(k, n - k + 1, tail)) if k else 0.0
+    high = float(special.betaincinv(k + 1, n - k, 1 - tail)) if k < n else 1.0
+    return Estimate(k / n, low, high)
 
 
 def efficiency(error: ArrayLike, std: ArrayLike) -> Estimate:
@@ -294,4 +296,4 @@ def covers(error: ArrayLike, covariance: ArrayLike, level: float = 0.95) -> NDAr
     (n,) bool
     """
     e = np.asarray(error, np.float64)
-    return np.asarray(nees(e, covariance) <= stats.chi2.ppf(level, e.shape[1]))
+    return np.asarray(nees(e, covariance) <= special.chdtri(e.shape[1], 1 - level))

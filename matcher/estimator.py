@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from phasemark import UsageError
 from phasemark.data import Bank
@@ -191,7 +191,7 @@ class MaximumLikelihood:
             fit may be a side peak.
             """
             best = _best_of_frame(fits)
-            limit = stats.chi2.isf(_DOUBTFUL if side_peaks else _HOPELESS, np.maximum(fits.dof[best], 1))
+            limit = special.chdtri(np.maximum(fits.dof[best], 1), _DOUBTFUL if side_peaks else _HOPELESS)
             cost, frame = fits.cost[best], fits.frame[best]
             certain = evidence.on == "phasors" or self.background is not None or hopeless
             hope = True if certain else cost < bare[frame]
@@ -241,13 +241,13 @@ class MaximumLikelihood:
         if not np.isfinite(fits.cost).any():
             return False
         best = fits.cost.argmin()
-        return bool(fits.cost[best] > stats.chi2.isf(_DOUBTFUL, max(int(fits.dof[best]), 1)))
+        return bool(fits.cost[best] > special.chdtri(max(int(fits.dof[best]), 1), _DOUBTFUL))
 
     def _worth_a_search(self, evidence: Evidence, bare: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return which frames have enough returns to place a landmark, and are not explained without one."""
         returned = evidence.seen.returned
         enough = (returned & self._used).sum(axis=1) >= MIN_RETURNS
-        explained = bare <= stats.chi2.isf(self.false_alarm, np.maximum(returned.sum(axis=1), 1))
+        explained = bare <= special.chdtri(np.maximum(returned.sum(axis=1), 1), self.false_alarm)
         return np.flatnonzero(enough & ~explained)
 
     def _fit(
@@ -358,7 +358,7 @@ class MaximumLikelihood:
         p_values = p_values_of(fits.cost, fits.dof, frames, fits.frame)
         order = np.lexsort((fits.cost, fits.frame))
         first = np.searchsorted(fits.frame[order], np.arange(len(frames) + 1))
-        doubt = np.asarray(stats.chi2.isf(self.false_alarm, np.maximum(fits.dof, 1)))
+        doubt = np.asarray(special.chdtri(np.maximum(fits.dof, 1), self.false_alarm), np.float64)
         answers = []
         for k in range(len(frames)):
             own = order[first[k] : first[k + 1]]
@@ -508,14 +508,14 @@ def p_values_of(
     """
     freedom = np.maximum(dof, 1).astype(np.float64)
     if not frames.std_from_scatter:
-        p = stats.chi2.sf(cost, freedom)
+        p = special.chdtrc(freedom, cost)
     else:
         n = np.where(frames.n_effective > 0, frames.n_effective, np.nan).reshape(len(frames), -1)
         nu = np.array([np.nanmedian(row) if np.isfinite(row).any() else 0.0 for row in n])[frame] - 1
         nu = np.maximum(nu, 5.0)  # the variance of F(1, ν) exists above 4
         mean = freedom * nu / (nu - 2)
         variance = freedom * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
-        p = stats.chi2.sf(cost * 2 * mean / variance, 2 * mean**2 / variance)
+        p = special.chdtrc(2 * mean**2 / variance, cost * 2 * mean / variance)
     return np.where(dof > 0, p, 0.0)
 
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import special
 
 from phasemark.matcher.bounds import Estimate
 
@@ -32,7 +32,7 @@ def wilson(successes: int, n: int, level: float = 0.95) -> Estimate:
     """
     if n == 0:
         return Estimate(math.nan, 0.0, 1.0)
-    z = float(stats.norm.ppf((1 + level) / 2))
+    z = float(special.ndtri((1 + level) / 2))
     p = successes / n
     middle = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
@@ -49,7 +49,7 @@ def mean_interval(values: ArrayLike, level: float = 0.95) -> Estimate:
     if n < 2:
         return Estimate(float(array.mean()) if n else math.nan, -math.inf, math.inf)
     mean = float(array.mean())
-    half = float(stats.t.ppf((1 + level) / 2, n - 1)) * float(array.std(ddof=1)) / math.sqrt(n)
+    half = float(special.stdtrit(n - 1, (1 + level) / 2)) * float(array.std(ddof=1)) / math.sqrt(n)
     return Estimate(mean, mean - half, mean + half)
 
 
@@ -66,6 +66,6 @@ def rms_interval(values: ArrayLike, level: float = 0.95) -> Estimate:
     mean = float(squares.mean())
     if mean == 0:
         return Estimate(0.0, 0.0, 0.0)
-    half = float(stats.t.ppf((1 + level) / 2, n - 1)) * float(squares.std(ddof=1)) / (2 * mean * math.sqrt(n))
+    half = float(special.stdtrit(n - 1, (1 + level) / 2)) * float(squares.std(ddof=1)) / (2 * mean * math.sqrt(n))
     rms = math.sqrt(mean)
     return Estimate(rms, rms * math.exp(-half), rms * math.exp(half))

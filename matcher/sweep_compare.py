@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from scipy import stats
+from scipy import special
 
 from phasemark import UsageError
 from phasemark.matcher.sweep_plan import Condition
@@ -71,7 +71,7 @@ def compare_cells(first: Sequence[Cell], second: Sequence[Cell]) -> tuple[Differ
             if name in other.rmse:
                 a, b = cell.rmse[name], other.rmse[name]
                 errors = [math.log(x.high / x.value) if x.value > 0 and x.high < math.inf else math.nan for x in (a, b)]
-                scale = math.hypot(*errors) / float(stats.norm.ppf(0.975))
+                scale = math.hypot(*errors) / float(special.ndtri(0.975))
                 z = (math.log(a.value / b.value) / scale) if scale > 0 else 0.0 if a.value == b.value else math.nan
                 found.append(_difference(cell, f"rmse {name}", a.value, b.value, z))
         for name in ("class_right", "outliers", "accepted"):
@@ -88,7 +88,7 @@ def compare_cells(first: Sequence[Cell], second: Sequence[Cell]) -> tuple[Differ
 
 
 def _difference(cell: Cell, quantity: str, first: float, second: float, z: float) -> Difference:
-    p_value = 1.0 if math.isnan(z) else float(2 * stats.norm.sf(abs(z)))
+    p_value = 1.0 if math.isnan(z) else float(2 * special.ndtr(-abs(z)))
     return Difference(cell.condition, cell.method, quantity, first, second, p_value, False)
 
 

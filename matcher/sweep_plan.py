@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
-from scipy.stats import qmc
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, parse_grid
@@ -263,6 +262,8 @@ class SweepPlan(ScenePlan):
         )
 
     def _sobol(self, axes: dict[str, tuple[float, ...]]) -> list[dict[str, float]]:
+        from scipy.stats import qmc  # slow to import
+
         if not axes:
             return [{}]
         # the scrambling spawns streams of its own, which a Philox keyed by hand cannot

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from phasemark.matcher.bounds import Estimate, nees
 from phasemark.matcher.intervals import mean_interval, rms_interval, wilson
@@ -165,7 +165,7 @@ class SweepTrials:
         bounded = np.isfinite(std).all(axis=1)
         honest = inner & np.isfinite(covariance).all(axis=(1, 2))
         squared = nees(error[honest], covariance[honest]) if honest.any() else np.empty(0)
-        limits = [float(stats.chi2.ppf(level, len(at))) for level in LEVELS]
+        limits = [float(special.chdtri(len(at), 1 - level)) for level in LEVELS]
         typical = np.median(bound[bounded], axis=0) if bounded.any() else np.full(bound.shape[1:], np.nan)
         condition_number, weak = _observability(typical, at)
         return Cell(

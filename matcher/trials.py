@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from phasemark.matcher.bounds import Estimate, covers, cramer_rao, efficiency, mean_of, nees, share
 from phasemark.matcher.filters import FilteredFrames, kalman_filter, phasor_mean
@@ -116,7 +116,7 @@ class Trials:
         """Errors beyond 5 σ of the bound, or of the matcher's own covariance in any direction, or no view, (n,)."""
         with np.errstate(invalid="ignore"):
             own = np.abs(self.error) > OUTLIER_SIGMA * np.sqrt(np.einsum("npp->np", self.covariance))
-            limit = stats.chi2.isf(2 * stats.norm.sf(OUTLIER_SIGMA), len(self.free))
+            limit = special.chdtri(len(self.free), 2 * special.ndtr(-OUTLIER_SIGMA))
             improbable = nees(self.error, self.covariance) > limit
         return np.asarray(self.astray | own.any(axis=1) | improbable)
 

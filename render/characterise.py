@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from phasemark import UsageError
 from phasemark.render.capture import capture
@@ -103,7 +103,7 @@ class Comparison:
     @property
     def p_value(self) -> float:
         """Probability of a larger χ² if the prediction is right; 1 if nothing is compared."""
-        return float(stats.chi2.sf(self.chi2, self.degrees_of_freedom)) if self.degrees_of_freedom else 1.0
+        return float(special.chdtrc(self.degrees_of_freedom, self.chi2)) if self.degrees_of_freedom else 1.0
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists, for JSON."""
@@ -226,7 +226,7 @@ class Characterisation:
     @property
     def p_value(self) -> float:
         """Probability of a larger χ² over all points if every prediction is right."""
-        return float(stats.chi2.sf(self.chi2, self.degrees_of_freedom)) if self.degrees_of_freedom else 1.0
+        return float(special.chdtrc(self.degrees_of_freedom, self.chi2)) if self.degrees_of_freedom else 1.0
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain numbers, lists and strings, for JSON; None where there is no number."""
@@ -641,8 +641,8 @@ def _interpolated(x: _Float, share: _Float, error: _Float, level: float) -> tupl
     step = float(x[j] - x[j - 1])
     if share[j - 1] == 0 or share[j] == 1:
         return float(x[j] + x[j - 1]) / 2, step / 2
-    left, right, at = (float(stats.norm.ppf(value)) for value in (share[j - 1], share[j], level))
-    slope = (right - left) / step * float(stats.norm.pdf(at))
+    left, right, at = (float(special.ndtri(value)) for value in (share[j - 1], share[j], level))
+    slope = (right - left) / step * math.exp(-(at**2) / 2) / math.sqrt(2 * math.pi)
     return float(x[j - 1]) + (at - left) / (right - left) * step, max(float(error[j - 1]), float(error[j])) / slope
 
 
@@ -696,7 +696,7 @@ def _return_probability(expected: ExpectedFlatField) -> _Float:
     amplitude = np.abs(expected.phasor_e)
     noisy = variance > 0
     scale = np.where(noisy, variance, 1.0)
-    passed = stats.ncx2.sf(limit**2 / scale, 2, np.maximum(amplitude**2 / scale, 1e-12))
+    passed = 1 - special.chndtr(limit**2 / scale, 2, amplitude**2 / scale)
     return np.where(noisy, passed, amplitude >= limit)
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import optimize, special
 
 from phasemark import UsageError
 from phasemark.render.correlation import Harmonic, correlation_curve, correlation_peak
@@ -412,7 +412,7 @@ class _Data:
         scaled = np.where(good, self.variance_m2 * self.light, np.nan)  # shot noise: σ² follows 1 / light
         middle = np.nanmedian(scaled, axis=(1, 2), keepdims=True)
         stuck = good & (middle > 0).all() & (self.variance_m2 == 0).any(axis=0)
-        limit = stats.chi2.ppf(1 - _PIXEL_FALSE_ALARM / scaled.size, self.n - 1) / np.maximum(self.n - 1, 1)
+        limit = special.chdtri(self.n - 1, _PIXEL_FALSE_ALARM / scaled.size) / np.maximum(self.n - 1, 1)
         loud = np.nan_to_num(scaled) > np.maximum(limit, _NOISY_FACTOR**2) * middle
         centre = np.nanmedian(offset_m)
         spread = 1.4826 * np.nanmedian(np.abs(offset_m - centre))

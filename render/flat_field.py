@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
+from scipy import special
 
 from phasemark import UsageError
 from phasemark.render.background import Background
@@ -181,7 +181,7 @@ class ExpectedFlatField:
         counts = np.arange(math.ceil(EXACT_POISSON_BELOW + 12 * math.sqrt(EXACT_POISSON_BELOW)))
         kept = np.where(counts < well, read_below_top(counts.astype(np.float64)), 0.0)
         for level in np.unique(mean[few]):
-            clear[mean == level] = stats.poisson.pmf(counts, level) @ kept
+            clear[mean == level] = np.exp(special.xlogy(counts, level) - special.gammaln(counts + 1) - level) @ kept
         many = mean[~few]
         edge = min(well, top + 8 * sensor.read_noise_e)
         low, std = many - 8 * np.sqrt(many), np.sqrt(many)

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from phasemark.landmarks import Box, Cone, Cylinder, Revolution, Sphere
 from phasemark.landmarks.spec import Upper
@@ -119,6 +118,8 @@ def neighbours(upper: Upper, steps: int, lattice: Lattice) -> Iterator[Upper]:
 
 def _spread(dimensions: int, n: int, seed: int) -> NDArray[np.float64]:
     """Return points that fill a unit cube evenly, (n, dimensions)."""
+    from scipy.stats import qmc  # slow to import
+
     return np.asarray(qmc.Halton(dimensions, rng=np.random.default_rng(seed)).random(n))
 
 

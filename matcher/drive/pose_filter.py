@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from phasemark.matcher.drive.odometry import OdometryModel, Reading, motion_jacobian, motion_noise, moved
 from phasemark.matcher.landmark_map import Placement
@@ -43,7 +43,7 @@ class PoseFilter:
         self.state: NDArray[np.float64] = np.array([*pose, 0.0, 0.0])
         self.covariance = model.start(pose_covariance)
         self._model = model
-        self._limit = float(stats.chi2.ppf(gate, POSE))
+        self._limit = float(special.chdtri(POSE, 1 - gate))
 
     @property
     def pose(self) -> NDArray[np.float64]:
