@@ -121,7 +121,7 @@ def read_frames(
         The file cannot be read, is empty or damaged, or its frames do not have the sensor's pixels; names file, line
         and column where there are any.
     UsageError
-        `unit` or `quantity` is missing, contradicts the file, or is not one of the above.
+        `unit` or `quantity` is missing though the file says neither, contradicts the file, or is not one of the above.
 
     Warns
     -----
@@ -214,7 +214,9 @@ def _settled(name: str, given: str | None, raw: _Raw, known: tuple[str, ...], pa
         raise UsageError(f"--{name} is {given}, but {path} says {stated}")
     value = given or stated
     if value is None:
-        raise UsageError(f"{path}: does not say its {name}: give --{name} {'|'.join(known)}")
+        # a file that says one of the two was written by a program that says both: damaged, or somebody else's
+        asked = InputFileError if raw.stated else UsageError
+        raise asked(f"{path}: does not say its {name}: give --{name} {'|'.join(known)}")
     return value
 
 

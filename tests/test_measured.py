@@ -217,6 +217,14 @@ def test_a_missing_or_wrong_option_is_a_usage_error_that_names_it(tmp_path, opti
         read_frames(path, sensor=SMALL, **options)
 
 
+def test_a_file_that_says_one_of_unit_and_quantity_has_lost_the_other(tmp_path):
+    path = tmp_path / "frames.npz"
+    np.savez(path, range=IMAGE[None], unit="m")
+    with pytest.raises(InputFileError, match=r"does not say its quantity: give --quantity range\|z"):
+        read_frames(path, sensor=SMALL)
+    assert read_frames(path, sensor=SMALL, quantity="range").range_m[0, 0].tolist() == IMAGE.tolist()
+
+
 def test_ranges_no_such_camera_can_measure_are_invalid_with_a_warning(tmp_path):
     path = csv_file(tmp_path, "1,2,3,4,5,6\n1,0,-3,4,15,6\n")  # c / 2f is 14.99 m
     with pytest.warns(

@@ -1,5 +1,7 @@
 """Which landmark to build: searched for a camera and a working range, drawn, and confirmed by simulated frames."""
 
+from typing import TYPE_CHECKING
+
 from phasemark.matcher.design.bound import RangeBound, range_bound
 from phasemark.matcher.design.confirm import Confirmation, Trial, confirm, confirm_design, ratio
 from phasemark.matcher.design.drawing import drawing_svg
@@ -12,7 +14,6 @@ from phasemark.matcher.design.output import (
     summary,
     write_design,
 )
-from phasemark.matcher.design.picture import bound_picture, pareto_picture
 from phasemark.matcher.design.plan import (
     DesignPlan,
     LimitsPlan,
@@ -26,6 +27,9 @@ from phasemark.matcher.design.rules import Check, Room
 from phasemark.matcher.design.run import run_design
 from phasemark.matcher.design.search import Candidate, Design, Scored
 from phasemark.matcher.design.separation import ClassDistances, most_apart, turn_distance
+
+if TYPE_CHECKING:
+    from phasemark.matcher.design.picture import bound_picture, pareto_picture
 
 __all__ = [
     "Candidate",
@@ -62,3 +66,12 @@ __all__ = [
     "turn_distance",
     "write_design",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Import pictures when they are asked for: matplotlib takes half a second to load."""
+    if name in ("bound_picture", "pareto_picture"):
+        from phasemark.matcher.design import picture
+
+        return getattr(picture, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

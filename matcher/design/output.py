@@ -19,7 +19,6 @@ from phasemark.matcher.bounds import Estimate, confusion_probability
 from phasemark.matcher.design.bound import RangeBound
 from phasemark.matcher.design.confirm import Confirmation, ratio
 from phasemark.matcher.design.drawing import drawing_svg
-from phasemark.matcher.design.picture import bound_picture, pareto_picture
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.search import Design, Scored
 
@@ -252,6 +251,8 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
     OutputExistsError, StorageError
         A file cannot be written.
     """
+    from phasemark.matcher.design.picture import bound_picture, pareto_picture  # matplotlib is slow to import
+
     near, far = design.plan.distance_m
     notes = [f"for {Path(design.plan.sensor).stem}, {near:g} … {far:g} m"]
     table = [{key: _plain(value) for key, value in row.items()} for row in pareto_rows(design)]

@@ -1,7 +1,8 @@
 """A robot that stays on its path: odometry corrected before landmarks, simulated from light to pose."""
 
+from typing import TYPE_CHECKING
+
 from phasemark.matcher.drive.output import OUTPUTS, path_csv, stops_csv, summary, write_drive
-from phasemark.matcher.drive.picture import drive_animation, drive_picture
 from phasemark.matcher.drive.plan import (
     CameraPlan,
     DrivePlan,
@@ -14,6 +15,9 @@ from phasemark.matcher.drive.plan import (
 )
 from phasemark.matcher.drive.pose_filter import PoseFilter
 from phasemark.matcher.drive.simulate import Drive, Equipment, Stop, pose_error, run_drive
+
+if TYPE_CHECKING:
+    from phasemark.matcher.drive.picture import drive_animation, drive_picture
 
 __all__ = [
     "OUTPUTS",
@@ -38,3 +42,12 @@ __all__ = [
     "summary",
     "write_drive",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Import pictures when they are asked for: matplotlib takes half a second to load."""
+    if name in ("drive_animation", "drive_picture"):
+        from phasemark.matcher.drive import picture
+
+        return getattr(picture, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from phasemark.data import write_atomically
 from phasemark.matcher.bounds import nees
-from phasemark.matcher.drive.picture import drive_animation, drive_picture
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
 
 OUTPUTS = ("path.csv", "stops.csv", "summary.json", "drive.png", "drive.gif")
@@ -128,6 +127,8 @@ def write_drive(drive: Drive, folder: Path, *, force: bool = False) -> list[Path
     OutputExistsError, StorageError
         A file cannot be written.
     """
+    from phasemark.matcher.drive.picture import drive_animation, drive_picture  # matplotlib is slow to import
+
     picture = io.BytesIO()
     drive_picture(drive).savefig(picture, format="png", dpi=130)
     text = json.dumps(summary(drive), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
