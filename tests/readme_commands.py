@@ -6,6 +6,8 @@ HTML comments directly above a block change how it is run:
     make an input file that the reader would bring; :data:`GIVEN` knows how.
 ``<!-- test: phasemark CMD += OPTIONS -->``
     append options to that command: a later option overrides an earlier one, so a grid becomes small.
+``<!-- test: as in PAGE -->``
+    do not run the block, whose commands a block that is run on that page of the same folder or above prints too.
 ``<!-- test: skip REASON -->``
     do not run the block.
 """
@@ -43,6 +45,12 @@ class Block:
         return any(directive.startswith("skip ") for directive in self.directives)
 
     @property
+    def twin(self) -> str | None:
+        """The page that runs the same commands."""
+        pages = [directive.removeprefix("as in ") for directive in self.directives if directive.startswith("as in ")]
+        return pages[0] if pages else None
+
+    @property
     def given(self) -> list[str]:
         return [directive.removeprefix("given ") for directive in self.directives if directive.startswith("given ")]
 
@@ -69,7 +77,7 @@ def read_blocks(markdown: str) -> list[Block]:
         elif fence:
             body, opened, language = [], number, fence[1]
         elif directive:
-            known = directive[1].startswith(("given ", "skip ")) or " += " in directive[1]
+            known = directive[1].startswith(("given ", "skip ", "as in ")) or " += " in directive[1]
             if not known:
                 raise ValueError(f"line {number}: unknown directive '{directive[1]}'")
             directives.append(directive[1])
@@ -101,6 +109,9 @@ def run_page(page: Path, folder: Path) -> Iterator[str]:
     for block in read_blocks(page.read_text(encoding="utf-8")):
         if block.skipped:
             continue
+        if block.twin:
+            _check_twin(block, page)
+            continue
         for name in block.given:
             if not (folder / name).exists():
                 GIVEN[name](folder / name)
@@ -115,6 +126,18 @@ def run_page(page: Path, folder: Path) -> Iterator[str]:
                     yield command
                 elif program not in SET_UP:
                     raise AssertionError(f"{page.name}:{block.line}: no rule for '{command}'")
+
+
+def _check_twin(block: Block, page: Path) -> None:
+    twins = [
+        other
+        for other in read_blocks((page.parent / block.twin).read_text(encoding="utf-8"))
+        if not (other.skipped or other.twin)
+    ]
+    run = [shlex.split(command, comments=True) for twin in twins for command in shell_commands(twin)]
+    for command in shell_commands(block):
+        what = f"{page.name}:{block.line}: {command}"
+        assert shlex.split(command, comments=True) in run, f"{what}\nis not run in {block.twin}"
 
 
 def _run(command: list[str], folder: Path, what: str) -> None:

@@ -191,12 +191,3 @@ def test_an_own_matcher_is_judged_beside_the_papers(tmp_path):
     lines = done.stdout.splitlines()
     assert sum("median range" in line for line in lines) == sum("nearest image" in line for line in lines) == 4
     assert (tmp_path / lines[-1]).stat().st_size > 10_000
-
-
-def test_the_command_line_finds_a_matcher_in_the_folder_it_is_called_from(tmp_path):
-    for name in ("own_matcher.py", "own_matcher.toml"):
-        (tmp_path / name).write_bytes(EXAMPLE.with_name(name).read_bytes())
-    program = [Path(sys.executable).with_name("phasemark"), "sweep", "run", "own_matcher.toml", "--trials", "2"]
-    options = ["--matcher", "own_matcher:match", "--out", "own"]
-    done = subprocess.run([*program, *options], capture_output=True, text=True, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")

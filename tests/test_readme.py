@@ -48,6 +48,17 @@ def test_a_directive_belongs_to_the_next_block_alone() -> None:
     assert (first.skipped, second.skipped) == (True, False)
 
 
+@pytest.mark.parametrize(("other", "runs"), [("a --b", True), ("a --c", False)])
+def test_commands_said_to_run_elsewhere_do(tmp_path: Path, other: str, runs: bool) -> None:
+    (tmp_path / "one.md").write_text(f"<!-- test: as in two.md -->\n```bash\n{RUN[0]} a --b   # words\n```\n")
+    (tmp_path / "two.md").write_text(f"```bash\n{RUN[0]} {other}\n```\n")
+    if runs:
+        assert list(run_page(tmp_path / "one.md", tmp_path)) == []
+    else:
+        with pytest.raises(AssertionError, match=r"one\.md:2: .*\nis not run in two\.md"):
+            list(run_page(tmp_path / "one.md", tmp_path))
+
+
 @pytest.mark.parametrize(
     "text", ["<!-- test: skipp it -->\n```bash\na\n```", "<!-- test: skip x -->\ntext\n```bash\na\n```"]
 )
