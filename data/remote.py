@@ -15,6 +15,7 @@ import struct
 import subprocess
 import sys
 import threading
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import IO, Any
@@ -31,6 +32,9 @@ ATTEMPTS = 20
 
 CONNECT_SECONDS = 10
 """How long a Dask scheduler may take to answer."""
+
+PATIENCE_SECONDS = 10
+"""How long a shard may take before a look whether the cluster has any worker."""
 
 _LENGTH = struct.Struct("<q")
 
@@ -226,6 +230,8 @@ class DaskMaker:
             self._client: Any = connect(address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
             raise UsageError(f"no Dask scheduler answers at {address} ({' '.join(str(error).split())})") from None
+        self._address = address
+        self._told = False
         self._described = _described(job)
         self._serial = iter(range(sys.maxsize))
         self._closed = False
@@ -235,7 +241,7 @@ class DaskMaker:
         return max(2, 2 * int(sum(self._client.nthreads().values())))
 
     def make(self, start: int, stop: int) -> Sequence[NDArray[Any]]:
-        """Have the cluster make a shard; again, if its worker dies."""
+        """Have the cluster make a shard; again, if its worker dies. Without workers, say so once and wait for one."""
         from distributed import KilledWorker
 
         for _ in range(ATTEMPTS):
@@ -244,7 +250,7 @@ class DaskMaker:
             key = f"phasemark-{id(self)}-{start}-{stop}-{next(self._serial)}"  # a new key: nothing is remembered of it
             future = self._client.submit(make_bytes, *self._described, start, stop, key=key, pure=False, retries=5)
             try:
-                return [np.frombuffer(raw, np.uint8) for raw in future.result()]
+                return [np.frombuffer(raw, np.uint8) for raw in self._answer(future)]
             except KilledWorker:
                 continue
             except PhasemarkError:
@@ -254,6 +260,19 @@ class DaskMaker:
             finally:
                 future.release()
         raise StorageError(f"the cluster lost items {start} … {stop - 1} {ATTEMPTS} times")
+
+    def _answer(self, future: Any) -> Sequence[bytes]:
+        while True:
+            try:
+                answer: Sequence[bytes] = future.result(timeout=PATIENCE_SECONDS)
+            except TimeoutError:
+                if future.done():
+                    raise
+                if not self._told and not self._client.nthreads():
+                    self._told = True
+                    warnings.warn(f"no worker is connected to {self._address}: waiting for one", stacklevel=2)
+            else:
+                return answer
 
     def close(self) -> None:
         """Leave the cluster."""
