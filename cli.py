@@ -554,7 +554,12 @@ def _bank_build(
         str | None,
         typer.Option("--model", help="ray; hard: centre rays, nothing mixed; or planar: the paper's own generator."),
     ] = None,
-    full: Annotated[bool, typer.Option("--full", help="Every class at every D and δ; a must for meshes.")] = False,
+    albedo: Annotated[
+        float | None, typer.Option("--albedo", help="Of the landmarks, in place of their own.")
+    ] = None,
+    full: Annotated[
+        bool, typer.Option("--full", help="Every class at every D and δ; taken where nothing less will do.")
+    ] = False,
     workers: _Workers = None,
     resume: _Resume = False,
     dry_run: _DryRun = False,
@@ -566,8 +571,10 @@ def _bank_build(
 ) -> None:
     """Build a bank of noise-free model images."""
     from phasemark.data import BankPlan, MeshPlan, build_bank, load_plan
+    from phasemark.data.plan import factored_refusal
 
     plan = BankPlan() if plan_file is None else load_plan(plan_file)
+    layout_stated = "layout" in plan.model_fields_set or full
     changes: dict[str, Any] = {}
     if classes or meshes:
         changes["classes"] = tuple(classes or ())
@@ -583,12 +590,17 @@ def _bank_build(
             )
             for name, path in map(_name_and_file, meshes or ())
         )
-    for key, value in (("sensor", sensor), ("distance_m", distance), ("delta_deg", delta), ("model", model)):
-        if value is not None:
-            changes[key] = value
-    if full or meshes:
+    options = (
+        ("sensor", sensor), ("distance_m", distance), ("delta_deg", delta), ("model", model), ("albedo", albedo)
+    )  # fmt: skip
+    changes |= {key: value for key, value in options if value is not None}
+    if full:
         changes["layout"] = "full"
     plan = BankPlan(**{**plan.model_dump(), **changes})
+    if not layout_stated and (reason := factored_refusal(plan.resolve())) is not None:
+        plan = plan.model_copy(update={"layout": "full"})
+        if not plan.meshes:
+            typer.echo(f"note: a full bank, every class at every D and δ: {reason}", err=True)
     _build(build_bank, plan, out, shard, dry_run, as_json, workers, resume, force, shard_size, scheduler)
 
 
@@ -1044,11 +1056,13 @@ def _calibrate(
         str | None, typer.Option("--fix", metavar="NAMES", help="Leave these as they are, e.g. fov.")
     ] = None,
     height: Annotated[
-        float, typer.Option("--height", metavar="M", help="Landmark's origin above the lens, as it is thought to be.")
-    ] = 0.0,
+        float | None,
+        typer.Option("--height", metavar="M", help="Landmark's origin above the lens, as it is thought to be."),
+    ] = None,
     bearing: Annotated[
-        float, typer.Option("--bearing", metavar="DEG", help="Where the camera sees it if 0 is stated, likewise.")
-    ] = 0.0,
+        float | None,
+        typer.Option("--bearing", metavar="DEG", help="Where the camera sees it if 0 is stated, likewise."),
+    ] = None,
     albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmark, likewise.")] = None,
     position_std: Annotated[
         float | None, typer.Option("--position-std", metavar="M", help="How well the places of the lens are known.")
@@ -1130,13 +1144,18 @@ def _calibrate(
     bright = float(mesh.metadata.get("albedo", 0.8)) if albedo is None else albedo
     if not 0 < bright <= 1:
         raise UsageError(f"--albedo must be in (0, 1], got {bright:g}")
+    start = Mounting.of_sensor(base, bright)
+    if height is not None:
+        start = replace(start, height_m=height)
+    if bearing is not None:
+        start = replace(start, bearing_rad=math.radians(bearing))
     found = calibrate(
         mesh,
         filtered,
         known,
         free=None if free is None else _names(free),
         fixed=() if fix is None else _names(fix),
-        start=replace(Mounting.of_sensor(base, bright), height_m=height, bearing_rad=math.radians(bearing)),
+        start=start,
         on=on,  # type: ignore[arg-type]  # calibrate says what is right
         background=background,
         pose_std=stds,
