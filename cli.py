@@ -554,9 +554,7 @@ def _bank_build(
         str | None,
         typer.Option("--model", help="ray; hard: centre rays, nothing mixed; or planar: the paper's own generator."),
     ] = None,
-    albedo: Annotated[
-        float | None, typer.Option("--albedo", help="Of the landmarks, in place of their own.")
-    ] = None,
+    albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmarks, in place of their own.")] = None,
     full: Annotated[
         bool, typer.Option("--full", help="Every class at every D and δ; taken where nothing less will do.")
     ] = False,
