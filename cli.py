@@ -570,7 +570,10 @@ def _bank_build(
     """Build a bank of noise-free model images."""
     from phasemark.data import BankPlan, MeshPlan, build_bank, load_plan
     from phasemark.data.plan import factored_refusal
+    from phasemark.landmarks import catalog
 
+    if plan_file is not None and str(plan_file) in catalog():
+        raise UsageError(f"'{plan_file}' is a class of the catalogue, not a plan: give --class {plan_file}")
     plan = BankPlan() if plan_file is None else load_plan(plan_file)
     layout_stated = "layout" in plan.model_fields_set or full
     changes: dict[str, Any] = {}
@@ -980,6 +983,13 @@ def _match(
     background = _background(wall, floor)
     if auto_background and background is not None:
         raise UsageError("--auto-background estimates wall and floor: leave --wall and --floor out")
+    refined = (
+        ("--free", bool(free)), ("--on", on != "ranges"), ("--pixels", pixels != "all"), ("--robust", robust),
+        ("--auto-background", auto_background),
+    )  # fmt: skip
+    for option, used in refined:
+        if used and method == "nearest":
+            raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
     parameters = ["distance_m", "delta_rad"]
     for name in free or ():
         if name not in _FREE:
@@ -1012,6 +1022,8 @@ def _match(
             robust=robust,
         ).match(filtered)
         _save_match_pictures(plots, filtered, matches, opened, background, force)
+        if not any(match.class_name for match in matches):
+            _note_unlikely_unit(filtered, opened)
     answers = []
     for match in matches:
         answer = match.as_dict()
@@ -1445,6 +1457,27 @@ def _save_match_pictures(
         write_atomically(path, buffer.getvalue(), force=force)
 
 
+_FAR_FROM_BANK = 3.0
+"""A factor between ranges and a bank's distances that no landmark before its background makes."""
+
+
+def _note_unlikely_unit(filtered: FilteredFrames, bank: Bank) -> None:
+    """Say so where frames in which nothing was found are nowhere near the bank's distances."""
+    import numpy as np
+
+    ranges = filtered.range_m[np.isfinite(filtered.range_m)]
+    if not ranges.size:
+        return
+    near, far = float(np.percentile(ranges, 5)), float(np.percentile(ranges, 95))
+    first, last = float(bank.distance_m[0]), float(bank.distance_m[-1])
+    if far < first / _FAR_FROM_BANK or near > last * _FAR_FROM_BANK:
+        typer.echo(
+            f"note: the frames' ranges are {near:.3g} … {far:.3g} m, the bank's distances {first:g} … {last:g} m: is"
+            " --unit right, and the bank the one for this place?",
+            err=True,
+        )
+
+
 def _one_landmark(xy: tuple[float, float], yaw_deg: float) -> LandmarkMap:
     """Return the map of a landmark of any class."""
     from phasemark.matcher import LandmarkMap, MappedLandmark
@@ -1632,6 +1665,8 @@ def _echo_facts(facts: Mapping[str, Any]) -> None:
             value = ", ".join(f"{k} {v}" for k, v in value.items())
         elif isinstance(value, list | tuple):
             value = ", ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value)
+        elif isinstance(value, float):
+            value = f"{value:.6g}"
         typer.echo(f"{key.replace('_', ' ').ljust(width)}  {value}")
 
 

@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from phasemark import UsageError
 from phasemark.matcher.match import Match
 from phasemark.matcher.models import VIEW
-from phasemark.matcher.picture import match_picture
 from phasemark.matcher.sweep import read_plan_of
 from phasemark.matcher.sweep_job import Round, SweepJob
 from phasemark.matcher.sweep_plan import SweepPlan
 from phasemark.matcher.sweep_tables import SweepTrials
 from phasemark.render import Background, Frames
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _SIGMA = 1e-9
 """Errors in units of a bound that is unknown come before all others."""
@@ -104,6 +106,8 @@ def _job(plan: SweepPlan) -> SweepJob:
 
 
 def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, method: str) -> Example:
+    from phasemark.matcher.picture import match_picture  # it loads matplotlib
+
     number, trial = int(trials.condition[k]), int(trials.trial[k])
     condition = trials.conditions[number]
     frames = job.frames(number, job.plan.methods[m], job.views(number, trial, trial + 1), trial)
