@@ -42,7 +42,8 @@ def calibration_toml(found: Calibration, *, base_name: str) -> str:
     ]
     for name, use in USES.items():
         if name in found.free:
-            header.append(f"{name} = {shown(found, name)} ± {shown_std(found, name)} {PARAMETERS[name].unit}: {use}")
+            unit = f" {PARAMETERS[name].unit}" if PARAMETERS[name].unit else ""
+            header.append(f"{name} = {shown(found, name)} ± {shown_std(found, name)}{unit}: {use}")
     header += found.notes
     return sensor_toml(found.sensor, comments, header=header, otherwise=f"assumed: as in {base_name}")
 
