@@ -983,6 +983,11 @@ def _match(
     background = _background(wall, floor)
     if auto_background and background is not None:
         raise UsageError("--auto-background estimates wall and floor: leave --wall and --floor out")
+    parameters = ["distance_m", "delta_rad"]
+    for name in free or ():
+        if name not in _FREE:
+            raise UsageError(f"--free must be {' or '.join(_FREE)}, got '{name}'")
+        parameters.append(_FREE[name])
     refined = (
         ("--free", bool(free)), ("--on", on != "ranges"), ("--pixels", pixels != "all"), ("--robust", robust),
         ("--auto-background", auto_background),
@@ -990,11 +995,6 @@ def _match(
     for option, used in refined:
         if used and method == "nearest":
             raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
-    parameters = ["distance_m", "delta_rad"]
-    for name in free or ():
-        if name not in _FREE:
-            raise UsageError(f"--free must be {' or '.join(_FREE)}, got '{name}'")
-        parameters.append(_FREE[name])
     with open_bank(bank, untrusted=True) as opened:
         measured = read_frames(
             frames,
@@ -1022,8 +1022,9 @@ def _match(
             robust=robust,
         ).match(filtered)
         _save_match_pictures(plots, filtered, matches, opened, background, force)
-        if not any(match.class_name for match in matches):
-            _note_unlikely_unit(filtered, opened)
+        missed = next((k for k, match in enumerate(matches) if match.class_name is None), None)
+        if missed is not None:
+            _note_why_nothing(filtered[missed : missed + 1], opened, auto_background or background is not None)
     answers = []
     for match in matches:
         answer = match.as_dict()
@@ -1461,9 +1462,11 @@ _FAR_FROM_BANK = 3.0
 """A factor between ranges and a bank's distances that no landmark before its background makes."""
 
 
-def _note_unlikely_unit(filtered: FilteredFrames, bank: Bank) -> None:
-    """Say so where frames in which nothing was found are nowhere near the bank's distances."""
+def _note_why_nothing(filtered: FilteredFrames, bank: Bank, has_background: bool) -> None:
+    """Say what is odd about a position where nothing was found: ranges nowhere near the bank's, or a wall behind."""
     import numpy as np
+
+    from phasemark.matcher import estimate_surroundings
 
     ranges = filtered.range_m[np.isfinite(filtered.range_m)]
     if not ranges.size:
@@ -1474,6 +1477,14 @@ def _note_unlikely_unit(filtered: FilteredFrames, bank: Bank) -> None:
         typer.echo(
             f"note: the frames' ranges are {near:.3g} … {far:.3g} m, the bank's distances {first:g} … {last:g} m: is"
             " --unit right, and the bank the one for this place?",
+            err=True,
+        )
+        return
+    behind = None if has_background else estimate_surroundings(filtered).background
+    if behind is not None:
+        typer.echo(
+            f"note: something returns behind what is nearest, from {behind.wall_m:.2f} m or so, and nothing was stated to"
+            " stand there: try --method refine --auto-background, or --wall and --floor",
             err=True,
         )
 

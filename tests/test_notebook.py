@@ -84,5 +84,6 @@ def test_banks_and_frame_sets_tell_what_they_hold_open_or_closed(tmp_path):
 
 
 def test_the_display_of_notebooks_does_not_load_matplotlib_before_it_is_used():
-    code = "import sys, phasemark.landmarks, phasemark.render, phasemark.data, phasemark.matcher; sys.exit('matplotlib' in sys.modules)"
+    packages = "phasemark.landmarks, phasemark.render, phasemark.data, phasemark.matcher"
+    code = f"import sys, {packages}; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
