@@ -1483,8 +1483,8 @@ def _note_why_nothing(filtered: FilteredFrames, bank: Bank, has_background: bool
     behind = None if has_background else estimate_surroundings(filtered).background
     if behind is not None:
         typer.echo(
-            f"note: something returns behind what is nearest, from {behind.wall_m:.2f} m or so, and nothing was stated to"
-            " stand there: try --method refine --auto-background, or --wall and --floor",
+            f"note: something returns behind what is nearest, from {behind.wall_m:.2f} m or so, and nothing was stated"
+            " to stand there: try --method refine --auto-background, or --wall and --floor",
             err=True,
         )
 

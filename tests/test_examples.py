@@ -223,6 +223,52 @@ def test_labelled_frames_are_read_back(tmp_path):
     assert "(32, 2, 16, 16)" in done.stdout
 
 
+DATA_LOADER = '''
+"""What the example asks of PyTorch, by its documentation: workers get the data set pickled, batches are stacked."""
+import multiprocessing, random, sys
+
+import numpy as np
+
+
+class DataLoader:
+    def __init__(self, dataset, batch_size, shuffle, num_workers, multiprocessing_context):
+        self.__dict__.update(locals())
+
+    def __iter__(self):
+        order = list(range(len(self.dataset)))
+        random.Random(1).shuffle(order)
+        with multiprocessing.get_context(self.multiprocessing_context).Pool(self.num_workers) as workers:
+            for start in range(0, len(order), self.batch_size):
+                samples = workers.map(self.dataset.__getitem__, order[start : start + self.batch_size])
+                yield tuple(np.stack(column) for column in zip(*samples))
+'''
+
+
+def test_labelled_frames_go_through_a_data_loader_with_worker_processes(tmp_path):
+    (tmp_path / "torch" / "utils").mkdir(parents=True)
+    for package in ("torch", "torch/utils"):
+        (tmp_path / package / "__init__.py").touch()
+    (tmp_path / "torch" / "utils" / "data.py").write_text(DATA_LOADER)
+    program = [sys.executable, "-W", "error", EXAMPLE.with_name("labelled_frames.py"), "--views", "40"]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(program, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert "PyTorch: a batch of (32, 2, 16, 16), 4 classes in it" in done.stdout
+
+
+def test_without_xarray_the_example_says_what_to_install(tmp_path):
+    for name in ("xarray", "torch"):  # as if they were not there
+        (tmp_path / f"{name}.py").write_text("raise ImportError")
+    program = [sys.executable, "-W", "error", EXAMPLE.with_name("labelled_frames.py"), "--views", "8"]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(program, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[:2] == [
+        "xarray: not installed (pip install xarray h5netcdf)",
+        "PyTorch: not installed; the first samples by hand: (12, 2, 16, 16), 12 in the split",
+    ]
+
+
 def test_too_few_views_are_refused_in_one_line(tmp_path):
     done = run_example("labelled_frames.py", "--views", 0, folder=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
