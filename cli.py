@@ -61,6 +61,26 @@ Then, by task:
 phasemark --help lists all commands, COMMAND --help explains one, --install-completion teaches them to your shell.
 """
 
+
+def _one_of(*words: str) -> Callable[[str], list[str]]:
+    """Return what completes an argument to one of some words; a shell goes on with files where none fits."""
+    return lambda incomplete: [word for word in words if word.startswith(incomplete)]
+
+
+def _a_class(incomplete: str) -> list[str]:
+    from phasemark.landmarks.catalog import catalog
+
+    return _one_of(*catalog())(incomplete)
+
+
+def _a_preset(incomplete: str) -> list[str]:
+    from phasemark.render import preset_names
+
+    return _one_of(*preset_names())(incomplete)
+
+
+_a_plan_kind = _one_of("bank", "frames", "sweep", "drive", "design")
+
 app = typer.Typer(
     name="phasemark",
     pretty_exceptions_enable=False,
@@ -81,24 +101,49 @@ app.add_typer(_plan_app, name="plan")
 
 _Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 _Force = Annotated[bool, typer.Option("--force", help="Replace an output that exists.")]
-_Unit = Annotated[str | None, typer.Option("--unit", help="Unit of the mesh file: m, cm, mm or inch.")]
-_Up = Annotated[str, typer.Option("--up", help="Axis of the mesh file that points up: x, y, z, -x, -y or -z.")]
-_Origin = Annotated[str, typer.Option("--origin", help=_ORIGIN_HELP)]
+_Unit = Annotated[
+    str | None,
+    typer.Option(
+        "--unit", help="Unit of the mesh file: m, cm, mm or inch.", autocompletion=_one_of("m", "cm", "mm", "inch")
+    ),
+]
+_Up = Annotated[
+    str,
+    typer.Option(
+        "--up",
+        help="Axis of the mesh file that points up: x, y, z, -x, -y or -z.",
+        autocompletion=_one_of("x", "y", "z", "-x", "-y", "-z"),
+    ),
+]
+_Origin = Annotated[str, typer.Option("--origin", help=_ORIGIN_HELP, autocompletion=_one_of("file", "base", "center"))]
 _SensorOption = Annotated[
-    str, typer.Option("--sensor", metavar="NAME|FILE", help="A preset, or a sensor file (.toml).")
+    str,
+    typer.Option("--sensor", metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=_a_preset),
 ]
 _Wall = Annotated[float | None, typer.Option("--wall", metavar="M", help="Distance of a wall behind the landmark.")]
 _Floor = Annotated[float | None, typer.Option("--floor", metavar="M", help="How far a floor lies below the lens.")]
-_FramesUnit = Annotated[str | None, typer.Option("--unit", help="Unit of the frames: m, cm or mm.")]
+_FramesUnit = Annotated[
+    str | None, typer.Option("--unit", help="Unit of the frames: m, cm or mm.", autocompletion=_one_of("m", "cm", "mm"))
+]
 _Quantity = Annotated[
-    str | None, typer.Option("--quantity", help="range (along the ray) or z (along the optical axis).")
+    str | None,
+    typer.Option(
+        "--quantity", help="range (along the ray) or z (along the optical axis).", autocompletion=_one_of("range", "z")
+    ),
 ]
 _ValidStatus = Annotated[
     list[int] | None, typer.Option("--valid-status", help="Value of 'status' that marks a valid pixel; repeatable.")
 ]
 _FlipH = Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")]
 _FlipV = Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")]
-_Rotate = Annotated[int, typer.Option("--rotate", help="Turn the image clockwise by 0, 90, 180 or 270 degrees.")]
+_Rotate = Annotated[
+    int,
+    typer.Option(
+        "--rotate",
+        help="Turn the image clockwise by 0, 90, 180 or 270 degrees.",
+        autocompletion=_one_of("0", "90", "180", "270"),
+    ),
+]
 _Resume = Annotated[bool, typer.Option("--resume", help="Continue an unfinished run of the same plan.")]
 _DryRun = Annotated[bool, typer.Option("--dry-run", help="Say how large it would be and how long it would take.")]
 _Scheduler = Annotated[
@@ -157,7 +202,9 @@ def _sensor_list(as_json: _Json = False) -> None:
 
 @_sensor_app.command("show")
 def _sensor_show(
-    name_or_file: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).")],
+    name_or_file: Annotated[
+        str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=_a_preset)
+    ],
     as_json: _Json = False,
 ) -> None:
     """Print every field of a sensor; the text is a sensor file again."""
@@ -181,7 +228,9 @@ def _sensor_show(
 
 @_sensor_app.command("characterise")
 def _sensor_characterise(
-    name_or_file: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).")],
+    name_or_file: Annotated[
+        str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=_a_preset)
+    ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, its pictures and numbers.")],
     n_frames: Annotated[
         int | None, typer.Option("--frames", min=2, help="Frames at each point; by default 51200 readings a point.")
@@ -226,7 +275,12 @@ def _sensor_fit(
     ] = None,
     sensor: _SensorOption = "pmd-16x16",
     amplitude_unit: Annotated[
-        str, typer.Option("--amplitude-unit", help="Unit of amplitude and intensity: electrons or arbitrary.")
+        str,
+        typer.Option(
+            "--amplitude-unit",
+            help="Unit of amplitude and intensity: electrons or arbitrary.",
+            autocompletion=_one_of("electrons", "arbitrary"),
+        ),
     ] = "electrons",
     unit: _FramesUnit = None,
     quantity: _Quantity = None,
@@ -309,7 +363,10 @@ def _landmark_list(as_json: _Json = False) -> None:
 
 @_landmark_app.command("show")
 def _landmark_show(
-    name_or_file: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A class, or an STL, PLY, OBJ or OFF file.")],
+    name_or_file: Annotated[
+        str,
+        typer.Argument(metavar="NAME|FILE", help="A class, or an STL, PLY, OBJ or OFF file.", autocompletion=_a_class),
+    ],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for NAME.png and NAME.html.")] = None,
     unit: _Unit = None,
     up: _Up = "z",
@@ -332,7 +389,7 @@ def _landmark_show(
 
 @_landmark_app.command("export")
 def _landmark_export(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A class of the catalogue.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A class of the catalogue.", autocompletion=_a_class)],
     out: Annotated[Path, typer.Option("-o", "--out", help="The file; .stl, .ply, .obj or .off.")],
     force: _Force = False,
 ) -> None:
@@ -467,7 +524,9 @@ def _render(
     delta: Annotated[float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen.")] = 0.0,
     bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
     height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the optical axis.")] = 0.0,
-    class_name: Annotated[str | None, typer.Option("--class", help="A class of the catalogue.")] = None,
+    class_name: Annotated[
+        str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=_a_class)
+    ] = None,
     mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
     unit: _Unit = None,
     up: _Up = "z",
@@ -476,7 +535,12 @@ def _render(
     wall: _Wall = None,
     floor: _Floor = None,
     variant: Annotated[
-        str, typer.Option("--variant", help="exact, or hard: what the centre ray of each pixel sees, nothing mixed.")
+        str,
+        typer.Option(
+            "--variant",
+            help="exact, or hard: what the centre ray of each pixel sees, nothing mixed.",
+            autocompletion=_one_of("exact", "hard"),
+        ),
     ] = "exact",
     force: _Force = False,
 ) -> None:
@@ -539,22 +603,32 @@ def _bank_build(
     plan_file: Annotated[
         Path | None, typer.Argument(metavar="[PLAN]", help="A plan (.toml); options override it.")
     ] = None,
-    classes: Annotated[list[str] | None, typer.Option("--class", help="A class of the catalogue; repeatable.")] = None,
+    classes: Annotated[
+        list[str] | None, typer.Option("--class", help="A class of the catalogue; repeatable.", autocompletion=_a_class)
+    ] = None,
     meshes: Annotated[list[str] | None, typer.Option("--mesh", metavar="NAME=FILE", help="Repeatable.")] = None,
     unit: _Unit = None,
     up: _Up = "z",
     origin: _Origin = "file",
     symmetry: Annotated[int, typer.Option("--symmetry", help="Turns that leave the mesh as it is.")] = 1,
     sensor: Annotated[
-        str | None, typer.Option("--sensor", metavar="NAME|FILE", help="A preset or sensor file.")
+        str | None,
+        typer.Option("--sensor", metavar="NAME|FILE", help="A preset or sensor file.", autocompletion=_a_preset),
     ] = None,
     distance: Annotated[str | None, typer.Option("--distance", metavar="START:STOP:STEP", help="Metres.")] = None,
     delta: Annotated[str | None, typer.Option("--delta", metavar="START:STOP:STEP", help="Degrees.")] = None,
     model: Annotated[
         str | None,
-        typer.Option("--model", help="ray; hard: centre rays, nothing mixed; or planar: the paper's own generator."),
+        typer.Option(
+            "--model",
+            help="ray; hard: centre rays, nothing mixed; or planar: the paper's own generator.",
+            autocompletion=_one_of("ray", "hard", "planar"),
+        ),
     ] = None,
-    full: Annotated[bool, typer.Option("--full", help="Every class at every D and δ; a must for meshes.")] = False,
+    albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmarks, in place of their own.")] = None,
+    full: Annotated[
+        bool, typer.Option("--full", help="Every class at every D and δ; taken where nothing less will do.")
+    ] = False,
     workers: _Workers = None,
     resume: _Resume = False,
     dry_run: _DryRun = False,
@@ -566,8 +640,13 @@ def _bank_build(
 ) -> None:
     """Build a bank of noise-free model images."""
     from phasemark.data import BankPlan, MeshPlan, build_bank, load_plan
+    from phasemark.data.plan import factored_refusal
+    from phasemark.landmarks import catalog
 
+    if plan_file is not None and str(plan_file) in catalog():
+        raise UsageError(f"'{plan_file}' is a class of the catalogue, not a plan: give --class {plan_file}")
     plan = BankPlan() if plan_file is None else load_plan(plan_file)
+    layout_stated = "layout" in plan.model_fields_set or full
     changes: dict[str, Any] = {}
     if classes or meshes:
         changes["classes"] = tuple(classes or ())
@@ -583,12 +662,17 @@ def _bank_build(
             )
             for name, path in map(_name_and_file, meshes or ())
         )
-    for key, value in (("sensor", sensor), ("distance_m", distance), ("delta_deg", delta), ("model", model)):
-        if value is not None:
-            changes[key] = value
-    if full or meshes:
+    options = (
+        ("sensor", sensor), ("distance_m", distance), ("delta_deg", delta), ("model", model), ("albedo", albedo)
+    )  # fmt: skip
+    changes |= {key: value for key, value in options if value is not None}
+    if full:
         changes["layout"] = "full"
     plan = BankPlan(**{**plan.model_dump(), **changes})
+    if not layout_stated and (reason := factored_refusal(plan.resolve())) is not None:
+        plan = plan.model_copy(update={"layout": "full"})
+        if not plan.meshes:
+            typer.echo(f"note: a full bank, every class at every D and δ: {reason}", err=True)
     _build(build_bank, plan, out, shard, dry_run, as_json, workers, resume, force, shard_size, scheduler)
 
 
@@ -709,10 +793,23 @@ def _frames_merge(
 @_frames_app.command("export")
 def _frames_export(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="npz, csv, png16, ply, bop or rosbag.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="FORMAT",
+            help="npz, csv, png16, ply, bop or rosbag.",
+            autocompletion=_one_of("npz", "csv", "png16", "ply", "bop", "rosbag"),
+        ),
+    ],
     out: Annotated[Path, typer.Option("-o", "--out", help="The file (npz, csv) or folder to write.")],
     quantity: Annotated[
-        str | None, typer.Option("--quantity", help="range or z, in npz, csv and png16; BOP and ROS have z.")
+        str | None,
+        typer.Option(
+            "--quantity",
+            help="range or z, in npz, csv and png16; BOP and ROS have z.",
+            autocompletion=_one_of("range", "z"),
+        ),
     ] = None,
     force: _Force = False,
 ) -> None:
@@ -728,13 +825,29 @@ def _frames_import(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV, NPY, NPZ, HDF5, PNG; a folder of PNG, a bag.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The measured frames as .npz, range along the ray, metres.")],
     sensor: _SensorOption = "pmd-16x16",
-    unit: Annotated[str | None, typer.Option("--unit", help="m, cm or mm, if the file does not say.")] = None,
-    quantity: Annotated[str | None, typer.Option("--quantity", help="range or z, if the file does not say.")] = None,
-    invalid_means: Annotated[str, typer.Option("--invalid-means", help="missing or no-return.")] = "missing",
+    unit: Annotated[
+        str | None,
+        typer.Option("--unit", help="m, cm or mm, if the file does not say.", autocompletion=_one_of("m", "cm", "mm")),
+    ] = None,
+    quantity: Annotated[
+        str | None,
+        typer.Option("--quantity", help="range or z, if the file does not say.", autocompletion=_one_of("range", "z")),
+    ] = None,
+    invalid_means: Annotated[
+        str,
+        typer.Option("--invalid-means", help="missing or no-return.", autocompletion=_one_of("missing", "no-return")),
+    ] = "missing",
     valid_status: Annotated[list[int] | None, typer.Option("--valid-status", help="Repeatable.")] = None,
     flip_h: Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")] = False,
     flip_v: Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")] = False,
-    rotate: Annotated[int, typer.Option("--rotate", help="Turn clockwise by 90, 180 or 270 degrees.")] = 0,
+    rotate: Annotated[
+        int,
+        typer.Option(
+            "--rotate",
+            help="Turn clockwise by 90, 180 or 270 degrees.",
+            autocompletion=_one_of("0", "90", "180", "270"),
+        ),
+    ] = 0,
     topic: Annotated[str | None, typer.Option("--topic", help="Which images of a ROS bag.")] = None,
     force: _Force = False,
 ) -> None:
@@ -766,8 +879,14 @@ def _frames_show(
     out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png.")],
     index: Annotated[int, typer.Option("--index", min=0, help="Number of the frame.")] = 0,
     sensor: _SensorOption = "pmd-16x16",
-    unit: Annotated[str | None, typer.Option("--unit", help="m, cm or mm, of measured frames.")] = None,
-    quantity: Annotated[str | None, typer.Option("--quantity", help="range or z, of measured frames.")] = None,
+    unit: Annotated[
+        str | None,
+        typer.Option("--unit", help="m, cm or mm, of measured frames.", autocompletion=_one_of("m", "cm", "mm")),
+    ] = None,
+    quantity: Annotated[
+        str | None,
+        typer.Option("--quantity", help="range or z, of measured frames.", autocompletion=_one_of("range", "z")),
+    ] = None,
     force: _Force = False,
 ) -> None:
     """Draw one frame."""
@@ -848,7 +967,9 @@ def _merge(shards: Sequence[Path], out: Path, resume: bool, force: bool) -> None
 
 @_plan_app.command("example")
 def _plan_example(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.")],
+    kind: Annotated[
+        str, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.", autocompletion=_a_plan_kind)
+    ],
 ) -> None:
     """Print a plan with comments; it can be used as it is."""
     from phasemark.matcher.plan_kinds import plan_example
@@ -858,7 +979,9 @@ def _plan_example(
 
 @_plan_app.command("schema")
 def _plan_schema(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.")],
+    kind: Annotated[
+        str, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.", autocompletion=_a_plan_kind)
+    ],
 ) -> None:
     """Print the JSON Schema of a kind of plan, for editors and other programs."""
     from phasemark.matcher.plan_kinds import plan_schema
@@ -870,7 +993,12 @@ def _plan_schema(
 def _plan_check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A plan (.toml).")],
     kind: Annotated[
-        str | None, typer.Option("--kind", help="bank, frames, sweep, drive or design, if the plan leaves it open.")
+        str | None,
+        typer.Option(
+            "--kind",
+            help="bank, frames, sweep, drive or design, if the plan leaves it open.",
+            autocompletion=_a_plan_kind,
+        ),
     ] = None,
     as_json: _Json = False,
 ) -> None:
@@ -891,26 +1019,50 @@ def _match(
     unit: _FramesUnit = None,
     quantity: _Quantity = None,
     invalid_means: Annotated[
-        str, typer.Option("--invalid-means", help="What an invalid pixel stands for: missing or no-return.")
+        str,
+        typer.Option(
+            "--invalid-means",
+            help="What an invalid pixel stands for: missing or no-return.",
+            autocompletion=_one_of("missing", "no-return"),
+        ),
     ] = "missing",
     valid_status: _ValidStatus = None,
     flip_h: _FlipH = False,
     flip_v: _FlipV = False,
     rotate: _Rotate = 0,
-    filter_name: Annotated[str, typer.Option("--filter", help="kalman or phasor-mean.")] = "kalman",
+    filter_name: Annotated[
+        str, typer.Option("--filter", help="kalman or phasor-mean.", autocompletion=_one_of("kalman", "phasor-mean"))
+    ] = "kalman",
     method: Annotated[
         str,
         typer.Option(
             "--method",
+            autocompletion=_one_of("nearest", "refine"),
             help="nearest: the paper's minimum-distance classifier. refine: maximum likelihood, with covariance.",
         ),
     ] = "nearest",
     free: Annotated[
         list[str] | None,
-        typer.Option("--free", help="With refine, estimate this too: bearing or height; repeatable."),
+        typer.Option(
+            "--free",
+            help="With refine, estimate this too: bearing or height; repeatable.",
+            autocompletion=_one_of("bearing", "height"),
+        ),
     ] = None,
-    on: Annotated[str, typer.Option("--on", help="With refine: ranges, or phasors with the albedo free.")] = "ranges",
-    pixels: Annotated[str, typer.Option("--pixels", help="With refine, what gives the view: all or lower.")] = "all",
+    on: Annotated[
+        str,
+        typer.Option(
+            "--on",
+            help="With refine: ranges, or phasors with the albedo free.",
+            autocompletion=_one_of("ranges", "phasors"),
+        ),
+    ] = "ranges",
+    pixels: Annotated[
+        str,
+        typer.Option(
+            "--pixels", help="With refine, what gives the view: all or lower.", autocompletion=_one_of("all", "lower")
+        ),
+    ] = "all",
     robust: Annotated[bool, typer.Option("--robust", help="With refine, count residuals beyond 3 σ less.")] = False,
     false_alarm: Annotated[
         float, typer.Option("--false-alarm", help="Share of good frames that the test of the fit may refuse.")
@@ -975,6 +1127,13 @@ def _match(
         if name not in _FREE:
             raise UsageError(f"--free must be {' or '.join(_FREE)}, got '{name}'")
         parameters.append(_FREE[name])
+    refined = (
+        ("--free", bool(free)), ("--on", on != "ranges"), ("--pixels", pixels != "all"), ("--robust", robust),
+        ("--auto-background", auto_background),
+    )  # fmt: skip
+    for option, used in refined:
+        if used and method == "nearest":
+            raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
     with open_bank(bank, untrusted=True) as opened:
         measured = read_frames(
             frames,
@@ -1002,6 +1161,9 @@ def _match(
             robust=robust,
         ).match(filtered)
         _save_match_pictures(plots, filtered, matches, opened, background, force)
+        missed = next((k for k, match in enumerate(matches) if match.class_name is None), None)
+        if missed is not None:
+            _note_why_nothing(filtered[missed : missed + 1], opened, auto_background or background is not None)
     answers = []
     for match in matches:
         answer = match.as_dict()
@@ -1018,7 +1180,9 @@ def _match(
 
 @app.command("calibrate")
 def _calibrate(
-    landmark: Annotated[str, typer.Argument(metavar="BANK|CLASS", help="A bank, or a class of the catalogue.")],
+    landmark: Annotated[
+        str, typer.Argument(metavar="BANK|CLASS", help="A bank, or a class of the catalogue.", autocompletion=_a_class)
+    ],
     frames: Annotated[
         list[Path],
         typer.Argument(
@@ -1032,10 +1196,17 @@ def _calibrate(
         ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
-    class_name: Annotated[str | None, typer.Option("--class", help="Which class of a bank that has several.")] = None,
+    class_name: Annotated[
+        str | None, typer.Option("--class", help="Which class of a bank that has several.", autocompletion=_a_class)
+    ] = None,
     sensor: Annotated[
         str | None,
-        typer.Option("--sensor", metavar="NAME|FILE", help="The camera as it is thought to be; a bank has its own."),
+        typer.Option(
+            "--sensor",
+            metavar="NAME|FILE",
+            help="The camera as it is thought to be; a bank has its own.",
+            autocompletion=_a_preset,
+        ),
     ] = None,
     free: Annotated[
         str | None, typer.Option("--free", metavar="NAMES", help="Estimate these alone, e.g. pitch,roll,height.")
@@ -1044,11 +1215,13 @@ def _calibrate(
         str | None, typer.Option("--fix", metavar="NAMES", help="Leave these as they are, e.g. fov.")
     ] = None,
     height: Annotated[
-        float, typer.Option("--height", metavar="M", help="Landmark's origin above the lens, as it is thought to be.")
-    ] = 0.0,
+        float | None,
+        typer.Option("--height", metavar="M", help="Landmark's origin above the lens, as it is thought to be."),
+    ] = None,
     bearing: Annotated[
-        float, typer.Option("--bearing", metavar="DEG", help="Where the camera sees it if 0 is stated, likewise.")
-    ] = 0.0,
+        float | None,
+        typer.Option("--bearing", metavar="DEG", help="Where the camera sees it if 0 is stated, likewise."),
+    ] = None,
     albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmark, likewise.")] = None,
     position_std: Annotated[
         float | None, typer.Option("--position-std", metavar="M", help="How well the places of the lens are known.")
@@ -1063,13 +1236,25 @@ def _calibrate(
         tuple[float, float], typer.Option("--landmark-xy", metavar="X Y", help="Where it stands, for x_m,y_m.")
     ] = (0.0, 0.0),
     landmark_yaw: Annotated[float, typer.Option("--landmark-yaw", metavar="DEG", help="Heading of its x' axis.")] = 0.0,
-    on: Annotated[str, typer.Option("--on", help="auto, ranges, or phasors: amplitudes too.")] = "auto",
+    on: Annotated[
+        str,
+        typer.Option(
+            "--on",
+            help="auto, ranges, or phasors: amplitudes too.",
+            autocompletion=_one_of("auto", "ranges", "phasors"),
+        ),
+    ] = "auto",
     wall: _Wall = None,
     floor: _Floor = None,
     unit: _FramesUnit = None,
     quantity: _Quantity = None,
     invalid_means: Annotated[
-        str, typer.Option("--invalid-means", help="What an invalid pixel stands for: missing or no-return.")
+        str,
+        typer.Option(
+            "--invalid-means",
+            help="What an invalid pixel stands for: missing or no-return.",
+            autocompletion=_one_of("missing", "no-return"),
+        ),
     ] = "missing",
     valid_status: _ValidStatus = None,
     flip_h: _FlipH = False,
@@ -1130,13 +1315,18 @@ def _calibrate(
     bright = float(mesh.metadata.get("albedo", 0.8)) if albedo is None else albedo
     if not 0 < bright <= 1:
         raise UsageError(f"--albedo must be in (0, 1], got {bright:g}")
+    start = Mounting.of_sensor(base, bright)
+    if height is not None:
+        start = replace(start, height_m=height)
+    if bearing is not None:
+        start = replace(start, bearing_rad=math.radians(bearing))
     found = calibrate(
         mesh,
         filtered,
         known,
         free=None if free is None else _names(free),
         fixed=() if fix is None else _names(fix),
-        start=replace(Mounting.of_sensor(base, bright), height_m=height, bearing_rad=math.radians(bearing)),
+        start=start,
         on=on,  # type: ignore[arg-type]  # calibrate says what is right
         background=background,
         pose_std=stds,
@@ -1239,7 +1429,12 @@ def _demo(
 @_sweep_app.command("run")
 def _sweep_run(
     plan: Annotated[
-        str, typer.Argument(metavar="PLAN|NAME", help="A plan (.toml), or paper, distance-angle-noise or robustness.")
+        str,
+        typer.Argument(
+            metavar="PLAN|NAME",
+            help="A plan (.toml), or paper, distance-angle-noise or robustness.",
+            autocompletion=_one_of("paper", "distance-angle-noise", "robustness"),
+        ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for trials, tables and the report.")],
     trials: Annotated[
@@ -1426,6 +1621,37 @@ def _save_match_pictures(
         buffer = bytes_io.BytesIO()
         match_picture(filtered, matches[k], bank, background, k).savefig(buffer, format="png", dpi=120)
         write_atomically(path, buffer.getvalue(), force=force)
+
+
+_FAR_FROM_BANK = 3.0
+"""A factor between ranges and a bank's distances that no landmark before its background makes."""
+
+
+def _note_why_nothing(filtered: FilteredFrames, bank: Bank, has_background: bool) -> None:
+    """Say what is odd about a position where nothing was found: ranges nowhere near the bank's, or a wall behind."""
+    import numpy as np
+
+    from phasemark.matcher import estimate_surroundings
+
+    ranges = filtered.range_m[np.isfinite(filtered.range_m)]
+    if not ranges.size:
+        return
+    near, far = float(np.percentile(ranges, 5)), float(np.percentile(ranges, 95))
+    first, last = float(bank.distance_m[0]), float(bank.distance_m[-1])
+    if far < first / _FAR_FROM_BANK or near > last * _FAR_FROM_BANK:
+        typer.echo(
+            f"note: the frames' ranges are {near:.3g} … {far:.3g} m, the bank's distances {first:g} … {last:g} m: is"
+            " --unit right, and the bank the one for this place?",
+            err=True,
+        )
+        return
+    behind = None if has_background else estimate_surroundings(filtered).background
+    if behind is not None:
+        typer.echo(
+            f"note: something returns behind what is nearest, from {behind.wall_m:.2f} m or so, and nothing was stated"
+            " to stand there: try --method refine --auto-background, or --wall and --floor",
+            err=True,
+        )
 
 
 def _one_landmark(xy: tuple[float, float], yaw_deg: float) -> LandmarkMap:
@@ -1615,6 +1841,8 @@ def _echo_facts(facts: Mapping[str, Any]) -> None:
             value = ", ".join(f"{k} {v}" for k, v in value.items())
         elif isinstance(value, list | tuple):
             value = ", ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value)
+        elif isinstance(value, float):
+            value = f"{value:.6g}"
         typer.echo(f"{key.replace('_', ' ').ljust(width)}  {value}")
 
 

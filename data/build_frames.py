@@ -150,7 +150,7 @@ class FrameJob:
         step = 1 << 16
         for first in range(0, self.plan.views, step):
             truth = self.plan.draw_truth(first, min(first + step, self.plan.views))
-            views = _views(truth)
+            views = _views(truth).in_camera(self.sensor)
             for k, renderer in enumerate(self._renderers):
                 of_class = np.flatnonzero(truth["class_index"] == k)
                 vertices = renderer.topology.vertices

@@ -32,6 +32,9 @@ from phasemark.render import Sensor, preset
 DEFAULT_DISTANCE_M = "0.7:2.1:0.01"
 DEFAULT_DELTA_STEP_DEG = 1.0
 
+_YOUNGER_FIELDS = {"bearing_offset_deg", "height_offset_m"}
+"""Of a sensor: what resolved plans in older files lack, and mean 0 by."""
+
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
 _Albedo = Annotated[float, Field(gt=0, le=1)]
 
@@ -137,7 +140,8 @@ class ScenePlan(PlanModel, ABC):
         InputFileError
             The sensor file cannot be read.
         """
-        if set(self.sensor_overrides) >= set(Sensor.model_fields):  # a resolved plan needs no preset and no file
+        stated = set(self.sensor_overrides) | _YOUNGER_FIELDS
+        if stated >= set(Sensor.model_fields):  # a resolved plan needs no preset and no file
             return Sensor(**self.sensor_overrides)
         base = Sensor.from_toml(self.sensor) if _is_file(self.sensor) else preset(self.sensor)
         return base.with_(**self.sensor_overrides)
@@ -345,6 +349,8 @@ def factored_refusal(plan: BankPlan) -> str | None:
         return f"'{plan.landmarks[0].name}' and '{list(boxes.values())[1]}' stand on different boxes"
     if sensor.pitch_deg or sensor.roll_deg:
         return f"the sensor is tilted (pitch {sensor.pitch_deg:g}°, roll {sensor.roll_deg:g}°)"
+    if sensor.height_offset_m:
+        return f"the sensor is not mounted at the interface's height (height offset {sensor.height_offset_m:g} m)"
     if sensor.rows % 2:
         return f"the sensor has an odd number of rows ({sensor.rows})"
     if sensor.centre_px[1] != sensor.rows / 2:

@@ -57,9 +57,9 @@ def panel_frames(path: Path, sensor: Sensor) -> tuple[Frames, KnownPoses]:
     return frames, poses
 
 
-def residuals(frames: Frames, poses: KnownPoses, panel: trimesh.Trimesh, bearing_rad: float) -> NDArray[np.float64]:
+def residuals(frames: Frames, poses: KnownPoses, panel: trimesh.Trimesh) -> NDArray[np.float64]:
     """Return measured less expected ranges of zones on the panel, (poses, rows, cols), by the frames' own sensor."""
-    image = Renderer(panel, frames.sensor).render(poses.distance_m, poses.delta_rad, poses.bearing_rad + bearing_rad)
+    image = Renderer(panel, frames.sensor).render(poses.distance_m, poses.delta_rad, poses.bearing_rad)
     return np.asarray(frames.range_m[:, 0] - image.range_m - frames.sensor.range_offset_m)
 
 
@@ -84,8 +84,8 @@ def run(path: Path, sensor: Sensor) -> tuple[Calibration, list[str]]:
     # ranges follow from the zones' z by the half angles
     kept = Frames(frames.range_m * sensor.axis_cosine() / found.sensor.axis_cosine(), sensor=found.sensor)
     lines = [
-        describe("as assumed   ", residuals(frames[others], poses[others], panel, 0.0)),
-        describe("as calibrated", residuals(kept[others], poses[others], panel, found.mounting.bearing_rad)),
+        describe("as assumed   ", residuals(frames[others], poses[others], panel)),
+        describe("as calibrated", residuals(kept[others], poses[others], panel)),
     ]
     return found, [f"{len(known)} frames calibrate, {len(others)} others are compared", *lines]
 

@@ -2,8 +2,8 @@
 
 ``python examples/labelled_frames.py --views 200 --out out/labelled``
 
-Each frame comes with its truth: class, distance D, side δ. PyTorch is used where it is installed; the data set
-is the same without it.
+Each frame comes with its truth: class, distance D, side δ. xarray and PyTorch are used where they are installed
+(``pip install xarray h5netcdf torch``); the data set is the same without them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray
 
 from phasemark import PhasemarkError, UsageError
 from phasemark.data import FramePlan, build_frames
@@ -59,16 +58,27 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code if isinstance(error, PhasemarkError) else UsageError.exit_code
 
-    with xarray.open_dataset(path, engine="h5netcdf") as labelled:
-        near = labelled.range.where(labelled.distance[labelled.view_index] < 1.0).mean().item()
-        print(f"xarray: {dict(labelled.sizes)}, mean range of what is seen from less than 1 m: {near:.3f} m")
+    read_labelled(path)
     read_batch(path)
     print(path)
     return 0
 
 
+def read_labelled(path: Path) -> None:
+    """Open the set in xarray, if it is there, and ask for something by its labels."""
+    try:
+        import h5netcdf  # noqa: F401  # what xarray opens it with
+        import xarray
+    except ImportError:
+        print("xarray: not installed (pip install xarray h5netcdf)")
+        return
+    with xarray.open_dataset(path, engine="h5netcdf") as labelled:
+        near = labelled.range.where(labelled.distance[labelled.view_index] < 1.0).mean().item()
+        print(f"xarray: {dict(labelled.sizes)}, mean range of what is seen from less than 1 m: {near:.3f} m")
+
+
 def read_batch(path: Path) -> None:
-    """Read a shuffled batch of the training split, by PyTorch if it is there."""
+    """Read a shuffled batch of the training split in two worker processes, by PyTorch if it is there."""
     from phasemark.data import open_frames
 
     with open_frames(path) as frames:
@@ -78,9 +88,10 @@ def read_batch(path: Path) -> None:
         except ImportError:
             samples = [train[k] for k in range(min(32, len(train)))]
             images = np.stack([image for image, _, _ in samples])
-            print(f"PyTorch is not installed; the first samples by hand: {images.shape}, {len(train)} in the split")
+            print(f"PyTorch: not installed; the first samples by hand: {images.shape}, {len(train)} in the split")
             return
-        images, classes, _ = next(iter(DataLoader(train, batch_size=32, shuffle=True)))
+        loader = DataLoader(train, batch_size=32, shuffle=True, num_workers=2, multiprocessing_context="spawn")
+        images, classes, _ = next(iter(loader))
         print(f"PyTorch: a batch of {tuple(images.shape)}, {len(set(classes.tolist()))} classes in it")
 
 

@@ -62,7 +62,7 @@ class Calibration:
     Parameters
     ----------
     sensor : Sensor
-        The camera with what was found; fields that were not free are as they were.
+        The camera with what was found; what was not free is as it was, or as `start` said.
     base : Sensor
         The camera as it was thought to be.
     mounting, assumed : Mounting
@@ -228,7 +228,7 @@ def calibrate(
     fixed : sequence of str
         What of that to leave as it is.
     start : Mounting, optional
-        Where it is thought to be and what stays as it is; None: what the sensor states, straight ahead.
+        Where it is thought to be and what stays as it is; None: what the sensor states.
     albedo : float
         Of the landmark, as it is thought to be.
     on : {"auto", "ranges", "phasors"}
@@ -321,11 +321,12 @@ def _check_view(model: CalibrationModel, evidence: Evidence, assumed: Mounting) 
     poses, seen = model.poses, evidence.seen
     edge = max(assumed.half_angle_h_rad, assumed.half_angle_v_rad) * math.sqrt(2) + _OUT_OF_VIEW_RAD
     reach = np.arctan2(model.reach_m, poses.distance_m)
-    out = np.flatnonzero(np.abs(poses.bearing_rad) - reach > edge)
+    bearing = poses.bearing_rad + assumed.bearing_rad
+    out = np.flatnonzero(np.abs(bearing) - reach > edge)
     if out.size:
         k = int(out[0])
         raise UsageError(
-            f"{poses.where(k)}: the landmark is not in view: it stands {math.degrees(poses.bearing_rad[k]):.1f}° from"
+            f"{poses.where(k)}: the landmark is not in view: it stands {math.degrees(bearing[k]):.1f}° from"
             f" the optical axis, and the image ends at {math.degrees(assumed.half_angle_h_rad):.1f}°; are heading and"
             " bearing in degrees, counter-clockwise?"
         )
@@ -480,7 +481,11 @@ def _concluded(
 
 
 def _mounted(sensor: Sensor, mounting: Mounting, free: Sequence[str]) -> Sensor:
-    """Return a sensor with the fields that were estimated, to the digits of a sensor file."""
-    there = mounting.on(sensor)
-    fields = [PARAMETERS[name].field for name in free]
-    return sensor.with_(**{field: rounded(getattr(there, field)) for field in fields if field is not None})
+    """Return a sensor with the fields that were estimated, or stated anew, to the digits of a sensor file."""
+    there, before = mounting.on(sensor), Mounting.of_sensor(sensor, mounting.albedo)
+    changed = [
+        parameter.field
+        for name, parameter in PARAMETERS.items()
+        if name in free or getattr(mounting, parameter.attribute) != getattr(before, parameter.attribute)
+    ]
+    return sensor.with_(**{field: rounded(getattr(there, field)) for field in changed if field is not None})

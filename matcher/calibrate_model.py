@@ -2,7 +2,7 @@
 
 The mounting is eight numbers, :class:`Mounting`. Four of them turn or widen the camera itself (pitch, roll and both
 half angles), two move the landmark in its image (height and bearing), one delays the light (range offset) and one is
-the brightness of the landmark (albedo).
+the brightness of the landmark (albedo), the only one that is not the camera's.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ PARAMETERS = {
     for parameter in (
         Parameter("pitch", "pitch_rad", _DEGREE, 1 / _DEGREE, "°", "pitch_deg"),
         Parameter("roll", "roll_rad", _DEGREE, 1 / _DEGREE, "°", "roll_deg"),
-        Parameter("height", "height_m", _CM, 1e3, "mm", None),
-        Parameter("bearing", "bearing_rad", _DEGREE, 1 / _DEGREE, "°", None),
+        Parameter("height", "height_m", _CM, 1e3, "mm", "height_offset_m"),
+        Parameter("bearing", "bearing_rad", _DEGREE, 1 / _DEGREE, "°", "bearing_offset_deg"),
         Parameter("half_angle_h", "half_angle_h_rad", _DEGREE, 1 / _DEGREE, "°", "half_angle_h_deg"),
         Parameter("half_angle_v", "half_angle_v_rad", _DEGREE, 1 / _DEGREE, "°", "half_angle_v_deg"),
         Parameter("range_offset", "range_offset_m", _CM, 1e3, "mm", "range_offset_m"),
@@ -105,12 +105,12 @@ class Mounting:
 
     @classmethod
     def of_sensor(cls, sensor: Sensor, albedo: float) -> Mounting:
-        """Take what a sensor states; the landmark straight ahead at the lens's height."""
+        """Take what a sensor states."""
         return cls(
             math.radians(sensor.pitch_deg),
             math.radians(sensor.roll_deg),
-            0.0,
-            0.0,
+            sensor.height_offset_m,
+            math.radians(sensor.bearing_offset_deg),
             math.radians(sensor.half_angle_h_deg),
             math.radians(sensor.half_angle_v_deg),
             sensor.range_offset_m,
@@ -132,6 +132,8 @@ class Mounting:
         return sensor.with_(
             pitch_deg=math.degrees(self.pitch_rad),
             roll_deg=math.degrees(self.roll_rad),
+            bearing_offset_deg=math.degrees(self.bearing_rad),
+            height_offset_m=self.height_m,
             half_angle_h_deg=math.degrees(self.half_angle_h_rad),
             half_angle_v_deg=math.degrees(self.half_angle_v_rad),
             range_offset_m=self.range_offset_m,
@@ -236,11 +238,11 @@ class CalibrationModel:
             Whether the landmark alone is wanted even where nothing else is made of it.
         """
         mounting = Mounting.of_vector(theta)
-        image = self._render(mounting, self._views(mounting, shift))
+        image = self._render(mounting, self._views(shift))
         alone = image
         brighter = mounting.albedo / self._albedo - 1
         if self.has_background and (brighter or need_alone):
-            alone = self._render(mounting, self._views(mounting, shift), alone=True)
+            alone = self._render(mounting, self._views(shift), alone=True)
         turn = self._turn(mounting, image)
         k = len(self.poses)
         turn = turn.reshape(-1, *turn.shape[-2:])
@@ -329,7 +331,7 @@ class CalibrationModel:
     def coverage(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the share of each pixel that sees the landmark, (K, pixels)."""
         mounting = Mounting.of_vector(theta)
-        views = self._views(mounting, np.zeros((len(self.poses), 3)))
+        views = self._views(np.zeros((len(self.poses), 3)))
         return self._render(mounting, views, alone=True).coverage.reshape(len(views), -1)
 
     def _turn(self, mounting: Mounting, image: PhasorImages) -> NDArray[np.complex128]:
@@ -344,13 +346,13 @@ class CalibrationModel:
         longer = image.sensor.axis_cosine() / self._axis_cosine - 1
         return np.asarray(turn * np.exp(1j * np.nan_to_num(image.range_m) * longer / scale))
 
-    def _views(self, mounting: Mounting, shift: NDArray[np.float64]) -> Views:
+    def _views(self, shift: NDArray[np.float64]) -> Views:
         poses = self.poses
         return Views(
             poses.distance_m + shift[:, 0],
             poses.delta_rad + shift[:, 1],
-            poses.bearing_rad + shift[:, 2] + mounting.bearing_rad,
-            poses.height_m + mounting.height_m,
+            poses.bearing_rad + shift[:, 2],
+            poses.height_m,
         )
 
     def _render(self, mounting: Mounting, views: Views, *, alone: bool = False) -> PhasorImages:

@@ -23,6 +23,8 @@ TITLES = {
 }
 _POORLY = 0.5
 """Natural units (1°, 1 cm, 0.1): a standard deviation from which a number is called poorly known."""
+_WELL = 0.05
+"""And below which what it trades with does not matter: 3 arc minutes, half a millimetre."""
 _TRADES = 0.95
 """Correlation from which two numbers are said to trade."""
 _ALIKE = 1.3
@@ -92,7 +94,8 @@ def observability_notes(
         trades = f", for it trades with the {named(others)}" if others else ""
         notes.append(f"The {TITLES[name]} is poorly known, {value}{trades}: {advice([name, *others], poses)}.")
     told = {name for pair in pairs for name in pair[:2]} | set(poor)
-    if poses.distance_m.max() < _ALIKE * poses.distance_m.min():
+    alike = poses.distance_m.max() < _ALIKE * poses.distance_m.min()
+    if alike:
         for group in _ALIKE_AT_ONE_DISTANCE:
             names = [name for name in group if name in free]
             if len(names) > 1 and group[0] in names and not told & set(names):
@@ -100,8 +103,9 @@ def observability_notes(
                     f"The {named(names)} are told apart only because the landmark's shape and brightness are taken to"
                     f" be exact: {advice(names, poses)}."
                 )
+    well = {name for name, s in zip(free, std / scale, strict=True) if s < _WELL}
     for a, b, rho in pairs:
-        if a not in poor and b not in poor:
+        if a not in poor and b not in poor and (alike or not {a, b} <= well):
             notes.append(
                 f"The {TITLES[a]} and the {TITLES[b]} trade for one another (correlation {rho:.3f}):"
                 f" {advice([a, b], poses)}."

@@ -16,11 +16,7 @@ from phasemark.matcher.calibrate_poses import POSE_UNITS
 from phasemark.render.plot import draw_difference
 from phasemark.render.sensor_file import sensor_toml
 
-USES = {
-    "height": "of the landmark's origin above the lens: phasemark match --method refine --free height",
-    "bearing": "of the landmark where 0 was stated: phasemark match --pan (pan angle less this)",
-    "albedo": "of the landmark: 'albedo' in a plan",
-}
+USES = {"albedo": "of the landmark: phasemark bank build --albedo, or 'albedo' in a plan"}
 """Where the numbers go that a sensor file has no place for."""
 _SIGMAS, _BINS = 5.0, 50
 
@@ -46,7 +42,8 @@ def calibration_toml(found: Calibration, *, base_name: str) -> str:
     ]
     for name, use in USES.items():
         if name in found.free:
-            header.append(f"{name} = {shown(found, name)} ± {shown_std(found, name)} {PARAMETERS[name].unit}: {use}")
+            unit = f" {PARAMETERS[name].unit}" if PARAMETERS[name].unit else ""
+            header.append(f"{name} = {shown(found, name)} ± {shown_std(found, name)}{unit}: {use}")
     header += found.notes
     return sensor_toml(found.sensor, comments, header=header, otherwise=f"assumed: as in {base_name}")
 

@@ -7,6 +7,7 @@ gives the albedo too, relative to the landmark's.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,8 +57,8 @@ def estimate_surroundings(
     landmark_scale : float
         How much brighter the landmark is than its model: albedos count relative to it.
     bearing_known : bool
-        Whether the landmark stands on the optical axis. Otherwise the azimuth of what is near takes its place: the wall
-        is perpendicular to the line of sight, and a bearing of 4° ignored would move its two ends by 3 %.
+        Whether the mount points at the landmark. Otherwise the azimuth of what is near takes its place: the wall is
+        perpendicular to the line of sight, and a bearing of 4° ignored would move its two ends by 3 %.
 
     Returns
     -------
@@ -78,9 +79,11 @@ def estimate_surroundings(
     if far.sum() < _FEWEST:
         return Surroundings(None, nothing, nothing)
     ray = _level_rays(sensor)
+    azimuth = math.radians(sensor.bearing_offset_deg)
     if not bearing_known:
         azimuth = float(np.arctan2(ray[1], ray[0])[returned & ~far].mean())
-        forward = ranges * (np.cos(azimuth) * ray[0] + np.sin(azimuth) * ray[1])
+    facing = math.cos(azimuth) * ray[0] + math.sin(azimuth) * ray[1]
+    forward = ranges * facing
     down = -ray[2]
     above = pure & (down <= 0)
     wall_m = _weighted_middle(forward[above] if above.sum() >= 3 else forward[pure])
@@ -96,8 +99,8 @@ def estimate_surroundings(
     if frames.amplitude_e is not None:
         unit = sensor.contrast * sensor.signal_e
         lit = pure & ~short
-        # a wall across the axis: |S| = ρ cos θ / r², cos θ that of the ray
-        bright = frames.amplitude_e[index] / unit * ranges**2 / sensor.axis_cosine()
+        # a wall across the line of sight: |S| = ρ cos θ / r², cos θ that of the ray
+        bright = frames.amplitude_e[index] / unit * ranges**2 / facing
         if lit.any():
             albedo = float(np.clip(np.median(bright[lit]) / landmark_scale, 1e-3, 1.0))
     background = Background(wall_m=wall_m, floor_m=floor_m, wall_albedo=albedo, floor_albedo=albedo)

@@ -25,7 +25,7 @@ class Motion:
     Parameters
     ----------
     forward_m_s : float
-        Along the optical axis's heading.
+        Along the optical axis's heading; with a `bearing_offset_deg`, that of what the mount points at.
     sideways_m_s : float
         To the left.
     yaw_rate_rad_s : float

@@ -149,6 +149,7 @@ def planar_images(
     first, stop = rows if rows is not None else (0, sensor.rows)
     if not 0 <= first < stop <= sensor.rows:
         raise UsageError(f"'rows' must lie in 0 … {sensor.rows}, got {(first, stop)!r}")
+    asked, views = views, views.in_camera(sensor)
     _refuse_out_of_plane(sensor, views)
 
     middle = sensor.rows // 2
@@ -186,7 +187,7 @@ def planar_images(
         intensity=intensity,
         coverage=seen.astype(np.float64),
         sensor=sensor,
-        views=views,
+        views=asked,
         harmonics={int(order): intensity * np.exp(1j * order * phase) for order in harmonics},
     )
 

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -204,8 +204,9 @@ class Renderer:
             raise UsageError(f"'rows' must lie in 0 … {self.sensor.rows}, got {(first, stop)!r}")
         if variant not in ("exact", "hard"):
             raise UsageError(f"'variant' must be exact or hard, got {variant!r}")
-        self._check(views, background, workers)
-        return self._render(views, background, (first, stop), workers, variant)
+        seen = views.in_camera(self.sensor)
+        self._check(seen, background, workers)
+        return replace(self._render(seen, background, (first, stop), workers, variant), views=views)
 
     def jacobian(
         self,
@@ -252,7 +253,7 @@ class Renderer:
         ((1, 1, 16, 16), np.float64(2.04))
         """
         check_parameters(parameters)
-        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m)
+        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m).in_camera(self.sensor)
         self._check(views, background, workers)
         # a step may take a landmark that stands on the floor a hair into it
         whole = (0, self.sensor.rows)
@@ -274,7 +275,7 @@ class Renderer:
         workers: int,
         variant: Variant = "exact",
     ) -> PhasorImages:
-        """Render rows of views that have been checked."""
+        """Render rows of views that have been checked, as the camera itself has them."""
         run = self._render_tasks if variant == "exact" else self._cast_centres
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)

@@ -28,6 +28,8 @@ _NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _Fraction = Annotated[float, Field(gt=0, le=1)]
 _HalfAngleDeg = Annotated[float, Field(gt=0, lt=85)]
 _TiltDeg = Annotated[float, Field(ge=-45, le=45)]
+_TurnDeg = Annotated[float, Field(ge=-180, le=180)]
+_MountHeight = Annotated[float, Field(ge=-10, le=10)]
 _PixelCount = Annotated[int, Field(ge=1, le=4096)]
 _Share = Annotated[float, Field(ge=0, lt=1)]
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -49,6 +51,8 @@ _OPTICS = (
     "centre_px",
     "pitch_deg",
     "roll_deg",
+    "bearing_offset_deg",
+    "height_offset_m",
     "fill_factor",
     "vignetting",
     "modulation_hz",
@@ -121,6 +125,10 @@ class Sensor(BaseModel):
         Where the optical axis meets the image, pixels from the top left corner. None: the centre.
     pitch_deg, roll_deg : float
         How the camera is mounted; pitch is positive looking down.
+    bearing_offset_deg : float
+        Added to every bearing: the azimuth at which the camera sees what its mount points at.
+    height_offset_m : float
+        Added to every height: how far a landmark's origin lies above the lens where a view says 0.
     fill_factor : (width, height)
         Light-sensitive share of the pixel's pitch, a centred rectangle.
     vignetting : bool
@@ -211,6 +219,8 @@ class Sensor(BaseModel):
     principal_point_px: tuple[float, float] | None = None
     pitch_deg: _TiltDeg = 0.0
     roll_deg: _TiltDeg = 0.0
+    bearing_offset_deg: _TurnDeg = 0.0
+    height_offset_m: _MountHeight = 0.0
     fill_factor: tuple[_Fraction, _Fraction] = (1.0, 1.0)
     vignetting: bool = False
     # modulation and timing

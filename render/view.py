@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
+
+if TYPE_CHECKING:
+    from phasemark.render.sensor import Sensor
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,10 @@ class Views:
         Azimuth b of the landmark's axis in the camera frame.
     height_m : (n,) float64
         Height h of the landmark's origin above the optical axis.
+
+    Notes
+    -----
+    A camera whose mount is not as drawn sees them turned and raised: :meth:`in_camera`.
     """
 
     distance_m: NDArray[np.float64]
@@ -72,6 +80,21 @@ class Views:
 
     def __getitem__(self, index: slice | NDArray[np.integer]) -> Views:
         return Views(self.distance_m[index], self.delta_rad[index], self.bearing_rad[index], self.height_m[index])
+
+    def in_camera(self, sensor: Sensor) -> Views:
+        """Return the views as a camera itself has them: the offsets of its mounting added to bearing and height.
+
+        Parameters
+        ----------
+        sensor : Sensor
+        """
+        if not (sensor.bearing_offset_deg or sensor.height_offset_m):
+            return self
+        return replace(
+            self,
+            bearing_rad=self.bearing_rad + np.deg2rad(sensor.bearing_offset_deg),
+            height_m=self.height_m + sensor.height_offset_m,
+        )
 
     def landmark2cam(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return rotations (n, 3, 3) and translations (n, 3) with p_cam = R · p' + t.

@@ -208,14 +208,15 @@ def _write_workshop(path: Path) -> None:
 
 
 def _write_recording(path: Path) -> None:
-    """Write 12 frames of the cylinder at 0.7 m from 30° by 8 × 8 zones: z in millimetres, 0 if there is none."""
+    """Write 12 frames of the cylinder at 0.7 m from 30° by 8 × 8 zones, a wall behind: z in millimetres."""
     import numpy as np
 
     from phasemark.landmarks import build_mesh, catalog
-    from phasemark.render import Renderer, capture, preset
+    from phasemark.render import Background, Renderer, capture, preset
 
-    sensor = preset("vl53l5cx-8x8")
-    image = Renderer(build_mesh(catalog()["cylinder"]), sensor, albedo=0.8).render(distance_m=0.7, delta_rad=np.pi / 6)
+    sensor, wall = preset("vl53l5cx-8x8"), Background(wall_m=1.5)
+    renderer = Renderer(build_mesh(catalog()["cylinder"]), sensor, albedo=0.8)
+    image = renderer.render(distance_m=0.7, delta_rad=np.pi / 6, background=wall)
     frames = capture(image, sensor, rng=np.random.default_rng(1), n_frames=12)
     np.savetxt(path, np.nan_to_num(1e3 * frames.z_m).reshape(12, -1), delimiter=",", fmt="%.0f")
 

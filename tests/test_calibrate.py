@@ -40,7 +40,7 @@ def some_poses(rng, n):
 
 def take(mounting, poses, rng, *, sensor=PMD, background=None, n_frames=50, light=True):
     """Frames of a camera mounted so, labelled with the sensor as it is thought to be."""
-    there = mounting.on(sensor)
+    there = mounting.on(sensor).with_(bearing_offset_deg=0.0, height_offset_m=0.0)  # they are in the views
     views = Views(
         poses.distance_m, poses.delta_rad, poses.bearing_rad + mounting.bearing_rad, poses.height_m + mounting.height_m
     )
@@ -276,10 +276,7 @@ def folder(tmp_path_factory):
     rng = np.random.default_rng(70)
     truth, poses = some_mounting(rng), some_poses(rng, 8)
     frames = take(truth, poses, rng)
-    np.savez(
-        folder / "frames.npz", range=frames.range_m, amplitude=frames.amplitude_e, intensity=frames.intensity_e,
-        unit="m", quantity="range",
-    )  # fmt: skip
+    save(folder / "frames.npz", frames)
     np.savez(folder / "metres_as_mm.npz", range=frames.range_m / 1e3, unit="m", quantity="range")
     rows = np.column_stack([poses.distance_m, np.degrees(poses.delta_rad), np.degrees(poses.bearing_rad)])
     header = "distance_m,delta_deg,bearing_deg"
@@ -289,6 +286,13 @@ def folder(tmp_path_factory):
     np.savetxt(folder / "aside.csv", rows + np.array([0, 0, 60]), **write)
     np.savetxt(folder / "inside.csv", rows * [0.1, 1, 1], **write)
     return folder, truth
+
+
+def save(path, frames):
+    np.savez(
+        path, range=frames.range_m, amplitude=frames.amplitude_e, intensity=frames.intensity_e, unit="m",
+        quantity="range",
+    )  # fmt: skip
 
 
 def command(folder, tmp_path, *more, frames="frames.npz", poses="poses.csv", landmark="cylinder"):
@@ -325,6 +329,57 @@ def test_the_command_writes_a_sensor_that_every_other_command_takes(folder, tmp_
     assert "half_angle_h" in printed
     assert "fixed" in printed
     assert printed.splitlines()[-1] == str(tmp_path / "cam.png")
+
+
+def matched(folder, capsys, sensor, albedo, truth):
+    """Build a bank for a sensor file and match frames.npz; return errors of D (m), δ and heading (rad) in σ."""
+    bank = ["bank", "build", "--class", "cylinder", "--sensor", sensor, "--albedo", albedo, "--force",
+            "--distance", "0.85:1.15:0.01", "--delta", "15:75:1", "--out", str(folder / "bank.h5")]  # fmt: skip
+    assert main(bank) == 0
+    match = ["match", str(folder / "bank.h5"), str(folder / "frames.npz"), "--method", "refine", "--json",
+             "--landmark-xy", "0", "0", "--prior", "-0.7", "-0.7", "45", "--prior-std", "1", "45"]  # fmt: skip
+    capsys.readouterr()
+    assert main(match) == 0
+    answers = json.loads(capsys.readouterr().out)["matches"]
+    distance_m, delta_rad, heading_rad = truth
+    std = np.sqrt([np.diag(answer["covariance"])[:2] for answer in answers])
+    heading_std = np.radians([answer["poses"][0]["std"]["heading_deg"] for answer in answers])
+    return np.stack(
+        [
+            ([answer["distance_m"] for answer in answers] - distance_m) / std[:, 0],
+            (np.radians([answer["delta_deg"] for answer in answers]) - delta_rad) / std[:, 1],
+            (np.radians([answer["poses"][0]["heading_deg"] for answer in answers]) - heading_rad) / heading_std,
+        ],
+        axis=1,
+    )
+
+
+def test_with_the_calibrated_sensor_distance_side_and_heading_are_at_the_bound(folder, tmp_path, capsys):
+    """The whole mounting goes into the file: nothing is left to carry by hand but the landmark's albedo."""
+    path, truth = folder
+    assert command(path, tmp_path, "--json") == 0
+    albedo = json.loads(capsys.readouterr().out)["parameters"]["albedo"]["value"]
+    rng, n = np.random.default_rng(71), 24
+    poses = KnownPoses.polar(rng.uniform(0.9, 1.1, n), rng.uniform(20, 70, n) * DEGREE)  # the mount points at it
+    save(tmp_path / "frames.npz", take(truth, poses, rng))
+    # pointed at it, the robot heads along the line of sight (PHYSICS section 8, b = β = ψ = 0)
+    there = (poses.distance_m, poses.delta_rad, poses.delta_rad)
+    right = matched(tmp_path, capsys, str(tmp_path / "cam.toml"), str(albedo), there)
+    # χ²(24) / 24 at 99.9 % over 3 numbers, and a common error of the calibration, some 0.3 σ of a single match
+    assert (np.mean(right**2, axis=0) < stats.chi2.ppf(1 - 1e-3 / 3, n) / n + 0.3**2 * 4).all()
+    wrong = matched(tmp_path, capsys, "pmd-16x16", str(albedo), there)
+    assert abs(wrong.mean(axis=0)).min() > 3 * abs(right.mean(axis=0)).max()
+
+
+def test_what_is_stated_and_fixed_is_in_the_sensor_too():
+    poses = KnownPoses.polar([0.9, 1.2, 1.4], [0.1, 0.4, 0.9])
+    raised = replace(Mounting.of_sensor(PMD, 0.8), height_m=0.02)
+    frames = take(raised, poses, np.random.default_rng(3), n_frames=10)
+    found = calibrate(MESH, filtered(frames), poses, free=("pitch",), start=raised)
+    assert (found.sensor.height_offset_m, found.sensor.bearing_offset_deg) == (0.02, 0.0)
+    again = calibrate(MESH, replace(filtered(frames), sensor=found.sensor), poses, free=("pitch",))
+    assert again.mounting.height_m == 0.02  # a sensor file is where the next calibration starts
+    assert abs(again.value("pitch")) < 4 * again.std("pitch")
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,35 @@ def test_a_positive_roll_lowers_what_is_on_the_left():
     assert v == pytest.approx(8 + 8 * 0.1 * math.sin(roll) / TAN, abs=5e-3)
 
 
+def test_a_bearing_offset_moves_what_the_mount_points_at_to_the_left():
+    u, v = seen_at((0, 0, 0), PMD.with_(bearing_offset_deg=3))
+    assert u == pytest.approx(8 - 8 * math.tan(math.radians(3)) / TAN, abs=5e-3)  # a ball off the axis is an ellipse
+    assert v == pytest.approx(8, abs=5e-3)
+
+
+def test_a_height_offset_raises_the_landmark_in_the_image():
+    u, v = seen_at((0, 0, 0), PMD.with_(height_offset_m=0.05))
+    assert u == pytest.approx(8, abs=5e-3)
+    assert v == pytest.approx(8 - 8 * 0.05 / TAN, abs=5e-3)
+
+
+def test_offsets_of_the_mounting_are_added_to_views_and_the_images_keep_the_views_asked_for():
+    mounted = PMD.with_(bearing_offset_deg=2.0, height_offset_m=-0.02, pitch_deg=1.5)
+    plain = mounted.with_(bearing_offset_deg=0.0, height_offset_m=0.0)
+    body = block((-0.1, 0.1), (-0.07, 0.07), (-0.1, 0.05))
+    where, there = (1.0, 0.3, 0.01, 0.02), (1.0, 0.3, 0.01 + math.radians(2.0), 0.0)
+    behind = Background(wall_m=2.0, floor_m=0.2)
+    for call in (
+        lambda renderer, view: renderer.render(*view, background=behind).phasor,
+        lambda renderer, view: renderer.render(*view, variant="hard").phasor,
+        lambda renderer, view: renderer.jacobian(*view),
+    ):
+        np.testing.assert_array_equal(call(Renderer(body, mounted), where), call(Renderer(body, plain), there))
+    views = Renderer(body, mounted).render(*where).views
+    assert (views.bearing_rad[0], views.height_m[0]) == (0.01, 0.02)
+    assert mounted.optics_difference(plain) is not None
+
+
 def test_pitch_is_applied_after_roll():
     """Ry(pitch) · Rx(roll), by hand: the camera's left edge, rolled by 90°, looks up; then pitch lowers it."""
     sensor = PMD.with_(pitch_deg=4, roll_deg=45)

@@ -40,7 +40,18 @@ def test_the_tutorials_explain_every_example():
     assert [path.name for path in (ROOT / "examples").glob("*.py") if path.name not in tutorials] == []
 
 
-@pytest.mark.parametrize(("words", "found"), [("phasemark ba", "bank"), ("phasemark bank bu", "build")])
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("phasemark ba", "bank"),
+        ("phasemark bank bu", "build"),
+        ("phasemark match --me", "--method"),
+        ("phasemark match bank.h5 frames.csv --quantity ", "range z"),
+        ("phasemark bank build --class c", "cylinder cone"),
+        ("phasemark sensor show v", "vl53l5cx-8x8"),
+        ("phasemark match ban", ""),  # the shell goes on with files
+    ],
+)
 def test_a_shell_is_told_what_may_follow(words, found):
     environment = {
         "COMP_WORDS": words,
@@ -50,7 +61,7 @@ def test_a_shell_is_told_what_may_follow(words, found):
     }
     program = [str(Path(sys.executable).with_name("phasemark"))]
     done = subprocess.run(program, env=environment, capture_output=True, text=True)
-    assert (done.returncode, done.stdout.split()) == (0, [found])
+    assert (done.returncode, done.stdout.split()) == (0, found.split())
 
 
 def test_completion_can_be_installed(tmp_path):

@@ -152,6 +152,16 @@ def test_the_wall_is_found_across_the_line_of_sight_to_a_landmark_off_the_axis(e
     assert found.wall_m == pytest.approx(wall_m, abs=8e-3)
 
 
+def test_the_wall_is_found_by_a_camera_that_hangs_askew(equipment):
+    """Pitch, and a mount that points 4° beside the optical axis; PHYSICS section 3 has the wall level."""
+    sensor = equipment.sensor.with_(pitch_deg=-3.0, bearing_offset_deg=4.0)
+    image = equipment.renderers["cylinder"].seen_by(sensor).render(1.2, 0.5, background=Background(wall_m=2.4))
+    frames = kalman_filter(capture(image, sensor, rng=np.random.default_rng(3), n_frames=50))
+    found = estimate_surroundings(frames).background
+    assert found.wall_m == pytest.approx(2.4, abs=3e-3)  # noise leaves 1 mm
+    assert found.wall_albedo == pytest.approx(0.5, rel=0.02)
+
+
 # the filter
 
 

@@ -12,8 +12,10 @@ from phasemark.cli import main
 from phasemark.data import FramePlan, build_frames, export_frames, read_frames
 from phasemark.render import Views, preset
 
-SENSOR = preset("pmd-16x16")
+MOUNT = {"bearing_offset_deg": 3.0, "height_offset_m": -0.03}  # two pixels aside and one down
+SENSOR = preset("pmd-16x16").with_(**MOUNT)
 PLAN = FramePlan(
+    sensor_overrides=MOUNT,
     classes=["cone", "post"],
     views=12,
     frames_per_view=2,
@@ -275,7 +277,7 @@ def test_the_bag_is_a_ros_2_bag_with_labelled_quantities(frames, tmp_path):
     pose = seen["/tf"][7][1].transforms[0]
     sample = frames[7]
     rotation, translation = Views.broadcast(
-        sample["distance_m"], sample["delta_rad"], sample["bearing_rad"], sample["height_m"]
+        sample["distance_m"], sample["delta_rad"], sample["bearing_rad"] + np.deg2rad(3), sample["height_m"] - 0.03
     ).landmark2cam()
     got = pose.transform
     np.testing.assert_allclose([got.translation.x, got.translation.y, got.translation.z], translation[0], atol=1e-12)

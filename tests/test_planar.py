@@ -205,6 +205,11 @@ def test_some_rows_are_those_of_the_whole_image():
         np.testing.assert_array_equal(part.harmonic(3), whole.harmonic(3)[:, first:stop])
 
 
+def test_a_bearing_offset_moves_every_bearing():
+    turned = ranges(sensor=SENSOR.with_(bearing_offset_deg=3.0), distance_m=1.0, delta_rad=0.4, bearing_rad=0.01)
+    np.testing.assert_array_equal(turned, ranges(distance_m=1.0, delta_rad=0.4, bearing_rad=0.01 + math.radians(3)))
+
+
 def test_harmonics_and_vignetting_follow_their_definitions():
     plain, dimmed = (
         planar_images(CYLINDER, SENSOR.with_(vignetting=v), Views.broadcast(1.0), harmonics=(3,)) for v in (False, True)
@@ -298,6 +303,7 @@ def test_whole_pixels_on_one_face_agree_to_what_a_pixel_averages():
         ({"principal_point_px": (7, 8)}, "centred principal point, got"),
         ({"pitch_deg": 1}, "'pitch_deg' = 0, got 1"),
         ({"roll_deg": -2}, "'roll_deg' = 0, got -2"),
+        ({"height_offset_m": 0.02}, "'height_m' = 0, got 0.02"),
     ],
 )
 def test_a_camera_out_of_the_plane_is_refused(changes, message):

@@ -144,7 +144,7 @@ def _pose(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotation and translation from a model's frame to the optical one."""
     view = Views.broadcast(*(sample[name][k] for name in ("distance_m", "delta_rad", "bearing_rad", "height_m")))
-    rotation, translation = view.landmark2cam()
+    rotation, translation = view.in_camera(frames.sensor).landmark2cam()
     to_optical = CAM2OPTICAL @ frames.sensor.cam2level.T
     turned = to_optical @ rotation[0]
     return turned, to_optical @ translation[0] + turned @ centre_m

@@ -73,7 +73,7 @@ def _messages(frames: FrameSet, store: Any) -> Iterator[tuple[str, int, Any]]:
                 yield AMPLITUDE_TOPIC, time_ns, _image(types, header, sample["amplitude_e"][k])
             yield INFO_TOPIC, time_ns, _camera_info(types, header, frames)
             view = Views.broadcast(*(sample[name][k] for name in _VIEW))
-            rotation, translation = view.landmark2cam()
+            rotation, translation = view.in_camera(sensor).landmark2cam()
             landmark = f"{_LANDMARK}_{sample['class_name'][k]}"
             pose = _transform(types, time_ns, _CAMERA, landmark, rotation[0], translation[0])
             yield "/tf", time_ns, types["tf2_msgs/msg/TFMessage"](transforms=[pose])
