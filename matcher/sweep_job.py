@@ -33,7 +33,7 @@ from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.models import VIEW
 from phasemark.matcher.sweep_plan import Method, SweepPlan
-from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, predicted_range_std
+from phasemark.render import Background, Frames, PhasorImages, Renderer, Sensor, Views, capture, predicted_range_std
 
 FORMAT = "phasemark-trials"
 SCHEMA_VERSION = 1
