@@ -13,6 +13,8 @@ from markupsafe import Markup
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_DPI = 110
+
 
 def page_template(package: str, name: str) -> jinja2.Template:
     """Return a template of a package; it may extend ``page.html.j2``, which has the style, a title and a content block.
@@ -29,9 +31,13 @@ def page_template(package: str, name: str) -> jinja2.Template:
 
 
 def figure_png(figure: Figure) -> bytes:
-    """Return a figure as PNG, 110 dots an inch."""
+    """Return a figure as PNG, 110 dots an inch; its layout is computed once, and stays."""
+    if figure.get_layout_engine() is not None:
+        figure.set_dpi(_DPI)
+        figure.draw_without_rendering()
+        figure.set_layout_engine(None)  # or saving draws once more in vain
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
+    figure.savefig(buffer, format="png", dpi=_DPI)
     return buffer.getvalue()
 
 

@@ -17,7 +17,7 @@ from scipy import special
 from phasemark import UsageError
 from phasemark.matcher.likelihood import Quantity, counts
 from phasemark.matcher.models import VIEW
-from phasemark.render import Background, Renderer, Sensor, Views, predicted_range_std
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, predicted_range_std
 from phasemark.render.noise import phase_image_variance
 
 _WALL_STEP_M = 1e-4
@@ -67,6 +67,7 @@ def cramer_rao(
     pixels: str | NDArray[np.bool_] = "all",
     background: Background | None = None,
     nuisances: Sequence[str] | None = None,
+    image: PhasorImages | None = None,
     workers: int = 1,
 ) -> Bound:
     """Return the Cramér–Rao bound at some views (PHYSICS section 7).
@@ -88,6 +89,8 @@ def cramer_rao(
     background : Background, optional
     nuisances : sequence of str, optional
         Which of :data:`NUISANCES` are unknown too; None: the albedo on phasors, nothing on ranges.
+    image : PhasorImages, optional
+        What is seen at the views, where it has been rendered already: of the same landmark, optics and background.
     workers : int
         Threads.
 
@@ -118,7 +121,8 @@ def cramer_rao(
     if (background is None or background.wall_m is None) and set(nuisances) & {"wall_m", "wall_albedo"}:
         raise UsageError("a wall can be a nuisance only where there is one: give 'background' a wall")
     sensor = renderer.sensor
-    image = renderer.render_views(views, background=background, workers=workers)
+    if image is None:
+        image = renderer.render_views(views, background=background, workers=workers)
     slope = renderer.jacobian(
         *(getattr(views, name) for name in VIEW), background=background, parameters=free, workers=workers
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phasemark import InputFileError, OutputExistsError, UsageError
 from phasemark.data import versions, write_atomically
@@ -18,7 +19,7 @@ from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.shards import difference
 from phasemark.matcher.sweep_job import FORMAT, SCHEMA_VERSION, Round, SweepJob, check_matcher
 from phasemark.matcher.sweep_plan import SweepPlan
-from phasemark.matcher.sweep_tables import Cell, SweepTrials, csv_bytes, json_rows
+from phasemark.matcher.sweep_tables import Cell, SweepTrials, csv_bytes, json_rows, trials_csv
 
 TRIALS_AT_ONCE = 50
 """Trials of a shard: of one batch of a method, whatever the number of workers, so that no rounding depends on it."""
@@ -85,7 +86,7 @@ def run_sweep(
         rounds.append(following)
         trials = _read(plan, folder, len(rounds))
         following = _next_round(plan, trials, rounds)
-    write_atomically(folder / "trials.csv", csv_bytes(trials.trial_rows()), force=True)
+    write_atomically(folder / "trials.csv", trials_csv(trials), force=True)
     write_cells(plan, trials, folder)
     return trials
 
@@ -135,7 +136,9 @@ def write_cells(plan: SweepPlan, trials: SweepTrials, folder: Path) -> tuple[Cel
     """Write cells.csv and sweep.json, and return the cells."""
     cells = trials.cells()
     rows = [cell.row() for cell in cells]
-    write_atomically(folder / "cells.csv", csv_bytes(rows), force=True)
+    write_atomically(
+        folder / "cells.csv", csv_bytes({name: [row[name] for row in rows] for name in rows[0]}), force=True
+    )
     table = {"plan": plan.model_dump(mode="json"), "versions": versions(), "cells": json_rows(rows)}
     text = json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False)
     write_atomically(folder / "sweep.json", text.encode(), force=True)
@@ -214,9 +217,13 @@ def _read(plan: SweepPlan, folder: Path, n_rounds: int) -> SweepTrials:
             check_format(file, path, "sweep", FORMAT, SCHEMA_VERSION)
             for name in names:
                 parts.setdefault(name, []).append(file[name][...])
-    arrays = {name: np.concatenate(values) for name, values in parts.items()}
-    order = np.lexsort((arrays["trial"], arrays["condition"]))
-    arrays = {name: values[order] for name, values in arrays.items()}
+    # one round is most of the memory, and is not copied
+    arrays: dict[str, NDArray[Any]] = {
+        name: np.concatenate(parts.pop(name)) if n_rounds > 1 else parts.pop(name)[0] for name in names
+    }
+    if n_rounds > 1:  # alone it is in order
+        order = np.lexsort((arrays["trial"], arrays["condition"]))
+        arrays = {name: values[order] for name, values in arrays.items()}
     for name in ("condition", "trial", "dof", "found", "modes"):
         arrays[name] = arrays[name].astype(np.int64)
     return SweepTrials(

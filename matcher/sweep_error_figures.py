@@ -16,18 +16,21 @@ from phasemark.matcher.intervals import mean_interval, rms_interval
 from phasemark.matcher.sweep_plan import Method
 from phasemark.matcher.sweep_style import (
     AXIS_LABEL,
-    LOGARITHMIC,
+    NOMINAL,
     SHOWN,
-    is_nominal,
+    is_as_told,
     logarithmic,
     median,
     methods_of,
     panels,
     style,
+    value_ticks,
 )
 from phasemark.matcher.sweep_tables import Cell, SweepTrials
 
 _BINS = 10
+_APART, _BESIDE = 0.08, 0.3
+"""How far apart methods stand where an axis has nothing between its values, and how far the bound is drawn there."""
 
 
 def against_axis(cells: Sequence[Cell], axis: str, axes: Sequence[str]) -> Figure:
@@ -38,28 +41,39 @@ def against_axis(cells: Sequence[Cell], axis: str, axes: Sequence[str]) -> Figur
         bounds: dict[tuple[float, ...], list[str]] = {}
         for k, (method, along) in enumerate(groups.items()):
             colour, mark, stroke = style(k)
-            x = list(along)
-            rmse = [_typical([cell.rmse[parameter] for cell in along[value]], scale) for value in x]
-            whole = [median([cell.rmse_with_outliers[parameter].value * scale for cell in along[value]]) for value in x]
-            bias = [_mean([cell.bias[parameter] for cell in along[value]], scale) for value in x]
+            stroke = "none" if axis in NOMINAL else stroke
+            values = list(along)
+            x = _places(axis, values, k - (len(groups) - 1) / 2)
+            rmse = [_typical([cell.rmse[parameter] for cell in along[value]], scale) for value in values]
+            whole = [
+                median([cell.rmse_with_outliers[parameter].value * scale for cell in along[value]]) for value in values
+            ]
+            bias = [_mean([cell.bias[parameter] for cell in along[value]], scale) for value in values]
             look = {"color": colour, "marker": mark, "linestyle": stroke, "markersize": 4, "capsize": 2, "linewidth": 1}
             _with_bars(rows[0][column], x, rmse, {**look, "label": method})
             if any(value > 1.02 * one.value for value, one in zip(whole, rmse, strict=True)):
-                rows[0][column].plot(x, whole, color=colour, linewidth=0.7, alpha=0.6, label=f"{method}, with outliers")
+                rows[0][column].plot(
+                    x, whole, color=colour, linewidth=0.7, alpha=0.6, marker="_" if axis in NOMINAL else None,
+                    linestyle=stroke if axis in NOMINAL else "-", label=f"{method}, with outliers",
+                )  # fmt: skip
             _with_bars(rows[1][column], x, bias, look)
-            bound = tuple(median([cell.bound[parameter] * scale for cell in along[value]]) for value in x)
+            bound = tuple(median([cell.bound[parameter] * scale for cell in along[value]]) for value in values)
             bounds.setdefault(bound, []).append(method)
         by_size = sorted(bounds.items(), key=lambda item: -len(item[1]))
         for k, (bound, methods) in enumerate(by_size):
             label_of = "Cramér–Rao bound" if k == 0 else f"bound, {', '.join(methods)}"
-            rows[0][column].plot(x, bound, color="black", linewidth=1.2, linestyle=(0, (1 + 2 * k, 1)), label=label_of)
+            drawn: dict[str, Any] = {"color": "black", "linewidth": 1.2, "linestyle": (0, (1 + 2 * k, 1))}
+            x = _places(axis, values, 0)
+            if axis in NOMINAL:
+                rows[0][column].hlines(bound, np.subtract(x, _BESIDE), np.add(x, _BESIDE), label=label_of, **drawn)
+            else:
+                rows[0][column].plot(x, bound, label=label_of, **drawn)
         logarithmic(rows[0][column].yaxis)
         rows[0][column].set_ylabel(f"RMSE of {label} ({unit})")
         rows[1][column].set_ylabel(f"bias of {label} ({unit})")
         rows[1][column].axhline(0, color="black", linewidth=0.8)
         for row in rows:
-            if axis in LOGARITHMIC:
-                logarithmic(row[column].xaxis, x)
+            value_ticks(row[column].xaxis, axis, values)
             row[column].set_xlabel(AXIS_LABEL[axis])
             row[column].grid(which="both", linewidth=0.3)
     # above the panels: with many methods it would cover what it explains
@@ -86,7 +100,7 @@ def maps(cells: Sequence[Cell], quantity: str) -> Figure:
             for i, j in np.ndindex(table.shape):
                 if math.isfinite(table[i, j]):
                     colour = "white" if table[i, j] < middle else "black"
-                    panel.text(j, i, f"{table[i, j]:.2g}", ha="center", va="center", color=colour, fontsize=7)
+                    panel.text(j, i, f"{table[i, j]:.3g}", ha="center", va="center", color=colour, fontsize=7)
             panel.set_xticks(range(len(x)), [f"{a:g}" for a in x])
             panel.set_yticks(range(len(y)), [f"{d:g}" for d in y])
             panel.set_xlabel(AXIS_LABEL["delta_deg"])
@@ -110,7 +124,7 @@ def bias_arrows(cells: Sequence[Cell]) -> Figure:
         arrows = np.array([[one.value for one in mean[name]] for name in ("delta_rad", "distance_m")])
         sure = np.array([[one.low > 0 or one.high < 0 for one in mean[name]] for name in SHOWN]).any(axis=0)
         _arrows(panel, places, arrows, sure)
-        panel.set_title(method, fontsize=9, loc="left")
+        panel.set_title(method, fontsize=9, loc="left", pad=10)
     for panel in [panel for row in rows for panel in row][len(methods) :]:
         panel.set_axis_off()
     return figure
@@ -126,6 +140,7 @@ def observability(cells: Sequence[Cell]) -> Figure:
         values = [median([cell.condition_number for cell in groups[method, d, a]]) for a in x]
         left.plot(x, values, color=colour, marker=mark, linestyle=stroke, markersize=4, label=f"D = {d:g} m")
     logarithmic(left.yaxis)
+    value_ticks(left.xaxis, "delta_deg", x)
     left.set_xlabel(AXIS_LABEL["delta_deg"])
     left.set_ylabel("condition number of the bound (cm, °)")
     left.grid(which="both", linewidth=0.3)
@@ -141,14 +156,14 @@ def observability(cells: Sequence[Cell]) -> Figure:
         ]
     )
     _arrows(right, places, weak, True, both_ways=True)
-    right.set_title("weakest direction", fontsize=9, loc="left")
+    right.set_title("weakest direction", fontsize=9, loc="left", pad=10)
     return figure
 
 
 def position_in_cell(trials: SweepTrials, methods: Sequence[Method], first_m: float) -> Figure:
     """Draw the mean error against the position of the truth in a cell of the grid, which begins at `first_m`."""
     figure, (row,) = panels(2)
-    nominal = np.array([is_nominal(condition) for condition in trials.conditions])[trials.condition]
+    nominal = np.array([is_as_told(condition) for condition in trials.conditions])[trials.condition]
     error = trials.error
     limits = (trials.outlier[0], math.radians(trials.outlier[1]))
     for k, method in enumerate(methods):
@@ -178,7 +193,7 @@ def model_comparison(trials: SweepTrials, methods: Sequence[Method]) -> Figure:
     """Draw the nearest image's RMSE by the bank's model, without a wall and before one."""
     figure, (row,) = panels(2, height=3.0)
     chosen = [k for k, method in enumerate(methods) if method.method == "nearest"]
-    nominal = np.array([is_nominal(condition) for condition in trials.conditions])
+    nominal = np.array([is_as_told(condition) for condition in trials.conditions])
     walls = sorted({one.wall_m > 0 for one, as_told in zip(trials.conditions, nominal, strict=True) if as_told})
     error = trials.error
     limits = (trials.outlier[0], math.radians(trials.outlier[1]))
@@ -201,8 +216,8 @@ def model_comparison(trials: SweepTrials, methods: Sequence[Method]) -> Figure:
                 panel.hlines(y, rms.low, rms.high, color=colour, linewidth=1.2)
                 if lost >= 5e-4:
                     panel.annotate(
-                        f"{100 * lost:.2g} % outliers", (rms.high, y), (5, 0), textcoords="offset points", va="center",
-                        fontsize=7,
+                        f"{100 * lost:.2g} % outliers", (rms.high, y), (0, 5), textcoords="offset points",
+                        ha="right", fontsize=7,
                     )  # fmt: skip
                 panel.set_xlabel(f"RMSE of {label} ({unit})")
                 panel.set_ylim(len(chosen) - 0.4, -0.6)
@@ -213,6 +228,13 @@ def model_comparison(trials: SweepTrials, methods: Sequence[Method]) -> Figure:
         logarithmic(panel.xaxis)
     row[0].legend(fontsize=7)
     return figure
+
+
+def _places(axis: str, values: Sequence[float], side: float) -> list[float]:
+    """Return where values lie on an axis; where there is nothing between them, methods stand side by side."""
+    if axis not in NOMINAL:
+        return list(values)
+    return [place + side * _APART for place in range(len(values))]
 
 
 def _along(cells: Sequence[Cell], method: str, axis: str, axes: Sequence[str]) -> dict[float, list[Cell]]:

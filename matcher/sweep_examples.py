@@ -76,7 +76,7 @@ def sweep_frames(folder: str | os.PathLike[str], condition: int, trial: int) -> 
     if not 0 <= trial < (most or plan.trials):
         raise UsageError(f"{folder}: has trials 0 … {(most or plan.trials) - 1} of a condition, got {trial}")
     job = _job(plan)
-    return job.raw_frames(condition, job.views(condition, trial, trial + 1), trial)
+    return job.raw_frames(condition, job.image(condition, job.views(condition, trial, trial + 1)), trial)
 
 
 def worst_examples(plan: SweepPlan, trials: SweepTrials, n: int) -> list[Example]:
@@ -110,7 +110,8 @@ def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, method: str) ->
 
     number, trial = int(trials.condition[k]), int(trials.trial[k])
     condition = trials.conditions[number]
-    frames = job.frames(number, job.plan.methods[m], job.views(number, trial, trial + 1), trial)
+    image = job.image(number, job.views(number, trial, trial + 1))
+    frames = job.frames(number, job.plan.methods[m], image, trial)
     found = int(trials.found[k, m])
     covariance = trials.covariance[k, m]
     name = None if found < 0 else trials.classes[found]

@@ -33,7 +33,7 @@ from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.models import VIEW
 from phasemark.matcher.sweep_plan import Method, SweepPlan
-from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, predicted_range_std
+from phasemark.render import Background, Frames, PhasorImages, Renderer, Sensor, Views, capture, predicted_range_std
 
 FORMAT = "phasemark-trials"
 SCHEMA_VERSION = 1
@@ -166,17 +166,18 @@ class SweepJob:
         views = self.views(number, first, self.of.first + stop)
         truth = np.stack([getattr(views, name) for name in VIEW], axis=1)
         out = {name: np.zeros((len(views), len(self.plan.methods), *shape), kind) for name, shape, kind, _ in _FIELDS}
+        image = self.image(number, views)
         frames: dict[tuple[str, str], FilteredFrames] = {}
         bounds: dict[tuple[Any, ...], NDArray[np.float64]] = {}
         for m, method in enumerate(self.plan.methods):
             kind = (method.on, method.filter)
             if kind not in frames:
-                frames[kind] = self.frames(number, method, views, first)
+                frames[kind] = self.frames(number, method, image, first)
             what = (method.on, method.parameters, method.pixels)
             if what not in bounds and self.is_stranger(number):
                 bounds[what] = np.full((len(views), _N, _N), np.nan)
             elif what not in bounds:
-                bounds[what] = self.bound(number, method, views)
+                bounds[what] = self.bound(number, method, image)
             begun = time.perf_counter()
             matches = self._match(number, m, frames[kind], first)
             out["seconds"][:, m] = (time.perf_counter() - begun) / len(views)
@@ -215,11 +216,11 @@ class SweepJob:
         return self.believed_sensor(number).with_(**changes)
 
     def renderer(self, number: int, sensor: Sensor, *, dimension_error: float | None = None) -> Renderer:
-        """Return what renders the true landmark of a condition; the latest are kept, for they take time to make."""
+        """Return what renders the true landmark of a condition; a mesh's edges take time, and the latest are kept."""
         condition = self.all_conditions[number]
         if dimension_error is None:
             dimension_error = condition.dimension_error
-        key = (condition.class_name, dimension_error, condition.albedo, sensor.model_dump_json())
+        key = (condition.class_name, dimension_error, condition.albedo, sensor.harmonic_orders)
         with self._guard:
             if key not in self._renderers:
                 mesh = self.objects[condition.class_name].mesh
@@ -229,38 +230,46 @@ class SweepJob:
                 self._renderers[key] = Renderer(mesh, sensor, albedo=condition.albedo)
                 if len(self._renderers) > _RENDERERS_KEPT:
                     self._renderers.pop(next(iter(self._renderers)))
-            return self._renderers[key]
+            return self._renderers[key].seen_by(sensor)
 
     def background(self, number: int) -> Background | None:
         """Return what truly stands behind the landmark."""
         wall_m = self.all_conditions[number].wall_m
         return Background(wall_m=wall_m) if wall_m else None
 
-    def frames(self, number: int, method: Method, views: Views, first: int) -> FilteredFrames:
+    def image(self, number: int, views: Views) -> PhasorImages:
+        """Return what the true camera of a condition sees at some views, without noise."""
+        return self.renderer(number, self.true_sensor(number)).render_views(views, background=self.background(number))
+
+    def frames(self, number: int, method: Method, image: PhasorImages, first: int) -> FilteredFrames:
         """Return the filtered frames of some trials, as a method gets them; `first` is the first one's number."""
-        seen = self.raw_frames(number, views, first, on=method.on)
+        seen = self.raw_frames(number, image, first, on=method.on)
         return (phasor_mean if method.filter == "phasor-mean" else kalman_filter)(seen)
 
-    def raw_frames(self, number: int, views: Views, first: int, *, on: Quantity = "ranges") -> Frames:
+    def raw_frames(self, number: int, image: PhasorImages, first: int, *, on: Quantity = "ranges") -> Frames:
         """Return the frames of some trials, (n, n_frames, rows, cols), with the sensor that a method believes in."""
         true, believed = self.true_sensor(number), self.believed_sensor(number)
         if on == "phasors":
             true, believed = (sensor.with_(max_phase_std_rad=None) for sensor in (true, believed))
-        image = self.renderer(number, true).render_views(views, background=self.background(number))
         rng = stream(self.plan.seed, "sweep.noise", number)
         n_frames = self.all_conditions[number].n_frames
         frames = capture(image, true, rng=rng, n_frames=n_frames, first_view=first)
+        if true == believed:
+            return frames
         return Frames(frames.range_m, frames.amplitude_e, frames.intensity_e, flags=frames.flags, sensor=believed)
 
-    def bound(self, number: int, method: Method, views: Views) -> NDArray[np.float64]:
-        """Return the Cramér–Rao bound of the true world at some views, (n, 4, 4), NaN for what is not estimated."""
+    def bound(self, number: int, method: Method, image: PhasorImages) -> NDArray[np.float64]:
+        """Return the Cramér–Rao bound of the true world at the views of an image of it.
+
+        (n, 4, 4), NaN for what is not estimated.
+        """
         free = method.parameters
         found = cramer_rao(
-            self.renderer(number, self.true_sensor(number).with_(modulation="sine", harmonics=())), views, free=free,
-            n_frames=self.all_conditions[number].n_frames, on=method.on, pixels=method.pixels,
-            background=self.background(number),
+            self.renderer(number, self.true_sensor(number).with_(modulation="sine", harmonics=())), image.views,
+            free=free, n_frames=self.all_conditions[number].n_frames, on=method.on, pixels=method.pixels,
+            background=self.background(number), image=image,
         )  # fmt: skip
-        return _spread(found.covariance, free, len(views))
+        return _spread(found.covariance, free, len(image))
 
     def confusion(self, number: int, views: Views, first: int) -> NDArray[np.float64]:
         """Return a bound on how often another class explains a frame better, (n,); NaN beyond the first few trials.

@@ -63,7 +63,6 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     for figure in sweep_figures(plan, trials, cells):
         png, svg = figure_png(figure.figure), io.BytesIO()
         with matplotlib.rc_context({"svg.hashsalt": "phasemark"}):  # or the names inside would differ each time
-            figure.figure.set_layout_engine("none")  # it is laid out already
             figure.figure.savefig(svg, format="svg", metadata={"Date": None})
         write_atomically(folder / "figures" / f"{figure.name}.png", png, force=True)
         write_atomically(folder / "figures" / f"{figure.name}.svg", svg.getvalue(), force=True)

@@ -24,10 +24,13 @@ SHOWN = {"distance_m": ("distance", "mm", 1e3), "delta_rad": ("angle δ", "°", 
 AXIS_LABEL = {
     "distance_m": "distance D (m)", "delta_deg": "angle δ (°)", "noise_factor": "noise, relative to the sensor's",
     "n_frames": "frames averaged", "bearing_deg": "bearing (°)", "height_m": "height (m)", "pitch_deg": "pitch (°)",
-    "albedo": "albedo", "wall_m": "wall (m), 0: none", "wiggling": "wiggling, relative to square against square",
-    "unit": "unit, 0: no fixed pattern", "dimension_error": "relative error of the dimensions",
+    "albedo": "albedo", "wall_m": "wall (m)", "wiggling": "wiggling, relative to square against square",
+    "unit": "unit, with its fixed pattern", "dimension_error": "relative error of the dimensions",
 }  # fmt: skip
 LOGARITHMIC = ("distance_m", "noise_factor", "n_frames", "albedo")
+NOMINAL = ("unit", "wall_m")
+"""Axes whose values lie beside one another without anything between them; 0 stands for none."""
+_MOST_TICKS = 9
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,16 @@ def logarithmic(axis: Axis, ticks: Sequence[float] | None = None) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def is_nominal(condition: Condition) -> bool:
+def value_ticks(axis: Axis, name: str, values: Sequence[float]) -> None:
+    """Put a design's values on an axis: each of them, if they are few."""
+    if name in NOMINAL:
+        axis.set_ticks(range(len(values)), ["none" if value == 0 else f"{value:g}" for value in values])
+    elif name in LOGARITHMIC:
+        logarithmic(axis, values)
+    elif len(values) <= _MOST_TICKS:
+        axis.set_ticks(list(values), [f"{value:g}" for value in values])
+
+
+def is_as_told(condition: Condition) -> bool:
     """Return whether a condition is as a method takes it to be."""
     return all(getattr(condition, name) == 0 for name in MODEL_ERRORS)

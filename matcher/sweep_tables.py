@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -20,6 +20,7 @@ from phasemark.matcher.sweep_plan import Condition
 
 LEVELS = (0.5, 0.9, 0.95, 0.99)
 """Probabilities of the ellipsoids whose coverage is counted."""
+_ROWS_AT_ONCE = 5000
 _HONEST_SIGMA = 5.0
 """An error within so many standard deviations of the bound is no outlier, however large it is."""
 _UNIT = np.array([0.01, math.pi / 180, math.pi / 180, 0.01])
@@ -90,9 +91,14 @@ class SweepTrials:
     @property
     def error(self) -> NDArray[np.float64]:
         """Estimate less truth, δ wrapped by the true landmark's symmetry; (n, m, 4), NaN for strangers."""
-        error = self.estimate - self.truth[:, None]
-        error[self.true_class < 0] = np.nan
-        period = 2 * math.pi / np.array(self.symmetry, np.float64)[self.true_class][:, None]
+        return self.error_of(slice(None))
+
+    def error_of(self, rows: slice) -> NDArray[np.float64]:
+        """Return :attr:`error` of some trials."""
+        true_class = self.true_class[rows]
+        error = self.estimate[rows] - self.truth[rows, None]
+        error[true_class < 0] = np.nan
+        period = 2 * math.pi / np.array(self.symmetry, np.float64)[true_class][:, None]
         error[:, :, 1] -= period * np.round(error[:, :, 1] / period)
         return error
 
@@ -100,36 +106,41 @@ class SweepTrials:
         """Return where the trials of a condition lie."""
         return slice(*np.searchsorted(self.condition, [condition, condition + 1]))
 
-    def trial_rows(self) -> Iterator[dict[str, Any]]:
-        """Yield what trials.csv holds, trial by trial and method by method."""
-        error = self.error
-        for k in range(len(self)):
-            number = int(self.condition[k])
-            condition = self.conditions[number]
-            for m, method in enumerate(self.methods):
-                yield {
-                    "condition": number,
-                    "trial": int(self.trial[k]),
-                    "method": method,
-                    "class": condition.class_name,
-                    **{f"true_{name}": float(self.truth[k, i]) for i, name in enumerate(VIEW)},
-                    **{name: float(self.estimate[k, m, i]) for i, name in enumerate(VIEW)},
-                    **{f"error_{name}": float(error[k, m, i]) for i, name in enumerate(VIEW)},
-                    **{f"bound_{name}": _root(self.bound[k, m, i, i]) for i, name in enumerate(VIEW)},
-                    **{
-                        f"cov_{_SHORT[i]}_{_SHORT[j]}": float(self.covariance[k, m, i, j])
-                        for i in range(len(VIEW))
-                        for j in range(i, len(VIEW))
-                    },
-                    "chi2": float(self.chi2[k, m]),
-                    "dof": int(self.dof[k, m]),
-                    "p_value": float(self.p_value[k, m]),
-                    "p_none": float(self.p_none[k, m]),
-                    "found": "none" if self.found[k, m] < 0 else self.classes[self.found[k, m]],
-                    "modes": int(self.modes[k, m]),
-                    "accepted": int(self.accepted[k, m]),
-                    "seconds": float(self.seconds[k, m]),
-                }
+    def trial_table(self, rows: slice) -> dict[str, list[Any]]:
+        """Return what trials.csv holds of some trials: columns, trial by trial and method by method."""
+        m = len(self.methods)
+        number = self.condition[rows]
+        error = self.error_of(rows)
+        shared: dict[str, Sequence[Any]] = {
+            "condition": number.tolist(),
+            "trial": self.trial[rows].tolist(),
+            "method": self.methods * len(number),
+            "class": [self.conditions[k].class_name for k in number],
+            **{f"true_{name}": self.truth[rows, i].tolist() for i, name in enumerate(VIEW)},
+        }
+        names = (*self.classes, "none")
+        own: dict[str, NDArray[Any]] = {
+            **{name: self.estimate[rows, :, i] for i, name in enumerate(VIEW)},
+            **{f"error_{name}": error[:, :, i] for i, name in enumerate(VIEW)},
+            **{f"bound_{name}": _root(self.bound[rows, :, i, i]) for i, name in enumerate(VIEW)},
+            **{
+                f"cov_{_SHORT[i]}_{_SHORT[j]}": self.covariance[rows, :, i, j]
+                for i in range(len(VIEW))
+                for j in range(i, len(VIEW))
+            },
+            **{name: getattr(self, name)[rows] for name in ("chi2", "dof", "p_value", "p_none")},
+            "found": np.array(names, object)[self.found[rows]],
+            "modes": self.modes[rows],
+            "accepted": self.accepted[rows].astype(np.int64),
+            "seconds": self.seconds[rows],
+        }
+        return {
+            **{
+                name: list(values) if name == "method" else [value for value in values for _ in range(m)]
+                for name, values in shared.items()
+            },
+            **{name: values.reshape(-1).tolist() for name, values in own.items()},
+        }
 
     def cells(self) -> tuple[Cell, ...]:
         """Judge every method under every condition."""
@@ -295,16 +306,20 @@ class Cell:
 _UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 
 
-def csv_bytes(rows: Iterator[dict[str, Any]] | Sequence[dict[str, Any]]) -> bytes:
-    """Return rows as CSV; numbers as short as they can be read back exactly, nothing for NaN."""
+def csv_bytes(table: Mapping[str, Sequence[Any]], *, header: bool = True) -> bytes:
+    """Return columns as CSV; numbers as short as they can be read back exactly, nothing for NaN."""
     text = io.StringIO()
-    writer: Any = None
-    for row in rows:
-        if writer is None:
-            writer = csv.writer(text, lineterminator="\n")
-            writer.writerow(row)
-        writer.writerow(["" if isinstance(v, float) and math.isnan(v) else v for v in row.values()])
+    writer = csv.writer(text, lineterminator="\n")
+    if header:
+        writer.writerow(table)
+    writer.writerows(zip(*(["" if v != v else v for v in column] for column in table.values()), strict=True))
     return text.getvalue().encode()
+
+
+def trials_csv(trials: SweepTrials) -> Iterator[bytes]:
+    """Yield trials.csv piece by piece."""
+    for start in range(0, len(trials), _ROWS_AT_ONCE):
+        yield csv_bytes(trials.trial_table(slice(start, start + _ROWS_AT_ONCE)), header=start == 0)
 
 
 def json_rows(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -321,8 +336,9 @@ def _flat(name: str, value: Estimate) -> dict[str, float]:
     return {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
 
 
-def _root(variance: float) -> float:
-    return math.sqrt(variance) if variance >= 0 else math.nan
+def _root(variance: NDArray[np.float64]) -> NDArray[np.float64]:
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(variance)
 
 
 def _observability(covariance: NDArray[np.float64], at: NDArray[np.int64]) -> tuple[float, dict[str, float]]:

@@ -67,7 +67,7 @@ def coverage(cells: Sequence[Cell]) -> Figure:
         panel.set_xlabel("cell")
         panel.grid(linewidth=0.3)
     row[0].set_ylabel("share of errors within the ellipsoid (%)")
-    row[-1].legend(fontsize=7, loc="lower right")
+    figure.legend(*row[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=7)
     return figure
 
 
@@ -124,7 +124,7 @@ def confusion_bound(cells: Sequence[Cell]) -> Figure:
     panel.set_xlabel(f"bound on the probability of a wrong class (–), {_LEAST_BOUND:g} where it is less")
     panel.set_ylabel("share of wrong classes (–)")
     panel.grid(linewidth=0.3)
-    figure.legend(*panel.get_legend_handles_labels(), fontsize=7, loc="outside right upper")
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=7)
     return figure
 
 

@@ -5,7 +5,7 @@ The chain is a row of functions in the order in which the camera does things::
     spread_light          stray light, on intensity and every S_k           stray.py
     tap_means             offsets, harmonics, contrast, ambient light       taps.py, unit.py
     collect               PRNU, dark current, DSNU, dead and hot pixels     taps.py, unit.py
-    add_shot_noise        Poisson                                           electrons.py
+    draw_arrived          Poisson                                           electrons.py
     fill_well             clip at full well, flagged                        electrons.py
     add_read_noise        Gaussian                                          electrons.py
     convert, decode       gain, black level, round, clip; nominal inverse   electrons.py

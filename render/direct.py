@@ -31,10 +31,10 @@ def capture_direct(
     if sensor.range_std_m > 0:
         n = sensor.rows * sensor.cols
         words, chosen = np.empty((4, n), np.uint64), np.empty(n, np.int32)
-        uniform, normal = np.empty((2, n)), np.empty(n)
+        uniform, normal, samples = np.empty((2, n)), np.empty(n), np.arange(n)
         for view in range(shape[0]):
             for frame in range(n_frames):
-                fill_uniform(0, first_frame + frame, first_view + view, int(Term.RANGE), key, words, uniform)
+                fill_uniform(samples, first_frame + frame, first_view + view, int(Term.RANGE), key, words, uniform)
                 fill_normal(uniform[0], chosen, normal)
                 range_m[view, frame] += sensor.range_std_m * normal.reshape(shape[2:])
     furthest_m = np.inf if sensor.max_range_m is None else sensor.max_range_m

@@ -49,21 +49,23 @@ class ReadOut(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def add_shot_noise(taps, uniform, normal, first_sample, frame, view, key):
-    """Turn mean electrons into arrived ones: Poisson, or above `EXACT_POISSON_BELOW` a normal of its mean and variance.
+def draw_arrived(means, uniform, normal, samples, frame, view, key, arrived):
+    """Draw arrived electrons: Poisson, or above `EXACT_POISSON_BELOW` a normal of the Poisson's mean and variance.
 
-    `taps`, `uniform` and `normal` are (2, n): taps a and b of n pixels, with one uniform number and its normal deviate.
+    `means`, `uniform`, `normal` and `arrived` are (2, n): taps a and b of n pixels, with one uniform number and its
+    normal deviate; `samples`, (n,), are the pixels' numbers in the random stream.
     """
     for tap in range(2):
-        for i in range(taps.shape[1]):
-            mean = taps[tap, i]
+        for i in range(means.shape[1]):  # dim ones too: without a branch several run at once
+            arrived[tap, i] = means[tap, i] + math.sqrt(means[tap, i]) * normal[tap, i]
+        for i in range(means.shape[1]):
+            mean = means[tap, i]
             if mean >= EXACT_POISSON_BELOW:
-                taps[tap, i] = mean + math.sqrt(mean) * normal[tap, i]
-            elif mean >= _INVERSION_BELOW:
-                sample = 2 * (first_sample + i) + tap
-                taps[tap, i] = _poisson_by_rejection(mean, sample, frame, view, key)
+                continue
+            if mean >= _INVERSION_BELOW:
+                arrived[tap, i] = _poisson_by_rejection(mean, 2 * samples[i] + tap, frame, view, key)
             else:
-                taps[tap, i] = _poisson_by_inversion(mean, uniform[tap, i])
+                arrived[tap, i] = _poisson_by_inversion(mean, uniform[tap, i])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -156,26 +158,56 @@ def read_taps(means, start, stop, n_frames, first_view, first_frame, key, out, t
         Filled: whether a tap of the pixel reached its full well or the highest code.
     """
     n = means.shape[3]
-    words, chosen = np.empty((4, n), np.uint64), np.empty(2 * n, np.int32)
-    uniform, normal = np.empty((2, n)), np.empty((2, n))
+    every = np.arange(n)
+    words, chosen, uniform, normal = _scratch(n)
     for i in range(start, stop):
         mean = means[i // n_frames - start // n_frames]
         view, frame = first_view + i // n_frames, first_frame + i % n_frames
+        if i == start or i % n_frames == 0:
+            lit = _pixels_with_light(mean)  # no light has no noise: most of a frame may be nothing but background
+            light, arrived = np.empty((4, 2, len(lit))), np.empty((2, len(lit)))
+            for phase in range(4):
+                for tap in range(2):
+                    light[phase, tap] = mean[phase, tap][lit]
+            lit_words, lit_chosen, lit_uniform, lit_normal = _scratch(len(lit))
         over = saturated[i - start]
         over[:] = False
         for phase in range(4):
             row = taps[i - start, phase]
             row[:] = mean[phase]
             if out.shot_noise:
-                fill_uniform(phase * n, frame, view, _SHOT, key, words, uniform)
-                fill_normal(uniform.reshape(-1), chosen, normal.reshape(-1))
-                add_shot_noise(row, uniform, normal, phase * n, frame, view, key)
+                samples = phase * n + lit
+                fill_uniform(samples, frame, view, _SHOT, key, lit_words, lit_uniform)
+                fill_normal(lit_uniform.reshape(-1), lit_chosen, lit_normal.reshape(-1))
+                draw_arrived(light[phase], lit_uniform, lit_normal, samples, frame, view, key, arrived)
+                for k in range(len(lit)):
+                    row[0, lit[k]], row[1, lit[k]] = arrived[0, k], arrived[1, k]
             if out.full_well_e < math.inf:
                 fill_well(row, out.full_well_e, over)
             if out.read_noise_e > 0.0:
-                fill_uniform(phase * n, frame, view, _READ, key, words, uniform)
+                fill_uniform(phase * n + every, frame, view, _READ, key, words, uniform)
                 fill_normal(uniform.reshape(-1), chosen, normal.reshape(-1))
                 add_read_noise(row, out.read_noise_e, normal)
             if out.has_converter:
                 convert(row, out.gain, out.black_level, out.top_code, over)
                 decode(row, out.gain, out.black_level)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _scratch(n):
+    """Return room for the random numbers of n pixels: words, chosen, uniform, normal."""
+    return np.empty((4, n), np.uint64), np.empty(2 * n, np.int32), np.empty((2, n)), np.empty((2, n))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _pixels_with_light(mean):
+    """Return which pixels of (4, 2, pixels) mean electrons have any."""
+    n = mean.shape[2]
+    lit, count = np.empty(n, np.int64), 0
+    for pixel in range(n):
+        lit[count] = pixel
+        some = False
+        for phase in range(4):
+            some |= mean[phase, 0, pixel] > 0.0 or mean[phase, 1, pixel] > 0.0
+        count += some
+    return lit[:count].copy()

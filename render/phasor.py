@@ -32,7 +32,10 @@ def phasor_to_range_m(phasor: NDArray[np.complexfloating], sensor: Sensor) -> ND
     (...) float64
         Metres along the ray; NaN where the phasor is zero.
     """
-    range_m = wrap_range_m(sensor.metres_per_radian * np.angle(phasor), sensor)
+    signed_m = sensor.metres_per_radian * np.angle(phasor)
+    # what wrap_range_m does, which for ± c/4f needs no division
+    range_m = signed_m + np.where(signed_m < 0, sensor.unambiguous_range_m, 0.0)
+    range_m = np.where(range_m >= sensor.unambiguous_range_m, 0.0, range_m)
     return np.where(phasor == 0, np.nan, range_m)
 
 

@@ -19,7 +19,7 @@ _M0, _M1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 _W0, _W1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 _LOW_BITS, _HIGH_SHIFT = np.uint64(11), np.uint64(21)
 _UNIT = 2.0**-53
-_CENTRAL = 0.425
+_CENTRAL, _NEAR = 0.425, 5.0
 
 _ATTEMPT_SHIFT = np.uint64(8)  # the fourth word of the counter: term in the lowest byte, attempts above it
 
@@ -41,25 +41,31 @@ def draw_key(rng: np.random.Generator) -> NDArray[np.uint64]:
     return rng.integers(0, 2**32, size=2, dtype=np.uint64)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _round(c0, c1, c2, c3, k0, k1):
     p0, p1 = _M0 * c0, _M1 * c2
     return (p1 >> _HALF) ^ c1 ^ k0, p1 & _MASK, (p0 >> _HALF) ^ c3 ^ k1, p0 & _MASK
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _rounds(c0, c1, c2, c3, k0, k1):
+    for _ in range(10):
+        c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+        k0, k1 = (k0 + _W0) & _MASK, (k1 + _W1) & _MASK
+    return c0, c1, c2, c3
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def philox(words, key):
     """Turn n counters of four 32-bit words, (4, n) uint64, into the words drawn, in place; the key has two words."""
     k0, k1 = key[0], key[1]
-    for _ in range(10):
-        for i in range(words.shape[1]):  # the inner loop, so that the compiler can run several counters at once
-            words[0, i], words[1, i], words[2, i], words[3, i] = _round(
-                words[0, i], words[1, i], words[2, i], words[3, i], k0, k1
-            )
-        k0, k1 = (k0 + _W0) & _MASK, (k1 + _W1) & _MASK
+    for i in range(words.shape[1]):  # the compiler runs several counters at once, their words in registers
+        words[0, i], words[1, i], words[2, i], words[3, i] = _rounds(
+            words[0, i], words[1, i], words[2, i], words[3, i], k0, k1
+        )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _fractions(c0, c1, c2, c3):
     """Return two numbers in the open interval (0, 1), of 53 bits each, from four words."""
     first = np.int64((c0 << _HIGH_SHIFT) | (c1 >> _LOW_BITS))  # signed: quick to make a float
@@ -72,18 +78,15 @@ def uniform_pair(sample, frame, view, term, attempt, key):
     """Return two independent numbers, uniform in (0, 1); a term that needs more of them counts its attempts."""
     c0, c1, c2 = np.uint64(sample), np.uint64(frame), np.uint64(view)
     c3 = np.uint64(term) | (np.uint64(attempt) << _ATTEMPT_SHIFT)
-    k0, k1 = key[0], key[1]
-    for _ in range(10):
-        c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-        k0, k1 = (k0 + _W0) & _MASK, (k1 + _W1) & _MASK
+    c0, c1, c2, c3 = _rounds(c0, c1, c2, c3, key[0], key[1])
     return _fractions(c0, c1, c2, c3)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def fill_uniform(first_sample, frame, view, term, key, words, out):
-    """Fill `out`, (2, n), with the uniform pairs of n samples in a row; `words` is scratch, (4, n) uint64."""
+def fill_uniform(samples, frame, view, term, key, words, out):
+    """Fill `out`, (2, n), with the uniform pairs of n samples, by number; `words` is scratch, (4, n) uint64."""
     for i in range(out.shape[1]):
-        words[0, i] = np.uint64(first_sample + i)
+        words[0, i] = np.uint64(samples[i])
         words[1, i] = np.uint64(frame)
         words[2, i] = np.uint64(view)
         words[3, i] = np.uint64(term)
@@ -96,19 +99,27 @@ def fill_uniform(first_sample, frame, view, term, key, words, out):
 def fill_normal(uniform, chosen, out):
     """Fill `out` with the standard normal deviates below which the shares `uniform` lie; `chosen` is scratch, int32.
 
-    All flat, of one length. The middle 85 % in a loop that the compiler can run several at once, the tails after it.
+    All flat, of one length. The middle 85 % and the tails each in a loop that the compiler can run several at once.
     """
+    for i in range(len(uniform)):
+        out[i] = _central_quantile(uniform[i] - 0.5)
     n_tail = 0
     for i in range(len(uniform)):
-        q = uniform[i] - 0.5
-        out[i] = _central_quantile(q)
         chosen[n_tail] = i
-        n_tail += abs(q) > _CENTRAL
+        n_tail += abs(uniform[i] - 0.5) > _CENTRAL
+    root, size = np.empty(n_tail), np.empty(n_tail)
     for j in range(n_tail):
-        out[chosen[j]] = _tail_quantile(uniform[chosen[j]])
+        p = uniform[chosen[j]]
+        root[j] = math.sqrt(-math.log(p if p < 0.5 else 1.0 - p))
+    for j in range(n_tail):
+        size[j] = _near_tail(root[j])
+    for j in range(n_tail):
+        i = chosen[j]
+        above = size[j] if root[j] <= _NEAR else _far_tail(root[j])
+        out[i] = -above if uniform[i] < 0.5 else above
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _central_quantile(q):
     """Wichura's algorithm AS 241 (1988), good to 1e-15, for |q| = |p − ½| up to 0.425."""
     r = _CENTRAL * _CENTRAL - q * q
@@ -131,45 +142,47 @@ def _central_quantile(q):
     return q * num / den
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _near_tail(r):
+    """AS 241 outside the middle, for r = √(−ln p) up to 5 of the smaller share p: the deviate's size."""
+    r -= 1.6
+    num = 7.74545014278341407640e-4
+    num = num * r + 2.27238449892691845833e-2
+    num = num * r + 2.41780725177450611770e-1
+    num = num * r + 1.27045825245236838258e0
+    num = num * r + 3.64784832476320460504e0
+    num = num * r + 5.76949722146069140550e0
+    num = num * r + 4.63033784615654529590e0
+    num = num * r + 1.42343711074968357734e0
+    den = 1.05075007164441684324e-9
+    den = den * r + 5.47593808499534494600e-4
+    den = den * r + 1.51986665636164571966e-2
+    den = den * r + 1.48103976427480074590e-1
+    den = den * r + 6.89767334985100004550e-1
+    den = den * r + 1.67638483018380384940e0
+    den = den * r + 2.05319162663775882187e0
+    den = den * r + 1.0
+    return num / den
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _tail_quantile(p):
-    """AS 241 outside the middle."""
-    q = p - 0.5
-    r = math.sqrt(-math.log(p if q < 0 else 1.0 - p))
-    if r <= 5.0:
-        r -= 1.6
-        num = 7.74545014278341407640e-4
-        num = num * r + 2.27238449892691845833e-2
-        num = num * r + 2.41780725177450611770e-1
-        num = num * r + 1.27045825245236838258e0
-        num = num * r + 3.64784832476320460504e0
-        num = num * r + 5.76949722146069140550e0
-        num = num * r + 4.63033784615654529590e0
-        num = num * r + 1.42343711074968357734e0
-        den = 1.05075007164441684324e-9
-        den = den * r + 5.47593808499534494600e-4
-        den = den * r + 1.51986665636164571966e-2
-        den = den * r + 1.48103976427480074590e-1
-        den = den * r + 6.89767334985100004550e-1
-        den = den * r + 1.67638483018380384940e0
-        den = den * r + 2.05319162663775882187e0
-        den = den * r + 1.0
-    else:
-        r -= 5.0
-        num = 2.01033439929228813265e-7
-        num = num * r + 2.71155556874348757815e-5
-        num = num * r + 1.24266094738807843860e-3
-        num = num * r + 2.65321895265761230930e-2
-        num = num * r + 2.96560571828504891230e-1
-        num = num * r + 1.78482653991729133580e0
-        num = num * r + 5.46378491116411436990e0
-        num = num * r + 6.65790464350110377720e0
-        den = 2.04426310338993978564e-15
-        den = den * r + 1.42151175831644588870e-7
-        den = den * r + 1.84631831751005468180e-5
-        den = den * r + 7.86869131145613259100e-4
-        den = den * r + 1.48753612908506148525e-2
-        den = den * r + 1.36929880922735805310e-1
-        den = den * r + 5.99832206555887937690e-1
-        den = den * r + 1.0
-    return -num / den if q < 0 else num / den
+def _far_tail(r):
+    """AS 241 further out."""
+    r -= 5.0
+    num = 2.01033439929228813265e-7
+    num = num * r + 2.71155556874348757815e-5
+    num = num * r + 1.24266094738807843860e-3
+    num = num * r + 2.65321895265761230930e-2
+    num = num * r + 2.96560571828504891230e-1
+    num = num * r + 1.78482653991729133580e0
+    num = num * r + 5.46378491116411436990e0
+    num = num * r + 6.65790464350110377720e0
+    den = 2.04426310338993978564e-15
+    den = den * r + 1.42151175831644588870e-7
+    den = den * r + 1.84631831751005468180e-5
+    den = den * r + 7.86869131145613259100e-4
+    den = den * r + 1.48753612908506148525e-2
+    den = den * r + 1.36929880922735805310e-1
+    den = den * r + 5.99832206555887937690e-1
+    den = den * r + 1.0
+    return num / den

@@ -103,9 +103,24 @@ def demodulate(taps: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArr
     phasor_e : (..., rows, cols) complex128
     intensity_e : (..., rows, cols) float64
     """
-    tap_a, tap_b = taps[..., 0, :, :], taps[..., 1, :, :]
-    d = tap_a - tap_b
-    phasor_e = np.empty((*d.shape[:-3], *d.shape[-2:]), dtype=np.complex128)
-    phasor_e.real = 0.5 * (d[..., 0, :, :] - d[..., 2, :, :])
-    phasor_e.imag = 0.5 * (d[..., 3, :, :] - d[..., 1, :, :])
-    return phasor_e, (tap_a + tap_b).sum(axis=-3) / N_PHASES
+    rows, cols = taps.shape[-2:]
+    flat = np.ascontiguousarray(taps).reshape(-1, N_PHASES, N_TAPS, rows * cols)
+    phasor_e, intensity_e = np.empty((len(flat), rows * cols), np.complex128), np.empty((len(flat), rows * cols))
+    _demodulate(flat, phasor_e, intensity_e)
+    shape = (*taps.shape[:-4], rows, cols)
+    return phasor_e.reshape(shape), intensity_e.reshape(shape)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _demodulate(taps, phasor_e, intensity_e):
+    """Fill phasor and intensity, (n, pixels), from taps (n, 4, 2, pixels)."""
+    for i in range(len(taps)):
+        t = taps[i]
+        for pixel in range(t.shape[2]):
+            real = 0.5 * ((t[0, 0, pixel] - t[0, 1, pixel]) - (t[2, 0, pixel] - t[2, 1, pixel]))
+            imag = 0.5 * ((t[3, 0, pixel] - t[3, 1, pixel]) - (t[1, 0, pixel] - t[1, 1, pixel]))
+            phasor_e[i, pixel] = complex(real, imag)
+            total = t[0, 0, pixel] + t[0, 1, pixel]
+            for phase in range(1, 4):
+                total += t[phase, 0, pixel] + t[phase, 1, pixel]
+            intensity_e[i, pixel] = total / 4

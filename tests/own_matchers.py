@@ -18,23 +18,31 @@ def nearest_to_mean(frames):
 
 
 class Fails:
-    """Works for some batches, then raises; the number of calls is the test's."""
+    """Works for some batches, then raises or answers NaN; the number of calls is the test's."""
 
     left = 0
 
+    def __init__(self, badly):
+        self.badly = badly
+
     def __call__(self, frames):
         if Fails.left == 0:
-            raise ZeroDivisionError("no luck")
+            return self.badly(frames)
         Fails.left -= 1
         return nearest_to_mean(frames)
 
 
-fails = Fails()
-
-
-def off_by_3_mm(frames):
-    return [replace(match, distance_m=match.distance_m + 0.003) for match in nearest_to_mean(frames)]
+def no_luck(frames):
+    raise ZeroDivisionError("no luck")
 
 
 def nan_view(frames):
     return [Match(class_name="cone", accepted=True) for _ in range(len(frames))]
+
+
+fails = Fails(no_luck)
+turns_nan = Fails(nan_view)
+
+
+def off_by_3_mm(frames):
+    return [replace(match, distance_m=match.distance_m + 0.003) for match in nearest_to_mean(frames)]

@@ -58,7 +58,7 @@ def test_philox_gives_the_published_known_answers(counter, key, words):
 
 def test_a_uniform_pair_alone_is_that_of_the_row():
     key, words, row = np.array([5, 6], np.uint64), np.empty((4, 9), np.uint64), np.empty((2, 9))
-    fill_uniform(100, 3, 4, 1, key, words, row)
+    fill_uniform(100 + np.arange(row.shape[1]), 3, 4, 1, key, words, row)
     assert uniform_pair(107, 3, 4, 1, 0, key) == tuple(row[:, 7])
     assert uniform_pair(107, 3, 4, 1, 1, key) != tuple(row[:, 7])
 

@@ -53,10 +53,17 @@ def test_methods_see_the_same_frames_and_another_method_changes_nothing(referenc
     np.testing.assert_array_equal(both.estimate[:, :1], reference[1].estimate)
 
 
-def test_a_failed_sweep_keeps_what_is_done_and_goes_on(reference, tmp_path):
-    failing = plan("own_matchers:fails")
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ("fails", r"method 'mine', condition 1, trials 50 … 99: .* ZeroDivisionError: no luck"),
+        ("turns_nan", r"method 'mine', condition 1, trials 50 … 99: trial 50 names 'cone' with a view .* not finite"),
+    ],
+)
+def test_a_failed_sweep_keeps_what_is_done_and_goes_on(reference, tmp_path, bad, message):
+    failing = plan(f"own_matchers:{bad}")
     Fails.left = 3
-    with pytest.raises(UsageError, match=r"method 'mine', condition 1, trials 50 … 99: .* ZeroDivisionError: no luck"):
+    with pytest.raises(UsageError, match=message):
         run_sweep(failing, tmp_path, workers=1)
     Fails.left = 1  # the three batches that are done are not done again
     resumed = run_sweep(failing, tmp_path, workers=1, resume=True)

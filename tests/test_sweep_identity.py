@@ -1,0 +1,64 @@
+"""One sweep, whatever runs it: threads, worker processes, a cluster, or several lives of a program that is killed."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from sweep_ways import plan, tables
+
+from phasemark.matcher.sweep import run_sweep
+
+HERE = Path(__file__).parent
+TRIALS = 60
+
+
+def program(*arguments):
+    """Run the tests' program and return what it prints."""
+    command = [sys.executable, HERE / "sweep_ways.py", *map(str, arguments)]
+    quiet = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=quiet)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """The tables of one worker; of more than one round, so that a round depends on the one before."""
+    folder = tmp_path_factory.mktemp("ways")
+    run_sweep(plan(TRIALS), folder, workers=1)
+    assert (folder / "trials-001.h5").is_file()
+    return tables(folder)
+
+
+@pytest.mark.parametrize(("workers", "scheduler"), [(2, "threads"), (None, "local:2")])
+def test_threads_and_processes_give_the_tables_of_one_worker(reference, tmp_path, workers, scheduler):
+    run_sweep(plan(TRIALS), tmp_path, workers=workers, scheduler=scheduler)
+    assert tables(tmp_path) == reference
+
+
+@pytest.fixture(scope="module")
+def ways(tmp_path_factory):
+    """A folder in which the program was run, killed twice, and what it printed."""
+    folder = tmp_path_factory.mktemp("program")
+    return folder, program(folder, TRIALS, 2, 17)
+
+
+def test_a_sweep_killed_at_a_random_moment_and_resumed_gives_the_tables_of_one_that_was_not(ways, reference):
+    folder, counts = ways  # the program compares the killed ones with its first
+    assert sum(map(int, counts.split())) == 2
+    assert tables(folder / "warm") == reference
+
+
+def test_a_dask_cluster_gives_the_tables_of_one_worker(ways, reference):
+    pytest.importorskip("distributed")
+    assert tables(ways[0] / "dask") == reference
+
+
+@pytest.mark.soak
+def test_a_sweep_killed_at_20_random_moments_and_resumed_gives_the_same_tables(tmp_path):
+    counts = list(map(int, program(tmp_path, 300, 20, 18).split()))
+    assert sum(counts) == 20
+    assert sum(count > 0 for count in counts) > 1, "the kills all came at one stage"
+    print(f"killed before a trial was safe, in the first round, after it, at the end: {counts}")
