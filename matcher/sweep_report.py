@@ -99,7 +99,7 @@ def summary(trials: SweepTrials, cells: Sequence[Cell]) -> list[str]:
             cell = max(mine, key=_badness)
             worst.append(
                 f"for {method}, {_badness(cell):.3g} times the bound at {_where(cell, landmarks)}"
-                + (f" ({outliers} outliers in all)" if outliers else "")
+                + (f" ({outliers} outlier{'s' * (outliers > 1)} in all)" if outliers else "")
             )
     if worst:
         sentences.append(f"The worst cells are, {'; '.join(worst)}.")

@@ -19,6 +19,8 @@ _MOST_POINTS = 2000
 _LEAST_BOUND = 1e-7
 _ASIDE = 1.25
 """By which factor the marks of one method are moved from those of the next."""
+_CLEAR_BARS = 60
+"""Bars side by side that do not hide the marks; more are drawn the fainter."""
 
 
 def nees_quantiles(trials: SweepTrials) -> Figure:
@@ -59,7 +61,7 @@ def coverage(cells: Sequence[Cell]) -> Figure:
             low, shares, high = (
                 [100 * getattr(cell.coverage[level], end) for cell in mine] for end in ("low", "value", "high")
             )
-            panel.vlines(x, low, high, color=colour, linewidth=0.5)
+            panel.vlines(x, low, high, color=colour, linewidth=0.5, alpha=min(1.0, _CLEAR_BARS / max(1, len(mine))))
             if mine:
                 panel.plot(x, shares, mark, color=colour, markersize=2, label=method)
         panel.axhline(100 * level, color="black", linewidth=0.8)
