@@ -1,13 +1,13 @@
 """Draw the pictures of the documentation into docs/images: ``python docs/figures.py``.
 
-That of accuracy against cost shows the numbers of the last ``make bench``, in out/bench.json; those of accuracy come
-from the sweeps that ``phasemark sweep run NAME --out out/NAME`` left, NAME being that of a shipped plan.
+Some show what a long run left in out/: where it is not there, they stay as they are, and the command to run is named.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,18 @@ from phasemark.render.plot import draw_range
 
 IMAGES = Path(__file__).parent / "images"
 OUT = Path(__file__).parent.parent / "out"
-SWEEP_FIGURES = {
-    "accuracy-distance.png": "paper/figures/rmse-distance-m.png",
-    "accuracy-position.png": "paper/figures/position-in-cell.png",
+LEFT_BY = {
+    "phasemark sweep run paper --out out/paper": {
+        "accuracy-distance.png": "paper/figures/rmse-distance-m.png",
+        "accuracy-position.png": "paper/figures/position-in-cell.png",
+    },
+    "phasemark landmark design --out out/design": {
+        "design-bound.png": "design/bound.png",
+        "design-pareto.png": "design/pareto.png",
+        "design-mark-2.svg": "design/mark-2.svg",
+    },
 }
+"""Pictures that are those of a run, by its command."""
 
 
 def demo_figure() -> Figure:
@@ -100,12 +108,19 @@ def main() -> None:
     """Write every picture."""
     write(demo_figure(), "demo.png")
     write(drive_picture(run_drive(default_drive())), "drive.png")
-    for name, source in SWEEP_FIGURES.items():
-        if (OUT / source).exists():
-            write_atomically(IMAGES / name, (OUT / source).read_bytes(), force=True)
+    stale = []
+    for command, pictures in LEFT_BY.items():
+        for name, source in pictures.items():
+            if (OUT / source).exists():
+                write_atomically(IMAGES / name, (OUT / source).read_bytes(), force=True)
+            else:
+                stale.append(f"{name} stays as it is: run '{command}' first")
     bench = OUT / "bench.json"
     if bench.exists():
         write(cost_figure(json.loads(bench.read_text(encoding="utf-8"))["peer"]["rows"]), "cost.png")
+    else:
+        stale.append("cost.png stays as it is: run 'make bench' first")
+    sys.stderr.writelines(f"{line}\n" for line in stale)
 
 
 if __name__ == "__main__":

@@ -381,7 +381,10 @@ def _check_observable(solution: Solution, fit: Fit, poses: KnownPoses) -> None:
     weak = np.abs(vectors[:, -1])
     names = [name for name, share in zip(fit.free, weak, strict=True) if share > 0.3 * weak.max()]
     together = "cannot be told apart" if len(names) > 1 else "cannot be told"
-    raise UsageError(f"{named(names)} {together} from these poses: {advice(names, poses)}")
+    raise UsageError(
+        f"{named(names)} {together} from these poses: {advice(names, poses)}; and do they belong to these"
+        " frames (their order, angles in degrees, bearings counter-clockwise)?"
+    )
 
 
 def _degrees_of_freedom(fit: Fit, solution: Solution) -> int:

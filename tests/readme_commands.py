@@ -100,7 +100,8 @@ def _append(command: str, appended: list[tuple[list[str], str]]) -> str:
     words = shlex.split(command, comments=True)
     for prefix, options in appended:
         if words[: len(prefix)] == prefix:
-            command = f"{command} {options}"
+            typed, gap, comment = command.partition("  # ")
+            command = f"{typed} {options}{gap}{comment}"
     return command
 
 

@@ -43,6 +43,11 @@ def test_options_are_appended_to_the_named_command_alone() -> None:
     assert shell_commands(block) == ["phasemark bank build --delta 0:90:45", "phasemark bank info"]
 
 
+def test_options_are_appended_before_a_comment() -> None:
+    (block,) = read_blocks("<!-- test: phasemark a += --b -->\n```bash\nphasemark a    # first\n```")
+    assert shell_commands(block)[0].split() == ["phasemark", "a", "--b", "#", "first"]
+
+
 def test_a_directive_belongs_to_the_next_block_alone() -> None:
     first, second = read_blocks("<!-- test: skip slow -->\n```bash\na\n```\n\n```bash\nb\n```")
     assert (first.skipped, second.skipped) == (True, False)
