@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, look
 from own_matchers import nearest_to_mean
 from scipy import stats
 from test_sweep_tables import linear_sweep
@@ -82,6 +83,17 @@ def test_the_report_is_one_page_that_loads_nothing(folder):
     # one image a figure, and an example of each method
     assert page.count("<img") == len(figures) + 3
     assert page.count("phasemark sweep frames") == page.count("<img") - len(figures)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+@pytest.mark.parametrize("width_px", [390, 1280])
+def test_a_browser_shows_the_whole_report_on_a_phone_and_on_a_desktop(folder, tmp_path, width_px):
+    seen = look(folder / "report.html", width_px, tmp_path)
+    assert seen["width"] <= width_px
+    assert seen["cut"] == []
+    assert seen["console"] == []
+    assert len(seen["images"]) > 10
+    assert all(seen["images"])
 
 
 def test_a_report_regenerates_bit_for_bit(folder):
