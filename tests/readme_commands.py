@@ -20,7 +20,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 RUN = ("phasemark", "sha256sum")
@@ -135,7 +135,8 @@ def _check_twin(block: Block, page: Path) -> None:
         for other in read_blocks((page.parent / block.twin).read_text(encoding="utf-8"))
         if not (other.skipped or other.twin)
     ]
-    run = [shlex.split(command, comments=True) for twin in twins for command in shell_commands(twin)]
+    printed = [command for twin in twins for command in shell_commands(replace(twin, directives=()))]
+    run = [shlex.split(command, comments=True) for command in printed]
     for command in shell_commands(block):
         what = f"{page.name}:{block.line}: {command}"
         assert shlex.split(command, comments=True) in run, f"{what}\nis not run in {block.twin}"

@@ -32,7 +32,7 @@ def test_the_golden_bank_of_version_1_opens_and_is_what_is_built_today(tmp_path)
 
 def test_the_golden_frames_of_version_1_open_and_are_what_is_built_today(tmp_path):
     with open_frames(FRAMES) as golden, build_frames(FRAMES_PLAN, tmp_path / "frames.h5") as built:
-        assert golden.plan == built.plan
+        assert golden.plan.resolve() == built.plan  # which fills in fields of the sensor that came later
         old, new = golden[:], built[:]
         assert old.keys() == new.keys()
         for name in ("range_m", "range_hard_m", "range_mixed_m"):
