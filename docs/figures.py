@@ -30,6 +30,16 @@ LEFT_BY = {
         "accuracy-distance.png": "paper/figures/rmse-distance-m.png",
         "accuracy-position.png": "paper/figures/position-in-cell.png",
     },
+    "phasemark sweep run distance-angle-noise --out out/dan": {
+        "accuracy-noise.png": "dan/figures/rmse-noise-factor.png",
+        "accuracy-frames.png": "dan/figures/rmse-n-frames.png",
+        "accuracy-map.png": "dan/figures/map-ratio.png",
+        "accuracy-risk.png": "dan/figures/risk.png",
+    },
+    "phasemark sweep run robustness --out out/robustness": {
+        "accuracy-bearing.png": "robustness/figures/rmse-bearing-deg.png",
+        "accuracy-models.png": "robustness/figures/models.png",
+    },
     "phasemark landmark design --out out/design": {
         "design-bound.png": "design/bound.png",
         "design-pareto.png": "design/pareto.png",
