@@ -123,12 +123,27 @@ _SensorOption = Annotated[
 _Wall = Annotated[float | None, typer.Option("--wall", metavar="M", help="Distance of a wall behind the landmark.")]
 _Floor = Annotated[float | None, typer.Option("--floor", metavar="M", help="How far a floor lies below the lens.")]
 _FramesUnit = Annotated[
-    str | None, typer.Option("--unit", help="Unit of the frames: m, cm or mm.", autocompletion=_one_of("m", "cm", "mm"))
+    str | None,
+    typer.Option(
+        "--unit",
+        help="Unit of measured frames: m, cm or mm; if the file does not say.",
+        autocompletion=_one_of("m", "cm", "mm"),
+    ),
 ]
 _Quantity = Annotated[
     str | None,
     typer.Option(
-        "--quantity", help="range (along the ray) or z (along the optical axis).", autocompletion=_one_of("range", "z")
+        "--quantity",
+        help="range (along the ray) or z (along the optical axis); likewise.",
+        autocompletion=_one_of("range", "z"),
+    ),
+]
+_InvalidMeans = Annotated[
+    str,
+    typer.Option(
+        "--invalid-means",
+        help="What an invalid pixel stands for: missing or no-return.",
+        autocompletion=_one_of("missing", "no-return"),
     ),
 ]
 _ValidStatus = Annotated[
@@ -825,29 +840,13 @@ def _frames_import(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV, NPY, NPZ, HDF5, PNG; a folder of PNG, a bag.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The measured frames as .npz, range along the ray, metres.")],
     sensor: _SensorOption = "pmd-16x16",
-    unit: Annotated[
-        str | None,
-        typer.Option("--unit", help="m, cm or mm, if the file does not say.", autocompletion=_one_of("m", "cm", "mm")),
-    ] = None,
-    quantity: Annotated[
-        str | None,
-        typer.Option("--quantity", help="range or z, if the file does not say.", autocompletion=_one_of("range", "z")),
-    ] = None,
-    invalid_means: Annotated[
-        str,
-        typer.Option("--invalid-means", help="missing or no-return.", autocompletion=_one_of("missing", "no-return")),
-    ] = "missing",
-    valid_status: Annotated[list[int] | None, typer.Option("--valid-status", help="Repeatable.")] = None,
-    flip_h: Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")] = False,
-    flip_v: Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")] = False,
-    rotate: Annotated[
-        int,
-        typer.Option(
-            "--rotate",
-            help="Turn clockwise by 90, 180 or 270 degrees.",
-            autocompletion=_one_of("0", "90", "180", "270"),
-        ),
-    ] = 0,
+    unit: _FramesUnit = None,
+    quantity: _Quantity = None,
+    invalid_means: _InvalidMeans = "missing",
+    valid_status: _ValidStatus = None,
+    flip_h: _FlipH = False,
+    flip_v: _FlipV = False,
+    rotate: _Rotate = 0,
     topic: Annotated[str | None, typer.Option("--topic", help="Which images of a ROS bag.")] = None,
     force: _Force = False,
 ) -> None:
@@ -879,14 +878,8 @@ def _frames_show(
     out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png.")],
     index: Annotated[int, typer.Option("--index", min=0, help="Number of the frame.")] = 0,
     sensor: _SensorOption = "pmd-16x16",
-    unit: Annotated[
-        str | None,
-        typer.Option("--unit", help="m, cm or mm, of measured frames.", autocompletion=_one_of("m", "cm", "mm")),
-    ] = None,
-    quantity: Annotated[
-        str | None,
-        typer.Option("--quantity", help="range or z, of measured frames.", autocompletion=_one_of("range", "z")),
-    ] = None,
+    unit: _FramesUnit = None,
+    quantity: _Quantity = None,
     force: _Force = False,
 ) -> None:
     """Draw one frame."""
@@ -1018,14 +1011,7 @@ def _match(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Measured frames: CSV, NPY, NPZ or HDF5.")],
     unit: _FramesUnit = None,
     quantity: _Quantity = None,
-    invalid_means: Annotated[
-        str,
-        typer.Option(
-            "--invalid-means",
-            help="What an invalid pixel stands for: missing or no-return.",
-            autocompletion=_one_of("missing", "no-return"),
-        ),
-    ] = "missing",
+    invalid_means: _InvalidMeans = "missing",
     valid_status: _ValidStatus = None,
     flip_h: _FlipH = False,
     flip_v: _FlipV = False,
@@ -1248,14 +1234,7 @@ def _calibrate(
     floor: _Floor = None,
     unit: _FramesUnit = None,
     quantity: _Quantity = None,
-    invalid_means: Annotated[
-        str,
-        typer.Option(
-            "--invalid-means",
-            help="What an invalid pixel stands for: missing or no-return.",
-            autocompletion=_one_of("missing", "no-return"),
-        ),
-    ] = "missing",
+    invalid_means: _InvalidMeans = "missing",
     valid_status: _ValidStatus = None,
     flip_h: _FlipH = False,
     flip_v: _FlipV = False,

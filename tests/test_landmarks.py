@@ -60,7 +60,7 @@ def true_outline(name, lens):
 def test_tessellation_costs_at_most_1e_4_of_the_coverage_of_any_pixel(name):
     mesh = build_mesh(catalog()[name], part="upper")
     worst = 0.0
-    for lens, heading in random_lenses(20, seed=17):
+    for lens, heading in random_lenses(25, seed=17):
         true = coverage_of_hull(project(true_outline(name, lens), lens, heading))
         worst = max(worst, np.abs(coverage_of_mesh(mesh, lens, heading) - true).max())
     assert worst <= 1e-4
