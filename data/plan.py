@@ -366,7 +366,8 @@ def _from_catalog(name: str) -> LandmarkSpec:
 
 
 def _as_usage_error(error: ValidationError) -> UsageError:
-    first = error.errors()[0]
+    # a key that is misspelt is missing too: the spelling is what helps
+    first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
     own = first.get("ctx", {}).get("error")
     if isinstance(own, UsageError):
         key = ".".join(map(str, first["loc"]))

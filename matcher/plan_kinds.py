@@ -21,12 +21,11 @@ from phasemark.matcher.sweep_plan import SweepPlan, load_sweep
 
 @dataclass(frozen=True)
 class _Kind:
-    """A kind of plan: its model, its example, how a file of it is read, and keys that tell it from the others."""
+    """A kind of plan: its model, its example, and how a file of it is read."""
 
     model: type[BaseModel]
     example: Callable[[], str]
     load: Callable[[str | os.PathLike[str]], BaseModel]
-    keys: frozenset[str]
 
 
 def _shipped(package: str, name: str) -> Callable[[], str]:
@@ -42,23 +41,14 @@ def _load_scene(model: type[ScenePlan], path: str | os.PathLike[str]) -> BaseMod
 
 
 _KINDS = {
-    "frames": _Kind(
-        FramePlan, _shipped("phasemark.data", "frames.toml"), partial(_load_scene, FramePlan), frozenset({"views"})
-    ),
-    "sweep": _Kind(
-        SweepPlan,
-        _shipped("phasemark.matcher", "paper.toml"),
-        lambda path: load_sweep(path).resolve(),
-        frozenset({"axes", "methods"}),
-    ),
-    "drive": _Kind(DrivePlan, example_drive, load_drive_plan, frozenset({"map", "path", "odometry"})),
-    "design": _Kind(
-        DesignPlan, example_design, load_design_plan, frozenset({"n_classes", "limits", "sampling", "search"})
-    ),
-    # last, and without keys of its own: what is none of the others
-    "bank": _Kind(BankPlan, _shipped("phasemark.data", "bank.toml"), partial(_load_scene, BankPlan), frozenset()),
+    # first, for what might be any of them
+    "bank": _Kind(BankPlan, _shipped("phasemark.data", "bank.toml"), partial(_load_scene, BankPlan)),
+    "frames": _Kind(FramePlan, _shipped("phasemark.data", "frames.toml"), partial(_load_scene, FramePlan)),
+    "sweep": _Kind(SweepPlan, _shipped("phasemark.matcher", "paper.toml"), lambda path: load_sweep(path).resolve()),
+    "drive": _Kind(DrivePlan, example_drive, load_drive_plan),
+    "design": _Kind(DesignPlan, example_design, load_design_plan),
 }
-KINDS = ("bank", *(name for name in _KINDS if name != "bank"))
+KINDS = tuple(_KINDS)
 """Names of all kinds."""
 
 
@@ -108,7 +98,7 @@ def check_plan(path: str | os.PathLike[str], kind: str | None = None) -> tuple[s
     ----------
     path : path-like
     kind : str, optional
-        What it should be; without it, the plan's keys tell.
+        What it should be; without it, the kind that knows most of the plan's keys.
 
     Returns
     -------
@@ -126,7 +116,7 @@ def check_plan(path: str | os.PathLike[str], kind: str | None = None) -> tuple[s
             keys = set(read_toml(path))
         except InputFileError:
             keys = set()  # reading it below says what is wrong
-        kind = next((name for name, one in _KINDS.items() if keys & one.keys), "bank")
+        kind = max(KINDS, key=lambda name: len(keys & set(_KINDS[name].model.model_fields)))
     return kind, _kind(kind).load(path)
 
 

@@ -85,6 +85,18 @@ def test_h5dump_reads_values_dimensions_and_units(tmp_path, golden, name, kind):
     assert f'"{units}"' in said
 
 
+@pytest.mark.parametrize(
+    ("kind", "key"), [("frames", "views"), ("sweep", "methods"), ("drive", "path"), ("bank", "model")]
+)
+def test_a_misspelt_key_is_named_whatever_the_kind(tmp_path, kind, key):
+    path = tmp_path / "plan.toml"
+    text, count = re.subn(rf"^(\[{{0,2}}){key}\b", rf"\g<1>{key}x", plan_example(kind), flags=re.MULTILINE)
+    assert count > 0
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises((UsageError, InputFileError), match=f"{key}x"):
+        check_plan(path)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_example_of_a_plan_is_a_plan_and_fits_its_schema(tmp_path, kind):
     path = tmp_path / "plan.toml"
