@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from phasemark import OutputExistsError, PhasemarkError, StorageError, UsageError, __version__
+from phasemark import InputFileError, OutputExistsError, PhasemarkError, StorageError, UsageError, __version__
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -697,9 +697,7 @@ def _bank_info(
     as_json: _Json = False,
 ) -> None:
     """Say what a bank holds."""
-    from phasemark.data import open_bank
-
-    with open_bank(bank, untrusted=True) as opened:
+    with _open_bank(bank) as opened:
         info = opened.info()
     if as_json:
         _echo_json(info)
@@ -1086,7 +1084,7 @@ def _match(
 
     All frames of a file are averaged: the camera stands still. A file of shape (n, frames, rows, cols) has n positions.
     """
-    from phasemark.data import open_bank, read_frames
+    from phasemark.data import read_frames
     from phasemark.matcher import Matcher, kalman_filter, load_map, phasor_mean
 
     filters = {"kalman": kalman_filter, "phasor-mean": phasor_mean}
@@ -1120,7 +1118,7 @@ def _match(
     for option, used in refined:
         if used and method == "nearest":
             raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
-    with open_bank(bank, untrusted=True) as opened:
+    with _open_bank(bank) as opened:
         measured = read_frames(
             frames,
             sensor=opened.sensor,
@@ -1329,9 +1327,21 @@ def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
+def _open_bank(path: Path) -> Bank:
+    """Open a bank from anywhere; say of a mesh how a bank is made of it."""
+    from phasemark.data import open_bank
+    from phasemark.landmarks.reading import FORMATS
+
+    if path.suffix.lower().removeprefix(".") in FORMATS:
+        raise InputFileError(
+            f"{path}: a mesh, not a bank; one is made of it by: phasemark bank build --mesh part={path} --unit mm"
+            f" --out {path.stem}.h5"
+        )
+    return open_bank(path, untrusted=True)
+
+
 def _calibration_target(landmark: str, class_name: str | None, sensor: str | None) -> tuple[Trimesh, Sensor, str]:
     """Return the mesh of a landmark, and the camera as it is thought to be with its name."""
-    from phasemark.data import open_bank
     from phasemark.landmarks import catalog
 
     path = Path(landmark)
@@ -1340,7 +1350,7 @@ def _calibration_target(landmark: str, class_name: str | None, sensor: str | Non
             raise UsageError("--class belongs to a bank: give the class in its place")
         name = sensor or "pmd-16x16"
         return _load_landmark(landmark, None, "z", "file", from_catalog=True)[1], _load_sensor(name), name
-    with open_bank(path, untrusted=True) as bank:
+    with _open_bank(path) as bank:
         if class_name is None and len(bank.classes) > 1:
             raise UsageError(f"{landmark} has {', '.join(bank.classes)}: say with --class which one was recorded")
         mesh = bank.mesh(class_name or bank.classes[0])
