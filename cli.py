@@ -1297,19 +1297,21 @@ def _calibrate(
         start = replace(start, height_m=height)
     if bearing is not None:
         start = replace(start, bearing_rad=math.radians(bearing))
-    found = calibrate(
-        mesh,
-        filtered,
-        known,
-        free=None if free is None else _names(free),
-        fixed=() if fix is None else _names(fix),
-        start=start,
-        on=on,  # type: ignore[arg-type]  # calibrate says what is right
-        background=background,
-        pose_std=stds,
-        reports_z=quantity == "z" or None,
-        workers=workers or min(processors(), 4),
-    )
+    with _Progress("rendering poses") as progress:
+        found = calibrate(
+            mesh,
+            filtered,
+            known,
+            free=None if free is None else _names(free),
+            fixed=() if fix is None else _names(fix),
+            start=start,
+            on=on,  # type: ignore[arg-type]  # calibrate says what is right
+            background=background,
+            pose_std=stds,
+            reports_z=quantity == "z" or None,
+            workers=workers or min(processors(), 4),
+            progress=progress,
+        )
     buffer = bytes_io.BytesIO()
     residual_picture(found).savefig(buffer, format="png", dpi=100)
     write_atomically(picture, buffer.getvalue(), force=force)

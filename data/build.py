@@ -31,8 +31,9 @@ from phasemark.data.bank import (
 from phasemark.data.layout import Layout
 from phasemark.data.plan import BankPlan, MeshPlan, factored_refusal
 from phasemark.data.production import produce, refuse_unwritable_output
+from phasemark.data.progress import Progress
 from phasemark.data.provenance import mesh_sha256, versions
-from phasemark.data.shards import Place, Progress
+from phasemark.data.shards import Place
 from phasemark.landmarks import LandmarkSpec, Revolution, build_mesh, read_mesh
 from phasemark.render import PhasorImages, PlanarLandmark, Renderer, Sensor, Views, planar_images
 from phasemark.render.renderer import Variant

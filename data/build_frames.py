@@ -26,9 +26,10 @@ from phasemark.data.frames import (
 )
 from phasemark.data.layout import Layout
 from phasemark.data.production import produce, refuse_unwritable_output
+from phasemark.data.progress import Progress
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.seeds import stream
-from phasemark.data.shards import Place, Progress
+from phasemark.data.shards import Place
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture
 
 _KEYS = ("class_index", "albedo", "wall_m", "floor_m")

@@ -21,7 +21,8 @@ from phasemark.data.hdf5 import check_format, open_hdf5, reading
 from phasemark.data.layout import Layout
 from phasemark.data.plan import BankPlan
 from phasemark.data.production import produce, refuse_unwritable_output
-from phasemark.data.shards import Job, Place, Progress, difference, make_shard, pieces
+from phasemark.data.progress import Progress
+from phasemark.data.shards import Job, Place, difference, make_shard, pieces
 from phasemark.data.store import verify_checksum
 
 FORMAT = "phasemark-part"

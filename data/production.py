@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from phasemark import UsageError
+from phasemark.data.progress import Progress
 from phasemark.data.remote import open_maker
-from phasemark.data.shards import Job, Progress, build, manifest_path, refuse_difference, refuse_unfinished
+from phasemark.data.shards import Job, build, manifest_path, refuse_difference, refuse_unfinished
 from phasemark.data.store import checksum_path, refuse_unwritable
 
 

@@ -15,7 +15,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 from phasemark import OutputExistsError, UsageError
 from phasemark.data.executor import Maker, processors, run_tasks
 from phasemark.data.layout import Layout, place
+from phasemark.data.progress import Progress
 from phasemark.data.store import checksum_path, finish_publishing, publish, refuse_unwritable, sha256_of, storage_errors
-
-Progress = Callable[[int, int], None]
 
 SHARD_BYTES = 1 << 22
 """About how much of the file a shard holds; what a killed run loses is a few of these."""

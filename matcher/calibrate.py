@@ -17,6 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark import UsageError
+from phasemark.data.progress import Progress, counter
 from phasemark.matcher.calibrate_fit import Fit, Solution, inverse
 from phasemark.matcher.calibrate_model import NAMES, PARAMETERS, CalibrationModel, Mounting
 from phasemark.matcher.calibrate_notes import advice, named, observability_notes, odd_pose_notes
@@ -38,6 +39,8 @@ _UNKNOWN = 3.0
 _POSES_FOR_ERRORS = 6
 """Fewer poses do not tell the size of their errors."""
 _ROUNDS = 2
+_USUAL_RENDERINGS = 400
+"""Of all poses: what a progress bar reckons with."""
 _FRAMES_FOR_SCATTER = 10
 """Frames without amplitudes of one pose from which their scatter is a better judge of noise than the noise law."""
 _POSES_FOR_SANDWICH = 3
@@ -206,6 +209,7 @@ def calibrate(
     pose_std: PoseStd | None = None,
     reports_z: bool | None = None,
     workers: int = 1,
+    progress: Progress | None = None,
 ) -> Calibration:
     """Estimate how a camera is mounted, by maximum likelihood.
 
@@ -244,6 +248,8 @@ def calibrate(
         what the sensor says of itself.
     workers : int
         Threads that render.
+    progress : callable (done, total), optional
+        Called with how many times all poses have been rendered, and how often they usually are.
 
     Returns
     -------
@@ -271,7 +277,14 @@ def calibrate(
     assumed = start or Mounting.of_sensor(sensor, albedo)
     z = sensor.quantity == "z" if reports_z is None else reports_z
     model = CalibrationModel(
-        mesh, sensor, poses, albedo=assumed.albedo, background=background, reports_z=z, workers=workers
+        mesh,
+        sensor,
+        poses,
+        albedo=assumed.albedo,
+        background=background,
+        reports_z=z,
+        workers=workers,
+        rendered=counter(progress, _USUAL_RENDERINGS),
     )
     _check_view(model, evidence, assumed)
     edges = model.has_background or not _returns_beside(model, evidence, assumed)

@@ -6,51 +6,47 @@ a pose are estimated beside the mounting, each with its own standard deviation a
 
 Which pixels count is decided at the start and held while the mounting moves, so that the sum stays comparable; at the
 solution it is decided once more, and the mounting moves again.
+
+The cost of ranges has a kink wherever an edge passes the border of a pixel, and small minima between kinks, most along
+what the poses tell least. So the neighbourhood of the solution is searched for lower ones before it is taken.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phasemark.matcher.calibrate_model import NAMES, SCALE, CalibrationModel, Images, clipped
+from phasemark.matcher.calibrate_model import LONGEST_STEP, NAMES, SCALE, CalibrationModel, Images, clipped
+from phasemark.matcher.calibrate_register import OUTLINE, register
 from phasemark.matcher.coarse import DISAGREEMENT
 from phasemark.matcher.likelihood import Evidence, one_frame_limit_m
 from phasemark.render import predicted_range_std
 
-_OUTLINE = ("pitch", "roll", "height", "bearing", "half_angle_h", "half_angle_v")
-"""What an outline tells."""
-_OUTLINE_STD = np.array([3.0, 3.0, 3.0, 3.0, 0.7, 0.7])
-"""How far each may be from where it was thought to be, in natural units: only the registration leans on it."""
-_OUTLINE_NOISE = 0.2
-"""Of a pixel: how much of it the model says returns, against whether it did."""
-_RETURNS_FROM, _PREVAILS_FROM = 0.2, 0.6
-"""Coverage that is enough for a return, and for one from the landmark if something stands behind; below, the chance of
-it is taken to rise evenly."""
-_TRIED = np.array([-3.0, -1.5, 0.0, 1.5, 3.0])
-"""Pitches and bearings, degrees, from which the registration may start: a pixel apart."""
-_BESIDE = 0.02
-"""Share of pixels with a return from elsewhere, above which something stands behind."""
-_OUTLINE_STEPS = 6
-_OUTLINE_WIDTH = 0.2
-"""Half width of its differences, natural units: a seventh of a pixel."""
-_NEARBY_M = 0.1
-"""A return so much farther from the landmark than its own size is something else."""
 _CLEAR = 1.5
 """Phasors count where the noise of one frame is below its limit by this factor: nearer to the limit a frame's own noise
 decides whether its pixel is valid, and the brighter half would stand for all."""
+_STEADY, _ORDINARY = 2.0, 1.5
+"""Ranges count where the measured noise of one frame is below its limit by the first factor, or no more than the second
+times the median of its pose: fainter pixels see little of the landmark, and their ranges jump as the mounting moves."""
 _FULL = 1 - 1e-6
 """Coverage of a pixel that sees nothing but the landmark."""
 _MAX_ITERATIONS = 40
 _SETTLED = 1e-3
 """A step that promises to lower the whitened squared residual by less than this is not taken."""
-_LONGEST = 1.0
-"""No step is longer, in natural units: slopes jump where edges pass corners of pixels."""
+_SEARCHED = 3
+"""Directions, of those that the poses tell least, along which lower minima are looked for."""
+_SEARCH_STD = np.array([-6.0, -5.0, -4.0, -3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0])
+"""How far along each, standard deviations."""
+_SEARCH_FROM, _SEARCH_STEPS, _SEARCH_SETTLED = 3, 8, 0.03
+"""From how many of these places it descends by slopes over standard deviations, in so many steps unless they settle."""
+_SEARCHES, _GAINED = 4, 0.1
+"""How often the search is repeated about what it found, unless it saved less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,15 +102,44 @@ class Blocks:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sums:
-    """Normal equations with the poses eliminated."""
+class _Linear:
+    """Slopes at a mounting, whitened, and the normal matrix with the errors of the poses eliminated."""
 
-    information: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    scatter: NDArray[np.float64]
+    rows: NDArray[np.float64]  # (K, p, R)
+    own_rows: NDArray[np.float64]  # (K, q, R)
     cross: NDArray[np.float64]  # (K, p, q)
     own: NDArray[np.float64]  # (K, q, q)
-    own_gradient: NDArray[np.float64]  # (K, q)
+    information: NDArray[np.float64]  # (p, p)
+
+    def gradients(
+        self, residual: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what each pose says: gradients by the mounting, (K, p), and by its own errors, (K, q)."""
+        own = np.einsum("kqr,kr->kq", self.own_rows, residual) - u
+        eliminated = np.einsum("kpq,kq->kp", self.cross, self._solved(own))
+        return np.einsum("kpr,kr->kp", self.rows, residual) - eliminated, own
+
+    def own_step(self, own_gradient: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return by how much each pose's errors move with a step of the mounting, (K, q)."""
+        return self._solved(own_gradient - np.einsum("kpq,p->kq", self.cross, step))
+
+    def own_promise(self, own_gradient: NDArray[np.float64]) -> float:
+        """Return what the errors of the poses would save if they alone moved."""
+        return float((own_gradient * self._solved(own_gradient)).sum())
+
+    def _solved(self, own_gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.linalg.solve(self.own, own_gradient[..., None])[..., 0])
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A mounting with the errors of the poses, and what the model says there."""
+
+    theta: NDArray[np.float64]  # (8,)
+    u: NDArray[np.float64]  # (K, q)
+    images: Images
+    residual: NDArray[np.float64]  # (K, R)
+    cost: float
 
 
 class Fit:
@@ -147,30 +172,39 @@ class Fit:
         k = len(evidence.weight)
         self.factor = np.zeros((k, 3, 0)) if factor is None else factor
         self.edges = edges
+        self._steady = _steady(evidence)
 
     def start(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Move a mounting to where outlines agree (see :func:`register`), and set the albedo to the mean brightness."""
-        theta = register(self.model, self.evidence, theta, [name for name in _OUTLINE if name in self.free])
+        """Move a mounting to where outlines agree (see :func:`register`); set range offset and albedo by averages."""
+        theta = register(self.model, self.evidence, theta, [name for name in OUTLINE if name in self.free]).copy()
+        images = self.model.images(theta, self._no_shift)
+        if "range_offset" in self.free:
+            full = (self.evidence.weight > 0) & (images.coverage > _FULL)
+            if full.any():
+                late = np.median(np.angle(self.evidence.value[full] * images.phasor[full].conj()))
+                theta[NAMES.index("range_offset")] += self.evidence.sensor.metres_per_radian * late
         if "albedo" in self.free and self.evidence.on == "phasors":
-            images = self.model.images(theta, self._no_shift)
             use = self.pixels(theta, images, cautious=True)
             measured = np.abs(self.evidence.value[use]).sum()
             modelled = np.abs(images.phasor[use]).sum()
             if measured > 0 and modelled > 0:
-                theta = theta.copy()
-                theta[-1] *= measured / modelled
+                theta[NAMES.index("albedo")] *= measured / modelled
         return theta
 
     def pixels(self, theta: NDArray[np.float64], images: Images, *, cautious: bool = False) -> NDArray[np.bool_]:
         """Return which pixels count at a mounting, (K, pixels).
 
-        Those that returned and that the model says one frame can measure (PHYSICS section 7); with `cautious`, where
-        edges may not count, only those a pixel away from any edge, for the mounting may still move.
+        Those that returned and that one frame can measure (PHYSICS section 7): on phasors by what the model says, for
+        brightness is part of what is compared; on ranges by what was measured, which no mounting changes. With
+        `cautious`, where edges may not count, only those a pixel away from any edge, for the mounting may still move.
         """
         sensor = self.evidence.sensor
-        limit = one_frame_limit_m(sensor) / (_CLEAR if self.evidence.on == "phasors" else 1.0)
-        std = predicted_range_std(np.abs(images.phasor), images.intensity, sensor)
-        use = (self.evidence.weight > 0) & (images.phasor != 0) & (std <= limit * (1 + 1e-9))
+        if self.evidence.on == "phasors":
+            std = predicted_range_std(np.abs(images.phasor), images.intensity, sensor)
+            clear = std <= one_frame_limit_m(sensor) / _CLEAR * (1 + 1e-9)
+        else:
+            clear = self._steady
+        use = (self.evidence.weight > 0) & (images.phasor != 0) & clear
         if not self.edges:
             full = images.coverage > _FULL
             if cautious:
@@ -185,30 +219,29 @@ class Fit:
 
     def solve(self, theta: NDArray[np.float64], use: NDArray[np.bool_]) -> Solution:
         """Run Levenberg–Marquardt from a mounting with the pixels given, then with those of the solution."""
-        u = np.zeros((len(use), self.factor.shape[2]))
+        place = self._at(theta, np.zeros((len(use), self.factor.shape[2])), use)
         for _ in range(2):
-            theta, u = self._descend(theta, u, use)
-            images = self.model.images(theta, self._shift(u))
-            again = self.pixels(theta, images)
+            place = self._descend(place, use)
+            again = self.pixels(place.theta, place.images)
             if (again == use).all():
                 break
             use = again
+            place = self._at(place.theta, place.u, use)
         else:
-            theta, u = self._descend(theta, u, use)
-        return self.conclude(theta, u, use)
+            place = self._descend(place, use)
+        if self.evidence.on == "ranges":
+            place = self._search(place, use)
+        return self.conclude(place.theta, place.u, use)
 
     def conclude(self, theta: NDArray[np.float64], u: NDArray[np.float64], use: NDArray[np.bool_]) -> Solution:
         """Take stock of a mounting, with slopes over its standard deviations."""
-        shift = self._shift(u)
-        images = self.model.images(theta, shift)
-        residual = self._residual(images, use)
-        sums = self._sums(theta, u, images, use)
-        std = np.zeros(len(NAMES))
-        std[self.columns] = np.sqrt(np.diag(inverse(sums.information, self.scale)))
-        std = np.minimum(np.nan_to_num(std), 0.5 * SCALE)
-        sums = self._sums(theta, u, images, use, width=std)
-        cost = float((residual**2).sum() + (u**2).sum())
-        return Solution(theta, shift, images, use, residual, cost, sums.information, sums.scatter)
+        place = self._at(theta, u, use)
+        linear = self._linearise_wide(place, use)
+        by_pose, _ = linear.gradients(place.residual, u)
+        scatter = by_pose.T @ by_pose
+        return Solution(
+            theta, self._shift(u), place.images, use, place.residual, place.cost, linear.information, scatter
+        )
 
     def blocks(self, solution: Solution, unit: NDArray[np.float64]) -> Blocks:
         """Linearise about a solution.
@@ -249,139 +282,112 @@ class Fit:
             return np.asarray(evidence.sensor.metres_per_radian * slope.imag * seen)
         return np.concatenate([slope.real * root, slope.imag * root], axis=2)
 
-    def _sums(
-        self,
-        theta: NDArray[np.float64],
-        u: NDArray[np.float64],
-        images: Images,
-        use: NDArray[np.bool_],
-        width: NDArray[np.float64] | None = None,
-    ) -> _Sums:
+    def _at(self, theta: NDArray[np.float64], u: NDArray[np.float64], use: NDArray[np.bool_]) -> _Place:
+        images = self.model.images(theta, self._shift(u))
+        residual = self._residual(images, use)
+        return _Place(theta, u, images, residual, float((residual**2).sum() + (u**2).sum()))
+
+    def _linearise(self, place: _Place, use: NDArray[np.bool_], width: NDArray[np.float64] | None = None) -> _Linear:
         q = self.factor.shape[2]
         slope, of_pose = self.model.slopes(
-            theta, self._shift(u), self.free, self.evidence.on, of_poses=q > 0, width=width
+            place.theta, self._shift(place.u), self.free, self.evidence.on, of_poses=q > 0, width=width
         )
-        rows = self._whitened(slope, images, use)
-        residual = self._residual(images, use)
+        rows = self._whitened(slope, place.images, use)
         own_rows = np.zeros((len(rows), 0, rows.shape[2]))
         if q:
-            own_rows = np.einsum("kij,kir->kjr", self.factor, self._whitened(of_pose, images, use))
+            own_rows = np.einsum("kij,kir->kjr", self.factor, self._whitened(of_pose, place.images, use))
         cross = rows @ own_rows.transpose(0, 2, 1)
         own = own_rows @ own_rows.transpose(0, 2, 1) + np.eye(q)
-        own_gradient = np.einsum("kjr,kr->kj", own_rows, residual) - u
         eliminated = np.linalg.solve(own, cross.transpose(0, 2, 1))  # (K, q, p)
-        gradient = np.einsum("kpr,kr->kp", rows, residual) - np.einsum("kqp,kq->kp", eliminated, own_gradient)
         information = (rows @ rows.transpose(0, 2, 1) - cross @ eliminated).sum(axis=0)
-        scatter = np.einsum("ka,kb->ab", gradient, gradient)
-        return _Sums(information, gradient.sum(axis=0), scatter, cross, own, own_gradient)
+        return _Linear(rows, own_rows, cross, own, information)
+
+    def _linearise_wide(self, place: _Place, use: NDArray[np.bool_]) -> _Linear:
+        """Take slopes over the standard deviations that slopes at the place give."""
+        std = np.zeros(len(NAMES))
+        std[self.columns] = np.sqrt(np.diag(inverse(self._linearise(place, use).information, self.scale)))
+        return self._linearise(place, use, np.minimum(np.nan_to_num(std), 0.5 * SCALE))
 
     def _descend(
-        self, theta: NDArray[np.float64], u: NDArray[np.float64], use: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        self,
+        place: _Place,
+        use: NDArray[np.bool_],
+        *,
+        slopes: _Linear | None = None,
+        steps: int = _MAX_ITERATIONS,
+        settled: float = _SETTLED,
+    ) -> _Place:
+        """Run Levenberg–Marquardt with the slopes of each place, or with the same throughout, which is far cheaper."""
         damping = 1e-3
-        images = self.model.images(theta, self._shift(u))
-        cost = float((self._residual(images, use) ** 2).sum() + (u**2).sum())
-        sums = self._sums(theta, u, images, use)
-        for _ in range(_MAX_ITERATIONS):
-            matrix = sums.information * np.outer(self.scale, self.scale)
+        linear = slopes or self._linearise(place, use)
+        for _ in range(steps):
+            by_pose, own_gradient = linear.gradients(place.residual, place.u)
+            gradient = by_pose.sum(axis=0)
+            matrix = linear.information * np.outer(self.scale, self.scale)
             matrix = matrix + damping * np.diag(np.maximum(np.diag(matrix), 1e-12))
-            step = self.scale * np.linalg.lstsq(matrix, self.scale * sums.gradient, rcond=1e-14)[0]
-            step /= max(1.0, float(np.abs(step / self.scale).max()) / _LONGEST)
-            own_step = np.linalg.solve(
-                sums.own, (sums.own_gradient - np.einsum("kpq,p->kq", sums.cross, step))[..., None]
-            )
-            promise = float(sums.gradient @ step)
-            if u.size:
-                promise += float(
-                    (sums.own_gradient * np.linalg.solve(sums.own, sums.own_gradient[..., None])[..., 0]).sum()
-                )
-            if promise < _SETTLED:
+            step = self.scale * np.linalg.lstsq(matrix, self.scale * gradient, rcond=1e-14)[0]
+            step /= max(1.0, float(np.abs(step / self.scale).max()) / LONGEST_STEP)
+            if float(gradient @ step) + linear.own_promise(own_gradient) < settled:
                 break
-            moved = theta.copy()
-            moved[self.columns] += step
-            moved, moved_u = clipped(moved), u + own_step[..., 0]
-            there = self.model.images(moved, self._shift(moved_u))
-            its_cost = float((self._residual(there, use) ** 2).sum() + (moved_u**2).sum())
-            if its_cost <= cost:
-                theta, u, images = moved, moved_u, there
-                done = cost - its_cost < _SETTLED
-                cost, damping = its_cost, max(damping * 0.1, 1e-9)
+            there = self._stepped(place, use, linear, own_gradient, step)
+            if there.cost <= place.cost:
+                done = place.cost - there.cost < settled
+                place, damping = there, max(damping * 0.1, 1e-9)
                 if done:
                     break
-                sums = self._sums(theta, u, images, use)
+                linear = slopes or self._linearise(place, use)
             else:
                 damping *= 8
                 if damping > 1e5:
                     break
-        return theta, u
+        return place
+
+    def _stepped(
+        self,
+        place: _Place,
+        use: NDArray[np.bool_],
+        linear: _Linear,
+        own_gradient: NDArray[np.float64],
+        step: NDArray[np.float64],
+    ) -> _Place:
+        theta = place.theta.copy()
+        theta[self.columns] += step
+        return self._at(clipped(theta), place.u + linear.own_step(own_gradient, step), use)
+
+    def _search(self, place: _Place, use: NDArray[np.bool_]) -> _Place:
+        """Leave small minima for lower ones nearby, until there are none."""
+        for _ in range(_SEARCHES):
+            found = self._lower(place, use)
+            if place.cost - found.cost < _GAINED:
+                break
+            place = found
+        return place
+
+    def _lower(self, place: _Place, use: NDArray[np.bool_]) -> _Place:
+        """Descend from the best places within six standard deviations along what the poses tell least."""
+        wide = self._linearise_wide(place, use)
+        _, own_gradient = wide.gradients(place.residual, place.u)
+        values, vectors = np.linalg.eigh(inverse(wide.information, self.scale) / np.outer(self.scale, self.scale))
+        ways = self.scale[:, None] * vectors * np.sqrt(np.clip(values, 0.0, LONGEST_STEP))
+        steps = (_SEARCH_STD[:, None, None] * ways[:, -_SEARCHED:].T).reshape(-1, len(self.columns))
+
+        def stepped(step: NDArray[np.float64]) -> _Place:
+            return self._stepped(place, use, wide, own_gradient, step)
+
+        with ThreadPoolExecutor(self.model.workers) as pool:
+            costs = list(pool.map(lambda step: stepped(step).cost, steps))
+        descended = [
+            self._descend(stepped(steps[k]), use, slopes=wide, steps=_SEARCH_STEPS, settled=_SEARCH_SETTLED)
+            for k in np.argsort(costs, kind="stable")[:_SEARCH_FROM]
+        ]
+        return self._descend(min(descended, key=lambda one: one.cost), use)
 
 
-def register(
-    model: CalibrationModel, evidence: Evidence, theta: NDArray[np.float64], free: Sequence[str]
-) -> NDArray[np.float64]:
-    """Move a mounting to where the landmark's outlines agree with which pixels returned from near it.
-
-    Gauss–Newton on coverage less return, over differences of a seventh of a pixel, from the best of several pitches
-    and bearings. It needs no amplitudes, comes from two degrees away to some tenths of a pixel, and cares little what
-    stands behind.
-
-    Parameters
-    ----------
-    model : CalibrationModel
-    evidence : Evidence
-    theta : (8,) float64
-        Where the mounting is thought to be.
-    free : sequence of str
-        What may move.
-
-    Returns
-    -------
-    (8,) float64
-    """
-    if not free:
-        return theta
-    seen = evidence.seen
-    near = np.abs(seen.range_m - model.poses.distance_m[:, None]) < model.reach_m + _NEARBY_M
-    target = np.where(seen.returned & near, 1.0, 0.0)
-    known = seen.returned | seen.not_returned
-    if not (known & ~seen.returned).any() and (target[known] == 1).all():
-        known = np.ones_like(known)  # nothing was told apart: what is missing returned nothing
-    enough = _PREVAILS_FROM if (seen.returned & ~near).mean() > _BESIDE else _RETURNS_FROM
-    columns = np.array([NAMES.index(name) for name in free])
-    scale = SCALE[columns]
-    prior = np.array([_OUTLINE_STD[_OUTLINE.index(name)] for name in free])
-
-    def difference(at: NDArray[np.float64]) -> NDArray[np.float64]:
-        returns = np.minimum(model.coverage(at) / enough, 1.0)
-        return np.asarray(np.where(known, target - returns, 0.0) / _OUTLINE_NOISE)
-
-    def cost(at: NDArray[np.float64]) -> float:
-        away = (at - theta)[columns] / scale / prior
-        return float((difference(at) ** 2).sum() + (away**2).sum())
-
-    tried = [theta]
-    for name in ("pitch", "bearing"):
-        if name in free:
-            steps = np.eye(len(NAMES))[NAMES.index(name)] * SCALE[NAMES.index(name)]
-            tried = [clipped(one + side * steps) for one in tried for side in _TRIED]
-    best = min(tried, key=cost)
-    for _ in range(_OUTLINE_STEPS):
-        rows = []
-        for column in columns:
-            move = np.eye(len(NAMES))[column] * SCALE[column] * _OUTLINE_WIDTH
-            rows.append((difference(best - move) - difference(best + move)).ravel() / (2 * _OUTLINE_WIDTH))
-        design = np.array(rows)
-        away = (best - theta)[columns] / scale
-        matrix = design @ design.T + np.diag(1 / prior**2)
-        step = np.linalg.solve(matrix, design @ difference(best).ravel() - away / prior**2)
-        step /= max(1.0, float(np.abs(step).max()) / _LONGEST)
-        moved = best.copy()
-        moved[columns] += scale * step
-        moved = clipped(moved)
-        if cost(moved) >= cost(best):
-            break
-        best = moved
-    return best
+def _steady(evidence: Evidence) -> NDArray[np.bool_]:
+    """Return which pixels were measured well enough for their ranges to count, (K, pixels)."""
+    std, limit = evidence.one_frame_std_m, one_frame_limit_m(evidence.sensor)
+    usual = np.array([np.median(one[known]) if (known := np.isfinite(one)).any() else 0.0 for one in std])
+    return np.asarray(std <= np.clip(_ORDINARY * usual, limit / _STEADY, limit)[:, None] * (1 + 1e-9))
 
 
 def inverse(information: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:

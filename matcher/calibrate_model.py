@@ -8,7 +8,7 @@ the brightness of the landmark (albedo), the only one that is not the camera's.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -67,6 +67,8 @@ PARAMETERS = {
 NAMES = tuple(PARAMETERS)
 SCALE = np.array([parameter.scale for parameter in PARAMETERS.values()])
 """Natural units, in the order of :data:`NAMES`."""
+LONGEST_STEP = 1.0
+"""No search steps farther, in natural units: slopes jump where edges pass corners of pixels."""
 STEP = 2e-4
 """Half the width of a difference, radians or metres: 1/60 of a pixel, wide enough to average what jumps where an edge
 passes a corner of a pixel, narrow enough to be the slope."""
@@ -181,6 +183,8 @@ class CalibrationModel:
         Whether the camera measures z, and its ranges were made of that with the half angles of `sensor`.
     workers : int
         Threads.
+    rendered : callable
+        Called after each rendering of all poses.
     """
 
     def __init__(
@@ -193,8 +197,9 @@ class CalibrationModel:
         background: Background | None = None,
         reports_z: bool = False,
         workers: int = 1,
+        rendered: Callable[[], None] = lambda: None,
     ) -> None:
-        self.sensor, self.poses, self.workers = sensor, poses, workers
+        self.sensor, self.poses, self.workers, self._rendered = sensor, poses, workers, rendered
         self._axis_cosine = sensor.axis_cosine() if reports_z else None
         self._albedo = albedo
         self._renderer = Renderer(mesh, sensor, albedo=albedo, harmonics=())
@@ -356,6 +361,7 @@ class CalibrationModel:
         )
 
     def _render(self, mounting: Mounting, views: Views, *, alone: bool = False) -> PhasorImages:
+        self._rendered()
         renderer = self._renderer.seen_by(mounting.on(self.sensor))
         if alone or len(self._scenes) == 1:
             return renderer.render_views(views, background=None if alone else self._scenes[0][1])

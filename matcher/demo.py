@@ -7,7 +7,7 @@ import io
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank, BankPlan, build_bank
+from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher.filters import FilteredFrames, kalman_filter
@@ -32,8 +33,6 @@ WALL_M = 3.0
 LANDMARK_XY_M = (2.0, 1.0)
 SHIFT_STEPS = 0.37
 """How far, in steps of the bank, the second half of the cells lies off the grid."""
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)

@@ -57,6 +57,8 @@ class Evidence:
         On ranges exp(iφ), on phasors z in units of |S|; 0 where nothing returned.
     weight : float64
         1/variance of the residual (m⁻² on ranges); 0 where there is none.
+    one_frame_std_m : float64
+        Noise of a single frame's range; infinite where nothing returned.
     seen : Observation
         The same frames as the coarse search sees them. What one frame cannot measure to 0.1 rad is no return there,
         whether or not the camera dropped it.
@@ -66,6 +68,7 @@ class Evidence:
 
     value: NDArray[np.complex128]
     weight: NDArray[np.float64]
+    one_frame_std_m: NDArray[np.float64]
     seen: Observation
     on: Quantity
     sensor: Sensor
@@ -82,14 +85,14 @@ class Evidence:
         sensor = frames.sensor
         whole = Observation.from_frames(frames, (0, sensor.rows))
         measured = whole.returned
-        one_frame_m2 = np.divide(
-            frames.n_effective.reshape(measured.shape), whole.weight, out=np.zeros(measured.shape), where=measured
-        )
+        n_effective = frames.n_effective.reshape(measured.shape)
+        one_frame_m2 = np.divide(n_effective, whole.weight, out=np.full(measured.shape, np.inf), where=measured)
+        one_frame_std_m = np.sqrt(one_frame_m2)
         strong = measured & ~(one_frame_m2 > one_frame_limit_m(sensor) ** 2)
         seen = Observation(whole.range_m, whole.weight, strong, whole.not_returned | (measured & ~strong))
         turn = np.asarray(np.where(measured, np.exp(1j * seen.range_m / sensor.metres_per_radian), 0.0), np.complex128)
         if on == "ranges":
-            return cls(turn, whole.weight, seen, on, sensor)
+            return cls(turn, whole.weight, one_frame_std_m, seen, on, sensor)
         if frames.amplitude_e is None or frames.intensity_e is None:
             raise UsageError('on="phasors" needs frames with amplitude and intensity: match on="ranges"')
         shape = seen.range_m.shape
@@ -97,13 +100,13 @@ class Evidence:
         amplitude = np.where(measured, frames.amplitude_e.reshape(shape), 0.0) / unit
         intensity = np.where(measured, frames.intensity_e.reshape(shape), 0.0)
         variance = np.maximum(phase_image_variance(intensity, sensor), 1.0) / (2 * unit**2)
-        weight = np.where(measured, frames.n_effective.reshape(shape) / variance, 0.0)
-        return cls(turn * amplitude, weight, seen, on, sensor)
+        weight = np.where(measured, n_effective / variance, 0.0)
+        return cls(turn * amplitude, weight, one_frame_std_m, seen, on, sensor)
 
     def __getitem__(self, index: NDArray[np.integer] | slice) -> Evidence:
         seen = self.seen
         part = Observation(seen.range_m[index], seen.weight[index], seen.returned[index], seen.not_returned[index])
-        return Evidence(self.value[index], self.weight[index], part, self.on, self.sensor)
+        return Evidence(self.value[index], self.weight[index], self.one_frame_std_m[index], part, self.on, self.sensor)
 
     @property
     def per_pixel(self) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from phasemark import InputFileError, OutputExistsError, UsageError
 from phasemark.data import versions, write_atomically
 from phasemark.data.hdf5 import check_format, open_hdf5, reading
 from phasemark.data.production import produce, refuse_unwritable_output
+from phasemark.data.progress import Progress
 from phasemark.data.shards import difference
 from phasemark.matcher.sweep_job import FORMAT, SCHEMA_VERSION, Round, SweepJob, check_matcher
 from phasemark.matcher.sweep_plan import SweepPlan
@@ -23,8 +23,6 @@ from phasemark.matcher.sweep_tables import Cell, SweepTrials, csv_bytes, json_ro
 
 TRIALS_AT_ONCE = 50
 """Trials of a shard: of one batch of a method, whatever the number of workers, so that no rounding depends on it."""
-
-Progress = Callable[[int, int], None]
 
 
 def run_sweep(

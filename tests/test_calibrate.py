@@ -12,7 +12,9 @@ from phasemark import InputFileError, UsageError
 from phasemark.cli import main
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import KnownPoses, Mounting, PoseStd, calibrate, filter_poses, frames_of_poses, read_poses
+from phasemark.matcher.calibrate_fit import Fit
 from phasemark.matcher.calibrate_model import NAMES, PARAMETERS, CalibrationModel
+from phasemark.matcher.likelihood import Evidence
 from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, preset
 
 PMD = preset("pmd-16x16")
@@ -99,6 +101,34 @@ def test_the_fit_itself_passes_its_test(phasor_trials):
 def test_true_mountings_lie_within_their_ellipses_on_ranges_without_amplitudes():
     values = [trial(seed, on="ranges", light=False)[0] for seed in range(20, 23)]
     assert stats.chi2.ppf(1e-3 / 6, 21) < sum(values) < stats.chi2.ppf(1 - 1e-3 / 6, 21)
+
+
+def test_small_minima_on_ranges_are_left_for_the_one_next_to_the_truth():
+    rng = np.random.default_rng([2026, 318])  # one of thirty: descending alone ends 7 above
+    truth, poses = some_mounting(rng, 0.8), some_poses(rng, 8)
+    evidence = Evidence.from_frames(filtered(take(truth, poses, rng), "ranges"), "ranges")
+    model = CalibrationModel(MESH, PMD, poses, albedo=0.8)
+    fit = Fit(model, evidence, NAMES[:-1], None, edges=True)
+
+    def solved(theta):
+        return fit.solve(theta, fit.pixels(theta, model.images(theta, np.zeros((8, 3))), cautious=True))
+
+    found, right = solved(fit.start(Mounting.of_sensor(PMD, 0.8).vector)), solved(truth.vector)
+    assert (found.use == right.use).all()
+    assert found.cost < right.cost + 0.5
+
+
+def test_a_dark_landmark_is_calibrated_on_the_little_that_it_returns():
+    """At an albedo of 0.05 and beyond 1.6 m the noise of every pixel passes half the limit of 0.1 rad."""
+    rng = np.random.default_rng(66)
+    poses = KnownPoses.polar(rng.uniform(1.6, 1.9, 8), rng.uniform(0, 2 * math.pi, 8), rng.uniform(-3, 3, 8) * DEGREE)
+    truth = replace(Mounting.of_sensor(PMD, 0.05), pitch_rad=0.02, bearing_rad=-0.01, range_offset_m=0.03)
+    frames = filtered(take(truth, poses, rng), "ranges")
+    free = ("pitch", "bearing", "range_offset")
+    found = calibrate(MESH, frames, poses, on="ranges", free=free, albedo=0.05)
+    assert np.median(found.range_std_m[found.range_std_m > 0]) * math.sqrt(50) > 0.05 * PMD.metres_per_radian
+    assert (found.pose_residuals > 10).all()
+    assert nees(found, truth) < stats.chi2.ppf(0.999, 3)
 
 
 def test_errors_of_the_poses_are_estimated_and_widen_the_covariance():

@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data import BankPlan, build_bank, parse_grid
+from phasemark.data.progress import Progress, counter
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh
 from phasemark.matcher.bounds import Estimate, cramer_rao, efficiency, share
 from phasemark.matcher.design.plan import DesignPlan
-from phasemark.matcher.design.search import Design, Progress, Scored, counter
+from phasemark.matcher.design.search import Design, Scored
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.trials import Conditions, noisy_frames
 from phasemark.render import Renderer, Sensor, Views

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 
 from phasemark import UsageError
+from phasemark.data.progress import Progress, counter
 from phasemark.landmarks import LandmarkSpec, catalog
 from phasemark.landmarks.spec import Upper
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.rules import Check, upper_size
-from phasemark.matcher.design.search import Candidate, Design, Progress, Search, counter
+from phasemark.matcher.design.search import Candidate, Design, Search
 from phasemark.matcher.design.shapes import box_of, sample_boxes
 
 _USUAL_REFINEMENT = 600

@@ -30,8 +30,6 @@ from phasemark.matcher.design.separation import (
 from phasemark.matcher.design.shapes import Lattice, box_of, neighbours, sample_uppers
 from phasemark.render import Sensor
 
-Progress = Callable[[int, int], None]
-
 _BOX_MOVES = (8, 4, 2, 1)
 _UPPER_MOVES = (16, 8, 4, 2, 1)
 _ROUNDS = 3
@@ -331,16 +329,3 @@ class Design:
             if not front or candidate.class_distance > front[-1].class_distance:
                 front.append(candidate)
         return front
-
-
-def counter(progress: Progress | None, total: int) -> Callable[[], None]:
-    """Return what counts one step and reports it; the total grows where it was reckoned too small."""
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, max(total, done))
-
-    return step

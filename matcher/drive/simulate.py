@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank, BankPlan, build_bank
+from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
 from phasemark.matcher.bounds import cramer_rao
@@ -29,8 +30,6 @@ FREE = ("distance_m", "delta_rad", "bearing_rad")
 _BANK_STEP_M, _BANK_STEP_DEG, _BANK_MARGIN_M = 0.02, 2.0, 0.3
 _MOST_WAY = 1.5
 """A robot that has driven so many times the length of its path has lost it."""
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,33 @@
+"""How long work tells whoever waits for it how far it has come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+Progress = Callable[[int, int], None]
+"""Called with how many steps are done, and of how many."""
+
+
+def counter(progress: Progress | None, total: int) -> Callable[[], None]:
+    """Return what counts one step and reports it; the total grows where it was reckoned too small.
+
+    Parameters
+    ----------
+    progress : callable (done, total), optional
+        None: nothing is reported.
+    total : int
+        Steps reckoned with.
+
+    Returns
+    -------
+    callable
+    """
+    done = 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, max(total, done))
+
+    return step
