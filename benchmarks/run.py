@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from matching import matching
+from mounting import design, mounting
 from tolerance import tolerance
 
 from phasemark.data import BankPlan, build_bank, open_bank
@@ -484,6 +485,8 @@ SECTIONS: dict[str, tuple[str, Callable[[], Table]]] = {
     "capture": ("Capturing noisy frames", capturing),
     "chain": ("Capture, filters, matching", chain),
     "sweep": ("A sweep with its report", sweep),
+    "mounting": ("Calibrating a mounting on 50 poses", mounting),
+    "design": ("Designing a set of landmarks", design),
     "matching": ("Errors over the Cramér–Rao bound", partial(matching, SENSOR, SEED)),
     "tolerance": ("In a world that is not the model's", partial(tolerance, SENSOR, SEED)),
 }
