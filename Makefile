@@ -3,6 +3,7 @@
 #   make test          the tests (ARGS="-k name" for some of them)
 #   make lint types    style, import direction, types
 #   make bench soak    speed; the long statistical and fault tables
+#   make figures       the pictures of the documentation
 #   make wheel-check   what a release would ship, built from a clean clone
 
 VENV ?= .venv
@@ -11,7 +12,7 @@ ARGS ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test soak bench lint types wheel-check clean
+.PHONY: demo test soak bench figures lint types wheel-check clean
 
 demo: $(VENV)/.installed
 	$(BIN)/phasemark demo --out out/demo --force
@@ -24,6 +25,9 @@ soak: $(VENV)/.installed-test
 
 bench: $(BENCH_VENV)/.installed-bench
 	$(BENCH_VENV)/bin/python benchmarks/run.py $(ARGS)
+
+figures: $(BENCH_VENV)/.installed-bench
+	$(BENCH_VENV)/bin/python docs/figures.py --runs
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff check .

@@ -1,13 +1,18 @@
-"""Draw the pictures of the documentation into docs/images: ``python docs/figures.py``.
+"""Draw the pictures of the documentation into docs/images: ``make figures``, or ``python docs/figures.py --runs``.
 
-Some show what a long run left in out/: where it is not there, they stay as they are, and the command to run is named.
+Some show what a run of a minute or more has left in out/. Without ``--runs``, where that is not there they stay as they
+are, and the command is named.
 """
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
+import shlex
+import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +30,7 @@ from phasemark.render.plot import draw_range
 
 IMAGES = Path(__file__).parent / "images"
 OUT = Path(__file__).parent.parent / "out"
+PHASEMARK = (sys.executable, "-c", "import sys; from phasemark.cli import main; sys.exit(main())")
 LEFT_BY = {
     "phasemark sweep run paper --out out/paper": {
         "accuracy-distance.png": "paper/figures/rmse-distance-m.png",
@@ -116,21 +122,31 @@ def write(figure: Figure, name: str) -> None:
 
 def main() -> None:
     """Write every picture."""
+    parser = argparse.ArgumentParser(description="Draw the pictures of the documentation into docs/images.")
+    parser.add_argument("--runs", action="store_true", help="make the runs that are missing in out/, some minutes")
+    runs = parser.parse_args().runs
+    for command, pictures in LEFT_BY.items():
+        made = made_by(command, [OUT / source for source in pictures.values()], runs, *PHASEMARK)
+        for name, source in pictures.items() if made else ():
+            write_atomically(IMAGES / name, (OUT / source).read_bytes(), force=True)
+    bench = OUT / "bench.json"
+    if made_by("benchmarks/run.py peer", [bench], runs, sys.executable):
+        write(cost_figure(json.loads(bench.read_text(encoding="utf-8"))["peer"]["rows"]), "cost.png")
     write(demo_figure(), "demo.png")
     write(drive_picture(run_drive(default_drive())), "drive.png")
-    stale = []
-    for command, pictures in LEFT_BY.items():
-        for name, source in pictures.items():
-            if (OUT / source).exists():
-                write_atomically(IMAGES / name, (OUT / source).read_bytes(), force=True)
-            else:
-                stale.append(f"{name} stays as it is: run '{command}' first")
-    bench = OUT / "bench.json"
-    if bench.exists():
-        write(cost_figure(json.loads(bench.read_text(encoding="utf-8"))["peer"]["rows"]), "cost.png")
-    else:
-        stale.append("cost.png stays as it is: run 'make bench' first")
-    sys.stderr.writelines(f"{line}\n" for line in stale)
+
+
+def made_by(command: str, files: Sequence[Path], run: bool, *program: str) -> bool:
+    """Return whether a command has left its files; with `run` it is run if it has not."""
+    if all(file.exists() for file in files):
+        return True
+    if not run:
+        sys.stderr.write(f"stays as it is without --runs, or first: {command}\n")
+        return False
+    sys.stderr.write(f"running: {command}\n")
+    arguments = shlex.split(command.removeprefix("phasemark "))
+    subprocess.run([*program, *arguments], check=True, cwd=OUT.parent)
+    return True
 
 
 if __name__ == "__main__":
