@@ -294,17 +294,16 @@ def calibrate(
     images = model.images(theta, np.zeros((len(poses), 3)))
     use = fit.pixels(theta, images, cautious=True)
     _check_pixels(use, poses, evidence)
-    at_start = fit.conclude(theta, np.zeros((len(poses), fit.factor.shape[2])), use)
-    _check_observable(at_start, fit, poses)
+    _check_observable(fit.information(theta, use), fit, poses)
     solution = fit.solve(theta, use)
-    _check_observable(solution, fit, poses)
+    _check_observable(solution.information, fit, poses)
     estimated = None
     if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and _fit_probability(fit, solution, frames) < _FALSE_ALARM:
         for _ in range(_ROUNDS):
             estimated = estimate_pose_std(fit.blocks(solution, PoseStd(1.0, 1.0, 1.0).factor(poses)))
             fit = Fit(model, evidence, names, estimated.factor(poses), edges=edges)
             solution = fit.solve(solution.theta, solution.use)
-        _check_observable(solution, fit, poses)
+        _check_observable(solution.information, fit, poses)
     return _concluded(fit, solution, frames, assumed, edges, estimated)
 
 
@@ -385,8 +384,8 @@ def _check_pixels(use: NDArray[np.bool_], poses: KnownPoses, evidence: Evidence)
         )
 
 
-def _check_observable(solution: Solution, fit: Fit, poses: KnownPoses) -> None:
-    covariance = inverse(solution.information, fit.scale)
+def _check_observable(information: NDArray[np.float64], fit: Fit, poses: KnownPoses) -> None:
+    covariance = inverse(information, fit.scale)
     scaled = covariance / np.outer(fit.scale, fit.scale)
     values, vectors = np.linalg.eigh(scaled)
     if not math.sqrt(float(values[-1])) > _UNKNOWN:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phasemark.matcher.calibrate_model import LONGEST_STEP, NAMES, SCALE, CalibrationModel, Images, clipped
+from phasemark.matcher.calibrate_model import LONGEST_STEP, NAMES, SCALE, STEP, CalibrationModel, Images, clipped
 from phasemark.matcher.calibrate_register import OUTLINE, register
 from phasemark.matcher.coarse import DISAGREEMENT
 from phasemark.matcher.likelihood import Evidence, one_frame_limit_m
@@ -45,6 +45,8 @@ _SEARCH_STD = np.array([-6.0, -5.0, -4.0, -3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0
 """How far along each, standard deviations."""
 _SEARCH_FROM, _SEARCH_STEPS, _SEARCH_SETTLED = 3, 8, 0.03
 """From how many of these places it descends by slopes over standard deviations, in so many steps unless they settle."""
+_WIDTHS = (0.5, 1.0, 2.0)
+"""Standard deviations over which slopes are taken for the covariance."""
 _SEARCHES, _GAINED = 4, 0.1
 """How often the search is repeated about what it found, unless it saved less."""
 
@@ -231,16 +233,26 @@ class Fit:
             place = self._descend(place, use)
         if self.evidence.on == "ranges":
             place = self._search(place, use)
-        return self.conclude(place.theta, place.u, use)
+        return self._conclude(place, use)
 
-    def conclude(self, theta: NDArray[np.float64], u: NDArray[np.float64], use: NDArray[np.bool_]) -> Solution:
-        """Take stock of a mounting, with slopes over its standard deviations."""
-        place = self._at(theta, u, use)
-        linear = self._linearise_wide(place, use)
-        by_pose, _ = linear.gradients(place.residual, u)
-        scatter = by_pose.T @ by_pose
+    def information(self, theta: NDArray[np.float64], use: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return what the pixels given tell at a mounting, (p, p)."""
+        place = self._at(theta, np.zeros((len(use), self.factor.shape[2])), use)
+        return self._linearise(place, use).information
+
+    def _conclude(self, place: _Place, use: NDArray[np.bool_]) -> Solution:
+        """Take stock of a place, with slopes that neither a corner nor a faint pixel at one end has spoilt."""
+        linear = self._linearise_wide(place, use, _WIDTHS)
+        by_pose, _ = linear.gradients(place.residual, place.u)
         return Solution(
-            theta, self._shift(u), place.images, use, place.residual, place.cost, linear.information, scatter
+            place.theta,
+            self._shift(place.u),
+            place.images,
+            use,
+            place.residual,
+            place.cost,
+            linear.information,
+            by_pose.T @ by_pose,
         )
 
     def blocks(self, solution: Solution, unit: NDArray[np.float64]) -> Blocks:
@@ -287,26 +299,36 @@ class Fit:
         residual = self._residual(images, use)
         return _Place(theta, u, images, residual, float((residual**2).sum() + (u**2).sum()))
 
-    def _linearise(self, place: _Place, use: NDArray[np.bool_], width: NDArray[np.float64] | None = None) -> _Linear:
+    def _linearise(self, place: _Place, use: NDArray[np.bool_], *widths: NDArray[np.float64]) -> _Linear:
+        """Take slopes over least widths or, of each pixel, the median of those over several."""
         q = self.factor.shape[2]
-        slope, of_pose = self.model.slopes(
-            place.theta, self._shift(place.u), self.free, self.evidence.on, of_poses=q > 0, width=width
-        )
-        rows = self._whitened(slope, place.images, use)
+        found = [
+            self.model.slopes(
+                place.theta, self._shift(place.u), self.free, self.evidence.on, of_poses=q > 0, width=width
+            )
+            for width in widths or (None,)
+        ]
+        rows = np.median([self._whitened(slope, place.images, use) for slope, _ in found], axis=0)
         own_rows = np.zeros((len(rows), 0, rows.shape[2]))
         if q:
-            own_rows = np.einsum("kij,kir->kjr", self.factor, self._whitened(of_pose, place.images, use))
+            # the mount's bearing and a pose's move an image alike: only the same slopes cancel where they should
+            of_pose = np.median([self._whitened(slope, place.images, use) for _, slope in found], axis=0)
+            own_rows = np.einsum("kij,kir->kjr", self.factor, of_pose)
         cross = rows @ own_rows.transpose(0, 2, 1)
         own = own_rows @ own_rows.transpose(0, 2, 1) + np.eye(q)
         eliminated = np.linalg.solve(own, cross.transpose(0, 2, 1))  # (K, q, p)
         information = (rows @ rows.transpose(0, 2, 1) - cross @ eliminated).sum(axis=0)
         return _Linear(rows, own_rows, cross, own, information)
 
-    def _linearise_wide(self, place: _Place, use: NDArray[np.bool_]) -> _Linear:
-        """Take slopes over the standard deviations that slopes at the place give."""
+    def _linearise_wide(self, place: _Place, use: NDArray[np.bool_], widths: Sequence[float] = (1.0,)) -> _Linear:
+        """Take slopes over multiples of the standard deviations that slopes at the place give."""
+        narrow = self._linearise(place, use)
         std = np.zeros(len(NAMES))
-        std[self.columns] = np.sqrt(np.diag(inverse(self._linearise(place, use).information, self.scale)))
-        return self._linearise(place, use, np.minimum(np.nan_to_num(std), 0.5 * SCALE))
+        std[self.columns] = np.sqrt(np.diag(inverse(narrow.information, self.scale)))
+        std[NAMES.index("range_offset")] = 0.0  # its slope is exact
+        if (max(widths) * std <= STEP).all():
+            return narrow
+        return self._linearise(place, use, *(np.minimum(width * np.nan_to_num(std), 0.5 * SCALE) for width in widths))
 
     def _descend(
         self,
