@@ -463,6 +463,4 @@ def test_95_percent_ellipses_hold_the_truth_in_93_to_97_percent_of_500_runs(on):
     values = [trial(1000 + seed, 12, on=on) for seed in range(500)]
     inside = sum(value <= stats.chi2.ppf(0.95, len(found.free)) for value, found in values)
     print(f"{on}: {inside} of 500 true mountings within their 95 % ellipsoid")
-    interval = stats.binomtest(inside, 500).proportion_ci(0.999, method="exact")
-    assert interval.low <= 0.97
-    assert interval.high >= 0.93
+    assert 0.93 * 500 <= inside <= 0.97 * 500
