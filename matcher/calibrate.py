@@ -39,6 +39,8 @@ _UNKNOWN = 3.0
 _POSES_FOR_ERRORS = 6
 """Fewer poses do not tell the size of their errors."""
 _ROUNDS = 2
+_SLACK_M = 0.05
+"""A wall or floor may cut the landmark by so much where the mounting is thought to be."""
 _USUAL_RENDERINGS = 400
 """Of all poses: what a progress bar reckons with."""
 _FRAMES_FOR_SCATTER = 10
@@ -342,6 +344,7 @@ def _check_view(model: CalibrationModel, evidence: Evidence, assumed: Mounting) 
             f" the optical axis, and the image ends at {math.degrees(assumed.half_angle_h_rad):.1f}°; are heading and"
             " bearing in degrees, counter-clockwise?"
         )
+    model.check_behind(assumed.vector, _SLACK_M)
     inside = np.flatnonzero(model.lens_within())
     if inside.size:
         k = int(inside[0])

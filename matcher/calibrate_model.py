@@ -184,7 +184,7 @@ class CalibrationModel:
     workers : int
         Threads.
     rendered : callable
-        Called after each rendering of all poses.
+        Called with each rendering of all poses; threads may do so at the same time.
     """
 
     def __init__(
@@ -222,6 +222,25 @@ class CalibrationModel:
     def reach_m(self) -> float:
         """Distance of the landmark's farthest point from its origin."""
         return self._renderer.topology.radius_m
+
+    def check_behind(self, theta: NDArray[np.float64], slack_m: float) -> None:
+        """Refuse walls and floors that cut the landmark by more than a mounting may be off.
+
+        Parameters
+        ----------
+        theta : (8,) float64
+            Where the mounting is thought to be.
+        slack_m : float
+
+        Raises
+        ------
+        UsageError
+        """
+        views = self._views(np.zeros((len(self.poses), 3))).in_camera(Mounting.of_vector(theta).on(self.sensor))
+        views = replace(views, distance_m=views.distance_m - slack_m, height_m=views.height_m + slack_m)
+        for which, background in self._scenes:
+            if background is not None:
+                background.check_behind(self._renderer.topology.vertices, views[which])
 
     def lens_within(self) -> NDArray[np.bool_]:
         """Return from which poses the lens would stand in the landmark's foot print, (K,)."""
@@ -361,11 +380,18 @@ class CalibrationModel:
         )
 
     def _render(self, mounting: Mounting, views: Views, *, alone: bool = False) -> PhasorImages:
-        self._rendered()
         renderer = self._renderer.seen_by(mounting.on(self.sensor))
+        vertices = self._renderer.topology.vertices
+        self._rendered()
+
+        def seen(views: Views, background: Background | None) -> PhasorImages:
+            if background is not None:
+                background = background.giving_way(vertices, views.in_camera(renderer.sensor))
+            return renderer.render_views(views, background=background)
+
         if alone or len(self._scenes) == 1:
-            return renderer.render_views(views, background=None if alone else self._scenes[0][1])
-        parts = [renderer.render_views(views[which], background=background) for which, background in self._scenes]
+            return seen(views, None if alone else self._scenes[0][1])
+        parts = [seen(views[which], background) for which, background in self._scenes]
         back = np.argsort(np.concatenate([which for which, _ in self._scenes]))
         phasor, intensity, coverage = (
             np.concatenate([getattr(part, name) for part in parts])[back]

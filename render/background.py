@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -66,27 +66,55 @@ class Background:
         UsageError
             Naming the view and what would be right.
         """
+        farthest, deepest = self._extremes(vertices, views)
+        if self.floor_m is not None and (deepest > self.floor_m + 1e-9).any():
+            i = int(np.argmax(deepest > self.floor_m + 1e-9))
+            raise UsageError(
+                f"the floor {self.floor_m:g} m below the lens is above the landmark's lowest point in view"
+                f" {i}: 'floor_m' must be at least {deepest[i]:.4g}"
+            )
+        if self.wall_m is not None and (farthest > self.wall_m + 1e-9).any():
+            i = int(np.argmax(farthest > self.wall_m + 1e-9))
+            raise UsageError(
+                f"the wall at {self.wall_m:g} m is before the landmark's farthest point in view {i}:"
+                f" 'wall_m' must be at least {farthest[i]:.4g}"
+            )
+
+    def giving_way(self, vertices: NDArray[np.float64], views: Views) -> Background:
+        """Return it with wall and floor moved back to where they touch the landmark, if they would cut it.
+
+        For views that are only tried: a landmark may stand on the floor, and a search must be free to lower it.
+
+        Parameters
+        ----------
+        vertices : (v, 3) float64
+            Points of the landmark, landmark frame.
+        views : Views
+
+        Returns
+        -------
+        Background
+        """
+        farthest, deepest = self._extremes(vertices, views)
+        return replace(
+            self,
+            wall_m=None if self.wall_m is None else max(self.wall_m, float(farthest.max(initial=0.0))),
+            floor_m=None if self.floor_m is None else max(self.floor_m, float(deepest.max(initial=0.0))),
+        )
+
+    def _extremes(self, vertices: NDArray[np.float64], views: Views) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return how far from the lens each view's landmark reaches, if it may reach the wall, and how far below it."""
+        nowhere = np.full(len(views), -np.inf)
         if not len(vertices):
-            return
-        if self.floor_m is not None:
-            lowest = vertices[:, 2].min() + views.height_m
-            bad = np.flatnonzero(lowest < -self.floor_m - 1e-9)
-            if bad.size:
-                raise UsageError(
-                    f"the floor {self.floor_m:g} m below the lens is above the landmark's lowest point in view"
-                    f" {bad[0]}: 'floor_m' must be at least {-lowest[bad[0]]:.4g}"
-                )
+            return nowhere, nowhere
+        farthest = nowhere.copy()
         if self.wall_m is not None:
             # distance along the horizontal line of sight: D + x' cos δ + y' sin δ
             reach = np.hypot(vertices[:, 0], vertices[:, 1]).max()
             for i in np.flatnonzero(views.distance_m + reach > self.wall_m):
                 cos, sin = math.cos(views.delta_rad[i]), math.sin(views.delta_rad[i])
-                farthest = views.distance_m[i] + (vertices[:, 0] * cos + vertices[:, 1] * sin).max()
-                if farthest > self.wall_m + 1e-9:
-                    raise UsageError(
-                        f"the wall at {self.wall_m:g} m is before the landmark's farthest point in view {i}:"
-                        f" 'wall_m' must be at least {farthest:.4g}"
-                    )
+                farthest[i] = views.distance_m[i] + (vertices[:, 0] * cos + vertices[:, 1] * sin).max()
+        return farthest, -vertices[:, 2].min() - views.height_m
 
 
 @njit(cache=True, nogil=True, inline="always")
