@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 
 Progress = Callable[[int, int], None]
@@ -21,13 +22,15 @@ def counter(progress: Progress | None, total: int) -> Callable[[], None]:
     Returns
     -------
     callable
+        Threads may call it at the same time.
     """
-    done = 0
+    done, lock = 0, threading.Lock()
 
     def step() -> None:
         nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, max(total, done))
+        with lock:
+            done += 1
+            if progress is not None:
+                progress(done, max(total, done))
 
     return step

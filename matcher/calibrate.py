@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data.progress import Progress, counter
-from phasemark.matcher.calibrate_fit import Fit, Solution, inverse
+from phasemark.matcher.calibrate_fit import Fit, Knowledge, Place, inverse
 from phasemark.matcher.calibrate_model import NAMES, PARAMETERS, CalibrationModel, Mounting
 from phasemark.matcher.calibrate_notes import advice, named, observability_notes, odd_pose_notes
 from phasemark.matcher.calibrate_pose_errors import estimate_pose_std
@@ -39,6 +39,8 @@ _UNKNOWN = 3.0
 _POSES_FOR_ERRORS = 6
 """Fewer poses do not tell the size of their errors."""
 _ROUNDS = 2
+_MINIMA_COST = 50.0
+"""χ² that ending in a small minimum may cost; what fits worse has other reasons."""
 _SLACK_M = 0.05
 """A wall or floor may cut the landmark by so much where the mounting is thought to be."""
 _USUAL_RENDERINGS = 400
@@ -217,7 +219,8 @@ def calibrate(
 
     With y the filtered ranges of all poses, or the phasors z, and f the rendered ones, the residuals are those of
     matching (PHYSICS section 7) with the variance of the noise law; what moves is not the view, which is known, but the
-    camera. The covariance is the inverse of Jᵀ Σ⁻¹ J with slopes over the standard deviations found. Where χ² says that
+    camera. On ranges small minima are left for lower ones nearby. The covariance is the inverse of Jᵀ Σ⁻¹ J with slopes
+    over about the standard deviations found. Where χ² says that
     the residuals are more than noise, it is the sandwich over poses, or, if there are few of them, is scaled by χ².
 
     Parameters
@@ -291,22 +294,26 @@ def calibrate(
     _check_view(model, evidence, assumed)
     edges = model.has_background or not _returns_beside(model, evidence, assumed)
     exact = pose_std is None or pose_std.exact
-    fit = Fit(model, evidence, names, None if exact or pose_std is None else pose_std.factor(poses), edges=edges)
+    noise_measured = frames.amplitude_e is not None or frames.std_from_scatter or sensor.kind == "direct"
+    known = None if exact or pose_std is None else pose_std.factor(poses)
+    fit = Fit(model, evidence, names, known, edges=edges, noise_measured=noise_measured)
     theta = fit.start(assumed.vector)
     images = model.images(theta, np.zeros((len(poses), 3)))
     use = fit.pixels(theta, images, cautious=True)
     _check_pixels(use, poses, evidence)
     _check_observable(fit.information(theta, use), fit, poses)
-    solution = fit.solve(theta, use)
-    _check_observable(solution.information, fit, poses)
+    place = fit.solve(theta, use)
+    if _fit_probability(fit, place, frames, less=_MINIMA_COST) >= _FALSE_ALARM:
+        place = fit.search(place)
     estimated = None
-    if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and _fit_probability(fit, solution, frames) < _FALSE_ALARM:
+    if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and _fit_probability(fit, place, frames) < _FALSE_ALARM:
         for _ in range(_ROUNDS):
-            estimated = estimate_pose_std(fit.blocks(solution, PoseStd(1.0, 1.0, 1.0).factor(poses)))
-            fit = Fit(model, evidence, names, estimated.factor(poses), edges=edges)
-            solution = fit.solve(solution.theta, solution.use)
-        _check_observable(solution.information, fit, poses)
-    return _concluded(fit, solution, frames, assumed, edges, estimated)
+            estimated = estimate_pose_std(fit.blocks(place, PoseStd(1.0, 1.0, 1.0).factor(poses)))
+            fit = Fit(model, evidence, names, estimated.factor(poses), edges=edges, noise_measured=noise_measured)
+            place = fit.solve(place.theta, place.use, place.shift)
+    knowledge = fit.knowledge(place)
+    _check_observable(knowledge.information, fit, poses)
+    return _concluded(fit, place, knowledge, frames, assumed, edges, estimated)
 
 
 def _check(frames: FilteredFrames, poses: KnownPoses, names: tuple[str, ...], lit: bool) -> None:
@@ -402,19 +409,20 @@ def _check_observable(information: NDArray[np.float64], fit: Fit, poses: KnownPo
     )
 
 
-def _degrees_of_freedom(fit: Fit, solution: Solution) -> int:
-    return int(solution.use.sum()) * fit.evidence.per_pixel - len(fit.free)
+def _degrees_of_freedom(fit: Fit, place: Place) -> int:
+    return int(place.use.sum()) * fit.evidence.per_pixel - len(fit.free)
 
 
-def _fit_probability(fit: Fit, solution: Solution, frames: FilteredFrames) -> float:
-    """Return the probability of a larger χ²."""
-    dof = np.array([_degrees_of_freedom(fit, solution)])
-    return float(p_values_of(np.array([solution.cost]), dof, frames, np.array([0]))[0])
+def _fit_probability(fit: Fit, place: Place, frames: FilteredFrames, *, less: float = 0.0) -> float:
+    """Return the chance of a χ² as large as that of a place less something."""
+    dof = np.array([_degrees_of_freedom(fit, place)])
+    return float(p_values_of(np.array([max(place.cost - less, 0.0)]), dof, frames, np.array([0]))[0])
 
 
 def _concluded(
     fit: Fit,
-    solution: Solution,
+    place: Place,
+    knowledge: Knowledge,
     frames: FilteredFrames,
     assumed: Mounting,
     edges: bool,
@@ -423,14 +431,14 @@ def _concluded(
     """Take stock; `estimated` is what the residuals said of the poses, if they were asked."""
     model, evidence = fit.model, fit.evidence
     poses, sensor = model.poses, frames.sensor
-    pose_residuals = solution.use.sum(axis=1) * evidence.per_pixel
-    pose_chi2 = (solution.residual**2).sum(axis=1)
-    dof, p_value = _degrees_of_freedom(fit, solution), _fit_probability(fit, solution, frames)
-    covariance = inverse(solution.information, fit.scale)
+    pose_residuals = place.use.sum(axis=1) * evidence.per_pixel
+    pose_chi2 = (place.residual**2).sum(axis=1)
+    dof, p_value = _degrees_of_freedom(fit, place), _fit_probability(fit, place, frames)
+    covariance = inverse(knowledge.information, fit.scale)
     expected, source = float(max(dof, 1)), "the noise law"
     if frames.std_from_scatter:
         # weights that were estimated from ν + 1 frames are too large in the mean by ν / (ν − 2), and scatter themselves
-        nu = max(float(np.median(frames.n_effective.reshape(len(poses), -1)[solution.use])) - 1, 5.0)
+        nu = max(float(np.median(frames.n_effective.reshape(len(poses), -1)[place.use])) - 1, 5.0)
         covariance = covariance * nu / (nu - 4)
         expected, source = expected * nu / (nu - 2), "the scatter of the frames"
     notes: list[str] = []
@@ -442,10 +450,10 @@ def _concluded(
             " --heading-std and --delta-std)."
         )
     if dof > 0 and p_value < _FALSE_ALARM:
-        excess = solution.cost / expected
+        excess = place.cost / expected
         if len(poses) >= _POSES_FOR_SANDWICH * len(fit.free):
-            plain = inverse(solution.information, fit.scale)
-            covariance = plain @ solution.scatter @ plain * len(poses) / (len(poses) - len(fit.free))
+            plain = inverse(knowledge.information, fit.scale)
+            covariance = plain @ knowledge.scatter @ plain * len(poses) / (len(poses) - len(fit.free))
             source = "the scatter of the poses (sandwich), for the residuals are more than noise"
         else:
             covariance = covariance * excess
@@ -465,7 +473,7 @@ def _concluded(
         k = int(np.flatnonzero(pose_residuals == 0)[0])
         notes.append(f"{unseen} of {len(poses)} poses tell nothing: no pixel counts, first at {poses.where(k)}.")
     notes += observability_notes(fit.free, covariance, fit.scale, poses)
-    mounting = Mounting.of_vector(solution.theta)
+    mounting = Mounting.of_vector(place.theta)
     if mounting.albedo > 1 and "albedo" in fit.free:
         notes.append(
             f"An albedo of {mounting.albedo:.3g} cannot be: signal_e of the sensor is too low, or the amplitudes are"
@@ -473,7 +481,7 @@ def _concluded(
         )
     shape = (len(poses), sensor.rows, sensor.cols)
     before = model.images(assumed.vector, np.zeros((len(poses), 3)))
-    after = evidence.sensor.metres_per_radian * np.angle(evidence.value * solution.images.phasor.conj())
+    after = evidence.sensor.metres_per_radian * np.angle(evidence.value * place.images.phasor.conj())
     thought = evidence.sensor.metres_per_radian * np.angle(evidence.value * before.phasor.conj())
     return Calibration(
         sensor=_mounted(sensor, mounting, fit.free),
@@ -483,17 +491,17 @@ def _concluded(
         free=fit.free,
         covariance=covariance,
         covariance_from=source,
-        chi2=solution.cost,
+        chi2=place.cost,
         dof=dof,
         p_value=p_value,
         on=evidence.on,
         poses=poses,
-        pose_shift=solution.shift,
+        pose_shift=place.shift,
         pose_chi2=pose_chi2,
         pose_residuals=pose_residuals,
-        residual_m=np.where(solution.use, after, np.nan).reshape(shape),
-        residual_before_m=np.where(solution.use & (before.phasor != 0), thought, np.nan).reshape(shape),
-        range_std_m=np.where(solution.use, np.maximum(evidence.seen.weight, 1e-300) ** -0.5, np.nan).reshape(shape),
+        residual_m=np.where(place.use & (place.images.phasor != 0), after, np.nan).reshape(shape),
+        residual_before_m=np.where(place.use & (before.phasor != 0), thought, np.nan).reshape(shape),
+        range_std_m=np.where(place.use, np.maximum(evidence.seen.weight, 1e-300) ** -0.5, np.nan).reshape(shape),
         notes=tuple(notes),
     )
 

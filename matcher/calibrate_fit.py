@@ -32,19 +32,22 @@ _CLEAR = 1.5
 """Phasors count where the noise of one frame is below its limit by this factor: nearer to the limit a frame's own noise
 decides whether its pixel is valid, and the brighter half would stand for all."""
 _STEADY, _ORDINARY = 2.0, 1.5
-"""Ranges count where the measured noise of one frame is below its limit by the first factor, or no more than the second
-times the median of its pose: fainter pixels see little of the landmark, and their ranges jump as the mounting moves."""
+"""Ranges count where the measured noise of one frame is below its limit by the first factor or, within it, at most the
+second times the median of its pose: fainter pixels see little of the landmark, and their ranges jump as it moves."""
 _FULL = 1 - 1e-6
 """Coverage of a pixel that sees nothing but the landmark."""
-_MAX_ITERATIONS = 40
+_MAX_ITERATIONS, _FOLLOWED = 40, 8
+"""How often slopes are taken, and how many steps are tried with each."""
 _SETTLED = 1e-3
-"""A step that promises to lower the whitened squared residual by less than this is not taken."""
+"""A step that promises to lower χ² by less than this is not taken; where χ² is more than expected, by as much more."""
 _SEARCHED = 3
 """Directions, of those that the poses tell least, along which lower minima are looked for."""
 _SEARCH_STD = np.array([-6.0, -5.0, -4.0, -3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0])
 """How far along each, standard deviations."""
-_SEARCH_FROM, _SEARCH_STEPS, _SEARCH_SETTLED = 3, 8, 0.03
-"""From how many of these places it descends by slopes over standard deviations, in so many steps unless they settle."""
+_SEARCH_MOST = 1.0
+"""Natural units that a standard deviation is taken for at most, lest nothing is in view any more."""
+_SEARCH_FROM, _SEARCH_SETTLED = 3, 0.03
+"""From how many of these places it descends by slopes over standard deviations, and until steps promise so little."""
 _WIDTHS = (0.5, 1.0, 2.0)
 """Standard deviations over which slopes are taken for the covariance."""
 _SEARCHES, _GAINED = 4, 0.1
@@ -52,34 +55,48 @@ _SEARCHES, _GAINED = 4, 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """Where the likelihood is greatest.
+class Place:
+    """A mounting with the errors of the poses, and how well it fits.
 
     Parameters
     ----------
     theta : (8,) float64
         Mounting, in the order of :data:`~phasemark.matcher.calibrate_model.NAMES`.
+    u : (K, q) float64
+        Errors of the poses, of unit variance each.
     shift : (K, 3) float64
-        Estimated errors of the poses, :data:`~phasemark.matcher.calibrate_model.POSE`.
+        What they come to, :data:`~phasemark.matcher.calibrate_model.POSE`.
     images : Images
         The model there.
     use : (K, pixels) bool
+        Which pixels count.
     residual : (K, R) float64
         Whitened; 0 where a pixel does not count.
     cost : float
-        Their sum of squares, with that of the poses' errors in their standard deviations.
-    information : (p, p) float64
-        In the free parameters, uncertain poses taken into account.
-    scatter : (p, p) float64
-        Sum of outer products of the poses' own gradients: the middle of a sandwich.
+        Their sum of squares, with that of `u`.
     """
 
     theta: NDArray[np.float64]
+    u: NDArray[np.float64]
     shift: NDArray[np.float64]
     images: Images
     use: NDArray[np.bool_]
     residual: NDArray[np.float64]
     cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """What the frames tell of the free parameters at a place.
+
+    Parameters
+    ----------
+    information : (p, p) float64
+        Uncertain poses taken into account.
+    scatter : (p, p) float64
+        Sum of outer products of the poses' own gradients: the middle of a sandwich.
+    """
+
     information: NDArray[np.float64]
     scatter: NDArray[np.float64]
 
@@ -133,17 +150,6 @@ class _Linear:
         return np.asarray(np.linalg.solve(self.own, own_gradient[..., None])[..., 0])
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """A mounting with the errors of the poses, and what the model says there."""
-
-    theta: NDArray[np.float64]  # (8,)
-    u: NDArray[np.float64]  # (K, q)
-    images: Images
-    residual: NDArray[np.float64]  # (K, R)
-    cost: float
-
-
 class Fit:
     """One calibration problem.
 
@@ -157,6 +163,8 @@ class Fit:
         Root of the covariance of each pose's errors; None: they are exact.
     edges : bool
         Whether pixels that see the landmark in part may count.
+    noise_measured : bool
+        Whether the noise of ranges was measured, and so tells faint pixels; otherwise the model does.
     """
 
     def __init__(
@@ -167,6 +175,7 @@ class Fit:
         factor: NDArray[np.float64] | None,
         *,
         edges: bool,
+        noise_measured: bool = True,
     ) -> None:
         self.model, self.evidence, self.free = model, evidence, tuple(free)
         self.columns = np.array([NAMES.index(name) for name in free])
@@ -174,17 +183,18 @@ class Fit:
         k = len(evidence.weight)
         self.factor = np.zeros((k, 3, 0)) if factor is None else factor
         self.edges = edges
-        self._steady = _steady(evidence)
+        self._steady = _steady(evidence) if evidence.on == "ranges" and noise_measured else None
 
     def start(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Move a mounting to where outlines agree (see :func:`register`); set range offset and albedo by averages."""
         theta = register(self.model, self.evidence, theta, [name for name in OUTLINE if name in self.free]).copy()
         images = self.model.images(theta, self._no_shift)
-        if "range_offset" in self.free:
-            full = (self.evidence.weight > 0) & (images.coverage > _FULL)
-            if full.any():
-                late = np.median(np.angle(self.evidence.value[full] * images.phasor[full].conj()))
-                theta[NAMES.index("range_offset")] += self.evidence.sensor.metres_per_radian * late
+        full = (self.evidence.weight > 0) & (images.coverage > _FULL)
+        if "range_offset" in self.free and full.any():
+            turned = self.evidence.value[full] * images.phasor[full].conj()
+            mean = np.angle((turned / np.abs(turned)).sum())  # so that no range wraps about the median
+            late = mean + np.median(np.angle(turned * np.exp(-1j * mean)))
+            theta[NAMES.index("range_offset")] += self.evidence.sensor.metres_per_radian * late
         if "albedo" in self.free and self.evidence.on == "phasors":
             use = self.pixels(theta, images, cautious=True)
             measured = np.abs(self.evidence.value[use]).sum()
@@ -197,15 +207,15 @@ class Fit:
         """Return which pixels count at a mounting, (K, pixels).
 
         Those that returned and that one frame can measure (PHYSICS section 7): on phasors by what the model says, for
-        brightness is part of what is compared; on ranges by what was measured, which no mounting changes. With
-        `cautious`, where edges may not count, only those a pixel away from any edge, for the mounting may still move.
+        brightness is part of what is compared; on ranges by what was measured, which no mounting changes, unless their
+        noise was not. With `cautious`, where edges may not count, only those a pixel away from any edge, for the
+        mounting may still move.
         """
-        sensor = self.evidence.sensor
-        if self.evidence.on == "phasors":
+        sensor, clear = self.evidence.sensor, self._steady
+        if clear is None:
             std = predicted_range_std(np.abs(images.phasor), images.intensity, sensor)
-            clear = std <= one_frame_limit_m(sensor) / _CLEAR * (1 + 1e-9)
-        else:
-            clear = self._steady
+            limit = one_frame_limit_m(sensor) / (_CLEAR if self.evidence.on == "phasors" else 1.0)
+            clear = std <= limit * (1 + 1e-9)
         use = (self.evidence.weight > 0) & (images.phasor != 0) & clear
         if not self.edges:
             full = images.coverage > _FULL
@@ -219,59 +229,67 @@ class Fit:
     def _no_shift(self) -> NDArray[np.float64]:
         return np.zeros((len(self.evidence.weight), 3))
 
-    def solve(self, theta: NDArray[np.float64], use: NDArray[np.bool_]) -> Solution:
-        """Run Levenberg–Marquardt from a mounting with the pixels given, then with those of the solution."""
-        place = self._at(theta, np.zeros((len(use), self.factor.shape[2])), use)
-        for _ in range(2):
-            place = self._descend(place, use)
-            again = self.pixels(place.theta, place.images)
-            if (again == use).all():
-                break
-            use = again
-            place = self._at(place.theta, place.u, use)
-        else:
-            place = self._descend(place, use)
-        if self.evidence.on == "ranges":
-            place = self._search(place, use)
-        return self._conclude(place, use)
-
-    def information(self, theta: NDArray[np.float64], use: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return what the pixels given tell at a mounting, (p, p)."""
-        place = self._at(theta, np.zeros((len(use), self.factor.shape[2])), use)
-        return self._linearise(place, use).information
-
-    def _conclude(self, place: _Place, use: NDArray[np.bool_]) -> Solution:
-        """Take stock of a place, with slopes that neither a corner nor a faint pixel at one end has spoilt."""
-        linear = self._linearise_wide(place, use, _WIDTHS)
-        by_pose, _ = linear.gradients(place.residual, place.u)
-        return Solution(
-            place.theta,
-            self._shift(place.u),
-            place.images,
-            use,
-            place.residual,
-            place.cost,
-            linear.information,
-            by_pose.T @ by_pose,
-        )
-
-    def blocks(self, solution: Solution, unit: NDArray[np.float64]) -> Blocks:
-        """Linearise about a solution.
+    def solve(
+        self, theta: NDArray[np.float64], use: NDArray[np.bool_], shift: NDArray[np.float64] | None = None
+    ) -> Place:
+        """Run Levenberg–Marquardt with the pixels given, then with those of where it led.
 
         Parameters
         ----------
-        solution : Solution
+        theta : (8,) float64
+        use : (K, pixels) bool
+        shift : (K, 3) float64, optional
+            Errors of the poses to start from; None: none.
+        """
+        shift = self._no_shift if shift is None else shift
+        u = np.einsum("kji,ki->kj", np.linalg.pinv(self.factor), shift)
+        place = self._descend(self._at(theta, u, use))
+        for _ in range(2):
+            place = self._with_its_pixels(place)
+        return place
+
+    def search(self, place: Place) -> Place:
+        """Leave small minima for lower ones nearby, as long as that saves anything to speak of.
+
+        On ranges with exact poses: phasors have none, and errors of poses blur what a pixel tells by more than small
+        minima are wide.
+        """
+        if self.evidence.on == "phasors" or place.u.size:
+            return place
+        for _ in range(_SEARCHES):
+            before, place = place.cost, min(place, self._lower(place), key=lambda one: one.cost)
+            if before - place.cost < _GAINED:
+                break
+        return self._with_its_pixels(place)
+
+    def knowledge(self, place: Place) -> Knowledge:
+        """Tell how well a place is known, with slopes that neither a corner nor a faint pixel at one end has spoilt."""
+        linear = self._linearise_wide(place, _WIDTHS)
+        by_pose, _ = linear.gradients(self._pull(place), place.u)
+        return Knowledge(linear.information, by_pose.T @ by_pose)
+
+    def information(self, theta: NDArray[np.float64], use: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return what the pixels given tell at a mounting, (p, p), at little cost."""
+        return self._linearise(self._at(theta, np.zeros((len(use), self.factor.shape[2])), use)).information
+
+    def _with_its_pixels(self, place: Place) -> Place:
+        """Decide anew which pixels count, and descend from the place if others do."""
+        use = self.pixels(place.theta, place.images)
+        return place if (use == place.use).all() else self._descend(self._at(place.theta, place.u, use))
+
+    def blocks(self, place: Place, unit: NDArray[np.float64]) -> Blocks:
+        """Linearise about a place.
+
+        Parameters
+        ----------
+        place : Place
         unit : (K, 3, 4) float64
             How (D, δ, b) of each pose change with errors of unit size.
         """
-        slope, of_pose = self.model.slopes(solution.theta, solution.shift, self.free, self.evidence.on, of_poses=True)
-        rows = self._whitened(slope, solution.images, solution.use)
-        own = self._whitened(of_pose, solution.images, solution.use)
-        without = solution.residual + np.einsum("kir,ki->kr", own, solution.shift)
+        slope, of_pose = self.model.slopes(place.theta, place.shift, self.free, self.evidence.on, of_poses=True)
+        rows, own = self._whitened(slope, place), self._whitened(of_pose, place)
+        without = place.residual + np.einsum("kir,ki->kr", own, place.shift)
         return Blocks(without, rows * self.scale[:, None], np.einsum("kij,kir->kjr", unit, own))
-
-    def _shift(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.einsum("kij,kj->ki", self.factor, u))
 
     def _residual(self, images: Images, use: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return whitened residuals, (K, pixels), on phasors (K, 2 · pixels)."""
@@ -285,34 +303,39 @@ class Fit:
         difference = (evidence.value - images.phasor) * root
         return np.concatenate([difference.real, difference.imag], axis=1)
 
-    def _whitened(self, slope: NDArray[np.complex128], images: Images, use: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _pull(self, place: Place) -> NDArray[np.float64]:
+        """Return the residuals that slopes can lower: what the model has left costs the same wherever it goes."""
+        if self.evidence.on == "phasors":
+            return place.residual
+        return np.where(place.images.phasor == 0, 0.0, place.residual)
+
+    def _whitened(self, slope: NDArray[np.complex128], place: Place) -> NDArray[np.float64]:
         """Return whitened slopes, (K, parameters, residuals), of what the model's own say."""
         evidence = self.evidence
-        root = np.sqrt(np.where(use, evidence.weight, 0.0))[:, None]
+        root = np.sqrt(np.where(place.use, evidence.weight, 0.0))[:, None]
         if evidence.on == "ranges":
-            seen = np.where((images.phasor != 0)[:, None], root, 0.0)
+            seen = np.where((place.images.phasor != 0)[:, None], root, 0.0)
             return np.asarray(evidence.sensor.metres_per_radian * slope.imag * seen)
         return np.concatenate([slope.real * root, slope.imag * root], axis=2)
 
-    def _at(self, theta: NDArray[np.float64], u: NDArray[np.float64], use: NDArray[np.bool_]) -> _Place:
-        images = self.model.images(theta, self._shift(u))
+    def _at(self, theta: NDArray[np.float64], u: NDArray[np.float64], use: NDArray[np.bool_]) -> Place:
+        shift = np.einsum("kij,kj->ki", self.factor, u)
+        images = self.model.images(theta, shift)
         residual = self._residual(images, use)
-        return _Place(theta, u, images, residual, float((residual**2).sum() + (u**2).sum()))
+        return Place(theta, u, shift, images, use, residual, float((residual**2).sum() + (u**2).sum()))
 
-    def _linearise(self, place: _Place, use: NDArray[np.bool_], *widths: NDArray[np.float64]) -> _Linear:
-        """Take slopes over least widths or, of each pixel, the median of those over several."""
+    def _linearise(self, place: Place, *widths: NDArray[np.float64]) -> _Linear:
+        """Take slopes over the least widths, or those given; over several, the median of each pixel's."""
         q = self.factor.shape[2]
         found = [
-            self.model.slopes(
-                place.theta, self._shift(place.u), self.free, self.evidence.on, of_poses=q > 0, width=width
-            )
+            self.model.slopes(place.theta, place.shift, self.free, self.evidence.on, of_poses=q > 0, width=width)
             for width in widths or (None,)
         ]
-        rows = np.median([self._whitened(slope, place.images, use) for slope, _ in found], axis=0)
+        rows = np.median([self._whitened(slope, place) for slope, _ in found], axis=0)
         own_rows = np.zeros((len(rows), 0, rows.shape[2]))
         if q:
             # the mount's bearing and a pose's move an image alike: only the same slopes cancel where they should
-            of_pose = np.median([self._whitened(slope, place.images, use) for _, slope in found], axis=0)
+            of_pose = np.median([self._whitened(slope, place) for _, slope in found], axis=0)
             own_rows = np.einsum("kij,kir->kjr", self.factor, of_pose)
         cross = rows @ own_rows.transpose(0, 2, 1)
         own = own_rows @ own_rows.transpose(0, 2, 1) + np.eye(q)
@@ -320,30 +343,31 @@ class Fit:
         information = (rows @ rows.transpose(0, 2, 1) - cross @ eliminated).sum(axis=0)
         return _Linear(rows, own_rows, cross, own, information)
 
-    def _linearise_wide(self, place: _Place, use: NDArray[np.bool_], widths: Sequence[float] = (1.0,)) -> _Linear:
+    def _linearise_wide(self, place: Place, widths: Sequence[float] = (1.0,)) -> _Linear:
         """Take slopes over multiples of the standard deviations that slopes at the place give."""
-        narrow = self._linearise(place, use)
+        narrow = self._linearise(place)
         std = np.zeros(len(NAMES))
         std[self.columns] = np.sqrt(np.diag(inverse(narrow.information, self.scale)))
         std[NAMES.index("range_offset")] = 0.0  # its slope is exact
         if (max(widths) * std <= STEP).all():
             return narrow
-        return self._linearise(place, use, *(np.minimum(width * np.nan_to_num(std), 0.5 * SCALE) for width in widths))
+        return self._linearise(place, *(np.minimum(width * np.nan_to_num(std), 0.5 * SCALE) for width in widths))
 
-    def _descend(
-        self,
-        place: _Place,
-        use: NDArray[np.bool_],
-        *,
-        slopes: _Linear | None = None,
-        steps: int = _MAX_ITERATIONS,
-        settled: float = _SETTLED,
-    ) -> _Place:
-        """Run Levenberg–Marquardt with the slopes of each place, or with the same throughout, which is far cheaper."""
+    def _descend(self, place: Place) -> Place:
+        """Run Levenberg–Marquardt; slopes, which cost most, are taken anew when following them leads no farther."""
+        for _ in range(_MAX_ITERATIONS):
+            before, expected = place.cost, float(np.count_nonzero(place.residual))
+            settled = _SETTLED * max(1.0, place.cost / max(expected, 1.0))
+            place = self._follow(place, self._linearise(place), settled)
+            if before - place.cost < settled:
+                break
+        return place
+
+    def _follow(self, place: Place, linear: _Linear, settled: float) -> Place:
+        """Run Levenberg–Marquardt with the same slopes throughout."""
         damping = 1e-3
-        linear = slopes or self._linearise(place, use)
-        for _ in range(steps):
-            by_pose, own_gradient = linear.gradients(place.residual, place.u)
+        for _ in range(_FOLLOWED):
+            by_pose, own_gradient = linear.gradients(self._pull(place), place.u)
             gradient = by_pose.sum(axis=0)
             matrix = linear.information * np.outer(self.scale, self.scale)
             matrix = matrix + damping * np.diag(np.maximum(np.diag(matrix), 1e-12))
@@ -351,58 +375,45 @@ class Fit:
             step /= max(1.0, float(np.abs(step / self.scale).max()) / LONGEST_STEP)
             if float(gradient @ step) + linear.own_promise(own_gradient) < settled:
                 break
-            there = self._stepped(place, use, linear, own_gradient, step)
-            if there.cost <= place.cost:
-                done = place.cost - there.cost < settled
-                place, damping = there, max(damping * 0.1, 1e-9)
-                if done:
-                    break
-                linear = slopes or self._linearise(place, use)
-            else:
+            there = self._stepped(place, linear, own_gradient, step)
+            gain = place.cost - there.cost
+            if gain < 0:
                 damping *= 8
-                if damping > 1e5:
-                    break
+                continue
+            place, damping = there, max(damping * 0.1, 1e-9)
+            if gain < settled:
+                break
         return place
 
     def _stepped(
         self,
-        place: _Place,
-        use: NDArray[np.bool_],
+        place: Place,
         linear: _Linear,
         own_gradient: NDArray[np.float64],
         step: NDArray[np.float64],
-    ) -> _Place:
+    ) -> Place:
         theta = place.theta.copy()
         theta[self.columns] += step
-        return self._at(clipped(theta), place.u + linear.own_step(own_gradient, step), use)
+        return self._at(clipped(theta), place.u + linear.own_step(own_gradient, step), place.use)
 
-    def _search(self, place: _Place, use: NDArray[np.bool_]) -> _Place:
-        """Leave small minima for lower ones nearby, until there are none."""
-        for _ in range(_SEARCHES):
-            found = self._lower(place, use)
-            if place.cost - found.cost < _GAINED:
-                break
-            place = found
-        return place
-
-    def _lower(self, place: _Place, use: NDArray[np.bool_]) -> _Place:
+    def _lower(self, place: Place) -> Place:
         """Descend from the best places within six standard deviations along what the poses tell least."""
-        wide = self._linearise_wide(place, use)
-        _, own_gradient = wide.gradients(place.residual, place.u)
+        wide = self._linearise_wide(place)
+        _, own_gradient = wide.gradients(self._pull(place), place.u)
         values, vectors = np.linalg.eigh(inverse(wide.information, self.scale) / np.outer(self.scale, self.scale))
-        ways = self.scale[:, None] * vectors * np.sqrt(np.clip(values, 0.0, LONGEST_STEP))
+        ways = self.scale[:, None] * vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), _SEARCH_MOST)
         steps = (_SEARCH_STD[:, None, None] * ways[:, -_SEARCHED:].T).reshape(-1, len(self.columns))
 
-        def stepped(step: NDArray[np.float64]) -> _Place:
-            return self._stepped(place, use, wide, own_gradient, step)
+        def stepped(step: NDArray[np.float64]) -> Place:
+            return self._stepped(place, wide, own_gradient, step)
 
         with ThreadPoolExecutor(self.model.workers) as pool:
             costs = list(pool.map(lambda step: stepped(step).cost, steps))
         descended = [
-            self._descend(stepped(steps[k]), use, slopes=wide, steps=_SEARCH_STEPS, settled=_SEARCH_SETTLED)
+            self._follow(stepped(steps[k]), wide, _SEARCH_SETTLED)
             for k in np.argsort(costs, kind="stable")[:_SEARCH_FROM]
         ]
-        return self._descend(min(descended, key=lambda one: one.cost), use)
+        return self._descend(min(descended, key=lambda one: one.cost))
 
 
 def _steady(evidence: Evidence) -> NDArray[np.bool_]:

@@ -68,7 +68,7 @@ NAMES = tuple(PARAMETERS)
 SCALE = np.array([parameter.scale for parameter in PARAMETERS.values()])
 """Natural units, in the order of :data:`NAMES`."""
 LONGEST_STEP = 1.0
-"""No search steps farther, in natural units: slopes jump where edges pass corners of pixels."""
+"""No descent steps farther at once, in natural units: slopes jump where edges pass corners of pixels."""
 STEP = 2e-4
 """Half the width of a difference, radians or metres: 1/60 of a pixel, wide enough to average what jumps where an edge
 passes a corner of a pixel, narrow enough to be the slope."""

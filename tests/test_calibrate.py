@@ -111,7 +111,7 @@ def test_small_minima_on_ranges_are_left_for_the_one_next_to_the_truth():
     fit = Fit(model, evidence, NAMES[:-1], None, edges=True)
 
     def solved(theta):
-        return fit.solve(theta, fit.pixels(theta, model.images(theta, np.zeros((8, 3))), cautious=True))
+        return fit.search(fit.solve(theta, fit.pixels(theta, model.images(theta, np.zeros((8, 3))), cautious=True)))
 
     found, right = solved(fit.start(Mounting.of_sensor(PMD, 0.8).vector)), solved(truth.vector)
     assert (found.use == right.use).all()
@@ -129,6 +129,30 @@ def test_a_dark_landmark_is_calibrated_on_the_little_that_it_returns():
     assert np.median(found.range_std_m[found.range_std_m > 0]) * math.sqrt(50) > 0.05 * PMD.metres_per_radian
     assert (found.pose_residuals > 10).all()
     assert nees(found, truth) < stats.chi2.ppf(0.999, 3)
+
+
+def test_few_frames_without_amplitudes_have_the_noise_of_the_law_and_edges_that_the_model_tells():
+    """Five frames do not tell their noise, so it says nothing of which pixels are faint."""
+    rng = np.random.default_rng([77, 0])
+    truth, poses = some_mounting(rng, 0.8), some_poses(rng, 8)
+    found = calibrate(MESH, filtered(take(truth, poses, rng, n_frames=5, light=False), "ranges"), poses, on="ranges")
+    assert nees(found, truth) < stats.chi2.ppf(0.999, 7)
+
+
+def test_a_landmark_that_stands_on_the_floor_is_calibrated_with_the_floor_stated():
+    """The search lowers it by a hair now and then; the floor then gives way. And it says how far it is."""
+    rng, done = np.random.default_rng(3), []
+    poses = KnownPoses.polar(rng.uniform(1.0, 1.4, 4), rng.uniform(0, 6, 4), rng.uniform(-3, 3, 4) * DEGREE)
+    truth = replace(Mounting.of_sensor(PMD, 0.8), pitch_rad=0.005)
+    floor = Background(floor_m=-float(MESH.vertices[:, 2].min()))
+    frames = filtered(take(truth, poses, rng, background=floor), "ranges")
+    found = calibrate(
+        MESH, frames, poses, on="ranges", background=floor, free=("pitch", "height"), workers=2,
+        progress=lambda *step: done.append(step),
+    )  # fmt: skip
+    assert nees(found, truth) < stats.chi2.ppf(0.999, 2)
+    assert [step for step, _ in done] == list(range(1, len(done) + 1))
+    assert all(step <= total for step, total in done)
 
 
 def test_errors_of_the_poses_are_estimated_and_widen_the_covariance():
@@ -429,7 +453,7 @@ def test_what_is_stated_and_fixed_is_in_the_sensor_too():
         ({}, ["--albedo", "2"], 2, "--albedo must be in (0, 1]"),
         ({}, ["--class", "cone"], 2, "--class belongs to a bank"),
         ({}, ["--plot", "x.pdf"], 2, "must be a .png file"),
-        ({}, ["--wall", "0.5"], 2, "wall"),
+        ({}, ["--wall", "0.5"], 2, "'wall_m' must be at least"),
     ],
 )
 def test_the_command_says_in_one_line_what_is_wrong(folder, tmp_path, capsys, options, more, code, part):
@@ -463,4 +487,4 @@ def test_95_percent_ellipses_hold_the_truth_in_93_to_97_percent_of_500_runs(on):
     values = [trial(1000 + seed, 12, on=on) for seed in range(500)]
     inside = sum(value <= stats.chi2.ppf(0.95, len(found.free)) for value, found in values)
     print(f"{on}: {inside} of 500 true mountings within their 95 % ellipsoid")
-    assert 0.93 * 500 <= inside <= 0.97 * 500
+    assert 0.93 * 500 <= inside <= 0.97 * 500  # what is promised; fixed seeds, so it does not fail by chance
