@@ -10,6 +10,7 @@ import io
 import json
 import math
 import os
+import shlex
 import signal
 import sys
 import warnings
@@ -716,13 +717,13 @@ def _bank_verify(
     as_json: _Json = False,
 ) -> None:
     """Check a bank: checksum, schema, values, random images rendered again; and what its grid's spacing costs."""
-    from phasemark.data import open_bank, verify_bank
+    from phasemark.data import verify_bank
 
     report = verify_bank(bank, sample=sample, seed=seed)
     if population is not None:
         from phasemark.matcher import grid_loss
 
-        with open_bank(bank, untrusted=True) as opened:
+        with _open_bank(bank) as opened:
             loss = grid_loss(opened, population, seed=seed).as_dict()
         report |= {key: float(f"{value:.3g}") if isinstance(value, float) else value for key, value in loss.items()}
     _echo_json(report) if as_json else _echo_facts(report)
@@ -1334,10 +1335,11 @@ def _open_bank(path: Path) -> Bank:
     from phasemark.data import open_bank
     from phasemark.landmarks.reading import FORMATS
 
-    if path.suffix.lower().removeprefix(".") in FORMATS:
+    if path.exists() and path.suffix.lower().removeprefix(".") in FORMATS:
+        mesh, out = shlex.quote(f"part={path}"), shlex.quote(f"{path.stem}.h5")
         raise InputFileError(
-            f"{path}: a mesh, not a bank; one is made of it by: phasemark bank build --mesh part={path} --unit mm"
-            f" --out {path.stem}.h5"
+            f"{path}: a mesh, not a bank; if it is in millimetres, one is made of it by: phasemark bank build"
+            f" --mesh {mesh} --unit mm --out {out}"
         )
     return open_bank(path, untrusted=True)
 

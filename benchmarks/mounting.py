@@ -20,7 +20,8 @@ from scipy.optimize import least_squares
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import KnownPoses, Mounting, filter_poses
 from phasemark.matcher.calibrate_fit import Fit
-from phasemark.matcher.calibrate_model import NAMES, SCALE, CalibrationModel
+from phasemark.matcher.calibrate_model import NAMES, SCALE, STEP, CalibrationModel
+from phasemark.matcher.coarse import DISAGREEMENT
 from phasemark.matcher.likelihood import Evidence, Quantity
 from phasemark.render import Frames, Renderer, Views, capture, preset
 
@@ -46,7 +47,8 @@ def mounting() -> dict[str, Any]:
         start = fit.start(Mounting.of_sensor(SENSOR, ALBEDO).vector)
         use = fit.pixels(start, model.images(start, np.zeros((POSES, 3))))
         started = time.process_time()
-        found = fit.solve(start, use)
+        found = fit.search(fit.solve(start, use))
+        fit.knowledge(found)
         seconds = time.process_time() - started
         theirs, their_cost = peer(fit, start, found.use)
         rows.append(
@@ -120,21 +122,22 @@ def command_seconds(folder: Path, frames: Frames, poses: KnownPoses, on: Quantit
 
 
 def peer(fit: Fit, start: np.ndarray, use: np.ndarray) -> tuple[float, float]:
-    """Return processor seconds of SciPy's trust region solver on the same residuals, and where it ended."""
+    """Return processor seconds of SciPy's trust region solver on the same residuals and steps, and where it ended."""
     evidence, scale = fit.evidence, SCALE[fit.columns]
     root = np.sqrt(np.where(use, evidence.weight, 0.0))
     no_shift = np.zeros((len(use), 3))
 
     def residual(x: np.ndarray) -> np.ndarray:
         theta = start.copy()
-        theta[fit.columns] = x * scale
+        theta[fit.columns] += (x - 1) * scale
         phasor = fit.model.images(theta, no_shift).phasor
         if evidence.on == "ranges":
             turned = np.angle(evidence.value * phasor.conj())
-            return (np.where(phasor == 0, 5.0 * use, evidence.sensor.metres_per_radian * turned * root)).ravel()
+            lost = np.sqrt(DISAGREEMENT) * use
+            return np.where(phasor == 0, lost, evidence.sensor.metres_per_radian * turned * root).ravel()
         difference = (evidence.value - phasor) * root
         return np.concatenate([difference.real, difference.imag]).ravel()
 
     started = time.process_time()
-    found = least_squares(residual, start[fit.columns] / scale, diff_step=1e-4)
+    found = least_squares(residual, np.ones(len(scale)), jac="3-point", diff_step=STEP / scale)  # relative to ones
     return time.process_time() - started, 2 * float(found.cost)

@@ -123,17 +123,19 @@ def write(figure: Figure, name: str) -> None:
 def main() -> None:
     """Write every picture."""
     parser = argparse.ArgumentParser(description="Draw the pictures of the documentation into docs/images.")
-    parser.add_argument("--runs", action="store_true", help="make the runs that are missing in out/, some minutes")
+    parser.add_argument("--runs", action="store_true", help="make the runs that are missing in out/, ten minutes")
     runs = parser.parse_args().runs
+    write(demo_figure(), "demo.png")
+    write(drive_picture(run_drive(default_drive())), "drive.png")
     for command, pictures in LEFT_BY.items():
-        made = made_by(command, [OUT / source for source in pictures.values()], runs, *PHASEMARK)
+        made = made_by(f"{command} --force", [OUT / source for source in pictures.values()], runs, *PHASEMARK)
         for name, source in pictures.items() if made else ():
             write_atomically(IMAGES / name, (OUT / source).read_bytes(), force=True)
     bench = OUT / "bench.json"
+    if bench.exists() and "peer" not in json.loads(bench.read_text(encoding="utf-8")):
+        bench.unlink()  # it has other sections alone
     if made_by("benchmarks/run.py peer", [bench], runs, sys.executable):
         write(cost_figure(json.loads(bench.read_text(encoding="utf-8"))["peer"]["rows"]), "cost.png")
-    write(demo_figure(), "demo.png")
-    write(drive_picture(run_drive(default_drive())), "drive.png")
 
 
 def made_by(command: str, files: Sequence[Path], run: bool, *program: str) -> bool:
@@ -141,7 +143,8 @@ def made_by(command: str, files: Sequence[Path], run: bool, *program: str) -> bo
     if all(file.exists() for file in files):
         return True
     if not run:
-        sys.stderr.write(f"stays as it is without --runs, or first: {command}\n")
+        missing = ", ".join(str(file.relative_to(OUT.parent)) for file in files if not file.exists())
+        sys.stderr.write(f"pictures stay as they are: no {missing}; --runs makes it by: {command}\n")
         return False
     sys.stderr.write(f"running: {command}\n")
     arguments = shlex.split(command.removeprefix("phasemark "))

@@ -326,6 +326,7 @@ def bad_files(folder):
     (folder / "mixed.csv").write_text(",".join(["1"] * 256) + "\n" + ",".join(["1"] * 64) + "\n")
     (folder / "empty.csv").write_text("")
     np.save(folder / "small.npy", np.ones((4, 8, 8)))
+    (folder / "part.STL").write_bytes(b"solid")
     (folder / "cut.h5").write_bytes((folder / "bank.h5").read_bytes()[:5000])
     main(["landmark", "export", "post", "-o", str(folder / "box.stl")])
     (folder / "cut.stl").write_bytes((folder / "box.stl").read_bytes()[:-100])
