@@ -132,10 +132,14 @@ def main() -> None:
         for name, source in pictures.items() if made else ():
             write_atomically(IMAGES / name, (OUT / source).read_bytes(), force=True)
     bench = OUT / "bench.json"
-    if bench.exists() and "peer" not in json.loads(bench.read_text(encoding="utf-8")):
-        bench.unlink()  # it has other sections alone
+    if runs and bench.exists() and "peer" not in json.loads(bench.read_text(encoding="utf-8")):
+        bench.unlink()  # it has other sections alone, and would be replaced
     if made_by("benchmarks/run.py peer", [bench], runs, sys.executable):
-        write(cost_figure(json.loads(bench.read_text(encoding="utf-8"))["peer"]["rows"]), "cost.png")
+        measured = json.loads(bench.read_text(encoding="utf-8"))
+        if "peer" in measured:
+            write(cost_figure(measured["peer"]["rows"]), "cost.png")
+        else:
+            sys.stderr.write("cost.png stays as it is: out/bench.json has other sections\n")
 
 
 def made_by(command: str, files: Sequence[Path], run: bool, *program: str) -> bool:
