@@ -9,7 +9,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from open_set import DAMAGE, check_damaged, strangers
 from oracles import adaptive_images
-from scipy.stats import binomtest
 
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
@@ -90,8 +89,7 @@ def test_errors_are_at_the_bound_and_the_covariance_is_honest(bank, row):
     assert summary.nees.value <= 1.10 + z * (summary.nees.high - summary.nees.value)
     assert summary.coverage.high >= 0.935
     assert summary.coverage.low <= 0.965
-    wrong = sum(int((part.found != part.class_name).sum()) for part in parts)
-    assert binomtest(wrong, n).proportion_ci(0.999, method="exact").low <= 1e-3
+    assert sum(int((part.found != part.class_name).sum()) for part in parts) <= n / 1000
 
 
 @pytest.fixture(scope="module")
