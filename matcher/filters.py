@@ -55,6 +55,8 @@ class FilteredFrames:
     std_from_scatter : bool
         True if `std_m` was estimated from the scatter of the frames themselves, with n − 1 degrees of freedom, rather
         than predicted from amplitude and intensity: tests then need F, not χ².
+    time_s : (n,) float64, optional
+        Mean time stamp of the frames at each position, seconds.
 
     Raises
     ------
@@ -70,6 +72,7 @@ class FilteredFrames:
     n_effective: NDArray[np.float64]
     sensor: Sensor
     std_from_scatter: bool = False
+    time_s: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.range_m), self.sensor.rows, self.sensor.cols)
@@ -93,6 +96,7 @@ class FilteredFrames:
             self.n_effective[rows],
             self.sensor,
             self.std_from_scatter,
+            None if self.time_s is None else self.time_s[rows],
         )
 
     def without_offset(self) -> FilteredFrames:
@@ -319,7 +323,8 @@ def kalman_filter(frames: Frames, process_var_m2: float = 0.0) -> FilteredFrames
     track = _Track.empty(tally.n_valid.shape, frames.sensor)
     for range_m, valid in _in_time(frames):
         track.step(range_m, valid, process_var_m2, measurement_var)
-    return _result(tally, track.range_m, np.sqrt(track.scaled_var * measurement_var), track.n_effective())
+    filtered = _result(tally, track.range_m, np.sqrt(track.scaled_var * measurement_var), track.n_effective())
+    return _timed(filtered, frames)
 
 
 def phasor_mean(frames: Frames) -> FilteredFrames:
@@ -370,7 +375,8 @@ def phasor_mean(frames: Frames) -> FilteredFrames:
         scale = amplitude * np.sqrt(n_valid * (n_valid - 1.0))
         np.divide(across, scale, out=std_m, where=scale > 0)
     coherent = None if frames.amplitude_e is None else amplitude
-    return _result(tally, phasor_to_range_m(mean, frames.sensor), std_m, n_valid.astype(np.float64), coherent)
+    filtered = _result(tally, phasor_to_range_m(mean, frames.sensor), std_m, n_valid.astype(np.float64), coherent)
+    return _timed(filtered, frames)
 
 
 class PixelKalman:
@@ -636,6 +642,11 @@ def _result(
         sensor=tally.sensor,
         std_from_scatter=tally.amplitude is None or tally.intensity is None,
     )
+
+
+def _timed(filtered: FilteredFrames, frames: Frames) -> FilteredFrames:
+    """Give filtered frames the mean time stamp of the frames they were made of."""
+    return filtered if frames.time_s is None else replace(filtered, time_s=frames.time_s.mean(axis=1))
 
 
 def _floored(measurement_var_m2: NDArray[np.float64], process_var_m2: float) -> NDArray[np.float64]:

@@ -55,11 +55,15 @@ class Frames:
         What each tap reported in each phase image, electrons; in the shape of `range_m` with (4, 2) before the rows.
     invalid_means : {"missing", "no-return"}
         What an invalid pixel without flags stands for. Unknown cause is "missing".
+    time_s : array_like, optional
+        Time stamp of each frame in the recorder's clock, seconds; `range_m` without its rows and columns gives the
+        shape. Real stamps may repeat or run backwards.
 
     Raises
     ------
     UsageError
-        The shapes do not agree with each other or with the sensor, or a valid pixel's amplitude or intensity cannot be.
+        The shapes do not agree with each other or with the sensor, a valid pixel's amplitude or intensity cannot be, or
+        a time stamp is not finite.
     """
 
     def __init__(
@@ -73,6 +77,7 @@ class Frames:
         flags: ArrayLike | None = None,
         taps_e: ArrayLike | None = None,
         invalid_means: Literal["missing", "no-return"] = "missing",
+        time_s: ArrayLike | None = None,
     ) -> None:
         given = ranges = np.array(range_m, dtype=np.float64)
         if ranges.ndim not in (2, 3, 4):
@@ -127,6 +132,16 @@ class Frames:
             if taps.shape != expected:
                 raise UsageError(f"'taps_e' has shape {taps.shape}, but must have {expected}")
             self.taps_e = taps.reshape(*shape[:2], *_TAPS, *shape[2:])
+        self.time_s: NDArray[np.float64] | None = None
+        """Time stamps, (n, frames) seconds, or None."""
+        if time_s is not None:
+            times = np.array(time_s, dtype=np.float64)
+            if times.shape != given.shape[:-2]:
+                raise UsageError(f"'time_s' has shape {times.shape}, but must have {given.shape[:-2]}")
+            if not np.isfinite(times).all():
+                k = int(np.flatnonzero(~np.isfinite(times.ravel()))[0])
+                raise UsageError(f"'time_s' must be finite, got {times.ravel()[k]} at frame {k}")
+            self.time_s = times.reshape(shape[:2])
         self.sensor = sensor
 
     def __len__(self) -> int:
@@ -141,6 +156,21 @@ class Frames:
             sensor=self.sensor,
             flags=self.flags[index],
             taps_e=None if self.taps_e is None else self.taps_e[index],
+            time_s=None if self.time_s is None else self.time_s[index],
+        )
+
+    def each_a_position(self) -> Self:
+        """Return the frames of a moving camera: every frame a position of its own, (n · frames, 1, rows, cols)."""
+        flat = (-1, 1, self.sensor.rows, self.sensor.cols)
+        taps = self.taps_e
+        return type(self)(
+            self.range_m.reshape(flat),
+            None if self.amplitude_e is None else self.amplitude_e.reshape(flat),
+            None if self.intensity_e is None else self.intensity_e.reshape(flat),
+            sensor=self.sensor,
+            flags=self.flags.reshape(flat),
+            taps_e=None if taps is None else taps.reshape(-1, 1, *taps.shape[2:]),
+            time_s=None if self.time_s is None else self.time_s.reshape(-1, 1),
         )
 
     @property
