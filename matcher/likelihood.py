@@ -44,7 +44,10 @@ def counts(phasor: NDArray[np.complexfloating], intensity: NDArray[np.floating],
     (..., rows, cols) bool
         Whether the noise law gives a range at most 0.1 rad (0.24 m at 10 MHz) of noise.
     """
-    return predicted_range_std(np.abs(phasor), intensity, sensor) <= one_frame_limit_m(sensor) * (1 + 1e-9)
+    amplitude = np.abs(phasor)
+    return (amplitude > 0) & (
+        predicted_range_std(amplitude, intensity, sensor) <= one_frame_limit_m(sensor) * (1 + 1e-9)
+    )
 
 
 @dataclass(frozen=True, eq=False)
