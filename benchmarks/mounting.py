@@ -19,9 +19,9 @@ from scipy.optimize import least_squares
 
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import KnownPoses, Mounting, filter_poses
+from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.calibrate_fit import Fit
 from phasemark.matcher.calibrate_model import NAMES, SCALE, STEP, CalibrationModel
-from phasemark.matcher.coarse import DISAGREEMENT
 from phasemark.matcher.likelihood import Evidence, Quantity
 from phasemark.render import Frames, Renderer, Views, capture, preset
 

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from phasemark import UsageError
-from phasemark.matcher.likelihood import Quantity, counts
+from phasemark.matcher.agreement import counts
+from phasemark.matcher.likelihood import Quantity
 from phasemark.matcher.models import VIEW
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, predicted_range_std
 from phasemark.render.noise import phase_image_variance

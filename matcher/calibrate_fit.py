@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from phasemark.matcher.agreement import DISAGREEMENT, one_frame_limit_m
 from phasemark.matcher.calibrate_model import LONGEST_STEP, NAMES, SCALE, STEP, CalibrationModel, Images, clipped
 from phasemark.matcher.calibrate_register import OUTLINE, register
-from phasemark.matcher.coarse import DISAGREEMENT
-from phasemark.matcher.likelihood import Evidence, one_frame_limit_m
+from phasemark.matcher.likelihood import Evidence
 from phasemark.render import predicted_range_std
 
 _CLEAR = 1.5

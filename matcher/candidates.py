@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.data.bank import BankGroup, group_rows
-from phasemark.matcher.coarse import DISAGREEMENT, Observation, Templates
+from phasemark.matcher.agreement import DISAGREEMENT
+from phasemark.matcher.coarse import Observation, Templates
 from phasemark.matcher.models import closing_period
 from phasemark.render import PhasorImages
 

@@ -24,15 +24,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, disagrees
 from phasemark.matcher.filters import FilteredFrames, PixelState
 from phasemark.render import PhasorImages, Sensor, phasor_to_range_m, predicted_range_std, wrap_difference_m
 
-DISAGREEMENT = 25.0
-"""Cost of a pixel where frame and model disagree on whether anything returns: a residual of five σ."""
-MUST_RETURN_COVERAGE = 0.3
-"""A pixel that sees this much of the landmark must return something."""
-MAY_RETURN_COVERAGE = 0.005
-"""A pixel that sees less of the landmark than this returns nothing, unless a background does."""
 _RECHECKED = 64
 
 
@@ -190,9 +185,10 @@ class Templates:
         """Return the distances of n frames from templates of their own, (n, t) as `index` is, in float64."""
         residual = wrap_difference_m(self.about(seen)[:, None] - self.range_m[index].astype(np.float64), self.sensor)
         fit = seen.weight[:, None] * self.may_return[index] * residual**2
-        lost = seen.returned[:, None] & ~self.may_return[index]
-        absent = seen.not_returned[:, None] & self.must_return[index]
-        return np.asarray((fit + DISAGREEMENT * (lost | absent)).sum(axis=-1))
+        wrong = disagrees(
+            seen.returned[:, None], seen.not_returned[:, None], self.may_return[index], self.must_return[index]
+        )
+        return np.asarray((fit + DISAGREEMENT * wrong).sum(axis=-1))
 
     def best(self, seen: Observation, frame: int, costs: NDArray[np.float32], offset: int = 0) -> tuple[int, float]:
         """Return the nearest template of one frame and its exact distance.

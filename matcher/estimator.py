@@ -14,10 +14,11 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.data import Bank
+from phasemark.matcher.agreement import DISAGREEMENT, counts
 from phasemark.matcher.candidates import Search, Starts
-from phasemark.matcher.coarse import DISAGREEMENT, Observation
+from phasemark.matcher.coarse import Observation
 from phasemark.matcher.filters import FilteredFrames
-from phasemark.matcher.likelihood import Evidence, Quantity, counts
+from phasemark.matcher.likelihood import Evidence, Quantity
 from phasemark.matcher.match import Candidate, Match
 from phasemark.matcher.models import VIEW, BankModel, ImageModel, RenderedModel
 from phasemark.matcher.refine import SCALE, Fits, Settings, refine

@@ -16,38 +16,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.coarse import DISAGREEMENT, Observation
+from phasemark.matcher.agreement import DISAGREEMENT, one_frame_limit_m
+from phasemark.matcher.coarse import Observation
 from phasemark.matcher.filters import FilteredFrames
-from phasemark.render import Sensor, predicted_range_std
+from phasemark.render import Sensor
 from phasemark.render.noise import phase_image_variance
 
 Quantity = Literal["ranges", "phasors"]
-
-_USUAL_LIMIT_RAD = 0.1
-
-
-def one_frame_limit_m(sensor: Sensor) -> float:
-    """Return the largest one-frame σ of a pixel that counts, metres: 0.1 rad unless the sensor says otherwise."""
-    return (sensor.max_phase_std_rad or _USUAL_LIMIT_RAD) * sensor.metres_per_radian
-
-
-def counts(phasor: NDArray[np.complexfloating], intensity: NDArray[np.floating], sensor: Sensor) -> NDArray[np.bool_]:
-    """Return which pixels of noise-free images one frame measures to within the limit (PHYSICS section 7).
-
-    Parameters
-    ----------
-    phasor, intensity : (..., rows, cols)
-    sensor : Sensor
-
-    Returns
-    -------
-    (..., rows, cols) bool
-        Whether the noise law gives a range at most 0.1 rad (0.24 m at 10 MHz) of noise.
-    """
-    amplitude = np.abs(phasor)
-    return (amplitude > 0) & (
-        predicted_range_std(amplitude, intensity, sensor) <= one_frame_limit_m(sensor) * (1 + 1e-9)
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +137,8 @@ def gauss_newton_sums(
     frame : (m,) int64
         Which frame each model is held against.
     use : (m, pixels) bool
-        Which pixels count.
+        Which pixels count. On ranges, one of them that returns where the model has no light costs
+        :data:`~phasemark.matcher.agreement.DISAGREEMENT`.
     huber : float, optional
         Residual, in σ, from which the loss grows linearly, until it costs what one costs that nothing explains; from
         there it stays, and the pixel no longer counts. None: squares throughout.
@@ -216,7 +192,11 @@ def _sum_ranges(  # type: ignore[no-untyped-def]
             w = weight[f, q]
             s = phasor[k, q]
             size = s.real * s.real + s.imag * s.imag
-            if not use[k, q] or w == 0.0 or size == 0.0:
+            if not use[k, q] or w == 0.0:
+                continue
+            if size == 0.0:
+                cost[k] += DISAGREEMENT
+                capped[k] += DISAGREEMENT
                 continue
             ratio = value[f, q] * s.conjugate()
             residual = metres_per_radian * np.arctan2(ratio.imag, ratio.real)

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.data.bank import BankGroup
-from phasemark.matcher.coarse import DISAGREEMENT, Observation, Templates
+from phasemark.matcher.agreement import DISAGREEMENT
+from phasemark.matcher.coarse import Observation, Templates
 from phasemark.matcher.estimator import MaximumLikelihood, Pixels, p_values_of
 from phasemark.matcher.filters import FilteredFrames
 from phasemark.matcher.likelihood import Quantity

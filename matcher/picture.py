@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from phasemark.data import Bank
+from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters import FilteredFrames
-from phasemark.matcher.likelihood import counts
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import background_image
 from phasemark.render import Background, Renderer, phasor_to_range_m, predicted_range_std, wrap_difference_m

@@ -18,9 +18,9 @@ from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.data.build import BankJob
 from phasemark.data.seeds import stream
+from phasemark.matcher.agreement import counts
 from phasemark.matcher.bounds import cramer_rao
 from phasemark.matcher.filters import noise_free
-from phasemark.matcher.likelihood import counts
 from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.models import closing_period

@@ -15,8 +15,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.candidates import modes
-from phasemark.matcher.coarse import DISAGREEMENT, Observation, Templates
+from phasemark.matcher.coarse import Observation, Templates
 from phasemark.matcher.models import closing_period
 
 _THIN_M, _THIN_RAD = 0.06, math.radians(6)

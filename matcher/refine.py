@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.coarse import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE
-from phasemark.matcher.likelihood import Evidence, Sums, counts, gauss_newton_sums
+from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts, disagrees
+from phasemark.matcher.likelihood import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.models import VIEW, ImageModel, ModelImages
 
 ALBEDO = "albedo"
@@ -37,6 +37,8 @@ _LESS = 0.5
 """And at most this share of what a parabola costs there."""
 _CLOSE_CALL = 50.0
 """A fit whose cost is above its frame's best by more will not become the best."""
+_SETTLING_ROUNDS = 3
+"""How often a view that contradicts some pixels is left for a better one nearby."""
 _OPTIMISM = 3.0
 """A fit gives up where even so many times the promised decrease would not save it."""
 
@@ -57,6 +59,11 @@ class Settings:
         What stands behind, without the landmark; on phasors the albedo does not scale it.
     look_beside_rad : tuple of float
         How far to either side of a solution δ is tried once more; there may be a lower minimum behind a kink.
+    prior_std : tuple of float
+        Standard deviation of each free parameter about 0 before the frame was seen; infinite where nothing is known.
+        Empty: nothing is known of any.
+    returns_behind : (pixels,) bool, optional
+        Where the background alone returns light that one frame measures; None without a background.
     longest_step : float
         No step is longer, in natural units of 1 cm and 1°. Near a solution it should be short: where an edge crosses
         a pixel's border, slopes jump, and those of one side may lead far away on the other.
@@ -67,6 +74,8 @@ class Settings:
     huber: float | None = None
     background: NDArray[np.complex128] | None = None
     look_beside_rad: tuple[float, ...] = ()
+    prior_std: tuple[float, ...] = ()
+    returns_behind: NDArray[np.bool_] | None = None
     longest_step: float = 3.0
 
 
@@ -87,6 +96,8 @@ class Fits:
         The same with no residual adding more than that: what to compare with a scene that explains nothing.
     dof : int64
         Residuals in it, less the parameters fitted.
+    prior : float64
+        What the prior adds to the cost; no test of the fit counts it.
     covariance : (m, p, p) float64
         Of the free parameters of the view, nuisances taken into account; NaN where some direction is not observed.
     information : (m, p, p) float64
@@ -100,6 +111,7 @@ class Fits:
     cost: NDArray[np.float64]
     capped: NDArray[np.float64]
     dof: NDArray[np.int64]
+    prior: NDArray[np.float64]
     covariance: NDArray[np.float64]
     information: NDArray[np.float64]
 
@@ -164,6 +176,8 @@ def refine(
         again = problem.some(changed)
         moved = again.descend(again.state(state.theta[changed], use[changed]), _SETTLED)
         state = state.updated(changed, moved)
+    if not model.slopes_are_free:
+        state = problem.settle(state)
     return problem.conclude(state)
 
 
@@ -206,6 +220,8 @@ class _Problem:
         names = (*settings.free, ALBEDO) if self.with_albedo else settings.free
         self.columns = np.array([(*VIEW, ALBEDO).index(name) for name in names])
         self.scale = np.array([SCALE[name] for name in names])
+        known = np.array(settings.prior_std) if settings.prior_std else np.full(len(settings.free), np.inf)
+        self.prior_weight = np.concatenate([known**-2.0, np.zeros(len(names) - len(known))])
 
     def some(self, which: NDArray[np.integer]) -> _Problem:
         return _Problem(
@@ -249,7 +265,26 @@ class _Problem:
         sums = gauss_newton_sums(
             images.phasor, images.slope, self.evidence, self.frame, use & self.settings.pixels, self.settings.huber
         )
-        return _State(theta, use, images, sums)
+        return _State(theta, use, images, self._with_prior(sums, theta))
+
+    def prior_cost(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the whitened squared distance of parameters from what was known before, (m,)."""
+        return np.asarray((self.prior_weight * theta[:, self.columns] ** 2).sum(axis=1))
+
+    def _with_prior(self, sums: Sums, theta: NDArray[np.float64]) -> Sums:
+        """Add what was known of the parameters before the frame was seen."""
+        if not self.prior_weight.any():
+            return sums
+        cost, square = self.prior_cost(theta), np.diag(self.prior_weight)
+        if sums.gradient.shape[1] < len(square):  # images without slopes
+            return replace(sums, cost=sums.cost + cost, capped=sums.capped + cost)
+        return Sums(
+            sums.cost + cost,
+            sums.capped + cost,
+            sums.gradient - self.prior_weight * theta[:, self.columns],
+            sums.information + square,
+            sums.scatter + square,
+        )
 
     def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels count at some views, (m, pixels)."""
@@ -338,6 +373,70 @@ class _Problem:
         better = np.flatnonzero(found.sums.cost < state.sums.cost[which])
         return state.updated(which[better], _picked(found, better))
 
+    def settle(self, state: _State) -> _State:
+        """Leave views that contradict some pixels for better ones nearby.
+
+        Whether a pixel returns changes in a step where an edge enters it, which no slope shows. So views up to five
+        standard deviations away along the axes of the covariance are tried, with the whole cost of PHYSICS section 7.
+        """
+        cost, contradicted = self._whole_cost(state)
+        near = self._near_best(state, _CLOSE_CALL)
+        for _ in range(_SETTLING_ROUNDS):
+            near = near[contradicted[near]]
+            if not near.size:
+                break
+            moves = self._moves(state.sums, near)
+            source = np.repeat(near, moves.shape[1])
+            theta = state.theta[source]
+            theta[:, self.columns] += moves.reshape(len(source), -1)
+            theta[:, :4] = self._clipped(theta[:, :4])
+            tried = self.some(source).at(theta)
+            total = self.some(source)._whole_cost(tried)[0].reshape(len(near), -1)
+            best = total.argmin(axis=1)
+            chosen = np.flatnonzero(total[np.arange(len(near)), best] < cost[near] - 1)
+            if not chosen.size:
+                break
+            at = chosen * moves.shape[1] + best[chosen]
+            near = near[chosen]
+            there = self.some(near)
+            found = there.descend(there.at(theta[at], with_slopes=True), _SETTLED)
+            news, still = there._whole_cost(found)
+            wins = np.flatnonzero(news < cost[near])
+            state = state.updated(near[wins], _picked(found, wins))
+            cost[near[wins]], contradicted[near[wins]] = news[wins], still[wins]
+            near = near[wins]
+        return state
+
+    def at(self, theta: NDArray[np.float64], *, with_slopes: bool = False) -> _State:
+        """Return states at some parameters, each with the pixels that count there."""
+        view, free = np.ascontiguousarray(theta[:, :4]), self.settings.free
+        images = self.model.images(self.class_index, view, free if with_slopes else ())
+        if not with_slopes:
+            images = replace(images, slope=np.zeros((len(view), len(free), images.phasor.shape[1]), np.complex128))
+        scaled = self._scaled(images, theta)
+        return self._summed(theta, self.pixels_at(scaled, theta), scaled)
+
+    def _whole_cost(self, state: _State) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the cost of states with all their disagreements, and whether there are any; (m,) each."""
+        compared = state.use & (self.evidence.weight[self.frame] > 0)
+        wrong = self._wrong(state, np.empty(0, np.intp), np.empty((0, 0, 0)), ~compared).sum(axis=1)
+        n_open = (self.evidence.seen.returned[self.frame] & ~compared).sum(axis=1) - wrong
+        total = state.sums.cost + DISAGREEMENT * wrong + np.maximum(n_open, 0)
+        dark = (compared & (state.images.phasor == 0)).any(axis=1)
+        return np.asarray(total), np.asarray((wrong > 0) | dark)
+
+    def _moves(self, sums: Sums, which: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Return steps along the axes of the covariance, (k, moves, p); where there is none, natural units."""
+        p = len(self.columns)
+        matrix = _inverse(sums.information[which] * np.outer(self.scale, self.scale), np.ones(p))
+        known = np.isfinite(matrix).all(axis=(1, 2))
+        values, vectors = np.linalg.eigh(np.where(known[:, None, None], matrix, np.eye(p)))
+        axes = vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), 1.0)[:, None, :]
+        sizes = np.array([-5.0, -2.5, -1.0, 1.0, 2.5, 5.0])
+        moves = np.einsum("kpa,s->kasp", axes, sizes).reshape(len(which), -1, p)
+        longest = np.abs(moves).max(axis=2, keepdims=True)
+        return np.asarray(moves * np.minimum(1.0, 2.0 / np.maximum(longest, 1e-30)) * self.scale)
+
     def turned(self, states: _State, source: NDArray[np.integer], theta: NDArray[np.float64]) -> _State:
         """Return states that differ from `source` in δ alone, with the slopes from there."""
         before = ModelImages(**{name: values[source] for name, values in vars(states.images).items()})
@@ -376,7 +475,7 @@ class _Problem:
                     state.images.phasor[near], slope, evidence, self.frame[near],
                     state.use[near] & settings.pixels, settings.huber,
                 )  # fmt: skip
-                covariance[near] = self._covariance(sums)
+                covariance[near] = self._covariance(self._with_prior(sums, state.theta[near]))
         information = _inverse(covariance / np.outer(self.scale[:p], self.scale[:p]), 1 / self.scale[:p])
         all_pixels = np.ones_like(settings.pixels)
         sums = state.sums
@@ -384,6 +483,7 @@ class _Problem:
             sums = gauss_newton_sums(
                 state.images.phasor, state.images.slope, evidence, self.frame, state.use & all_pixels, settings.huber
             )
+            sums = self._with_prior(sums, state.theta)
         fitted = state.use & (evidence.weight[self.frame] > 0)
         wrong = self._wrong(state, near, covariance, ~fitted)
         returned = evidence.seen.returned[self.frame]
@@ -399,7 +499,8 @@ class _Problem:
             albedo=state.theta[:, 4],
             cost=sums.cost + DISAGREEMENT * n_wrong + n_open,
             capped=sums.capped + DISAGREEMENT * n_wrong + n_open,
-            dof=np.maximum(n_residuals - len(self.columns), 0),
+            dof=np.maximum(n_residuals - int((self.prior_weight == 0).sum()), 0),
+            prior=self.prior_cost(state.theta),
             covariance=covariance,
             information=information,
         )
@@ -408,16 +509,16 @@ class _Problem:
         self, state: _State, near: NDArray[np.intp], covariance: NDArray[np.float64], among: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Return which of some pixels return, or do not, as no view within three standard deviations explains."""
-        seen = self.evidence.seen
+        seen, settings = self.evidence.seen, self.settings
         returned, absent = seen.returned[self.frame], seen.not_returned[self.frame]
         # a kink nearby excuses a pixel where it keeps it from being compared
         among = among & self.model.trusted(self.class_index, state.theta[:, :4])
-        if self.settings.background is not None:
-            return np.asarray(absent & state.use & among)
 
         def disagree(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
-            lost = returned & (high < MAY_RETURN_COVERAGE)
-            return np.asarray((lost | (absent & (low > MUST_RETURN_COVERAGE))) & among)
+            may, must = high >= MAY_RETURN_COVERAGE, low > MUST_RETURN_COVERAGE
+            if settings.returns_behind is not None:
+                may, must = may | settings.returns_behind, state.use
+            return disagrees(returned, absent, may, must) & among
 
         low, high = state.images.coverage.copy(), state.images.coverage.copy()
         wrong = disagree(low, high)

@@ -25,10 +25,11 @@ from phasemark.data.build import read_landmarks
 from phasemark.data.layout import Layout
 from phasemark.data.seeds import stream
 from phasemark.data.shards import Place
+from phasemark.matcher.agreement import counts
 from phasemark.matcher.bounds import confusion_probability, cramer_rao
 from phasemark.matcher.estimator import LIKELY
 from phasemark.matcher.filters import FilteredFrames, PixelState, kalman_filter, phasor_mean
-from phasemark.matcher.likelihood import Quantity, counts
+from phasemark.matcher.likelihood import Quantity
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.models import VIEW

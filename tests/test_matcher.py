@@ -10,7 +10,8 @@ from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, Matches, PixelState, kalman_filter, noise_free
-from phasemark.matcher.coarse import DISAGREEMENT, Observation, Templates
+from phasemark.matcher.agreement import DISAGREEMENT
+from phasemark.matcher.coarse import Observation, Templates
 from phasemark.matcher.picture import match_picture, model_range_m
 from phasemark.render import Background, Frames, PhasorImages, Renderer, capture, preset
 

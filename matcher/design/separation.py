@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from phasemark.landmarks import Box, LandmarkSpec, build_mesh
 from phasemark.landmarks.spec import Upper
-from phasemark.matcher.coarse import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE
+from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts
 from phasemark.matcher.design.bound import SEARCH_TOLERANCE_M, box_alone
 from phasemark.matcher.design.plan import DesignPlan
-from phasemark.matcher.likelihood import counts
 from phasemark.render import Renderer, Sensor, Views, phasor_to_range_m, predicted_range_std, wrap_difference_m
 
 _STEP_M = 1e-4
