@@ -23,9 +23,8 @@ from phasemark.matcher.calibrate_model import NAMES, PARAMETERS, CalibrationMode
 from phasemark.matcher.calibrate_notes import advice, named, observability_notes, odd_pose_notes
 from phasemark.matcher.calibrate_pose_errors import estimate_pose_std
 from phasemark.matcher.calibrate_poses import KnownPoses, PoseStd
-from phasemark.matcher.coarse import assumed_std_m
 from phasemark.matcher.estimator import MIN_RETURNS, p_values_of
-from phasemark.matcher.filters import FilteredFrames, PixelState, kalman_filter, phasor_mean
+from phasemark.matcher.filters import FilteredFrames, PixelState, assumed_std_m, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood import Evidence, Quantity
 from phasemark.render import Background, Frames, Sensor, wrap_difference_m
 from phasemark.render.sensor_file import rounded

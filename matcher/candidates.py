@@ -27,6 +27,11 @@ _T = TypeVar("_T", bound=np.generic)
 _UNDECIDED, _SHARE = 300.0, 0.5
 """Other classes start too where their cost is larger by no more than this, and this share of the best: between the
 grid's points none of them fits."""
+_MOST_OTHER_SIDES = 2
+_OTHER_SIDE_RAD = math.radians(30.0)
+"""Sides that differ by more than this are tried too, at most so many of them."""
+_OTHER_SIDE_COST, _OTHER_SIDE_SHARE = 100.0, 4.0
+"""Their cost on the grid may be this much, and so many times that of the best."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +115,8 @@ class Search:
             by_class.append(above)
         frame, class_index, views, cost = [], [], [], []
         for f in range(n):
-            for b, i, j in modes(best[f], n_modes, self._closes):
-                if b < 0:
-                    break
+            found = modes(best[f], n_modes, self._closes)
+            for b, i, j in np.concatenate([found[found[:, 0] >= 0], self._other_sides(best[f], found)]):
                 least = float(best[f, b, i, j])
                 above = by_class[b][f, :, i, min(j, by_class[b].shape[-1] - 1)]
                 for c in np.argsort(above, kind="stable")[: None if all_classes else 1]:
@@ -128,6 +132,29 @@ class Search:
             np.array(views, np.float64).reshape(-1, 4),
             np.array(cost, np.float64),
         )
+
+    def _other_sides(self, cost: NDArray[np.float32], found: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the best views from sides far from those found already, where they cost little more; (k, 3).
+
+        A thin landmark looks nearly the same from the front and from the back. Without these views the neighbours of
+        one side alone would be compared, and the answer would not know that it is ambiguous.
+        """
+        profile = cost.min(axis=(0, 1))
+        least = float(profile.min())
+        taken = found[found[:, 0] >= 0, 2]
+        period = closing_period(self._delta) or 4 * math.pi
+        others = []
+        for _ in range(_MOST_OTHER_SIDES):
+            away = np.abs(self._delta[:, None] - self._delta[None, taken])
+            away = np.minimum(away, np.abs(period - away)).min(axis=1)
+            open_ = np.where(away > _OTHER_SIDE_RAD, profile, np.inf)
+            j = int(open_.argmin())
+            if not open_[j] <= _OTHER_SIDE_COST + _OTHER_SIDE_SHARE * least:
+                break
+            b, i = np.unravel_index(int(cost[:, :, j].argmin()), cost.shape[:2])
+            others.append((b, i, j))
+            taken = np.append(taken, j)
+        return np.array(others, np.int64).reshape(-1, 3)
 
     def _bearing(self, index: int) -> float:
         """Return the bearing whose image is shifted by whole columns: left is positive, and a smaller column."""

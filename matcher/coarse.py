@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, disagrees
-from phasemark.matcher.filters import FilteredFrames, PixelState
+from phasemark.matcher.filters import FilteredFrames, PixelState, assumed_std_m
 from phasemark.render import PhasorImages, Sensor, phasor_to_range_m, predicted_range_std, wrap_difference_m
 
 _RECHECKED = 64
@@ -73,12 +73,6 @@ class Observation:
 
     def __getitem__(self, index: slice) -> Observation:
         return Observation(self.range_m[index], self.weight[index], self.returned[index], self.not_returned[index])
-
-
-def assumed_std_m(range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
-    """Return the one-frame noise of a surface of albedo 0.8 that faces the camera at a range, metres."""
-    amplitude = 0.8 / np.maximum(range_m, 1e-3) ** 2
-    return np.maximum(predicted_range_std(amplitude, amplitude, sensor), 1e-4)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from phasemark.matcher.candidates import Search, Starts
 from phasemark.matcher.coarse import Observation
 from phasemark.matcher.filters import FilteredFrames
 from phasemark.matcher.likelihood import Evidence, Quantity
-from phasemark.matcher.match import Candidate, Match
+from phasemark.matcher.match import Candidate, Match, Reason
 from phasemark.matcher.models import VIEW, BankModel, ImageModel, RenderedModel
 from phasemark.matcher.refine import SCALE, Fits, Settings, refine
 from phasemark.matcher.surroundings import NEAREST_WALL_M, estimate_surroundings, without_background
@@ -42,6 +42,11 @@ _CLOSE_BY_RAD = tuple(math.radians(side) for side in (-0.7, -0.28, -0.12, 0.12, 
 _FINE, _COARSE = (0.011, math.radians(1.1)), (0.022, math.radians(2.2))
 """Widest grids, metres and radians, on which interpolation is at the bound, and on which it shows the way."""
 _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
+TOLERANCE_M, TOLERANCE_RAD = 0.03, math.radians(6.0)
+"""An accepted answer is right to within these at three standard deviations."""
+_TOLERATED_SIGMA = 3.0
+_AMBIGUITY = 1e-3
+"""Largest probability that an accepted answer leaves to other classes."""
 LIKELY = 100.0
 """An explanation whose cost is larger by this has no probability worth telling."""
 _MARGIN = 500.0
@@ -85,6 +90,8 @@ class MaximumLikelihood:
         on: Quantity = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
+        tolerance_m: float = TOLERANCE_M,
+        tolerance_rad: float = TOLERANCE_RAD,
         workers: int | None = None,
     ) -> None:
         if on not in ("ranges", "phasors"):
@@ -99,6 +106,7 @@ class MaximumLikelihood:
         self.free = check_free(free)
         self.on: Quantity = on
         self.false_alarm = false_alarm
+        self._tolerance = {name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW}
         self.auto = background == "auto"
         self.background = background if isinstance(background, Background) else None
         sensor = bank.sensor
@@ -123,7 +131,9 @@ class MaximumLikelihood:
         )
         self._stride = (along, around)
         self._search = Search(bank, self._behind, self._stride, "bearing_rad" in self.free)
-        self._symmetry = [int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes]
+        meshes = [bank.mesh(name) for name in bank.classes]
+        self._symmetry = [int(mesh.metadata["symmetry"]) for mesh in meshes]
+        self._middle = np.array([mesh.centroid for mesh in meshes])
 
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Match filtered frames."""
@@ -219,7 +229,31 @@ class MaximumLikelihood:
                 kept = self._trimmed(models.final, evidence, Fits.joined(fits), poor, seen)
                 starts = search.starts(kept, n_modes, all_classes=all_classes)
                 fits.append(self._fit(models, evidence, poor, starts, sides, behind))
+        if models.final is not None:
+            fits.append(self._from_behind(models.final, evidence, Fits.joined(fits), behind))
         return Fits.joined(fits)
+
+    def _from_behind(self, model: ImageModel, evidence: Evidence, fits: Fits, behind: PhasorImages | None) -> Fits:
+        """Let the other side of the best landmark explain each frame, its middle seen at the same place.
+
+        A thin landmark looks nearly the same from the front and from the back; no slope leads from one to the other.
+        """
+        best = _best_of_frame(fits)
+        odd = np.array([self._symmetry[c] % 2 for c in fits.class_index[best]], np.bool_)
+        best = best[odd & np.isfinite(fits.cost[best])]
+        view = fits.view[best].copy()
+        view[:, 1] += math.pi
+        middle = self._middle[fits.class_index[best]]
+        here, there = (_rotated(middle, delta) for delta in (fits.view[best, 1], view[:, 1]))
+        view[:, 0] += here[:, 0] - there[:, 0]
+        if "bearing_rad" in self.free:
+            view[:, 2] += np.arctan2(here[:, 1], fits.view[best, 0] + here[:, 0])
+            view[:, 2] -= np.arctan2(there[:, 1], view[:, 0] + there[:, 0])
+        settings = self._settings(behind)
+        limit = fits.cost[best] + LIKELY
+        return refine(
+            model, evidence, fits.frame[best], fits.class_index[best], view, settings, limit, at_first_sight=True
+        )
 
     def _trimmed(
         self, model: ImageModel, evidence: Evidence, fits: Fits, which: NDArray[np.int64], seen: Observation
@@ -267,7 +301,7 @@ class MaximumLikelihood:
         The best start is tried with δ moved to some sides too.
         A scout, where there is one, does this first; of what it finds only the best is refined again.
         """
-        settings = Settings(self.free, self._used, self._huber, None if behind is None else behind.phasor.reshape(-1))
+        settings = self._settings(behind)
         frame, class_index, view = enough[starts.frame], starts.class_index, starts.view
         if sides:
             first = np.flatnonzero(np.diff(starts.frame, prepend=-1))
@@ -302,6 +336,18 @@ class MaximumLikelihood:
         gap = others.cost - least[others.frame]
         others.cost[:] = _least_of_frame(final, len(evidence.weight))[others.frame] + gap
         return Fits.joined([final, others])
+
+    def _settings(self, behind: PhasorImages | None) -> Settings:
+        """Return what is estimated, before some background."""
+        return Settings(
+            self.free,
+            self._used,
+            self._huber,
+            None if behind is None else behind.phasor.reshape(-1),
+            returns_behind=None
+            if behind is None
+            else counts(behind.phasor, behind.intensity, behind.sensor).reshape(-1),
+        )
 
     def _modes(
         self,
@@ -356,7 +402,7 @@ class MaximumLikelihood:
         bare: NDArray[np.float64],
         backgrounds: list[Background | None],
     ) -> list[Match]:
-        p_values = p_values_of(fits.cost, fits.dof, frames, fits.frame)
+        p_values = p_values_of(fits.cost - fits.prior, fits.dof, frames, fits.frame)
         order = np.lexsort((fits.cost, fits.frame))
         first = np.searchsorted(fits.frame[order], np.arange(len(frames) + 1))
         doubt = np.asarray(special.chdtri(np.maximum(fits.dof, 1), self.false_alarm), np.float64)
@@ -380,7 +426,9 @@ class MaximumLikelihood:
         names = self.bank.classes
         if not len(own):
             nothing = {**dict.fromkeys(names, 0.0), "none": 1.0}
-            return Match(class_name=None, accepted=False, free=self.free, class_probability=nothing)
+            return Match(
+                class_name=None, accepted=False, free=self.free, class_probability=nothing, reason="no landmark"
+            )
         kept = self._distinct(fits, own)
         best = kept[0]
         c = int(fits.class_index[best])
@@ -408,9 +456,18 @@ class MaximumLikelihood:
             )
             for k, w in zip(kept, weight, strict=False)
         )
+        reason: Reason = ""
+        if not is_landmark:
+            reason = "no landmark"
+        elif p_values[best] < self.false_alarm:
+            reason = "poor fit"
+        elif not self._is_determined(covariance):
+            reason = "undetermined"
+        elif self._is_ambiguous(fits, kept, weight[:-1]):
+            reason = "ambiguous"
         return Match(
             class_name=names[c] if is_landmark else None,
-            accepted=is_landmark and known and bool(p_values[best] >= self.false_alarm),
+            accepted=not reason,
             distance_m=candidates[0].distance_m,
             delta_rad=candidates[0].delta_rad,
             bearing_rad=candidates[0].bearing_rad,
@@ -426,7 +483,27 @@ class MaximumLikelihood:
             condition_number=condition,
             weak_direction=weak,
             background=background,
+            reason=reason,
         )
+
+    def _is_determined(self, covariance: NDArray[np.float64]) -> bool:
+        """Return whether a frame tells every free parameter to within the tolerance, three standard deviations."""
+        if not np.isfinite(covariance).all():
+            return False
+        tolerance = np.array([self._tolerance[name] for name in self.free])
+        return bool((_TOLERATED_SIGMA * np.sqrt(np.maximum(np.diag(covariance), 0.0)) <= tolerance).all())
+
+    def _is_ambiguous(self, fits: Fits, kept: list[int], weight: NDArray[np.float64]) -> bool:
+        """Return whether other classes, or views beyond the tolerance, are too probable; `kept` is best first."""
+        best = kept[0]
+        period = 2 * math.pi / self._symmetry[fits.class_index[best]]
+        apart = np.abs(fits.view[kept] - fits.view[best])
+        apart[:, 1] = np.abs((apart[:, 1] + period / 2) % period - period / 2)
+        far = (apart > [self._tolerance[name] for name in VIEW]).any(axis=1)
+        other = fits.class_index[kept] != fits.class_index[best]
+        # where a landmark looks alike from two sides, a single pixel at an edge must not decide between them
+        alike = far & ~other & (fits.cost[kept] < fits.cost[best] + DISAGREEMENT)
+        return bool(weight[other].sum() > _AMBIGUITY * weight.sum() or alike.any())
 
     def _distinct_of_frames(self, fits: Fits, which: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return those of some fits that came to places of their own, the best at each."""
@@ -518,6 +595,13 @@ def p_values_of(
         variance = freedom * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
         p = special.chdtrc(2 * mean**2 / variance, cost * 2 * mean / variance)
     return np.where(dof > 0, p, 0.0)
+
+
+def _rotated(point_m: NDArray[np.float64], delta_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return R(δ) p' of PHYSICS section 1, horizontally; (m, 2)."""
+    cos, sin = np.cos(delta_rad), np.sin(delta_rad)
+    x, y = point_m[:, 0], point_m[:, 1]
+    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
 
 
 def _usual_workers() -> int:

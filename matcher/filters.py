@@ -13,12 +13,16 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
 from phasemark import UsageError
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.noise import measured_range_std, predicted_range_std
 from phasemark.render.phasor import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
 from phasemark.render.sensor import Sensor
+
+_LEAST_POOLED = 1e-4
+"""Least variance over that of the law; frames without any scatter are simulated, or frozen."""
 
 
 class PixelState(IntEnum):
@@ -107,12 +111,38 @@ class FilteredFrames:
         corrected = wrap_range_m(self.range_m - offset, self.sensor)
         return replace(self, range_m=corrected, sensor=self.sensor.with_(range_offset_m=0.0))
 
+    def with_pooled_noise(self) -> FilteredFrames:
+        """Return the frames of a direct sensor with the noise of its law, scaled to the scatter of all pixels together.
+
+        The scatter of a few frames in one pixel is a poor measure of its noise. The law (`range_std_m` and its
+        neighbours in :class:`~phasemark.render.Sensor`) says how the noise of the pixels compares; the median over
+        pixels and positions of scatter over law says how large it is. A single frame has the noise of the law.
+        """
+        if self.sensor.kind != "direct" or not self.std_from_scatter:
+            return self
+        law = assumed_std_m(np.nan_to_num(self.range_m, nan=1.0), self.sensor)
+        n = self.n_effective
+        ratio = np.divide(self.std_m**2 * n, law**2, out=np.full(n.shape, np.nan), where=(n > 1.5) & (law > 0))
+        scattered = np.isfinite(ratio)
+        scale = 1.0
+        if scattered.any():
+            freedom = float(np.median(n[scattered])) - 1
+            scale = float(np.median(ratio[scattered])) / float(special.chdtri(freedom, 0.5) / freedom)
+        std = np.sqrt(max(scale, _LEAST_POOLED)) * law / np.sqrt(np.maximum(n, 1.0))
+        return replace(self, std_m=np.where(n > 0, std, np.nan), std_from_scatter=False)
+
     def _repr_png_(self) -> bytes | None:
         """Show range and standard deviation of the first position in a notebook; nothing where there is none."""
         from phasemark.matcher.picture import filtered_picture
         from phasemark.render.plot import figure_png
 
         return figure_png(filtered_picture(self)) if len(self) else None
+
+
+def assumed_std_m(range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
+    """Return the one-frame noise of a surface of albedo 0.8 that faces the camera at a range, metres."""
+    amplitude = 0.8 / np.maximum(range_m, 1e-3) ** 2
+    return np.maximum(predicted_range_std(amplitude, amplitude, sensor), 1e-4)
 
 
 def noise_free(images: PhasorImages, n_frames: float) -> FilteredFrames:

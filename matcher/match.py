@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, overload
+from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data.notebook import table_html
 from phasemark.render import Background
+
+Reason = Literal["", "no landmark", "poor fit", "undetermined", "ambiguous"]
+"""Why an answer is refused; empty if it is accepted."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,10 @@ class Match:
         a covariance.
     background : Background or None
         What the match took to stand behind the landmark; estimated where the matcher was told to.
+    reason : {"", "no landmark", "poor fit", "undetermined", "ambiguous"}
+        Why the answer is refused; empty if it is accepted. "poor fit": χ² fails its test. "undetermined": the frame
+        leaves some free parameter open by more than the matcher tolerates. "ambiguous": another class or a view
+        far away explains the frame too.
     """
 
     class_name: str | None
@@ -90,6 +97,7 @@ class Match:
     condition_number: float = math.nan
     weak_direction: Mapping[str, float] = field(default_factory=dict)
     background: Background | None = None
+    reason: Reason = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers and text, angles in degrees too; NaN as None, so that it is valid JSON."""
@@ -100,6 +108,7 @@ class Match:
         return {
             "class": self.class_name,
             "accepted": self.accepted,
+            "reason": self.reason,
             "distance_m": plain(self.distance_m),
             "delta_deg": plain(math.degrees(self.delta_rad)),
             "bearing_deg": plain(math.degrees(self.bearing_rad)),
@@ -137,18 +146,19 @@ _COLUMNS = ("class", "D (m)", "δ (°)", "accepted", "p")
 def _cells(match: Match) -> tuple[str, ...]:
     """Return a match as the cells of a table, values ± their standard deviations where there are any."""
     if match.class_name is None:
-        return ("no landmark", "", "", "no", _number(match.p_value, ".3g"))
+        return ("no landmark", "", "", "refused", _number(match.p_value, ".3g"))
     cells = []
     for name, value, scale, form in (
         ("distance_m", match.distance_m, 1.0, ".4f"),
         ("delta_rad", match.delta_rad, 180 / math.pi, ".2f"),
     ):
         spread = ""
-        if match.covariance is not None and name in match.free:
+        if match.accepted and match.covariance is not None and name in match.free:
             k = match.free.index(name)
             spread = f" ± {scale * math.sqrt(max(float(match.covariance[k, k]), 0.0)):{form}}"
         cells.append(_number(scale * value, form) + spread)
-    return (match.class_name, *cells, "yes" if match.accepted else "no", _number(match.p_value, ".3g"))
+    verdict = "yes" if match.accepted else f"refused: {match.reason}" if match.reason else "refused"
+    return (match.class_name, *cells, verdict, _number(match.p_value, ".3g"))
 
 
 def _number(value: float, form: str) -> str:
@@ -166,6 +176,7 @@ class Matches(Sequence[Match]):
     ----------
     class_name : (n,) object
         Names, None where there is no landmark.
+    reason : (n,) object
     accepted : (n,) bool
     distance_m, delta_rad, bearing_rad, height_m, chi2, p_value, condition_number : (n,) float64
     dof : (n,) int64
@@ -200,6 +211,11 @@ class Matches(Sequence[Match]):
     def accepted(self) -> NDArray[np.bool_]:
         """Whether each match passed its test; (n,)."""
         return np.array([match.accepted for match in self], dtype=np.bool_)
+
+    @property
+    def reason(self) -> NDArray[np.object_]:
+        """Why each answer is refused, empty where it is accepted; (n,)."""
+        return np.array([match.reason for match in self], dtype=object)
 
     @property
     def dof(self) -> NDArray[np.int64]:

@@ -19,10 +19,10 @@ from phasemark.data import Bank
 from phasemark.data.bank import BankGroup
 from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.coarse import Observation, Templates
-from phasemark.matcher.estimator import MaximumLikelihood, Pixels, p_values_of
+from phasemark.matcher.estimator import TOLERANCE_M, TOLERANCE_RAD, MaximumLikelihood, Pixels, p_values_of
 from phasemark.matcher.filters import FilteredFrames
 from phasemark.matcher.likelihood import Quantity
-from phasemark.matcher.match import Candidate, Match, Matches
+from phasemark.matcher.match import Candidate, Match, Matches, Reason
 from phasemark.matcher.models import VIEW
 from phasemark.matcher.pruned import nearest_search
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, wrap_difference_m
@@ -70,6 +70,10 @@ class Matcher:
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool
         Whether "refine" counts residuals beyond 3 σ linearly (Huber); the covariance is then the sandwich.
+    tolerance_m, tolerance_rad : float
+        How far off an accepted answer of "refine" may be. It is refused as "undetermined" where three standard
+        deviations of a free length or angle exceed this, and as "ambiguous" where other classes keep a probability of
+        more than 0.001, or where a view farther away than this costs less than one contradicted pixel more.
     workers : int, optional
         Threads that render (None: one for each processor), where "refine" renders; the answer does not depend on it.
 
@@ -97,12 +101,17 @@ class Matcher:
         on: Quantity = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
+        tolerance_m: float = TOLERANCE_M,
+        tolerance_rad: float = TOLERANCE_RAD,
         workers: int | None = None,
     ) -> None:
         if method not in METHODS:
             raise UsageError(f"unknown method {method!r}: the methods are {', '.join(METHODS)}")
         if isinstance(background, str) and background != "auto":
             raise UsageError(f"'background' must be a Background, \"auto\" or None, got {background!r}")
+        for name, tolerance in (("tolerance_m", tolerance_m), ("tolerance_rad", tolerance_rad)):
+            if not tolerance > 0:
+                raise UsageError(f"'{name}' must be positive, got {tolerance!r}")
         if not 0 < false_alarm < 1:
             raise UsageError(f"'false_alarm' must be in (0, 1), got {false_alarm!r}")
         self.bank = bank
@@ -117,6 +126,8 @@ class Matcher:
                 on=on,
                 pixels=pixels,
                 robust=robust,
+                tolerance_m=tolerance_m,
+                tolerance_rad=tolerance_rad,
                 workers=workers,
             )
             return
@@ -163,7 +174,7 @@ class Matcher:
         difference = frames.sensor.optics_difference(self.bank.sensor)
         if difference is not None:
             raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
-        frames = frames.without_offset()
+        frames = frames.without_offset().with_pooled_noise()
         if self._likelihood is not None:
             return Matches(self._likelihood.match(frames))
         matches: list[Match] = []
@@ -188,7 +199,12 @@ class Matcher:
         enough = pose_seen.returned.sum(axis=1) >= MIN_RETURNS
         chi2, dof = self._goodness(pose_seen, class_seen, found)
         p_value = p_values_of(chi2, dof, frames, np.arange(len(frames)))
-        nothing = Match(class_name=None, accepted=False, class_probability=self._probabilities(np.empty(0), 0.0))
+        nothing = Match(
+            class_name=None,
+            accepted=False,
+            class_probability=self._probabilities(np.empty(0), 0.0),
+            reason="no landmark",
+        )
         return [
             self._answer(found, k, float(none_cost[k]), float(chi2[k]), int(dof[k]), float(p_value[k]))
             if enough[k]
@@ -234,9 +250,10 @@ class Matcher:
         )
         best = candidates[0]
         is_landmark = best.cost < none_cost
+        reason: Reason = "no landmark" if not is_landmark else "poor fit" if p_value < self.false_alarm else ""
         return Match(
             class_name=best.class_name if is_landmark else None,
-            accepted=bool(is_landmark and p_value >= self.false_alarm),
+            accepted=not reason,
             distance_m=best.distance_m,
             delta_rad=best.delta_rad,
             chi2=chi2,
@@ -245,6 +262,7 @@ class Matcher:
             class_probability=self._probabilities(found.cost[k], none_cost),
             alternatives=candidates[1:] if is_landmark else candidates,
             symmetry=self._symmetry[best.class_name],
+            reason=reason,
         )
 
     def _probabilities(self, cost: NDArray[np.float64], none_cost: float) -> dict[str, float]:

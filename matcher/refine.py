@@ -382,7 +382,7 @@ class _Problem:
         cost, contradicted = self._whole_cost(state)
         near = self._near_best(state, _CLOSE_CALL)
         for _ in range(_SETTLING_ROUNDS):
-            near = near[contradicted[near]]
+            near = near[np.flatnonzero(contradicted[near])]
             if not near.size:
                 break
             moves = self._moves(state.sums, near)
