@@ -72,7 +72,7 @@ class Search:
         self._delta = bank.delta_rad[:: stride[1]]
         self._closes = closing_period(bank.delta_rad) is not None
         sensor = bank.sensor
-        self._columns = 2 * math.atan(sensor.tan_half_angles[0]) / sensor.cols
+        self.column_rad = 2 * math.atan(sensor.tan_half_angles[0]) / sensor.cols
         most = sensor.cols // 4 if bearings else 0
         self._shifts = range(-most, most + 1)
         thin = slice(None, None, stride[0]), slice(None, None, stride[1])
@@ -158,7 +158,7 @@ class Search:
 
     def _bearing(self, index: int) -> float:
         """Return the bearing whose image is shifted by whole columns: left is positive, and a smaller column."""
-        return -self._shifts[index] * self._columns
+        return -self._shifts[index] * self.column_rad
 
     def _shifted(self, seen: Observation, shift: int) -> Observation:
         """Move frames so that what was `shift` columns right of the middle comes to the middle."""

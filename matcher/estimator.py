@@ -22,7 +22,7 @@ from phasemark.matcher.likelihood import Evidence, Quantity
 from phasemark.matcher.match import Candidate, Match, Reason
 from phasemark.matcher.models import VIEW, BankModel, ImageModel, RenderedModel
 from phasemark.matcher.refine import SCALE, Fits, Settings, refine
-from phasemark.matcher.surroundings import NEAREST_WALL_M, estimate_surroundings, without_background
+from phasemark.matcher.surroundings import NEAREST_WALL_M, estimate_surroundings, fit_background, without_background
 from phasemark.render import Background, PhasorImages, Renderer, phasor_to_range_m, wrap_difference_m
 
 Pixels = Literal["all", "lower"]
@@ -53,6 +53,10 @@ _MARGIN = 500.0
 """A rough fit whose cost is larger by this does not become the best one: a column of pixels on the wrong side of an
 edge costs half as much."""
 _MOST_REFINED = 3
+_WALLS_BEYOND_M = (0.5, 1.0, 2.0, 4.0)
+"""How far behind the landmark a wall is tried that no pixel sees alone."""
+_BACKGROUND_ROUNDS = 4
+"""How often background and views are fitted in turn."""
 _SHORT_STEP = 0.1
 """Longest step after a scout, in natural units: it comes within about so much."""
 _FRAMES_AT_ONCE = 256
@@ -169,14 +173,72 @@ class MaximumLikelihood:
                 models = _Models(self._rendered.with_background(background), scout)
                 seen = without_background(seen, around)
             fits = self._searched(models, evidence, seen, bare, background, behind)
+            if self._is_doubtful(fits):
+                background, fits = self._with_better_background(background, evidence, fits)
             if background is not None and self._is_doubtful(fits):
                 # what was taken for background, or lies beside it, may be landmark: search with both in the images
-                assert behind is not None
+                behind = _behind(self.bank, background)
+                models = _Models(self._rendered.with_background(background), models.scout)
                 search = Search(self.bank, behind, self._stride, "bearing_rad" in self.free)
                 again = self._searched(models, evidence, evidence.seen, bare, background, behind, search)
                 fits = Fits.joined([fits, again])
+                if self._is_doubtful(fits):
+                    background, fits = self._with_better_background(background, evidence, fits)
             answers.extend(self._answers(one, fits, bare, [background]))
         return answers
+
+    def _with_better_background(
+        self, background: Background | None, evidence: Evidence, fits: Fits
+    ) -> tuple[Background | None, Fits]:
+        """Fit the background behind the best view of one frame, then the views before it, in turn while that helps.
+
+        Where no pixel sees a background alone, walls at some distances behind the landmark are tried.
+        """
+        if background is not None:
+            return self._background_and_views(background, evidence, fits)
+        best = fits.view[fits.cost.argmin()]
+        found: tuple[Background | None, Fits] = (None, fits)
+        for beyond in _WALLS_BEYOND_M:
+            there = self._background_and_views(Background(wall_m=float(best[0]) + beyond), evidence, fits)
+            if there[1].cost.min() < found[1].cost.min():
+                found = there
+            if not self._is_doubtful(found[1]):
+                break
+        return found
+
+    def _background_and_views(self, background: Background, evidence: Evidence, fits: Fits) -> tuple[Background, Fits]:
+        """Fit a background behind the best view of one frame, then the views before it, in turn while that helps."""
+        assert self._rendered is not None
+        for _ in range(_BACKGROUND_ROUNDS):
+            finite = np.flatnonzero(np.isfinite(fits.cost))
+            if not finite.size:
+                break
+            best = finite[np.argsort(fits.cost[finite], kind="stable")][:_MOST_REFINED]
+            found, view = fit_background(
+                self._rendered,
+                evidence,
+                int(fits.class_index[best[0]]),
+                fits.view[best[0]],
+                self.free,
+                background,
+            )
+            if found == background:
+                break
+            behind = _behind(self.bank, found)
+            model = self._rendered.with_background(found)
+            settings = replace(self._settings(behind), look_beside_rad=_CLOSE_BY_RAD)
+            some = fits[best]
+            some.view[0] = view
+            again = refine(model, evidence, some.frame, some.class_index, some.view, settings)
+            others = self._other_classes(model, evidence, again, settings)
+            again = Fits.joined([again, others, self._from_behind(model, evidence, again, behind)])
+            if not again.cost.min() < fits.cost[best[0]]:
+                break
+            settled = again.cost.min() > fits.cost[best[0]] - 1
+            background, fits = found, again
+            if settled:
+                break
+        return background, fits
 
     def _searched(
         self,
@@ -251,8 +313,13 @@ class MaximumLikelihood:
             view[:, 2] -= np.arctan2(there[:, 1], view[:, 0] + there[:, 0])
         settings = self._settings(behind)
         limit = fits.cost[best] + LIKELY
+        half = self._search.column_rad / 2
+        sides = np.array([0.0, -half, half]) if "bearing_rad" in self.free else np.zeros(1)
+        views = np.tile(view, (len(sides), 1))
+        views[:, 2] += np.repeat(sides, len(view))
+        best, limit = np.tile(best, len(sides)), np.tile(limit, len(sides))
         return refine(
-            model, evidence, fits.frame[best], fits.class_index[best], view, settings, limit, at_first_sight=True
+            model, evidence, fits.frame[best], fits.class_index[best], views, settings, limit, at_first_sight=True
         )
 
     def _trimmed(
@@ -461,7 +528,7 @@ class MaximumLikelihood:
             reason = "no landmark"
         elif p_values[best] < self.false_alarm:
             reason = "poor fit"
-        elif not self._is_determined(covariance):
+        elif not self._is_determined(fits.std_without_one[best]):
             reason = "undetermined"
         elif self._is_ambiguous(fits, kept, weight[:-1]):
             reason = "ambiguous"
@@ -486,12 +553,10 @@ class MaximumLikelihood:
             reason=reason,
         )
 
-    def _is_determined(self, covariance: NDArray[np.float64]) -> bool:
+    def _is_determined(self, std: NDArray[np.float64]) -> bool:
         """Return whether a frame tells every free parameter to within the tolerance, three standard deviations."""
-        if not np.isfinite(covariance).all():
-            return False
         tolerance = np.array([self._tolerance[name] for name in self.free])
-        return bool((_TOLERATED_SIGMA * np.sqrt(np.maximum(np.diag(covariance), 0.0)) <= tolerance).all())
+        return bool((_TOLERATED_SIGMA * std <= tolerance).all())
 
     def _is_ambiguous(self, fits: Fits, kept: list[int], weight: NDArray[np.float64]) -> bool:
         """Return whether other classes, or views beyond the tolerance, are too probable; `kept` is best first."""

@@ -102,6 +102,9 @@ class Fits:
         Of the free parameters of the view, nuisances taken into account; NaN where some direction is not observed.
     information : (m, p, p) float64
         Its inverse.
+    std_without_one : (m, p) float64
+        Largest standard deviations that any single pixel's absence leaves: what a fit is sure of although one pixel at
+        an edge may claim to know more than it does. Infinite where that is not looked at.
     """
 
     frame: NDArray[np.int64]
@@ -114,6 +117,7 @@ class Fits:
     prior: NDArray[np.float64]
     covariance: NDArray[np.float64]
     information: NDArray[np.float64]
+    std_without_one: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -423,13 +427,13 @@ class _Problem:
         n_open = (self.evidence.seen.returned[self.frame] & ~compared).sum(axis=1) - wrong
         total = state.sums.cost + DISAGREEMENT * wrong + np.maximum(n_open, 0)
         dark = (compared & (state.images.phasor == 0)).any(axis=1)
-        return np.asarray(total), np.asarray((wrong > 0) | dark)
+        return np.asarray(total), np.asarray((wrong > 0) | dark, np.bool_)
 
     def _moves(self, sums: Sums, which: NDArray[np.integer]) -> NDArray[np.float64]:
         """Return steps along the axes of the covariance, (k, moves, p); where there is none, natural units."""
         p = len(self.columns)
         matrix = _inverse(sums.information[which] * np.outer(self.scale, self.scale), np.ones(p))
-        known = np.isfinite(matrix).all(axis=(1, 2))
+        known = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
         values, vectors = np.linalg.eigh(np.where(known[:, None, None], matrix, np.eye(p)))
         axes = vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), 1.0)[:, None, :]
         sizes = np.array([-5.0, -2.5, -1.0, 1.0, 2.5, 5.0])
@@ -467,6 +471,7 @@ class _Problem:
         # before a background the cost is final here; otherwise pixels that nothing explains may still change it
         margin = _CLOSE_CALL if settings.background is None else 0.0
         near = self._near_best(state, margin) if look_around else np.empty(0, np.intp)
+        without_one = np.full((len(state.theta), p), np.inf)
         if near.size:
             there = self.some(near)
             slope = there.slopes_around(state, near, self._std(covariance[near]))
@@ -476,6 +481,8 @@ class _Problem:
                     state.use[near] & settings.pixels, settings.huber,
                 )  # fmt: skip
                 covariance[near] = self._covariance(self._with_prior(sums, state.theta[near]))
+            rows = state.images.slope[near] if slope is None else slope
+            without_one[near] = there._std_without_one(state, near, rows, covariance[near])
         information = _inverse(covariance / np.outer(self.scale[:p], self.scale[:p]), 1 / self.scale[:p])
         all_pixels = np.ones_like(settings.pixels)
         sums = state.sums
@@ -503,7 +510,31 @@ class _Problem:
             prior=self.prior_cost(state.theta),
             covariance=covariance,
             information=information,
+            std_without_one=without_one,
         )
+
+    def _std_without_one(
+        self,
+        state: _State,
+        which: NDArray[np.integer],
+        slope: NDArray[np.complex128],
+        covariance: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Return the largest standard deviations without any one pixel, (k, p), by the Sherman–Morrison formula."""
+        p = covariance.shape[1]
+        phasor, weight = state.images.phasor[which], self.evidence.weight[self.frame]
+        use = state.use[which] & self.settings.pixels & (weight > 0) & (phasor != 0)
+        if self.evidence.on == "ranges":
+            turn = np.divide(1.0, phasor, out=np.zeros_like(phasor), where=use)
+            rows = self.evidence.sensor.metres_per_radian * (slope * turn[:, None]).imag[..., None]
+        else:
+            rows = np.stack([slope.real, slope.imag], axis=-1)
+        rows = rows[:, :p] * np.sqrt(weight * use)[:, None, :, None]  # (k, p, pixels, 1 or 2)
+        moved = np.einsum("kab,kbqr->kaqr", covariance, rows)
+        leverage = np.einsum("kaqr,kaqr->kqr", rows, moved)
+        more = moved**2 / np.maximum(1 - leverage, 1e-12)[:, None]
+        variance = np.einsum("kaa->ka", covariance) + more.sum(axis=3).max(axis=2)
+        return np.asarray(np.sqrt(variance))
 
     def _wrong(
         self, state: _State, near: NDArray[np.intp], covariance: NDArray[np.float64], among: NDArray[np.bool_]

@@ -8,13 +8,18 @@ gives the albedo too, relative to the landmark's.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark import UsageError
+from phasemark.matcher.agreement import counts
 from phasemark.matcher.coarse import Observation
 from phasemark.matcher.filters import FilteredFrames, PixelState
+from phasemark.matcher.likelihood import Evidence, Sums, gauss_newton_sums
+from phasemark.matcher.models import VIEW, RenderedModel
 from phasemark.render import Background, Sensor
 
 CLEARLY_BEHIND_M = 0.4
@@ -22,6 +27,14 @@ CLEARLY_BEHIND_M = 0.4
 NEAREST_WALL_M = 0.05
 """Nothing nearer is taken for a wall."""
 _FEWEST = 6
+_BACKGROUND_STEP_M = 1e-3
+"""Width of a difference between two places of a wall or floor."""
+_BACKGROUND_STEPS = 30
+_BACKGROUND_SETTLED = 0.1
+"""A step that promises to lower the whitened squared residual by less than this is not taken."""
+_LONGEST_STEP = 3.0
+_VIEW_SCALE = (0.01, math.radians(1), math.radians(1), 0.01)
+"""Natural units of the view; those of wall and floor are 0.1 m."""
 _USUAL_ALBEDO = 0.5
 
 
@@ -63,7 +76,7 @@ def estimate_surroundings(
     Returns
     -------
     Surroundings
-        Without a background where fewer than six pixels are clearly behind.
+        Without a background where no pixel is clearly behind.
     """
     sensor = frames.sensor
     returned = frames.state[index] == PixelState.RETURN
@@ -76,7 +89,7 @@ def estimate_surroundings(
     far = returned & (forward > nearest + CLEARLY_BEHIND_M)
     lonely = far & _inner(far)  # away from the landmark: not mixed
     pure = lonely if lonely.sum() >= _FEWEST else far
-    if far.sum() < _FEWEST:
+    if not far.any():
         return Surroundings(None, nothing, nothing)
     ray = _level_rays(sensor)
     azimuth = math.radians(sensor.bearing_offset_deg)
@@ -105,6 +118,85 @@ def estimate_surroundings(
             albedo = float(np.clip(np.median(bright[lit]) / landmark_scale, 1e-3, 1.0))
     background = Background(wall_m=wall_m, floor_m=floor_m, wall_albedo=albedo, floor_albedo=albedo)
     return Surroundings(background, (far | ~_inner(~far) & returned).ravel(), pure.ravel())
+
+
+def fit_background(
+    model: RenderedModel,
+    evidence: Evidence,
+    class_index: int,
+    view: NDArray[np.float64],
+    free: Sequence[str],
+    background: Background,
+) -> tuple[Background, NDArray[np.float64]]:
+    """Fit wall and floor together with the view of the landmark before them, from where both are thought to be.
+
+    Levenberg–Marquardt on the residuals of matching; slopes by the background are differences of rendered images.
+
+    Parameters
+    ----------
+    model : RenderedModel
+    evidence : Evidence
+        One frame.
+    class_index : int
+    view : (4,) float64
+    free : sequence of str
+        Which parameters of the view move.
+    background : Background
+        Where to start; its albedos are kept.
+
+    Returns
+    -------
+    background : Background
+    view : (4,) float64
+    """
+    names = [name for name in ("wall_m", "floor_m") if getattr(background, name) is not None]
+    columns = [VIEW.index(name) for name in free]
+    scale = np.array([*(_VIEW_SCALE[k] for k in columns), *([0.1] * len(names))])
+    frame, which = np.zeros(1, np.int64), np.array([class_index])
+
+    def moved(place: NDArray[np.float64]) -> Background:
+        return replace(background, **dict(zip(names, place.tolist(), strict=True)))
+
+    def sums_at(at: NDArray[np.float64], place: NDArray[np.float64]) -> Sums | None:
+        views = at[None]
+        try:
+            image = model.with_background(moved(place)).images(which, views, free)
+            beside = [
+                model.with_background(moved(place + step)).images(which, views, ()).phasor
+                for step in np.eye(len(place)) * _BACKGROUND_STEP_M
+            ]
+        except UsageError:  # the landmark does not stand before this wall, or on this floor
+            return None
+        by_place = [(phasor - image.phasor) / _BACKGROUND_STEP_M for phasor in beside]
+        slope = np.concatenate([image.slope, np.stack(by_place, axis=1)], axis=1)
+        return gauss_newton_sums(
+            image.phasor, slope, evidence, frame, counts(image.phasor, image.intensity, evidence.sensor), None
+        )
+
+    at, place = view.copy(), np.array([getattr(background, name) for name in names], np.float64)
+    sums, damping = sums_at(at, place), 1e-3
+    for _ in range(_BACKGROUND_STEPS):
+        if sums is None:
+            break
+        information = sums.information[0] * np.outer(scale, scale)
+        held = information + np.diag(damping * np.diag(information) + 1e-9)
+        step = np.linalg.solve(held, sums.gradient[0] * scale)
+        step *= min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-12))
+        promise = float(sums.gradient[0] @ (step * scale))
+        if promise < _BACKGROUND_SETTLED:
+            break
+        there = at.copy()
+        there[columns] += (step * scale)[: len(columns)]
+        there[0] = np.clip(there[0], *model.limits())
+        placed = place + (step * scale)[len(columns) :]
+        tried = sums_at(there, placed) if (placed > 0).all() else None
+        if tried is not None and tried.cost[0] < sums.cost[0]:
+            at, place, sums, damping = there, placed, tried, max(damping * 0.1, 1e-9)
+        else:
+            damping *= 8
+            if damping > 1e5:
+                break
+    return moved(place), at
 
 
 def without_background(seen: Observation, surroundings: Surroundings) -> Observation:
