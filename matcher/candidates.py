@@ -27,6 +27,8 @@ _T = TypeVar("_T", bound=np.generic)
 _UNDECIDED, _SHARE = 300.0, 0.5
 """Other classes start too where their cost is larger by no more than this, and this share of the best: between the
 grid's points none of them fits."""
+_GRID_STD_M = 0.01
+"""What half a step of the thinned grid changes in a range."""
 _MOST_OTHER_SIDES = 2
 _OTHER_SIDE_RAD = math.radians(30.0)
 """Sides that differ by more than this are tried too, at most so many of them."""
@@ -64,10 +66,21 @@ class Search:
         Every how many steps of the bank's grid an image is compared.
     bearings : bool
         Whether the landmark may be off to a side.
+    capped : bool
+        Whether no pixel costs more than a disagreement: other things may stand in view.
     """
 
-    def __init__(self, bank: Bank, behind: PhasorImages | None, stride: tuple[int, int], bearings: bool) -> None:
+    def __init__(
+        self,
+        bank: Bank,
+        behind: PhasorImages | None,
+        stride: tuple[int, int],
+        bearings: bool,
+        *,
+        capped: bool = False,
+    ) -> None:
         self._bank = bank
+        self._capped = capped
         self._distance = bank.distance_m[:: stride[0]]
         self._delta = bank.delta_rad[:: stride[1]]
         self._closes = closing_period(bank.delta_rad) is not None
@@ -193,7 +206,7 @@ class Search:
                 moved.range_m[:, picked], moved.weight[:, picked],
                 moved.returned[:, picked], moved.not_returned[:, picked],
             )  # fmt: skip
-            costs = templates.costs(part)
+            costs = templates.capped_costs(part, _GRID_STD_M) if self._capped else templates.costs(part)
             if is_upper:
                 upper = costs.reshape(n, n_class, shape[0])
             else:

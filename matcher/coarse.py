@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, disagrees
@@ -171,6 +172,25 @@ class Templates:
         constant = DISAGREEMENT * seen.returned.sum(axis=1)
         return np.asarray(query.astype(np.float32) @ matrix.T + constant[:, None].astype(np.float32))
 
+    def capped_costs(self, seen: Observation, grid_std_m: float) -> NDArray[np.float32]:
+        """Return the distances of n frames from all templates, (n, t), where no pixel costs more than a disagreement.
+
+        Parameters
+        ----------
+        seen : Observation
+        grid_std_m : float
+            What half a step of the grid changes in a range; added to the noise.
+        """
+        out = np.empty((len(seen.range_m), len(self)), np.float32)
+        variance = np.divide(1.0, seen.weight, out=np.zeros_like(seen.weight), where=seen.weight > 0)
+        weight = np.where(seen.returned, 1 / (variance + grid_std_m**2), 0.0)
+        period = self.sensor.unambiguous_range_m
+        _capped_costs(
+            self.range_m, self.may_return, self.must_return, self.about(seen), weight,
+            seen.returned, seen.not_returned, period, out,
+        )  # fmt: skip
+        return out
+
     def exact_costs(self, seen: Observation, frame: int, index: NDArray[np.integer]) -> NDArray[np.float64]:
         """Return the distances of one frame from some templates in float64, (t,)."""
         return np.asarray(self.costs_of_each(seen[frame : frame + 1], index[None])[0])
@@ -208,3 +228,22 @@ class Templates:
     def about(self, seen: Observation) -> NDArray[np.float64]:
         """Return measured ranges less the bank's mean, wrapped to ± c/4f, 0 where nothing returned."""
         return np.where(seen.returned, wrap_difference_m(seen.range_m - self.mean_m, self.sensor), 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _capped_costs(model, may, must, about, weight, returned, absent, period, out):  # type: ignore[no-untyped-def]
+    """Fill the costs of every frame at every template, no pixel above the disagreement."""
+    for f in range(out.shape[0]):
+        for t in range(out.shape[1]):
+            total = 0.0
+            for q in range(model.shape[1]):
+                if returned[f, q]:
+                    if may[t, q]:
+                        difference = abs(about[f, q] - model[t, q])
+                        difference = min(difference, abs(period - difference))
+                        total += min(weight[f, q] * difference * difference, DISAGREEMENT)
+                    else:
+                        total += DISAGREEMENT
+                elif absent[f, q] and must[t, q]:
+                    total += DISAGREEMENT
+            out[f, t] = total

@@ -45,6 +45,10 @@ _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
 TOLERANCE_M, TOLERANCE_RAD = 0.03, math.radians(6.0)
 """An accepted answer is right to within these at three standard deviations."""
 _TOLERATED_SIGMA = 3.0
+_STRANGE_SIGMA = 5.0
+"""A return farther from the model than this sees something else."""
+_FEWEST_EXPLAINED = 6
+"""Returns that each free parameter takes where unknown things stand in view."""
 _AMBIGUITY = 1e-3
 """Largest probability that an accepted answer leaves to other classes."""
 LIKELY = 100.0
@@ -89,7 +93,7 @@ class MaximumLikelihood:
         bank: Bank,
         *,
         free: Sequence[str] = ("distance_m", "delta_rad"),
-        background: Background | Literal["auto"] | None = None,
+        background: Background | Literal["auto", "unknown"] | None = None,
         false_alarm: float = 0.01,
         on: Quantity = "ranges",
         pixels: Pixels = "all",
@@ -112,13 +116,16 @@ class MaximumLikelihood:
         self.false_alarm = false_alarm
         self._tolerance = {name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW}
         self.auto = background == "auto"
+        self.unknown = background == "unknown"
+        if self.unknown and on != "ranges":
+            raise UsageError('background="unknown" takes on="ranges": the brightness of unknown things tells nothing')
         self.background = background if isinstance(background, Background) else None
         sensor = bank.sensor
         used = np.ones((sensor.rows, sensor.cols), np.bool_)
         if pixels == "lower":
             used[: sensor.rows // 2] = False
         self._used = used.ravel()
-        self._huber = ROBUST_FROM if robust else None
+        self._huber = ROBUST_FROM if robust or self.unknown else None
         self._behind = None if self.background is None else _behind(bank, self.background)
         on_grid = self.free == VIEW[:2]
         exact = on_grid and on == "ranges" and self.background is None and BankModel.fits(bank, *_FINE)
@@ -134,7 +141,7 @@ class MaximumLikelihood:
             for step, grid in zip(fine, (bank.distance_m, bank.delta_rad), strict=True)
         )
         self._stride = (along, around)
-        self._search = Search(bank, self._behind, self._stride, "bearing_rad" in self.free)
+        self._search = Search(bank, self._behind, self._stride, "bearing_rad" in self.free, capped=self.unknown)
         meshes = [bank.mesh(name) for name in bank.classes]
         self._symmetry = [int(mesh.metadata["symmetry"]) for mesh in meshes]
         self._middle = np.array([mesh.centroid for mesh in meshes])
@@ -152,6 +159,8 @@ class MaximumLikelihood:
         bare = bare_cost(evidence.seen, self._behind)
         models = _Models(self._bank_model or self._rendered, None if self._bank_model else self._scout)
         fits = self._searched(models, evidence, evidence.seen, bare, self.background, self._behind)
+        if self.unknown:
+            fits = self._without_borders(models, evidence, fits)
         return self._answers(frames, fits, bare, [self.background] * len(frames))
 
     def _match_auto(self, frames: FilteredFrames) -> list[Match]:
@@ -265,7 +274,7 @@ class MaximumLikelihood:
             """
             best = _best_of_frame(fits)
             limit = special.chdtri(np.maximum(fits.dof[best], 1), _DOUBTFUL if side_peaks else _HOPELESS)
-            cost, frame = fits.cost[best], fits.frame[best]
+            cost, frame = fits.tested[best], fits.frame[best]
             certain = evidence.on == "phasors" or self.background is not None or hopeless
             hope = True if certain else cost < bare[frame]
             return np.asarray(frame[(cost > limit) & hope])
@@ -282,7 +291,7 @@ class MaximumLikelihood:
             starts = search.starts(_some(seen, poor), n_modes, all_classes=all_classes)
             direct = _Models(models.final, None)
             fits.append(self._fit(direct, evidence, poor, starts, (-_BESIDE_RAD, _BESIDE_RAD), behind))
-        if self._huber is not None:
+        if self._huber is not None and not self.unknown:
             for _ in range(_TRIMMINGS):
                 poor = doubtful(Fits.joined(fits), hopeless=True)
                 if not poor.size:
@@ -322,6 +331,34 @@ class MaximumLikelihood:
             model, evidence, fits.frame[best], fits.class_index[best], views, settings, limit, at_first_sight=True
         )
 
+    def _without_borders(self, models: _Models, evidence: Evidence, fits: Fits) -> Fits:
+        """Fit the best views again without the pixels beside one that sees something else.
+
+        They may see a little of it too, at the sides of the landmark, where a wrong range turns the view most.
+        """
+        model = models.final
+        assert model is not None
+        best = _best_of_frame(fits)
+        best = best[np.isfinite(fits.cost[best]) & (fits.explained[best] >= _FEWEST_EXPLAINED * len(self.free))]
+        frame, view = fits.frame[best], np.ascontiguousarray(fits.view[best])
+        phasor = model.images(fits.class_index[best], view, ()).phasor
+        size = np.sqrt(evidence.weight[frame]) * np.abs(
+            evidence.sensor.metres_per_radian * np.angle(evidence.value[frame] * phasor.conj())
+        )
+        returned = evidence.seen.returned[frame]
+        other = returned & ((phasor == 0) | (size > _STRANGE_SIGMA))
+        beside = _beside(other.reshape(-1, evidence.sensor.rows, evidence.sensor.cols)).reshape(other.shape)
+        kept = ~beside | other
+        enough = (kept & returned & ~other).sum(axis=1) >= _FEWEST_EXPLAINED * len(self.free)
+        weight = evidence.weight.copy()
+        weight[frame[enough]] *= kept[enough]
+        inside = replace(evidence, weight=weight)
+        some = fits[best[enough]]
+        settings = self._settings(None)
+        again = refine(model, inside, some.frame, some.class_index, some.view, settings)
+        rest = np.setdiff1d(np.arange(len(fits)), best[enough])
+        return Fits.joined([again, fits[rest]])
+
     def _trimmed(
         self, model: ImageModel, evidence: Evidence, fits: Fits, which: NDArray[np.int64], seen: Observation
     ) -> Observation:
@@ -343,7 +380,7 @@ class MaximumLikelihood:
         if not np.isfinite(fits.cost).any():
             return False
         best = fits.cost.argmin()
-        return bool(fits.cost[best] > special.chdtri(max(int(fits.dof[best]), 1), _DOUBTFUL))
+        return bool(fits.tested[best] > special.chdtri(max(int(fits.dof[best]), 1), _DOUBTFUL))
 
     def _worth_a_search(self, evidence: Evidence, bare: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return which frames have enough returns to place a landmark, and are not explained without one."""
@@ -411,6 +448,7 @@ class MaximumLikelihood:
             self._used,
             self._huber,
             None if behind is None else behind.phasor.reshape(-1),
+            unknown_around=self.unknown,
             returns_behind=None
             if behind is None
             else counts(behind.phasor, behind.intensity, behind.sensor).reshape(-1),
@@ -469,7 +507,7 @@ class MaximumLikelihood:
         bare: NDArray[np.float64],
         backgrounds: list[Background | None],
     ) -> list[Match]:
-        p_values = p_values_of(fits.cost - fits.prior, fits.dof, frames, fits.frame)
+        p_values = p_values_of(fits.tested, fits.dof, frames, fits.frame)
         order = np.lexsort((fits.cost, fits.frame))
         first = np.searchsorted(fits.frame[order], np.arange(len(frames) + 1))
         doubt = np.asarray(special.chdtri(np.maximum(fits.dof, 1), self.false_alarm), np.float64)
@@ -502,7 +540,8 @@ class MaximumLikelihood:
         is_landmark = bool(fits.capped[best] < bare)
         covariance = fits.covariance[best]
         known = bool(np.isfinite(covariance).all())
-        none_cost = min(bare, float(doubt[best]))
+        left = DISAGREEMENT * float(fits.unexplained[best])
+        none_cost = min(bare, float(doubt[best]) + left)
         costs = np.append(fits.cost[kept], none_cost)
         weight = np.exp(-0.5 * np.minimum(costs - costs.min(), 1400.0))
         weight /= weight.sum()
@@ -528,6 +567,8 @@ class MaximumLikelihood:
             reason = "no landmark"
         elif p_values[best] < self.false_alarm:
             reason = "poor fit"
+        elif self.unknown and fits.explained[best] < _FEWEST_EXPLAINED * len(self.free):
+            reason = "undetermined"
         elif not self._is_determined(fits.std_without_one[best]):
             reason = "undetermined"
         elif self._is_ambiguous(fits, kept, weight[:-1]):
@@ -541,7 +582,7 @@ class MaximumLikelihood:
             height_m=candidates[0].height_m,
             free=self.free,
             covariance=covariance.copy() if known else None,
-            chi2=float(fits.cost[best]),
+            chi2=float(fits.tested[best]),
             dof=int(fits.dof[best]),
             p_value=float(p_values[best]),
             class_probability=probability,
@@ -660,6 +701,16 @@ def p_values_of(
         variance = freedom * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
         p = special.chdtrc(2 * mean**2 / variance, cost * 2 * mean / variance)
     return np.where(dof > 0, p, 0.0)
+
+
+def _beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which pixels have a neighbour in a mask, left, right, above or below; (n, rows, cols)."""
+    out = np.zeros_like(mask)
+    out[:, 1:] |= mask[:, :-1]
+    out[:, :-1] |= mask[:, 1:]
+    out[:, :, 1:] |= mask[:, :, :-1]
+    out[:, :, :-1] |= mask[:, :, 1:]
+    return out
 
 
 def _rotated(point_m: NDArray[np.float64], delta_rad: NDArray[np.float64]) -> NDArray[np.float64]:

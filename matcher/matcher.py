@@ -58,9 +58,11 @@ class Matcher:
     free : sequence of str
         What "refine" estimates: distance_m and delta_rad, and on request bearing_rad and height_m; what is not free
         is 0.
-    background : Background, "auto" or None
+    background : Background, "auto", "unknown" or None
         What stands behind the landmark. None: nothing is expected to return beside it. "auto", with "refine": wall and
-        floor are estimated from each frame's own far pixels.
+        floor are estimated from each frame's own far pixels. "unknown", with "refine" on ranges: other things may stand
+        before, beside and behind it; what the landmark does not explain costs a disagreement when views and classes
+        are compared, and is left out of the test of the fit.
     false_alarm : float
         Share of good frames that the test of the fit may refuse.
     on : {"ranges", "phasors"}
@@ -96,7 +98,7 @@ class Matcher:
         method: str = "nearest",
         *,
         free: Sequence[str] = VIEW[:2],
-        background: Background | Literal["auto"] | None = None,
+        background: Background | Literal["auto", "unknown"] | None = None,
         false_alarm: float = 0.01,
         on: Quantity = "ranges",
         pixels: Pixels = "all",
@@ -107,8 +109,8 @@ class Matcher:
     ) -> None:
         if method not in METHODS:
             raise UsageError(f"unknown method {method!r}: the methods are {', '.join(METHODS)}")
-        if isinstance(background, str) and background != "auto":
-            raise UsageError(f"'background' must be a Background, \"auto\" or None, got {background!r}")
+        if isinstance(background, str) and background not in ("auto", "unknown"):
+            raise UsageError(f'\'background\' must be a Background, "auto", "unknown" or None, got {background!r}')
         for name, tolerance in (("tolerance_m", tolerance_m), ("tolerance_rad", tolerance_rad)):
             if not tolerance > 0:
                 raise UsageError(f"'{name}' must be positive, got {tolerance!r}")

@@ -7,6 +7,7 @@ decide otherwise it is decided again there, once, and the view moves again.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -64,6 +65,8 @@ class Settings:
         Empty: nothing is known of any.
     returns_behind : (pixels,) bool, optional
         Where the background alone returns light that one frame measures; None without a background.
+    unknown_around : bool
+        Whether unknown things may stand in view: what the landmark does not explain is then left out of the test.
     longest_step : float
         No step is longer, in natural units of 1 cm and 1°. Near a solution it should be short: where an edge crosses
         a pixel's border, slopes jump, and those of one side may lead far away on the other.
@@ -76,6 +79,7 @@ class Settings:
     look_beside_rad: tuple[float, ...] = ()
     prior_std: tuple[float, ...] = ()
     returns_behind: NDArray[np.bool_] | None = None
+    unknown_around: bool = False
     longest_step: float = 3.0
 
 
@@ -96,6 +100,10 @@ class Fits:
         The same with no residual adding more than that: what to compare with a scene that explains nothing.
     dof : int64
         Residuals in it, less the parameters fitted.
+    unexplained : int64
+        Returns that are left to unknown things in view; in `cost` each is a disagreement, in `dof` it is none.
+    explained : int64
+        Returns that are compared and not left to unknown things.
     prior : float64
         What the prior adds to the cost; no test of the fit counts it.
     covariance : (m, p, p) float64
@@ -114,10 +122,17 @@ class Fits:
     cost: NDArray[np.float64]
     capped: NDArray[np.float64]
     dof: NDArray[np.int64]
+    unexplained: NDArray[np.int64]
+    explained: NDArray[np.int64]
     prior: NDArray[np.float64]
     covariance: NDArray[np.float64]
     information: NDArray[np.float64]
     std_without_one: NDArray[np.float64]
+
+    @property
+    def tested(self) -> NDArray[np.float64]:
+        """The part of the cost that a χ² test judges: neither prior nor what is left to unknown things; (m,)."""
+        return np.asarray(self.cost - self.prior - DISAGREEMENT * self.unexplained)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -499,6 +514,11 @@ class _Problem:
         # pixels is not better for it
         n_open = (returned & ~fitted & ~wrong).sum(axis=1)
         n_residuals = fitted.sum(axis=1) * evidence.per_pixel + n_wrong + n_open
+        unexplained = np.zeros(len(state.theta), np.int64)
+        if settings.unknown_around:
+            outlying = fitted & self._outlying(state)
+            unexplained = outlying.sum(axis=1) + (wrong & returned).sum(axis=1)
+            fitted = fitted & ~outlying
         return Fits(
             frame=self.frame,
             class_index=self.class_index,
@@ -506,12 +526,22 @@ class _Problem:
             albedo=state.theta[:, 4],
             cost=sums.cost + DISAGREEMENT * n_wrong + n_open,
             capped=sums.capped + DISAGREEMENT * n_wrong + n_open,
-            dof=np.maximum(n_residuals - int((self.prior_weight == 0).sum()), 0),
+            dof=np.maximum(n_residuals - unexplained - int((self.prior_weight == 0).sum()), 0),
+            unexplained=unexplained,
+            explained=fitted.sum(axis=1),
             prior=self.prior_cost(state.theta),
             covariance=covariance,
             information=information,
             std_without_one=without_one,
         )
+
+    def _outlying(self, state: _State) -> NDArray[np.bool_]:
+        """Return where the robust loss of a range has reached what a disagreement costs, (m, pixels)."""
+        sensor, huber = self.evidence.sensor, self.settings.huber or math.inf
+        phasor = state.images.phasor
+        residual = sensor.metres_per_radian * np.angle(self.evidence.value[self.frame] * phasor.conj())
+        size = np.abs(residual) * np.sqrt(self.evidence.weight[self.frame])
+        return np.asarray((phasor == 0) | (huber * (2 * size - huber) >= DISAGREEMENT))
 
     def _std_without_one(
         self,

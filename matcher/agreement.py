@@ -1,0 +1,67 @@
+"""What a pixel of a frame says against what a model says of it: the one table of PHYSICS section 7.
+
+| frame, model | nothing returns | something may return | something must return |
+|---|---|---|---|
+| return | :data:`DISAGREEMENT` | squared residual | squared residual |
+| no return | 0 | 0 | :data:`DISAGREEMENT` |
+| missing | 0 | 0 | 0 |
+
+Nothing that a frame shows is free: a return is either compared with the range of light that the model has there, or it
+costs what a residual of five standard deviations does. The only exception are pixels that an edge enters or leaves
+within the uncertainty of the view; such a return costs 1, what a compared pixel costs on average.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.render import Sensor, phasor_to_range_m, predicted_range_std
+
+DISAGREEMENT = 25.0
+"""Cost of a pixel where frame and model disagree on whether anything returns: a residual of five σ."""
+MUST_RETURN_COVERAGE = 0.3
+"""A pixel that sees this much of the landmark must return something."""
+MAY_RETURN_COVERAGE = 0.005
+"""A pixel that sees less of the landmark than this returns nothing, unless a background does."""
+_USUAL_LIMIT_RAD = 0.1
+_ROUNDING = 1e-9
+
+
+def one_frame_limit_m(sensor: Sensor) -> float:
+    """Return the largest one-frame σ of a pixel that counts, metres: 0.1 rad unless the sensor says otherwise."""
+    return (sensor.max_phase_std_rad or _USUAL_LIMIT_RAD) * sensor.metres_per_radian
+
+
+def counts(phasor: NDArray[np.complexfloating], intensity: NDArray[np.floating], sensor: Sensor) -> NDArray[np.bool_]:
+    """Return which pixels of noise-free images one frame measures to within the limit (PHYSICS section 7).
+
+    Parameters
+    ----------
+    phasor, intensity : (..., rows, cols)
+    sensor : Sensor
+
+    Returns
+    -------
+    (..., rows, cols) bool
+        Whether light returns and the noise law gives a range at most 0.1 rad (0.24 m at 10 MHz) of noise. A direct
+        sensor measures what returns at least `min_intensity` from within `max_range_m`.
+    """
+    amplitude = np.abs(phasor)
+    lit = amplitude > 0
+    if sensor.kind == "direct":
+        lit &= np.asarray(intensity) >= sensor.min_intensity
+        if sensor.max_range_m is not None:
+            lit &= np.where(lit, phasor_to_range_m(np.where(lit, phasor, 1.0), sensor), 0.0) <= sensor.max_range_m
+    std = predicted_range_std(amplitude, intensity, sensor)
+    return np.asarray(lit & (std <= one_frame_limit_m(sensor) * (1 + _ROUNDING)))
+
+
+def disagrees(
+    returned: NDArray[np.bool_],
+    not_returned: NDArray[np.bool_],
+    may_return: NDArray[np.bool_],
+    must_return: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Return which pixels of frames contradict the model: a return out of nothing, or none where one must be."""
+    return np.asarray((returned & ~may_return) | (not_returned & must_return))
