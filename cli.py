@@ -31,8 +31,10 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
     from phasemark.data import Bank, BankPlan, FramePlan
+    from phasemark.data.plan import ScenePlan
     from phasemark.landmarks import LandmarkSpec
     from phasemark.matcher import Calibration, FilteredFrames, LandmarkMap, Match, Matches, RobotPose
+    from phasemark.matcher.drive import DrivePlan
     from phasemark.render import Background, Estimate, Sensor
 
 __all__ = ["app", "main"]
@@ -332,6 +334,7 @@ def _sensor_fit(
         )
         for path in frames
     ]
+    _note_too_far(base, {"--distance": max(distance)})
     fit = fit_sensor(
         [one[k : k + 1] for one in measured for k in range(len(one))],  # every position of a file has its distance
         distance,
@@ -584,7 +587,9 @@ def _render(
         _, mesh = _load_landmark(path, unit, up, origin)
     if variant not in ("exact", "hard"):
         raise UsageError(f"--variant must be exact or hard, got '{variant}'")
-    image = Renderer(mesh, _load_sensor(sensor), albedo=mesh.metadata.get("albedo", 0.8)).render(
+    camera = _load_sensor(sensor)
+    _note_too_far(camera, {"--distance": distance, "--wall": wall})
+    image = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8)).render(
         distance,
         math.radians(delta),
         math.radians(bearing),
@@ -930,6 +935,7 @@ def _build(
     from phasemark.data import build_part, estimate, parse_part
     from phasemark.data.executor import processors
 
+    _note_plan_too_far(plan)
     if dry_run:
         facts = estimate(plan, workers=workers or processors())
         _echo_json(facts) if as_json else _echo_facts({**facts, "seconds": f"about {facts['seconds']:.3g}"})
@@ -995,9 +1001,13 @@ def _plan_check(
     as_json: _Json = False,
 ) -> None:
     """Check a plan and say what it is; with --json print it with every default made explicit."""
+    from phasemark.data.plan import ScenePlan
+    from phasemark.matcher.drive import DrivePlan
     from phasemark.matcher.plan_kinds import check_plan
 
     found, plan = check_plan(file, kind)
+    if isinstance(plan, ScenePlan | DrivePlan):
+        _note_plan_too_far(plan)
     if as_json:
         _echo_json({"kind": found, "plan": plan.model_dump(mode="json")})
     else:
@@ -1132,6 +1142,7 @@ def _match(
             rotate=rotate,
             untrusted=True,
         )
+        _note_too_far(opened.sensor, {"--wall": wall})
         plots = [] if plot is None else _numbered(plot, len(measured.range_m))
         _refuse_existing(plots, force)
         filtered = filters[filter_name](measured)
@@ -1271,6 +1282,8 @@ def _calibrate(
     if (position_std, heading_std, delta_std) != (None, None, None):
         stds = PoseStd(position_std or 0.0, math.radians(heading_std or 0.0), math.radians(delta_std or 0.0))
     known = read_poses(poses, landmark_xy_m=landmark_xy, landmark_yaw_rad=math.radians(landmark_yaw))
+    furthest_m = float(known.distance_m.max()) if len(known.distance_m) else None
+    _note_too_far(base, {f"{poses}: the landmark": furthest_m, "--wall": wall})
     measured = [
         read_frames(
             path,
@@ -1455,11 +1468,10 @@ def _sweep_run(
     sys.path.append(str(Path.cwd()))  # a matcher of one's own lies here; an installed program does not look here itself
     if matcher is not None:
         changes["methods"] = (*loaded.methods, Method(name=matcher, method=matcher))
+    changed = SweepPlan(**{**loaded.model_dump(), **changes})
+    _note_plan_too_far(changed)
     with _Progress("trials") as progress:
-        run_sweep(
-            SweepPlan(**{**loaded.model_dump(), **changes}), out, workers=workers, scheduler=scheduler, resume=resume,
-            force=force, progress=progress,
-        )  # fmt: skip
+        run_sweep(changed, out, workers=workers, scheduler=scheduler, resume=resume, force=force, progress=progress)
     typer.echo(write_report(out))
 
 
@@ -1564,6 +1576,7 @@ def _drive(
         typer.echo(example_drive(), nl=False)
         return
     plan = default_drive() if plan_file is None else load_drive_plan(plan_file)
+    _note_plan_too_far(plan)
     _refuse_existing([out / name for name in OUTPUTS], force)
     _make_folder(out)
     with _Progress("driving, cm") as progress:
@@ -1775,6 +1788,20 @@ def _background(wall: float | None, floor: float | None) -> Background | None:
     from phasemark.render import Background
 
     return None if wall is None and floor is None else Background(wall_m=wall, floor_m=floor)
+
+
+def _note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None]) -> None:
+    """Write a note for each distance that the sensor shows wrapped, or not at all."""
+    for name, distance_m in distances_m.items():
+        described = None if distance_m is None else sensor.describe_beyond_range(name, distance_m)
+        if described is not None:
+            typer.echo(f"note: {described}", err=True)
+
+
+def _note_plan_too_far(plan: ScenePlan | DrivePlan) -> None:
+    """Write a note for each key of a plan with distances that the sensor shows wrapped, or not at all."""
+    distances_m = {f"'{name}'": distance_m for name, distance_m in plan.greatest_distances_m().items()}
+    _note_too_far(plan.build_sensor(), distances_m)
 
 
 def _make_folder(path: Path) -> None:

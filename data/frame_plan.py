@@ -247,6 +247,11 @@ class FramePlan(ScenePlan):
             }
         )
 
+    def greatest_distances_m(self) -> dict[str, float]:
+        """Return the far end of the landmarks' and walls' distances, metres."""
+        spreads = {"distance_m": self.distance_m, "wall_m": self.wall_m}
+        return {name: spread.highest for name, spread in spreads.items() if spread is not None}
+
     def landmark_names(self) -> list[str]:
         """Names of the classes of a resolved plan, in the order of their numbers."""
         parts: list[LandmarkSpec | MeshPlan] = [*self.landmarks, *self.meshes]

@@ -130,6 +130,10 @@ class ScenePlan(PlanModel, ABC):
     def resolve(self) -> Self:
         """Return the plan with every default made explicit."""
 
+    @abstractmethod
+    def greatest_distances_m(self) -> dict[str, float]:
+        """Return the greatest distance that each key of the plan asks for, metres."""
+
     def build_sensor(self) -> Sensor:
         """Return the sensor, overrides applied.
 
@@ -246,6 +250,10 @@ class BankPlan(ScenePlan):
             layout=self.layout,
             harmonics=self.harmonics,
         )
+
+    def greatest_distances_m(self) -> dict[str, float]:
+        """Return the end of the grid of distances, metres."""
+        return {"distance_m": self.distance_m[-1]}
 
     @property
     def delta_rad(self) -> NDArray[np.float64]:

@@ -282,6 +282,11 @@ class SweepPlan(ScenePlan):
             points.append(point)
         return points
 
+    def greatest_distances_m(self) -> dict[str, float]:
+        """Return the far end of the axes of distances, and of the banks, metres."""
+        axes = {f"axes.{name}": max(self.axes[name]) for name in ("distance_m", "wall_m") if name in self.axes}
+        return {**axes, "bank_distance_m": self.bank_distance_m[1]}
+
     @property
     def class_names(self) -> tuple[str, ...]:
         """Names of all landmarks, those of the catalogue first."""

@@ -109,6 +109,56 @@ def test_render_writes_picture_and_phasors(run, tmp_path):
         np.testing.assert_array_equal(data["coverage"], expected.coverage[0])
 
 
+WRAPS = "is beyond c / 2f = 14.99 m, where ranges wrap: it shows at about"
+FAR_FRAMES = """
+views = 4
+sensor = "vl53l5cx-8x8"
+variants = ["mixed"]
+wall_m = { normal = [3.8, 0.1], within = [3.0, 4.1] }
+"""
+FAR_SWEEP = """
+name = "far"
+bank_distance_m = [15.0, 17.0]
+axes = { distance_m = [16.0], wall_m = [0.0, 18.0] }
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "notes"),
+    [
+        (
+            None,
+            ["render", "--class", "cone", "--distance", "20", "-o", "x.png"],
+            [f"--distance at 20 m {WRAPS} 5.01 m"],
+        ),
+        (None, ["render", "--class", "cone", "--wall", "16", "-o", "x.png"], [f"--wall at 16 m {WRAPS} 1.01 m"]),
+        (None, ["render", "--class", "cone", "--wall", "14.9", "-o", "x.png"], []),
+        (
+            None,
+            ["bank", "build", "--distance", "14:20:2", "--dry-run", "-o", "b.h5"],
+            [f"'distance_m' at 20 m {WRAPS} 5.01 m"],
+        ),
+        (
+            FAR_FRAMES,
+            ["frames", "build", "plan.toml", "--dry-run", "-o", "f.h5"],
+            ["'wall_m' at 4.1 m is beyond the sensor's 'max_range_m' = 4 m: the sensor reports nothing from there"],
+        ),
+        (FAR_SWEEP, ["plan", "check", "plan.toml"], ["axes.distance_m", "axes.wall_m", "bank_distance_m"]),
+    ],
+)
+def test_distances_that_wrap_or_return_nothing_are_noted(run, tmp_path, monkeypatch, text, arguments, notes):
+    monkeypatch.chdir(tmp_path)
+    if text is not None:
+        (tmp_path / "plan.toml").write_text(text, encoding="utf-8")
+    code, _, err = run(*arguments)
+    assert code == 0
+    lines = err.splitlines()
+    assert len(lines) == len(notes)
+    for line, note in zip(lines, notes, strict=True):
+        assert line.startswith("note: ")
+        assert note in line
+
+
 def test_a_hard_render_has_no_mixed_pixel(run, tmp_path):
     run("render", "--class", "cone", "--distance", 1.0, "--variant", "hard", "-o", tmp_path / "f.png")
     with np.load(tmp_path / "f.npz") as data:
