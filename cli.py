@@ -1988,6 +1988,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         finally:
             sys.stdout.flush()
     except PhasemarkError as error:
+        for note in getattr(error, "__notes__", ()):  # the traceback of a user's own code
+            typer.echo(note, err=True)
         _report_error(str(error))
         return error.exit_code
     except BrokenPipeError:

@@ -1,10 +1,13 @@
 """Sweeps as they are run: same numbers for any number of workers, resumed, refused, kept."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from own_matchers import Fails
 
 from phasemark import OutputExistsError, UsageError
+from phasemark.cli import main
 from phasemark.matcher.sweep import read_sweep, run_sweep
 from phasemark.matcher.sweep_plan import SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
 
@@ -114,6 +117,74 @@ def test_a_wrong_plan_is_refused_in_one_line(changes, message):
 def test_a_bad_matcher_is_told_in_one_line(matcher, message, tmp_path):
     with pytest.raises(UsageError, match=message):
         run_sweep(plan(matcher), tmp_path, workers=1)
+
+
+@pytest.mark.parametrize(
+    ("matcher", "got"),
+    [
+        ("returns_integers", ", got an object of type int for frame 0"),
+        ("returns_one_too_few", ", got 4"),
+        ("returns_none", ", got None"),
+        ("returns_a_number", ", got an object of type int"),
+        (
+            "returns_text_for_a_distance",
+            ", but the Match for frame 0 has 'distance_m' of type str: it must be a number",
+        ),
+        (
+            "returns_a_small_covariance",
+            ", but the Match for frame 0 has 'covariance' of shape (1, 1): it must be (2, 2), as 'free' has 2 names",
+        ),
+    ],
+)
+def test_what_a_matcher_must_return_is_told_in_one_line(matcher, got, tmp_path):
+    with pytest.raises(UsageError) as refused:
+        run_sweep(plan(f"own_matchers:{matcher}", trials=5), tmp_path, workers=1)
+    where = "method 'mine', condition 0, trials 0 … 4"
+    due = f"the matcher 'own_matchers:{matcher}' must return a Match for each of the 5 frames"
+    assert str(refused.value) == f"{where}: {due}{got}"
+
+
+@pytest.mark.parametrize(
+    ("matcher", "raised", "scheduler"),
+    [
+        ("no_luck", "ZeroDivisionError: no luck", "threads"),
+        ("no_luck", "ZeroDivisionError: no luck", "local:1"),
+        ("fails_late", "ZeroDivisionError: no luck", "threads"),
+        ("exits", "SystemExit: no licence", "threads"),
+        ("raises_usage_error", "UsageError: of its own", "threads"),
+    ],
+)
+def test_what_a_matcher_raises_is_shown_with_its_own_traceback(
+    matcher, raised, scheduler, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(Path(__file__).parent)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    (tmp_path / "plan.toml").write_text(
+        'name = "small"\ntrials = 2\nclasses = ["cone"]\nbank_distance_m = [0.9, 1.1]\n'
+        f'methods = [{{ name = "mine", method = "own_matchers:{matcher}" }}]\n',
+        encoding="utf-8",
+    )
+    options = ["--scheduler", scheduler, "-o", str(tmp_path / "out")]
+    assert main(["sweep", "run", str(tmp_path / "plan.toml"), *options]) == 2
+    *traceback, error = capsys.readouterr().err.splitlines()
+    assert error.startswith("error: method 'mine', condition 0, trials 0 … 1: ")
+    assert error.endswith(f"the matcher 'own_matchers:{matcher}' raised {raised}")
+    assert traceback[0] == "Traceback (most recent call last):"
+    assert traceback[-1].endswith(raised)
+    files = {line.split('"')[1] for line in traceback if line.startswith("  File ")}
+    assert {Path(file).name for file in files} == {"own_matchers.py"}
+
+
+def test_a_module_that_fails_when_imported_is_shown_with_its_own_traceback(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "broken_matcher.py").write_text("import sys\nsys.exit(3)\n", encoding="utf-8")
+    assert main(["sweep", "run", "paper", "--matcher", "broken_matcher:match", "-o", "out"]) == 2
+    *traceback, error = capsys.readouterr().err.splitlines()
+    assert error == "error: the matcher 'broken_matcher:match' cannot be imported (SystemExit: 3)"
+    assert [line.split('"')[1] for line in traceback if line.startswith("  File ")] == [
+        str(tmp_path / "broken_matcher.py")
+    ]
 
 
 def test_a_folder_with_a_sweep_is_not_overwritten_unasked(reference):
