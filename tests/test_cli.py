@@ -175,6 +175,15 @@ def test_a_terminal_without_the_signs_still_gets_the_table() -> None:
     assert r"16 \xd7 16  22° \xd7 22°" in done.stdout.decode("cp1251")
 
 
+@pytest.mark.parametrize(("arguments", "code"), [(["--version"], 0), (["sensor", "show", "pmd-17x17"], 2)])
+def test_the_package_runs_as_a_module(arguments: list[str], code: int, tmp_path: Path) -> None:
+    as_module = [sys.executable, "-m", "phasemark", *arguments]
+    done = subprocess.run(as_module, cwd=tmp_path, capture_output=True, text=True)
+    as_program = subprocess.run([PHASEMARK, *arguments], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == code
+    assert (done.stdout, done.stderr) == (as_program.stdout, as_program.stderr)
+
+
 def test_help_imports_nothing_heavy() -> None:
     # What makes a start slow, checked by name: a measured time would depend on the machine.
     heavy = {"embreex", "h5py", "jinja2", "manifold3d", "matplotlib", "numba", "numpy", "pydantic", "scipy", "trimesh"}
