@@ -13,9 +13,11 @@ import os
 import shlex
 import signal
 import sys
+import threading
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -266,8 +268,9 @@ def _sensor_characterise(
     sensor = _load_sensor(name_or_file)
     _refuse_existing([out / name for name in NAMES], force)
     _make_folder(out)
-    found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
-    report = write_characterisation(found, name_or_file, out, seed=seed, force=force)[0]
+    with _Progress("measuring"):
+        found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
+        report = write_characterisation(found, name_or_file, out, seed=seed, force=force)[0]
     if as_json:
         facts = found.as_dict()
         _echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
@@ -467,7 +470,8 @@ def _landmark_design(
     if confirm_frames:
         with _Progress("matching simulated frames") as progress:
             confirmed = confirm_design(design, confirm_frames, workers=workers, progress=progress)
-    files = write_design(design, confirmed, out, force=force)
+    with _Progress("writing the design"):
+        files = write_design(design, confirmed, out, force=force)
     facts = summary(design, confirmed)
     if as_json:
         _echo_json({"files": [str(path) for path in files], **facts})
@@ -724,11 +728,12 @@ def _bank_verify(
     """Check a bank: checksum, schema, values, random images rendered again; and what its grid's spacing costs."""
     from phasemark.data import verify_bank
 
-    report = verify_bank(bank, sample=sample, seed=seed)
+    with _Progress("verifying"):
+        report = verify_bank(bank, sample=sample, seed=seed)
     if population is not None:
         from phasemark.matcher import grid_loss
 
-        with _open_bank(bank) as opened:
+        with _open_bank(bank) as opened, _Progress("matching random views"):
             loss = grid_loss(opened, population, seed=seed).as_dict()
         report |= {key: float(f"{value:.3g}") if isinstance(value, float) else value for key, value in loss.items()}
     _echo_json(report) if as_json else _echo_facts(report)
@@ -794,7 +799,8 @@ def _frames_verify(
     """Check a frame set: checksum, schema, values, and random views rendered and captured again."""
     from phasemark.data import verify_frames
 
-    report = verify_frames(frames, sample=sample, seed=seed)
+    with _Progress("verifying"):
+        report = verify_frames(frames, sample=sample, seed=seed)
     _echo_json(report) if as_json else _echo_facts(report)
 
 
@@ -1419,7 +1425,8 @@ def _demo(
     _make_folder(out)
     with _Progress("matching") as progress:
         result = run_demo(outputs[0], seed=seed, workers=workers, force=force, progress=progress)
-    report = write_demo(result, out, force=force)
+    with _Progress("writing the report"):
+        report = write_demo(result, out, force=force)
     if as_json:
         cells = [{key: _plain(value) for key, value in row.items()} for row in cell_rows(result.cells)]
         _echo_json({"report": str(report), "seconds": result.seconds, "cells": cells})
@@ -1472,7 +1479,9 @@ def _sweep_run(
     _note_plan_too_far(changed)
     with _Progress("trials") as progress:
         run_sweep(changed, out, workers=workers, scheduler=scheduler, resume=resume, force=force, progress=progress)
-    typer.echo(write_report(out))
+    with _Progress("writing the report"):
+        report = write_report(out)
+    typer.echo(report)
 
 
 @_sweep_app.command("report")
@@ -1485,7 +1494,8 @@ def _sweep_report(
     from phasemark.matcher.sweep_report import summary, write_report
     from phasemark.matcher.sweep_tables import json_rows
 
-    report = write_report(folder)
+    with _Progress("writing the report"):
+        report = write_report(folder)
     trials = read_sweep(folder)[1]
     cells = trials.cells()
     if as_json:
@@ -1581,7 +1591,8 @@ def _drive(
     _make_folder(out)
     with _Progress("driving, cm") as progress:
         drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
-    files = write_drive(drive, out, force=force)
+    with _Progress("drawing"):
+        files = write_drive(drive, out, force=force)
     facts = summary(drive)
     if as_json:
         _echo_json({"files": [str(path) for path in files], **facts})
@@ -1821,16 +1832,29 @@ def _refuse_existing(paths: Iterable[Path], force: bool) -> None:
             raise OutputExistsError(f"{path}: exists already; --force replaces it")
 
 
+_PROGRESS_SECONDS = 10.0
+"""Time between two lines of progress where stderr is no terminal; work that takes less writes none."""
+
+
 class _Progress:
-    """A progress bar on stderr, called with (done, total); nothing if stderr is not a terminal."""
+    """Progress on stderr, reported by a call with (done, total): a bar on a terminal, a line now and then elsewhere.
 
-    def __init__(self, what: str) -> None:
-        self._what = what
+    The lines come from a thread of their own, so that work which reports nothing for long is heard of all the same.
+    """
 
-    def __enter__(self) -> Callable[[int, int], None] | None:
+    def __init__(self, what: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._what, self._clock = what, clock
         self._bar: Progress | None = None
+        self._reported: tuple[int, int] | None = None
+        self._ended = threading.Event()
+        self._lines: threading.Thread | None = None
+
+    def __enter__(self) -> Callable[[int, int], None]:
         if not sys.stderr.isatty():
-            return None
+            self._begun = self._clock()
+            self._lines = threading.Thread(target=self._write_lines, daemon=True)
+            self._lines.start()
+            return self._note
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -1844,6 +1868,28 @@ class _Progress:
     def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.stop()
+        self._ended.set()
+        if self._lines is not None:
+            self._lines.join()
+
+    def _note(self, done: int, total: int) -> None:
+        self._reported = done, total
+
+    def _write_lines(self) -> None:
+        while not self._ended.wait(_PROGRESS_SECONDS):
+            with suppress(OSError, ValueError):  # a closed stderr is no reason to end the work
+                typer.echo(self._line(), err=True)
+
+    def _line(self) -> str:
+        done = "" if self._reported is None else f" {self._reported[0]}/{self._reported[1]},"
+        return f"{self._what}:{done} {_duration(self._clock() - self._begun)} elapsed"
+
+
+def _duration(seconds: float) -> str:
+    """Write a time in whole seconds, minutes and hours."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 def _describe_upper(spec: LandmarkSpec) -> str:

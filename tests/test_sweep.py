@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from own_matchers import Fails
 
-from phasemark import OutputExistsError, UsageError
+from phasemark import OutputExistsError, UsageError, cli
 from phasemark.cli import main
 from phasemark.matcher.sweep import read_sweep, run_sweep
 from phasemark.matcher.sweep_plan import SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
@@ -164,6 +164,7 @@ def test_what_a_matcher_raises_is_shown_with_its_own_traceback(
         f'methods = [{{ name = "mine", method = "own_matchers:{matcher}" }}]\n',
         encoding="utf-8",
     )
+    monkeypatch.setattr(cli, "_PROGRESS_SECONDS", 1e6)  # no line of progress among those of the error
     options = ["--scheduler", scheduler, "-o", str(tmp_path / "out")]
     assert main(["sweep", "run", str(tmp_path / "plan.toml"), *options]) == 2
     *traceback, error = capsys.readouterr().err.splitlines()
