@@ -173,6 +173,9 @@ _Shard = Annotated[str | None, typer.Option("--shard", metavar="I/N", help="Buil
 _ShardItems = Annotated[
     int | None, typer.Option("--shard-size", min=1, help="Images or views per shard; the result does not depend on it.")
 ]
+_MaxSize = Annotated[
+    str, typer.Option("--max-size", metavar="SIZE", help="Refuse to write a larger file, e.g. 500MB or 20GB.")
+]
 _Sample = Annotated[int, typer.Option("--sample", min=0, help="How many random items to render again.")]
 _Seed = Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")]
 _Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; the result does not depend on it.")]
@@ -657,6 +660,7 @@ def _bank_build(
     workers: _Workers = None,
     resume: _Resume = False,
     dry_run: _DryRun = False,
+    max_size: _MaxSize = "2GB",
     shard: _Shard = None,
     shard_size: _ShardItems = None,
     scheduler: _Scheduler = "threads",
@@ -698,7 +702,7 @@ def _bank_build(
         plan = plan.model_copy(update={"layout": "full"})
         if not plan.meshes:
             typer.echo(f"note: a full bank, every class at every D and δ: {reason}", err=True)
-    _build(build_bank, plan, out, shard, dry_run, as_json, workers, resume, force, shard_size, scheduler)
+    _build(build_bank, plan, out, shard, dry_run, max_size, as_json, workers, resume, force, shard_size, scheduler)
 
 
 @_bank_app.command("info")
@@ -761,6 +765,7 @@ def _frames_build(
     workers: _Workers = None,
     resume: _Resume = False,
     dry_run: _DryRun = False,
+    max_size: _MaxSize = "2GB",
     shard: _Shard = None,
     shard_size: _ShardItems = None,
     scheduler: _Scheduler = "threads",
@@ -773,7 +778,7 @@ def _frames_build(
     plan = read_plan(plan_file, FramePlan)
     changes = {key: value for key, value in (("seed", seed), ("views", views)) if value is not None}
     plan = plan.model_copy(update=changes)
-    _build(build_frames, plan, out, shard, dry_run, as_json, workers, resume, force, shard_size, scheduler)
+    _build(build_frames, plan, out, shard, dry_run, max_size, as_json, workers, resume, force, shard_size, scheduler)
 
 
 @_frames_app.command("info")
@@ -924,12 +929,17 @@ def _refuse_index(index: int, n: int) -> None:
         raise UsageError(f"--index must be below {n}, the number of frames, got {index}")
 
 
+_NOTED_BYTES = 100_000_000
+"""A file of at least this size is announced before it is built."""
+
+
 def _build(
     build: Callable[..., Any],
     plan: BankPlan | FramePlan,
     out: Path,
     shard: str | None,
     dry_run: bool,
+    max_size: str,
     as_json: bool,
     workers: int | None,
     resume: bool,
@@ -938,21 +948,44 @@ def _build(
     scheduler: str,
 ) -> None:
     """Build a bank or frame set, whole or in part; or say what that would take."""
-    from phasemark.data import build_part, estimate, parse_part
+    from phasemark.data import build_part, estimate, parse_part, planned_size
     from phasemark.data.executor import processors
+    from phasemark.data.size import format_size, parse_size
 
+    limit = parse_size(max_size, "--max-size")
+    part, parts = (1, 1) if shard is None else parse_part(shard)
     _note_plan_too_far(plan)
+    facts: dict[str, Any] = planned_size(plan)
+    counts = {name: n // parts for name, n in facts.items()}
+    size = counts.pop("bytes")
     if dry_run:
-        facts = estimate(plan, workers=workers or processors())
-        _echo_json(facts) if as_json else _echo_facts({**facts, "seconds": f"about {facts['seconds']:.3g}"})
+        seconds = "not tried: the file would be larger than --max-size"
+        if size <= limit:
+            facts = estimate(plan, workers=workers or processors())
+            seconds = f"about {facts['seconds']:.3g}"
+        if as_json:
+            _echo_json({**facts, "seconds": facts.get("seconds")})
+        else:
+            _echo_facts({**facts, "seconds": seconds})
         return
+    described = f"{out}: {', '.join(f'{n} {name}' for name, n in counts.items())}, {format_size(size)}"
+    if size > limit:
+        smaller = (
+            "thin 'distance_m' or 'delta_deg'" if "images" in counts else "take fewer 'views' or 'frames_per_view'"
+        )
+        raise UsageError(
+            f"{described}, would be larger than --max-size {format_size(limit)}: {smaller}, or allow"
+            f" --max-size {format_size(size * 11 // 10).replace(' ', '')}"
+        )
+    if size >= _NOTED_BYTES:
+        typer.echo(f"note: {described}; --dry-run estimates the time", err=True)
     with _Progress("rendering") as progress:
         options: dict[str, Any] = {
             "workers": workers, "resume": resume, "force": force, "shard_items": shard_size, "scheduler": scheduler,
             "progress": progress,
         }  # fmt: skip
         if shard is not None:
-            build_part(plan, parse_part(shard), out, **options)
+            build_part(plan, (part, parts), out, **options)
         else:
             build(plan, out, **options).close()
     if as_json:

@@ -159,6 +159,61 @@ def test_distances_that_wrap_or_return_nothing_are_noted(run, tmp_path, monkeypa
         assert note in line
 
 
+VGA = """
+sensor = "pmd-16x16"
+sensor_overrides = { rows = 480, cols = 640 }
+layout = "full"
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "words"),
+    [
+        # 4 classes, 141 distances, 180 sides; a phasor, an intensity and a coverage of 4 bytes a number
+        (VGA, ["bank", "build", "plan.toml", "-o", "x.h5"], ["101520 images, 499 GB", "2 GB", "--max-size 549GB"]),
+        (VGA, ["bank", "build", "plan.toml", "-o", "x.h5", "--shard", "1/1000", "--max-size", "498MB"], ["101 images"]),
+        (VGA, ["bank", "build", "plan.toml", "-o", "x.h5", "--distance", "1:9:0.0001", "--delta", "0:9:1e-4"], ["TB"]),
+        (
+            "views = 1000000000",
+            ["frames", "build", "plan.toml", "-o", "x.h5"],
+            ["1000000000 views, 1000000000 frames, 6.49 TB", "'views'"],
+        ),
+        ("views = 1", ["frames", "build", "plan.toml", "-o", "x.h5", "--max-size", "6kB"], ["6.49 kB", "6 kB"]),
+        ("views = 1", ["frames", "build", "plan.toml", "-o", "x.h5", "--max-size", "20 apples"], ["such as 20GB"]),
+    ],
+)
+def test_a_file_that_would_be_too_large_is_refused_before_it_is_begun(
+    run, tmp_path, monkeypatch, text, arguments, words
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plan.toml").write_text(text, encoding="utf-8")
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert all(word in err for word in words), err
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.toml"]
+
+
+def test_a_dry_run_states_a_size_that_would_be_refused(run, tmp_path):
+    (tmp_path / "plan.toml").write_text(VGA, encoding="utf-8")
+    command = ["bank", "build", tmp_path / "plan.toml", "--dry-run", "-o", tmp_path / "x.h5"]
+    code, out, err = run(*command, "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out) == {"images": 101520, "bytes": 101520 * 640 * 480 * 16, "seconds": None}
+    assert "not tried" in run(*command)[1]
+
+
+def test_a_large_file_that_is_allowed_is_announced(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("phasemark.cli._NOTED_BYTES", 100_000)
+    command = ["bank", "build", "--class", "cone", *SMALL, "-o", tmp_path / "b.h5", "--max-size"]
+    assert run(*command, "0.19MB")[0] == 2
+    code, _, err = run(*command, "0.2 MB")
+    assert code == 0
+    # 5 distances from 18 sides of the lower half, and from one of the upper half, of 8 · 16 pixels of 16 bytes
+    assert err == f"note: {tmp_path / 'b.h5'}: 95 images, 195 kB; --dry-run estimates the time\n"
+
+
 def test_a_hard_render_has_no_mixed_pixel(run, tmp_path):
     run("render", "--class", "cone", "--distance", 1.0, "--variant", "hard", "-o", tmp_path / "f.png")
     with np.load(tmp_path / "f.npz") as data:
