@@ -406,6 +406,7 @@ def _landmark_show(
     folder = out or Path()
     picture, page = folder / f"{name}.png", folder / f"{name}.html"
     _refuse_existing([picture, page], force)
+    _make_folder(folder)
     write_atomically(picture, mesh_picture(mesh), force=force)
     write_atomically(page, mesh_html(mesh, name).encode(), force=force)
     typer.echo(picture)

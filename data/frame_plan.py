@@ -99,6 +99,9 @@ class Distribution(PlanModel):
 def _to_distribution(value: Any, info: ValidationInfo) -> Any:
     if isinstance(value, int | float) and not isinstance(value, bool):
         value = {"fixed": value}
+    if value is not None and not isinstance(value, Mapping | Distribution):
+        kinds = ", ".join(KINDS)
+        raise UsageError(f"'{info.field_name}' must be a number or a table with one of {kinds}, got {value!r}")
     if isinstance(value, Mapping):
         try:
             return Distribution(**value)

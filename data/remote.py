@@ -227,7 +227,9 @@ class DaskMaker:
         try:
             from distributed import Client
         except ImportError:
-            raise UsageError("--scheduler with an address needs Dask: pip install 'phasemark[dask]'") from None
+            raise UsageError(
+                "--scheduler with an address needs Dask: pip install -e '.[dask]' in the clone of phasemark"
+            ) from None
         try:
             connect: Any = Client
             self._client: Any = connect(address, timeout=CONNECT_SECONDS, set_as_default=False)

@@ -295,8 +295,8 @@ def test_landmarks_are_listed_shown_exported_and_checked(run, tmp_path):
     code, out, _ = run("landmark", "list", "--json")
     assert (code, [spec["name"] for spec in json.loads(out)]) == (0, ["cylinder", "cone", "sphere", "post"])
     assert "180°" in run("landmark", "list")[1]
-    assert run("landmark", "show", "cone", "-o", tmp_path)[0] == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"cone.png", "cone.html"}
+    assert run("landmark", "show", "cone", "-o", tmp_path / "new" / "pictures")[0] == 0
+    assert {path.name for path in (tmp_path / "new" / "pictures").iterdir()} == {"cone.png", "cone.html"}
     for kind in ("stl", "ply", "obj", "off"):
         assert run("landmark", "export", "cone", "-o", tmp_path / f"cone.{kind}")[0] == 0
         code, out, err = run("landmark", "check", tmp_path / f"cone.{kind}", "--unit", "m", "--json")
@@ -532,3 +532,20 @@ def test_force_replaces_an_output(run, folder, tmp_path):
     assert run("bank", "build", "--class", "cone", *SMALL, "-o", target)[0] == 4
     assert run("bank", "build", "--class", "cone", *SMALL, "-o", target, "--force")[0] == 0
     assert run("bank", "info", target)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "arguments"),
+    [
+        ("rosbags.typesys", "ros", ["frames", "export", "f.h5", "--to", "rosbag", "-o", "bag"]),
+        ("distributed", "dask", ["frames", "build", "plan.toml", "--scheduler", "tcp://localhost:1", "-o", "g.h5"]),
+    ],
+)
+def test_a_missing_package_is_installed_from_the_clone(run, tmp_path, monkeypatch, module, extra, arguments):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plan.toml").write_text("views = 1", encoding="utf-8")
+    assert run("frames", "build", "plan.toml", "-o", "f.h5")[0] == 0
+    monkeypatch.setitem(sys.modules, module, None)
+    code, _, err = run(*arguments)
+    assert code == 2
+    assert err.endswith(f": pip install -e '.[{extra}]' in the clone of phasemark\n")

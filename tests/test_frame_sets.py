@@ -82,6 +82,11 @@ def sha256(path):
         ({"views": 1, "albedo": {"uniform": [0, 1]}}, "'albedo' must be in"),
         ({"views": 1, "splits": {"train": 0.5}}, "'splits' must be shares that add up to 1"),
         ({"views": 1, "colour": "red"}, "unknown key 'colour'"),
+        (
+            {"views": 1, "distance_m": "near"},
+            "'distance_m' must be a number or a table with .*, got 'near'",
+        ),
+        ({"views": 1, "splits": {"a b": 1.0}}, "each key of 'splits' must begin with a letter or digit .*, got 'a b'"),
         ({"views": 1, "delta_deg": {"gauss": [0, 1]}}, "unknown key 'gauss'"),
         ({"views": 1, "delta_deg": {"fixed": 0, "within": [0, 1]}}, "'within' cuts the tails of 'normal'"),
     ],

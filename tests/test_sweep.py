@@ -8,8 +8,9 @@ from own_matchers import Fails
 
 from phasemark import OutputExistsError, UsageError, cli
 from phasemark.cli import main
+from phasemark.matcher.plan_kinds import plan_schema
 from phasemark.matcher.sweep import read_sweep, run_sweep
-from phasemark.matcher.sweep_plan import SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
+from phasemark.matcher.sweep_plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
 
 EXACT = ("condition", "trial", "truth", "estimate", "bound", "covariance", "chi2", "p_value", "found", "accepted")
 
@@ -93,6 +94,15 @@ def test_rounds_go_on_until_the_rmse_is_known(tmp_path):
     ("changes", "message"),
     [
         ({"axes": {"distance_m": [0.8]}}, "'distance_m' must leave its spread"),
+        ({"wall_m": 4.0}, "unknown key 'wall_m': it is an axis and belongs under [axes], as axes.wall_m"),
+        ({"knows": "wall"}, "unknown key 'knows': it belongs to a method, under [[methods]]"),
+        ({"methods": [{"name": "a", "wall_m": 4}]}, "methods.0: unknown key 'wall_m': it is an axis and belongs under"),
+        ({"methods": [{"name": "a", "trials": 4}]}, "'trials': it belongs to the plan itself, above [[methods]]"),
+        ({"methods": []}, "'methods' must have at least 1 item, got []"),
+        (
+            {"methods": [{"name": "a", "method": "own"}]},
+            "'method' must be nearest, refine, or MODULE:NAME of a callable of your own, got 'own'",
+        ),
         ({"trials": 0}, "'trials' must be greater than or equal to 2, got 0"),
         ({"axes": {"colour": [1.0]}}, "unknown axis 'colour'"),
         ({"axes": {"n_frames": [2.5]}}, "'n_frames' must be a whole number"),
@@ -203,6 +213,18 @@ def test_star_varies_each_axis_alone_and_sobol_stays_inside():
     assert len(sobol) == 16
     assert all(0.95 <= one.distance_m <= 1.05 and 0.4 <= one.albedo <= 0.8 for one in sobol)
     assert {type(one.n_frames) for one in sobol} == {int}
+
+
+def test_the_schema_names_every_axis():
+    axes = plan_schema("sweep")["properties"]["axes"]
+    assert set(axes["properties"]) == set(AXES) - {"class_name"}
+    assert axes["additionalProperties"] is False
+    for name, schema in axes["properties"].items():
+        value = schema["anyOf"][1]
+        with pytest.raises(UsageError):
+            plan(axes={name: [value["maximum"] * 1.001 + 1]})
+        with pytest.raises(UsageError):
+            plan(axes={name: [value["minimum"] - 1]})
 
 
 def test_shipped_plans_are_plans():
