@@ -931,7 +931,9 @@ def _refuse_index(index: int, n: int) -> None:
 
 
 _NOTED_BYTES = 100_000_000
-"""A file of at least this size is announced before it is built."""
+"""A file of at least this size is announced before it is built, with the time it takes."""
+_TRIAL_SECONDS = 2.0
+"""About how long that time is tried for."""
 
 
 def _build(
@@ -951,6 +953,7 @@ def _build(
     """Build a bank or frame set, whole or in part; or say what that would take."""
     from phasemark.data import build_part, estimate, parse_part, planned_size
     from phasemark.data.executor import processors
+    from phasemark.data.production import refuse_unwritable_output
     from phasemark.data.size import format_size, parse_size
 
     limit = parse_size(max_size, "--max-size")
@@ -960,14 +963,14 @@ def _build(
     counts = {name: n // parts for name, n in facts.items()}
     size = counts.pop("bytes")
     if dry_run:
-        seconds = "not tried: the file would be larger than --max-size"
+        about = "not tried: the file would be larger than --max-size"
         if size <= limit:
             facts = estimate(plan, workers=workers or processors())
-            seconds = f"about {facts['seconds']:.3g}"
+            about = f"about {facts['seconds']:.3g}"
         if as_json:
             _echo_json({**facts, "seconds": facts.get("seconds")})
         else:
-            _echo_facts({**facts, "seconds": seconds})
+            _echo_facts({**facts, "seconds": about})
         return
     described = f"{out}: {', '.join(f'{n} {name}' for name, n in counts.items())}, {format_size(size)}"
     if size > limit:
@@ -979,7 +982,10 @@ def _build(
             f" --max-size {format_size(size * 11 // 10).replace(' ', '')}"
         )
     if size >= _NOTED_BYTES:
-        typer.echo(f"note: {described}; --dry-run estimates the time", err=True)
+        refuse_unwritable_output(out, force=force, resume=resume)
+        threads = workers or processors()
+        seconds = estimate(plan, workers=threads, trial_seconds=_TRIAL_SECONDS)["seconds"] / parts
+        typer.echo(f"note: {described}; about {_duration(seconds)} on {threads} processors here", err=True)
     with _Progress("rendering") as progress:
         options: dict[str, Any] = {
             "workers": workers, "resume": resume, "force": force, "shard_items": shard_size, "scheduler": scheduler,

@@ -224,6 +224,12 @@ def test_a_larger_plan_makes_the_file_larger_by_what_the_arithmetic_says(small, 
     assert 0 < files[0] - planned[0] < 2_000_000  # the meshes of the whole catalogue
 
 
+def test_a_trial_that_has_no_time_still_estimates_the_time():
+    facts = estimate(PLAN, trial_seconds=0.0)
+    assert facts["views"] == 20
+    assert 0 < facts["seconds"] < 600
+
+
 def test_a_dry_run_knows_the_size(frames_file):
     facts = estimate(PLAN)
     assert facts["bytes"] == frames_file.stat().st_size
