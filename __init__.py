@@ -10,6 +10,48 @@ __version__ = "0.1.0"
 __all__ = ["InputFileError", "OutputExistsError", "PhasemarkError", "StorageError", "UsageError", "__version__"]
 
 
+_TYPES = {
+    "string_type": "a string",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+}
+"""What is right where pydantic finds another type."""
+
+_PATTERNS = {
+    r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "begin with a letter or digit and hold only letters, digits, '_', '.' and '-'",
+    r"^(nearest|refine|[A-Za-z_][\w.]*:[A-Za-z_]\w*)$": "be nearest, refine, or MODULE:NAME of a callable of your own",
+}
+"""What the patterns of fields say, in words."""
+
+
+def _in_words(kind: str, message: str) -> str:
+    """Return what would be right, ``must …``, of a finding of pydantic."""
+    if kind in _TYPES:
+        return f"must be {_TYPES[kind]}"
+    if kind == "string_pattern_mismatch":
+        pattern = message.partition("'")[2].removesuffix("'")
+        return f"must {_PATTERNS.get(pattern, f'match {pattern}')}"
+    subject, should, rest = message.partition(" should ")
+    if should and " " not in subject:  # "Tuple should have at least 1 item after validation, not 0"
+        message = f"must {rest.partition(' after validation')[0]}"
+    return message if message.startswith("must") else f"must be {message}"
+
+
+def _quoted(text: str) -> str:
+    """Return what stands between the first quotation marks."""
+    return text.split("'")[1]
+
+
 class PhasemarkError(Exception):
     """Base of every error the user can mend; its message is one line that says what to do.
 
@@ -37,18 +79,25 @@ class UsageError(PhasemarkError, ValueError):
         whole : str
             The key to name when the finding is about the model as a whole.
         """
-        key = ".".join(str(part) for part in location) or whole
+        of_key = location[-1:] == ("[key]",)  # the finding is about a key of a table, not about its value
+        key = ".".join(str(part) for part in (location[:-2] if of_key else location)) or whole
         if kind == "extra_forbidden":
             return cls(f"unknown key '{key}'")
         if kind == "missing":
             return cls(f"'{key}' is missing")
+        if kind == "union_tag_not_found":
+            return cls(f"'{key}.{_quoted(message)}' is missing")
         own = message.removeprefix("Value error, ")
         if own != message and own.startswith("'"):  # a nested model has put its own finding into words already
             return cls(f"{key}: {own}")
-        message = own.removeprefix("Input should be ")
-        message = message if message.startswith("must") else f"must be {message}"
+        named = f"each key of '{key}'" if of_key else f"'{key}'"
+        if kind == "union_tag_invalid":
+            tag = message.partition(" using ")[2]
+            named = f"'{key}.{_quoted(tag)}'"
+            value = _quoted(message)
+            own = f"must be one of {message.partition('expected tags: ')[2]}"
         shown = repr(value)
-        return cls(f"'{key}' {message}, got {shown if len(shown) <= 80 else shown[:77] + '...'}")
+        return cls(f"{named} {_in_words(kind, own)}, got {shown if len(shown) <= 80 else shown[:77] + '...'}")
 
 
 class InputFileError(PhasemarkError, ValueError):

@@ -13,9 +13,11 @@ import os
 import shlex
 import signal
 import sys
+import threading
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,8 +33,10 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
     from phasemark.data import Bank, BankPlan, FramePlan
+    from phasemark.data.plan import ScenePlan
     from phasemark.landmarks import LandmarkSpec
     from phasemark.matcher import Calibration, FilteredFrames, LandmarkMap, Match, Matches, RobotPose
+    from phasemark.matcher.drive import DrivePlan
     from phasemark.render import Background, Estimate, Sensor
 
 __all__ = ["app", "main"]
@@ -169,6 +173,9 @@ _Shard = Annotated[str | None, typer.Option("--shard", metavar="I/N", help="Buil
 _ShardItems = Annotated[
     int | None, typer.Option("--shard-size", min=1, help="Images or views per shard; the result does not depend on it.")
 ]
+_MaxSize = Annotated[
+    str, typer.Option("--max-size", metavar="SIZE", help="Refuse to write a larger file, e.g. 500MB or 20GB.")
+]
 _Sample = Annotated[int, typer.Option("--sample", min=0, help="How many random items to render again.")]
 _Seed = Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")]
 _Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; the result does not depend on it.")]
@@ -264,8 +271,9 @@ def _sensor_characterise(
     sensor = _load_sensor(name_or_file)
     _refuse_existing([out / name for name in NAMES], force)
     _make_folder(out)
-    found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
-    report = write_characterisation(found, name_or_file, out, seed=seed, force=force)[0]
+    with _Progress("measuring"):
+        found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
+        report = write_characterisation(found, name_or_file, out, seed=seed, force=force)[0]
     if as_json:
         facts = found.as_dict()
         _echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
@@ -332,6 +340,7 @@ def _sensor_fit(
         )
         for path in frames
     ]
+    _note_too_far(base, {"--distance": max(distance)})
     fit = fit_sensor(
         [one[k : k + 1] for one in measured for k in range(len(one))],  # every position of a file has its distance
         distance,
@@ -397,6 +406,7 @@ def _landmark_show(
     folder = out or Path()
     picture, page = folder / f"{name}.png", folder / f"{name}.html"
     _refuse_existing([picture, page], force)
+    _make_folder(folder)
     write_atomically(picture, mesh_picture(mesh), force=force)
     write_atomically(page, mesh_html(mesh, name).encode(), force=force)
     typer.echo(picture)
@@ -464,7 +474,8 @@ def _landmark_design(
     if confirm_frames:
         with _Progress("matching simulated frames") as progress:
             confirmed = confirm_design(design, confirm_frames, workers=workers, progress=progress)
-    files = write_design(design, confirmed, out, force=force)
+    with _Progress("writing the design"):
+        files = write_design(design, confirmed, out, force=force)
     facts = summary(design, confirmed)
     if as_json:
         _echo_json({"files": [str(path) for path in files], **facts})
@@ -584,7 +595,9 @@ def _render(
         _, mesh = _load_landmark(path, unit, up, origin)
     if variant not in ("exact", "hard"):
         raise UsageError(f"--variant must be exact or hard, got '{variant}'")
-    image = Renderer(mesh, _load_sensor(sensor), albedo=mesh.metadata.get("albedo", 0.8)).render(
+    camera = _load_sensor(sensor)
+    _note_too_far(camera, {"--distance": distance, "--wall": wall})
+    image = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8)).render(
         distance,
         math.radians(delta),
         math.radians(bearing),
@@ -648,6 +661,7 @@ def _bank_build(
     workers: _Workers = None,
     resume: _Resume = False,
     dry_run: _DryRun = False,
+    max_size: _MaxSize = "2GB",
     shard: _Shard = None,
     shard_size: _ShardItems = None,
     scheduler: _Scheduler = "threads",
@@ -689,7 +703,7 @@ def _bank_build(
         plan = plan.model_copy(update={"layout": "full"})
         if not plan.meshes:
             typer.echo(f"note: a full bank, every class at every D and δ: {reason}", err=True)
-    _build(build_bank, plan, out, shard, dry_run, as_json, workers, resume, force, shard_size, scheduler)
+    _build(build_bank, plan, out, shard, dry_run, max_size, as_json, workers, resume, force, shard_size, scheduler)
 
 
 @_bank_app.command("info")
@@ -719,11 +733,12 @@ def _bank_verify(
     """Check a bank: checksum, schema, values, random images rendered again; and what its grid's spacing costs."""
     from phasemark.data import verify_bank
 
-    report = verify_bank(bank, sample=sample, seed=seed)
+    with _Progress("verifying"):
+        report = verify_bank(bank, sample=sample, seed=seed)
     if population is not None:
         from phasemark.matcher import grid_loss
 
-        with _open_bank(bank) as opened:
+        with _open_bank(bank) as opened, _Progress("matching random views"):
             loss = grid_loss(opened, population, seed=seed).as_dict()
         report |= {key: float(f"{value:.3g}") if isinstance(value, float) else value for key, value in loss.items()}
     _echo_json(report) if as_json else _echo_facts(report)
@@ -751,6 +766,7 @@ def _frames_build(
     workers: _Workers = None,
     resume: _Resume = False,
     dry_run: _DryRun = False,
+    max_size: _MaxSize = "2GB",
     shard: _Shard = None,
     shard_size: _ShardItems = None,
     scheduler: _Scheduler = "threads",
@@ -763,7 +779,7 @@ def _frames_build(
     plan = read_plan(plan_file, FramePlan)
     changes = {key: value for key, value in (("seed", seed), ("views", views)) if value is not None}
     plan = plan.model_copy(update=changes)
-    _build(build_frames, plan, out, shard, dry_run, as_json, workers, resume, force, shard_size, scheduler)
+    _build(build_frames, plan, out, shard, dry_run, max_size, as_json, workers, resume, force, shard_size, scheduler)
 
 
 @_frames_app.command("info")
@@ -789,7 +805,8 @@ def _frames_verify(
     """Check a frame set: checksum, schema, values, and random views rendered and captured again."""
     from phasemark.data import verify_frames
 
-    report = verify_frames(frames, sample=sample, seed=seed)
+    with _Progress("verifying"):
+        report = verify_frames(frames, sample=sample, seed=seed)
     _echo_json(report) if as_json else _echo_facts(report)
 
 
@@ -913,12 +930,19 @@ def _refuse_index(index: int, n: int) -> None:
         raise UsageError(f"--index must be below {n}, the number of frames, got {index}")
 
 
+_NOTED_BYTES = 100_000_000
+"""A file of at least this size is announced before it is built, with the time it takes."""
+_TRIAL_SECONDS = 2.0
+"""About how long that time is tried for."""
+
+
 def _build(
     build: Callable[..., Any],
     plan: BankPlan | FramePlan,
     out: Path,
     shard: str | None,
     dry_run: bool,
+    max_size: str,
     as_json: bool,
     workers: int | None,
     resume: bool,
@@ -927,20 +951,48 @@ def _build(
     scheduler: str,
 ) -> None:
     """Build a bank or frame set, whole or in part; or say what that would take."""
-    from phasemark.data import build_part, estimate, parse_part
+    from phasemark.data import build_part, estimate, parse_part, planned_size
     from phasemark.data.executor import processors
+    from phasemark.data.production import refuse_unwritable_output
+    from phasemark.data.size import format_size, parse_size
 
+    limit = parse_size(max_size, "--max-size")
+    part, parts = (1, 1) if shard is None else parse_part(shard)
+    _note_plan_too_far(plan)
+    facts: dict[str, Any] = planned_size(plan)
+    counts = {name: n // parts for name, n in facts.items()}
+    size = counts.pop("bytes")
     if dry_run:
-        facts = estimate(plan, workers=workers or processors())
-        _echo_json(facts) if as_json else _echo_facts({**facts, "seconds": f"about {facts['seconds']:.3g}"})
+        about = "not tried: the file would be larger than --max-size"
+        if size <= limit:
+            facts = estimate(plan, workers=workers or processors())
+            about = f"about {facts['seconds']:.3g}"
+        if as_json:
+            _echo_json({**facts, "seconds": facts.get("seconds")})
+        else:
+            _echo_facts({**facts, "seconds": about})
         return
+    described = f"{out}: {', '.join(f'{n} {name}' for name, n in counts.items())}, {format_size(size)}"
+    if size > limit:
+        smaller = (
+            "thin 'distance_m' or 'delta_deg'" if "images" in counts else "take fewer 'views' or 'frames_per_view'"
+        )
+        raise UsageError(
+            f"{described}, would be larger than --max-size {format_size(limit)}: {smaller}, or allow"
+            f" --max-size {format_size(size * 11 // 10).replace(' ', '')}"
+        )
+    if size >= _NOTED_BYTES:
+        refuse_unwritable_output(out, force=force, resume=resume)
+        threads = workers or processors()
+        seconds = estimate(plan, workers=threads, trial_seconds=_TRIAL_SECONDS)["seconds"] / parts
+        typer.echo(f"note: {described}; about {_duration(seconds)} on {threads} processors here", err=True)
     with _Progress("rendering") as progress:
         options: dict[str, Any] = {
             "workers": workers, "resume": resume, "force": force, "shard_items": shard_size, "scheduler": scheduler,
             "progress": progress,
         }  # fmt: skip
         if shard is not None:
-            build_part(plan, parse_part(shard), out, **options)
+            build_part(plan, (part, parts), out, **options)
         else:
             build(plan, out, **options).close()
     if as_json:
@@ -995,9 +1047,13 @@ def _plan_check(
     as_json: _Json = False,
 ) -> None:
     """Check a plan and say what it is; with --json print it with every default made explicit."""
+    from phasemark.data.plan import ScenePlan
+    from phasemark.matcher.drive import DrivePlan
     from phasemark.matcher.plan_kinds import check_plan
 
     found, plan = check_plan(file, kind)
+    if isinstance(plan, ScenePlan | DrivePlan):
+        _note_plan_too_far(plan)
     if as_json:
         _echo_json({"kind": found, "plan": plan.model_dump(mode="json")})
     else:
@@ -1132,6 +1188,7 @@ def _match(
             rotate=rotate,
             untrusted=True,
         )
+        _note_too_far(opened.sensor, {"--wall": wall})
         plots = [] if plot is None else _numbered(plot, len(measured.range_m))
         _refuse_existing(plots, force)
         filtered = filters[filter_name](measured)
@@ -1271,6 +1328,8 @@ def _calibrate(
     if (position_std, heading_std, delta_std) != (None, None, None):
         stds = PoseStd(position_std or 0.0, math.radians(heading_std or 0.0), math.radians(delta_std or 0.0))
     known = read_poses(poses, landmark_xy_m=landmark_xy, landmark_yaw_rad=math.radians(landmark_yaw))
+    furthest_m = float(known.distance_m.max()) if len(known.distance_m) else None
+    _note_too_far(base, {f"{poses}: the landmark": furthest_m, "--wall": wall})
     measured = [
         read_frames(
             path,
@@ -1406,7 +1465,8 @@ def _demo(
     _make_folder(out)
     with _Progress("matching") as progress:
         result = run_demo(outputs[0], seed=seed, workers=workers, force=force, progress=progress)
-    report = write_demo(result, out, force=force)
+    with _Progress("writing the report"):
+        report = write_demo(result, out, force=force)
     if as_json:
         cells = [{key: _plain(value) for key, value in row.items()} for row in cell_rows(result.cells)]
         _echo_json({"report": str(report), "seconds": result.seconds, "cells": cells})
@@ -1455,12 +1515,13 @@ def _sweep_run(
     sys.path.append(str(Path.cwd()))  # a matcher of one's own lies here; an installed program does not look here itself
     if matcher is not None:
         changes["methods"] = (*loaded.methods, Method(name=matcher, method=matcher))
+    changed = SweepPlan(**{**loaded.model_dump(), **changes})
+    _note_plan_too_far(changed)
     with _Progress("trials") as progress:
-        run_sweep(
-            SweepPlan(**{**loaded.model_dump(), **changes}), out, workers=workers, scheduler=scheduler, resume=resume,
-            force=force, progress=progress,
-        )  # fmt: skip
-    typer.echo(write_report(out))
+        run_sweep(changed, out, workers=workers, scheduler=scheduler, resume=resume, force=force, progress=progress)
+    with _Progress("writing the report"):
+        report = write_report(out)
+    typer.echo(report)
 
 
 @_sweep_app.command("report")
@@ -1473,7 +1534,8 @@ def _sweep_report(
     from phasemark.matcher.sweep_report import summary, write_report
     from phasemark.matcher.sweep_tables import json_rows
 
-    report = write_report(folder)
+    with _Progress("writing the report"):
+        report = write_report(folder)
     trials = read_sweep(folder)[1]
     cells = trials.cells()
     if as_json:
@@ -1564,11 +1626,13 @@ def _drive(
         typer.echo(example_drive(), nl=False)
         return
     plan = default_drive() if plan_file is None else load_drive_plan(plan_file)
+    _note_plan_too_far(plan)
     _refuse_existing([out / name for name in OUTPUTS], force)
     _make_folder(out)
     with _Progress("driving, cm") as progress:
         drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
-    files = write_drive(drive, out, force=force)
+    with _Progress("drawing"):
+        files = write_drive(drive, out, force=force)
     facts = summary(drive)
     if as_json:
         _echo_json({"files": [str(path) for path in files], **facts})
@@ -1777,6 +1841,20 @@ def _background(wall: float | None, floor: float | None) -> Background | None:
     return None if wall is None and floor is None else Background(wall_m=wall, floor_m=floor)
 
 
+def _note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None]) -> None:
+    """Write a note for each distance that the sensor shows wrapped, or not at all."""
+    for name, distance_m in distances_m.items():
+        described = None if distance_m is None else sensor.describe_beyond_range(name, distance_m)
+        if described is not None:
+            typer.echo(f"note: {described}", err=True)
+
+
+def _note_plan_too_far(plan: ScenePlan | DrivePlan) -> None:
+    """Write a note for each key of a plan with distances that the sensor shows wrapped, or not at all."""
+    distances_m = {f"'{name}'": distance_m for name, distance_m in plan.greatest_distances_m().items()}
+    _note_too_far(plan.build_sensor(), distances_m)
+
+
 def _make_folder(path: Path) -> None:
     """Make a folder for outputs, and those above it; one that is there already will do."""
     try:
@@ -1794,16 +1872,29 @@ def _refuse_existing(paths: Iterable[Path], force: bool) -> None:
             raise OutputExistsError(f"{path}: exists already; --force replaces it")
 
 
+_PROGRESS_SECONDS = 10.0
+"""Time between two lines of progress where stderr is no terminal; work that takes less writes none."""
+
+
 class _Progress:
-    """A progress bar on stderr, called with (done, total); nothing if stderr is not a terminal."""
+    """Progress on stderr, reported by a call with (done, total): a bar on a terminal, a line now and then elsewhere.
 
-    def __init__(self, what: str) -> None:
-        self._what = what
+    The lines come from a thread of their own, so that work which reports nothing for long is heard of all the same.
+    """
 
-    def __enter__(self) -> Callable[[int, int], None] | None:
+    def __init__(self, what: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._what, self._clock = what, clock
         self._bar: Progress | None = None
+        self._reported: tuple[int, int] | None = None
+        self._ended = threading.Event()
+        self._lines: threading.Thread | None = None
+
+    def __enter__(self) -> Callable[[int, int], None]:
         if not sys.stderr.isatty():
-            return None
+            self._begun = self._clock()
+            self._lines = threading.Thread(target=self._write_lines, daemon=True)
+            self._lines.start()
+            return self._note
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -1817,6 +1908,28 @@ class _Progress:
     def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.stop()
+        self._ended.set()
+        if self._lines is not None:
+            self._lines.join()
+
+    def _note(self, done: int, total: int) -> None:
+        self._reported = done, total
+
+    def _write_lines(self) -> None:
+        while not self._ended.wait(_PROGRESS_SECONDS):
+            with suppress(OSError, ValueError):  # a closed stderr is no reason to end the work
+                typer.echo(self._line(), err=True)
+
+    def _line(self) -> str:
+        done = "" if self._reported is None else f" {self._reported[0]}/{self._reported[1]},"
+        return f"{self._what}:{done} {_duration(self._clock() - self._begun)} elapsed"
+
+
+def _duration(seconds: float) -> str:
+    """Write a time in whole seconds, minutes and hours."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 def _describe_upper(spec: LandmarkSpec) -> str:
@@ -1961,6 +2074,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         finally:
             sys.stdout.flush()
     except PhasemarkError as error:
+        for note in getattr(error, "__notes__", ()):  # the traceback of a user's own code
+            typer.echo(note, err=True)
         _report_error(str(error))
         return error.exit_code
     except BrokenPipeError:

@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOT_FILES = {"__init__.py", "cli.py", "py.typed"}
+ROOT_FILES = {"__init__.py", "__main__.py", "cli.py", "py.typed"}
 ROOMS = {"data", "landmarks", "matcher", "render"}
 
 IMPORT_ALL = """
@@ -100,6 +100,7 @@ def main() -> None:
         print(run(python, "-I", "-W", "error", "-c", IMPORT_ALL, cwd=work), end="")
         run(work / "venv" / "bin" / "phasemark", "--help", cwd=work)
         run(work / "venv" / "bin" / "phasemark", "sensor", "list", cwd=work)
+        run(python, "-I", "-m", "phasemark", "sensor", "list", cwd=work)
 
 
 if __name__ == "__main__":

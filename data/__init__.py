@@ -12,6 +12,7 @@ from phasemark.data.jobs import build_part, estimate, merge_parts, parse_part
 from phasemark.data.measured import read_frames, write_measured
 from phasemark.data.plan import BankPlan, MeshPlan, load_plan, read_plan
 from phasemark.data.provenance import mesh_sha256, versions
+from phasemark.data.size import planned_size
 from phasemark.data.store import read_checksum, verify_checksum, write_atomically, write_checksum
 from phasemark.data.verify import verify_bank, verify_frames
 
@@ -38,6 +39,7 @@ __all__ = [
     "open_frames",
     "parse_grid",
     "parse_part",
+    "planned_size",
     "read_checksum",
     "read_frames",
     "read_plan",

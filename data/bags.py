@@ -27,7 +27,9 @@ def ros_types() -> Any:
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise UsageError("ROS bags need the package rosbags: pip install 'phasemark[ros]'") from None
+        raise UsageError(
+            "ROS bags need the package rosbags: pip install -e '.[ros]' in the clone of phasemark"
+        ) from None
     return get_typestore(Stores.ROS2_HUMBLE)
 
 

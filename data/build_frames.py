@@ -30,6 +30,7 @@ from phasemark.data.progress import Progress
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.seeds import stream
 from phasemark.data.shards import Place
+from phasemark.data.size import frame_set_fields
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture
 
 _KEYS = ("class_index", "albedo", "wall_m", "floor_m")
@@ -47,6 +48,8 @@ def build_frames(
     progress: Progress | None = None,
 ) -> FrameSet:
     """Render and capture a frame set and write it with its checksum.
+
+    Its size has no limit here: :func:`phasemark.data.planned_size` says beforehand how large it gets.
 
     The same plan gives the same bytes, whatever the number of workers or the size of shards. Memory does not grow with
     the frames. A run that was ended early leaves ``FILE.partial`` and ``FILE.manifest`` if anything was finished.
@@ -125,12 +128,7 @@ class FrameJob:
     @property
     def fields(self) -> list[str]:
         """Names of the large datasets, in the order in which :meth:`make` returns them."""
-        per_frame = ["range", "flags"] if self.sensor.kind == "direct" else ["range", "amplitude", "intensity", "flags"]
-        if self.plan.keep_taps:
-            per_frame.append("taps")
-        if "shot" in self.plan.variants:
-            per_frame.append("range_shot")
-        return [*per_frame, "coverage", *(f"range_{name}" for name in ("hard", "mixed") if name in self.plan.variants)]
+        return frame_set_fields(self.plan, self.sensor)
 
     def identity(self) -> dict[str, Any]:
         """Return all that the file's bytes depend on."""

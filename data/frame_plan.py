@@ -99,6 +99,9 @@ class Distribution(PlanModel):
 def _to_distribution(value: Any, info: ValidationInfo) -> Any:
     if isinstance(value, int | float) and not isinstance(value, bool):
         value = {"fixed": value}
+    if value is not None and not isinstance(value, Mapping | Distribution):
+        kinds = ", ".join(KINDS)
+        raise UsageError(f"'{info.field_name}' must be a number or a table with one of {kinds}, got {value!r}")
     if isinstance(value, Mapping):
         try:
             return Distribution(**value)
@@ -246,6 +249,11 @@ class FramePlan(ScenePlan):
                 "variants": tuple(name for name in order if name in self.variants),
             }
         )
+
+    def greatest_distances_m(self) -> dict[str, float]:
+        """Return the far end of the landmarks' and walls' distances, metres."""
+        spreads = {"distance_m": self.distance_m, "wall_m": self.wall_m}
+        return {name: spread.highest for name, spread in spreads.items() if spread is not None}
 
     def landmark_names(self) -> list[str]:
         """Names of the classes of a resolved plan, in the order of their numbers."""

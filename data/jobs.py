@@ -29,6 +29,7 @@ FORMAT = "phasemark-part"
 SCHEMA_VERSION = 1
 
 _TRIAL_ITEMS = 64
+_GOLDEN = (5**0.5 - 1) / 2
 
 
 def job_for(plan: BankPlan | FramePlan) -> BankJob | FrameJob:
@@ -301,7 +302,7 @@ class MergeJob:
         return [np.concatenate(values) for values in found]
 
 
-def estimate(plan: BankPlan | FramePlan, *, workers: int = 1) -> dict[str, Any]:
+def estimate(plan: BankPlan | FramePlan, *, workers: int = 1, trial_seconds: float | None = None) -> dict[str, Any]:
     """Return how large a bank or frame set would be and about how long it would take, from a small trial.
 
     Parameters
@@ -309,6 +310,8 @@ def estimate(plan: BankPlan | FramePlan, *, workers: int = 1) -> dict[str, Any]:
     plan : BankPlan or FramePlan
     workers : int
         Processors that will work on it.
+    trial_seconds : float, optional
+        End the trial after about this time, with a rougher result. None: it takes 64 items.
 
     Returns
     -------
@@ -322,11 +325,16 @@ def estimate(plan: BankPlan | FramePlan, *, workers: int = 1) -> dict[str, Any]:
     count = min(_TRIAL_ITEMS, total)
     step = max(1, total // count)
     begun = time.perf_counter()
-    run = 8
+    run = 8 if trial_seconds is None else 1
+    starts = np.arange(0, total, step * run)
+    if trial_seconds is not None:  # in an order of which every beginning is spread over all of them
+        starts = starts[np.argsort(np.arange(len(starts)) * _GOLDEN % 1)]
     made = 0
-    for first in range(0, total, step * run):
+    for first in starts.tolist():
         made += min(run, total - first)
         make_shard(job, first, min(first + run, total))
+        if trial_seconds is not None and time.perf_counter() - begun > trial_seconds:
+            break
     seconds = (time.perf_counter() - begun) / made * total / workers
     if isinstance(plan, FramePlan):
         items = {"views": total, "frames": total * plan.frames_per_view}

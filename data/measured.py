@@ -41,6 +41,8 @@ _STATED = re.compile(r"\b(unit|quantity)=(\S+)")
 _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
 _NOT_A_NUMBER = ("", "nan")
+_BEYOND_MAX_RANGE = 1.25
+"""How far beyond `max_range_m` a direct sensor may still report: real chips exceed their data sheet by a little."""
 _UNREADABLE = (
     OSError, EOFError, ValueError, KeyError, RuntimeError, SyntaxError, zipfile.BadZipFile, csv.Error, zlib.error,
     tokenize.TokenError,  # NumPy tokenizes the header of an NPY file
@@ -84,8 +86,9 @@ def read_frames(
     (n, frames, rows, cols), or (rows, cols) for a single frame.
 
     A range that is not finite is invalid, and so is a 0, by which most sensors mean that they have no reading. So is
-    one that no such camera can measure, negative or beyond c / 2f, and a warning tells how many there are; if it is
-    most of the others, unit or sensor are wrong, which is an error.
+    one that no such camera can measure, and a warning tells how many there are; if it is most of the others, unit or
+    sensor are wrong, which is an error. A camera measures no negative range, none beyond c / 2f, and, if it is a direct
+    sensor with `max_range_m`, none beyond 1.25 times that.
 
     Parameters
     ----------
@@ -140,7 +143,8 @@ def read_frames(
             f"{path}: does not say its unit and quantity: give --unit {'|'.join(METRES_PER_UNIT)} and --quantity"
             " range (along the ray)|z (along the optical axis)"
         )
-    unit_scale = METRES_PER_UNIT[_settled("unit", unit, raw, tuple(METRES_PER_UNIT), path)]
+    settled_unit = _settled("unit", unit, raw, tuple(METRES_PER_UNIT), path)
+    unit_scale = METRES_PER_UNIT[settled_unit]
     settled_quantity = _settled("quantity", quantity, raw, QUANTITIES, path)
 
     arrays = {name: _as_frames(values, name, shape, raw.flat, path) for name, values in raw.arrays.items()}
@@ -163,7 +167,7 @@ def read_frames(
     if settled_quantity == "z":
         range_m = range_m / sensor.axis_cosine()
     valid = _upright(valid, flip_h, flip_v, rotate) & np.isfinite(range_m)
-    valid &= ~_impossible(range_m, valid, sensor, path)
+    valid &= ~_impossible(range_m, valid, sensor, settled_unit, path)
     try:
         return Frames(
             range_m,
@@ -183,24 +187,45 @@ def _upright(values: NDArray[Any], flip_h: bool, flip_v: bool, rotate: int) -> N
     return np.rot90(values, -rotate // 90, axes=(-2, -1))
 
 
+def _range_limit(sensor: Sensor) -> tuple[float, str]:
+    """Return the range below which all readings of a sensor lie, metres, and where the limit comes from."""
+    if sensor.kind == "direct" and sensor.max_range_m is not None:
+        return _BEYOND_MAX_RANGE * sensor.max_range_m, f"{_BEYOND_MAX_RANGE:g} times the sensor's 'max_range_m'"
+    return sensor.unambiguous_range_m, "c / 2f"
+
+
 def _impossible(
-    range_m: NDArray[np.float64], valid: NDArray[np.bool_], sensor: Sensor, path: Path
+    range_m: NDArray[np.float64], valid: NDArray[np.bool_], sensor: Sensor, unit: str, path: Path
 ) -> NDArray[np.bool_]:
     empty = valid & (range_m == 0)  # how most sensors write that they have no reading: it says nothing of the unit
     if valid.any() and empty.sum() == valid.sum():
         raise InputFileError(f"{path}: every range is 0, which stands for no reading")
-    wrong = valid & ~empty & ~((range_m > 0) & (range_m < sensor.unambiguous_range_m))
+    limit_m, reason = _range_limit(sensor)
+    wrong = valid & ~empty & ~((range_m > 0) & (range_m < limit_m))
     count, of = int(wrong.sum()), int((valid & ~empty).sum())
     if count:
         place = np.argwhere(wrong)[0]
         message = (
-            f"{path}: {count} of {of} ranges are not in 0 … {sensor.unambiguous_range_m:.4g} m (c / 2f), the first in"
+            f"{path}: {count} of {of} ranges are not in 0 … {limit_m:.4g} m ({reason}), the first in"
             f" frame {place[1]}, row {place[2]}, column {place[3]}: {range_m[tuple(place)]:.6g} m"
         )
         if 2 * count > of:
-            raise InputFileError(f"{message}; is --unit right?")
+            readings_m = range_m[valid & ~empty]
+            raise InputFileError(f"{message}; is --unit right?{_fitting_units(readings_m, limit_m, unit)}")
         warnings.warn(f"{message}; taken as invalid", UserWarning, stacklevel=3)
     return np.asarray(wrong | empty)
+
+
+def _fitting_units(readings_m: NDArray[np.float64], limit_m: float, unit: str) -> str:
+    """Return a sentence that names the smaller units in which all readings would be possible, if there are any."""
+    per_unit = METRES_PER_UNIT[unit]
+    factors = {name: per_unit / metres for name, metres in METRES_PER_UNIT.items() if metres < per_unit}
+    fitting = [
+        f"--unit {name} (dividing by {factor:g})"
+        for name, factor in factors.items()
+        if (readings_m > 0).all() and (readings_m < limit_m * factor).all()
+    ]
+    return f" All would fit with {' or '.join(fitting)}" if fitting else ""
 
 
 def _settled(name: str, given: str | None, raw: _Raw, known: tuple[str, ...], path: Path) -> str:

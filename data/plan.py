@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import os
 import tomllib
@@ -70,7 +71,12 @@ class PlanModel(BaseModel):
         try:
             super().__init__(**data)
         except ValidationError as error:
-            raise _as_usage_error(error) from None
+            raise _as_usage_error(error, type(self)) from None
+
+    @classmethod
+    def place_of_key(cls, key: str) -> str | None:
+        """Return where a key belongs that this table does not have, or None if nobody knows."""
+        return None
 
 
 class MeshPlan(PlanModel):
@@ -129,6 +135,10 @@ class ScenePlan(PlanModel, ABC):
     @abstractmethod
     def resolve(self) -> Self:
         """Return the plan with every default made explicit."""
+
+    @abstractmethod
+    def greatest_distances_m(self) -> dict[str, float]:
+        """Return the greatest distance that each key of the plan asks for, metres."""
 
     def build_sensor(self) -> Sensor:
         """Return the sensor, overrides applied.
@@ -246,6 +256,10 @@ class BankPlan(ScenePlan):
             layout=self.layout,
             harmonics=self.harmonics,
         )
+
+    def greatest_distances_m(self) -> dict[str, float]:
+        """Return the end of the grid of distances, metres."""
+        return {"distance_m": self.distance_m[-1]}
 
     @property
     def delta_rad(self) -> NDArray[np.float64]:
@@ -365,11 +379,22 @@ def _from_catalog(name: str) -> LandmarkSpec:
     return known[name]
 
 
-def _as_usage_error(error: ValidationError) -> UsageError:
+def _as_usage_error(error: ValidationError, model: type[PlanModel]) -> UsageError:
     # a key that is misspelt is missing too: the spelling is what helps
     first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
+    if first["type"] == "extra_forbidden" and len(first["loc"]) == 1:
+        return _unknown_key(str(first["loc"][0]), model)
     own = first.get("ctx", {}).get("error")
     if isinstance(own, UsageError):
         key = ".".join(map(str, first["loc"]))
         return own if f"'{key}'" in str(own) or not key else UsageError(f"{key}: {own}")
     return UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"])
+
+
+def _unknown_key(key: str, model: type[PlanModel]) -> UsageError:
+    """Say of an unknown key where it belongs, which known one it resembles, or which there are."""
+    keys = list(model.model_fields)
+    similar = difflib.get_close_matches(key, keys, n=1)
+    place = model.place_of_key(key)
+    hint = place or (f"did you mean '{similar[0]}'?" if similar else f"there are {', '.join(keys)}")
+    return UsageError(f"unknown key '{key}': {hint}")

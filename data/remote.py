@@ -180,8 +180,11 @@ class _Process:
             self._send({"start": start, "stop": stop})
             count = _LENGTH.unpack(_exactly(self._child.stdout, 8))[0]
             if count < 0:  # an error's message
-                kind, message = json.loads(_exactly(self._child.stdout, -count))
-                raise _ERRORS.get(kind, PhasemarkError)(message)
+                kind, message, notes = json.loads(_exactly(self._child.stdout, -count))
+                failed = _ERRORS.get(kind, PhasemarkError)(message)
+                for note in notes:
+                    failed.add_note(note)
+                raise failed
             return [
                 _exactly(self._child.stdout, _LENGTH.unpack(_exactly(self._child.stdout, 8))[0]) for _ in range(count)
             ]
@@ -224,7 +227,9 @@ class DaskMaker:
         try:
             from distributed import Client
         except ImportError:
-            raise UsageError("--scheduler with an address needs Dask: pip install 'phasemark[dask]'") from None
+            raise UsageError(
+                "--scheduler with an address needs Dask: pip install -e '.[dask]' in the clone of phasemark"
+            ) from None
         try:
             connect: Any = Client
             self._client: Any = connect(address, timeout=CONNECT_SECONDS, set_as_default=False)
@@ -292,7 +297,8 @@ def serve() -> None:
             try:
                 arrays = make_bytes(described["spec"], described["identity"], request["start"], request["stop"])
             except PhasemarkError as error:
-                raw = json.dumps([type(error).__name__, str(error)]).encode()
+                notes = getattr(error, "__notes__", [])
+                raw = json.dumps([type(error).__name__, str(error), notes]).encode()
                 answers.write(_LENGTH.pack(-len(raw)) + raw)
             else:
                 answers.write(_LENGTH.pack(len(arrays)))

@@ -10,9 +10,12 @@ from __future__ import annotations
 import importlib
 import json
 import math
+import numbers
+import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -63,6 +66,8 @@ _CONFUSION_TRIALS = 4
 """For so many views of a condition, which hardly differ, the bound on class confusion is computed."""
 _WIGGLES = (3, 5, 7)
 _RENDERERS_KEPT = 16
+_TERMINATED = 128 + signal.SIGTERM
+"""The exit status with which the command line ends on SIGTERM: no error of a user's module."""
 
 
 @dataclass(frozen=True)
@@ -362,17 +367,13 @@ class SweepJob:
         method = self.plan.methods[m]
         where = f"method '{method.name}', condition {number}, trials {first} … {first + len(frames) - 1}"
         match = self.matcher(number, m)
-        try:
-            matches = Matches(match(frames))
-        except PhasemarkError as error:
-            raise type(error)(f"{where}: {error}") from None
-        except Exception as error:
-            if ":" not in method.method:
-                raise
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            raise UsageError(f"{where}: {method.method} raised {reason}") from error
-        if len(matches) != len(frames):
-            raise UsageError(f"{where}: must return {len(frames)} matches, got {len(matches)}")
+        if ":" in method.method:
+            matches = _matches_of_plugin(match, method.method, frames, where)
+        else:
+            try:
+                matches = Matches(match(frames))
+            except PhasemarkError as error:
+                raise type(error)(f"{where}: {error}") from None
         for k, one in enumerate(matches):
             if one.class_name is not None and not np.isfinite([getattr(one, name) for name in VIEW]).all():
                 raise UsageError(f"{where}: trial {first + k} names '{one.class_name}' with a view that is not finite")
@@ -415,7 +416,7 @@ def check_matcher(text: str) -> None:
     Raises
     ------
     UsageError
-        With the reason.
+        With the reason; if the module's own code failed, its traceback is a note of the error (:pep:`678`).
     """
     _imported(text)
 
@@ -424,13 +425,79 @@ def _imported(text: str) -> Callable[[FilteredFrames], Sequence[Match]]:
     module, _, name = text.partition(":")
     try:
         found = getattr(importlib.import_module(module), name)
-    except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise UsageError(f"the matcher '{text}' cannot be imported ({reason})") from None
+    except (Exception, SystemExit) as error:
+        if isinstance(error, SystemExit) and error.code == _TERMINATED:
+            raise
+        failed = UsageError(f"the matcher '{text}' cannot be imported ({_named(error)})")
+        if own := _own_traceback(error):
+            failed.add_note(own)
+        raise failed from None
     if not callable(found):
         raise UsageError(f"the matcher '{text}' must be callable, got {type(found).__name__}")
     match: Callable[[FilteredFrames], Sequence[Match]] = found
     return match
+
+
+def _matches_of_plugin(
+    match: Callable[[FilteredFrames], Any], text: str, frames: FilteredFrames, where: str
+) -> Matches:
+    """Call a user's matcher, and refuse what is not a Match for each frame."""
+    due = f"{where}: the matcher '{text}' must return a Match for each of the {len(frames)} frames"
+    try:
+        found = match(frames)
+        matches = list(found) if isinstance(found, Iterable) else None
+    except (Exception, SystemExit) as error:
+        failed = UsageError(f"{where}: the matcher '{text}' raised {_named(error)}")
+        failed.add_note(_own_traceback(error) or _named(error))
+        raise failed from None
+    if matches is None:
+        raise UsageError(f"{due}, got {'None' if found is None else f'an object of type {type(found).__name__}'}")
+    for k, one in enumerate(matches):
+        if not isinstance(one, Match):
+            raise UsageError(f"{due}, got an object of type {type(one).__name__} for frame {k}")
+        if (wrong := _wrong_field(one)) is not None:
+            raise UsageError(f"{due}, but the Match for frame {k} has {wrong}")
+    if len(matches) != len(frames):
+        raise UsageError(f"{due}, got {len(matches)}")
+    return Matches(matches)
+
+
+def _wrong_field(match: Match) -> str | None:
+    """Return what is wrong with the types of a user's match, or None."""
+    if not isinstance(match.class_name, str | None):
+        return f"'class_name' {match.class_name!r}: it must be a str or None"
+    for name in (*VIEW, "chi2", "p_value"):
+        value = getattr(match, name)
+        if not isinstance(value, numbers.Real):
+            return f"'{name}' of type {type(value).__name__}: it must be a number"
+    if not isinstance(match.dof, numbers.Integral):
+        return f"'dof' of type {type(match.dof).__name__}: it must be a whole number"
+    if not isinstance(match.class_probability, Mapping):
+        return f"'class_probability' of type {type(match.class_probability).__name__}: it must be a mapping"
+    if match.covariance is not None:
+        n = len(match.free)
+        if not set(match.free) <= set(VIEW):
+            return f"'free' {match.free!r}: it must name some of {', '.join(VIEW)}"
+        if np.shape(match.covariance) != (n, n):
+            return f"'covariance' of shape {np.shape(match.covariance)}: it must be {(n, n)}, as 'free' has {n} names"
+    return None
+
+
+def _named(error: BaseException) -> str:
+    """Return type and message of an exception in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split()).rstrip(":")
+
+
+def _own_traceback(error: BaseException) -> str:
+    """Return the traceback of a user's code, without our calls and those that import it; empty if nothing is left."""
+    own = error.__traceback__
+    while own is not None and _is_ours_or_import(own.tb_frame.f_code.co_filename):
+        own = own.tb_next
+    return "" if own is None else "".join(traceback.format_exception(type(error), error, own)).rstrip()
+
+
+def _is_ours_or_import(filename: str) -> bool:
+    return filename in (__file__, importlib.__file__) or filename.startswith("<frozen importlib")
 
 
 def _spread(matrix: NDArray[np.float64], free: Sequence[str], n: int) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, parse_grid
@@ -78,11 +78,28 @@ _LIMITS: dict[str, tuple[float, float]] = {
 }  # fmt: skip
 
 
+def _axis_schema(name: str) -> dict[str, Any]:
+    """Return the JSON Schema of an axis: its values, whole numbers or not, within its limits."""
+    low, high = _LIMITS[name]
+    value = {"type": "integer" if name in _WHOLE else "number", "minimum": low, "maximum": high}
+    return {"anyOf": [{"type": "string"}, value, {"type": "array", "items": value, "minItems": 1}]}
+
+
 def _axis(value: Any) -> Any:
     return tuple(parse_grid(value, "axis").tolist()) if isinstance(value, str | int | float) else value
 
 
 _Axis = Annotated[tuple[float, ...], BeforeValidator(_axis), Field(min_length=1)]
+_AXES_SCHEMA = {
+    "type": "object",
+    "description": "Axis to its values: START:STOP:STEP, V1,V2,…, a number or a list",
+    "additionalProperties": False,
+    "properties": {name: _axis_schema(name) for name in AXES[1:]},
+}
+
+
+def _place_of_axis(key: str) -> str | None:
+    return f"it is an axis and belongs under [axes], as axes.{key}" if key in AXES[1:] else None
 
 
 class Method(PlanModel):
@@ -119,6 +136,13 @@ class Method(PlanModel):
     bank_model: Literal["ray", "hard", "planar"] = "ray"
     bank_step: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (0.01, 1.0)
     false_alarm: Annotated[float, Field(gt=0, lt=1)] = 0.01
+
+    @classmethod
+    def place_of_key(cls, key: str) -> str | None:
+        """Return where a key belongs that is not one of a method."""
+        return (
+            "it belongs to the plan itself, above [[methods]]" if key in SweepPlan.model_fields else _place_of_axis(key)
+        )
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
@@ -188,7 +212,7 @@ class SweepPlan(ScenePlan):
     max_trials: Annotated[int, Field(ge=2, le=10_000_000)] | None = None
     design: Literal["grid", "star", "sobol"] = "grid"
     points: Annotated[int, Field(ge=1, le=_MOST_CELLS)] = 64
-    axes: dict[str, _Axis] = Field(default_factory=dict)
+    axes: Annotated[dict[str, _Axis], WithJsonSchema(_AXES_SCHEMA)] = Field(default_factory=dict)
     spread: tuple[Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=360)]] = (0.01, 1.0)
     methods: Annotated[tuple[Method, ...], Field(min_length=1)] = (Method(name="refine"),)
     strangers: tuple[LandmarkSpec, ...] = ()
@@ -196,6 +220,11 @@ class SweepPlan(ScenePlan):
     bank_distance_m: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (0.7, 2.1)
     fixed_pattern_rad: Annotated[float, Field(ge=0, le=1)] = 0.002
     outlier: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (0.05, 5.0)
+
+    @classmethod
+    def place_of_key(cls, key: str) -> str | None:
+        """Return where a key belongs that is not one of the plan itself."""
+        return "it belongs to a method, under [[methods]]" if key in Method.model_fields else _place_of_axis(key)
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
@@ -281,6 +310,11 @@ class SweepPlan(ScenePlan):
                     point[name] = round(point[name])
             points.append(point)
         return points
+
+    def greatest_distances_m(self) -> dict[str, float]:
+        """Return the far end of the axes of distances, and of the banks, metres."""
+        axes = {f"axes.{name}": max(self.axes[name]) for name in ("distance_m", "wall_m") if name in self.axes}
+        return {**axes, "bank_distance_m": self.bank_distance_m[1]}
 
     @property
     def class_names(self) -> tuple[str, ...]:

@@ -603,6 +603,38 @@ class Sensor(BaseModel):
         """Range at which the phase wraps, c / 2f."""
         return SPEED_OF_LIGHT_M_S / (2 * self.modulation_hz)
 
+    def describe_beyond_range(self, name: str, distance_m: float) -> str | None:
+        """Return a sentence on what the sensor shows of something too far away, or None if it is near enough.
+
+        Parameters
+        ----------
+        name : str
+            What has this distance, for the sentence.
+        distance_m : float
+
+        Returns
+        -------
+        str or None
+            Ranges wrap at c / 2f; a direct sensor reports nothing from beyond `max_range_m`.
+
+        Examples
+        --------
+        >>> preset("pmd-16x16").describe_beyond_range("the wall", 20.0)
+        'the wall at 20 m is beyond c / 2f = 14.99 m, where ranges wrap: it shows at about 5.01 m'
+        """
+        if not math.isfinite(distance_m):
+            return None
+        if self.kind == "direct" and self.max_range_m is not None:
+            if distance_m <= self.max_range_m:
+                return None
+            limit = f"the sensor's 'max_range_m' = {self.max_range_m:.4g} m"
+            return f"{name} at {distance_m:g} m is beyond {limit}: the sensor reports nothing from there"
+        period_m = self.unambiguous_range_m
+        if distance_m < period_m:
+            return None
+        shown = f"it shows at about {distance_m % period_m:.3g} m"
+        return f"{name} at {distance_m:g} m is beyond c / 2f = {period_m:.4g} m, where ranges wrap: {shown}"
+
     def ray_directions(self, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return unit ray directions of image points, level camera frame (PHYSICS section 2).
 

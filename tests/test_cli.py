@@ -6,13 +6,14 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import pytest
 
-from phasemark import PhasemarkError, __version__, cli
+from phasemark import PhasemarkError, StorageError, __version__, cli
 from phasemark.render import Sensor, preset, preset_names
 
 PHASEMARK = str(Path(sys.executable).with_name("phasemark"))
@@ -173,6 +174,79 @@ def test_a_terminal_without_the_signs_still_gets_the_table() -> None:
     done = subprocess.run([PHASEMARK, "sensor", "list"], env=environment, capture_output=True)
     assert done.returncode == 0
     assert r"16 \xd7 16  22° \xd7 22°" in done.stdout.decode("cp1251")
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(["--version"], 0), (["sensor", "show", "pmd-17x17"], 2)])
+def test_the_package_runs_as_a_module(arguments: list[str], code: int, tmp_path: Path) -> None:
+    as_module = [sys.executable, "-m", "phasemark", *arguments]
+    done = subprocess.run(as_module, cwd=tmp_path, capture_output=True, text=True)
+    as_program = subprocess.run([PHASEMARK, *arguments], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == code
+    assert (done.stdout, done.stderr) == (as_program.stdout, as_program.stderr)
+
+
+class Clock:
+    """Time that passes when the test says so."""
+
+    seconds = 0.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+
+def test_a_line_of_progress_says_what_how_far_and_for_how_long(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    progress = cli._Progress("rendering", clock)
+    with progress as report:
+        clock.seconds = 10.0
+        assert progress._line() == "rendering: 10 s elapsed"
+        report(7, 200)
+        clock.seconds = 83.2
+        assert progress._line() == "rendering: 7/200, 1 min 23 s elapsed"
+        clock.seconds = 3600 * 5 + 60 * 7 + 3
+        assert progress._line() == "rendering: 7/200, 5 h 7 min elapsed"
+    assert capsys.readouterr().err == ""  # as it took no time on a real clock
+
+
+@pytest.mark.parametrize(
+    ("command", "what"),
+    [
+        (["bank", "build", "--class", "cone", "--distance", "1", "--delta", "0", "-o", "b.h5"], "rendering"),
+        (["frames", "build", "frames.toml", "--views", "1", "-o", "f.h5"], "rendering"),
+        (["sweep", "run", "paper", "-o", "s"], "trials"),
+        (["landmark", "design", "-o", "d"], "searching"),
+        (["demo", "-o", "o"], "matching"),
+        (["drive", "-o", "o"], "driving, cm"),
+        (["sensor", "characterise", "ideal", "-o", "c"], "measuring"),
+    ],
+)
+def test_long_work_writes_lines_where_stderr_is_no_terminal(
+    run: Callable[..., Outcome], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: list[str], what: str
+) -> None:
+    # The work itself is replaced by waiting for two lines.
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "_PROGRESS_SECONDS", 1e-3)
+    (tmp_path / "frames.toml").write_text("views = 1\n", encoding="utf-8")
+    lines: list[str] = []
+    two = threading.Event()
+
+    def echo(message: object = "", err: bool = False, **options: object) -> None:
+        lines.append(str(message))
+        if len(lines) == 2:
+            two.set()
+
+    def work(*arguments: object, **options: object) -> NoReturn:
+        assert two.wait(60)
+        raise StorageError("enough")
+
+    monkeypatch.setattr(cli.typer, "echo", echo)
+    for name in (
+        "data.build_bank", "data.build_frames", "matcher.sweep.run_sweep", "matcher.design.run_design",
+        "matcher.demo.run_demo", "matcher.drive.run_drive", "render.characterise",
+    ):  # fmt: skip
+        monkeypatch.setattr(f"phasemark.{name}", work)
+    assert run(*command) == (5, "", "error: enough\n")
+    assert [line.partition(":")[0] for line in lines[:2]] == [what] * 2
 
 
 def test_help_imports_nothing_heavy() -> None:

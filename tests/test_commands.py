@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -109,6 +110,115 @@ def test_render_writes_picture_and_phasors(run, tmp_path):
         np.testing.assert_array_equal(data["coverage"], expected.coverage[0])
 
 
+WRAPS = "is beyond c / 2f = 14.99 m, where ranges wrap: it shows at about"
+FAR_FRAMES = """
+views = 4
+sensor = "vl53l5cx-8x8"
+variants = ["mixed"]
+wall_m = { normal = [3.8, 0.1], within = [3.0, 4.1] }
+"""
+FAR_SWEEP = """
+name = "far"
+bank_distance_m = [15.0, 17.0]
+axes = { distance_m = [16.0], wall_m = [0.0, 18.0] }
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "notes"),
+    [
+        (
+            None,
+            ["render", "--class", "cone", "--distance", "20", "-o", "x.png"],
+            [f"--distance at 20 m {WRAPS} 5.01 m"],
+        ),
+        (None, ["render", "--class", "cone", "--wall", "16", "-o", "x.png"], [f"--wall at 16 m {WRAPS} 1.01 m"]),
+        (None, ["render", "--class", "cone", "--wall", "14.9", "-o", "x.png"], []),
+        (
+            None,
+            ["bank", "build", "--distance", "14:20:2", "--dry-run", "-o", "b.h5"],
+            [f"'distance_m' at 20 m {WRAPS} 5.01 m"],
+        ),
+        (
+            FAR_FRAMES,
+            ["frames", "build", "plan.toml", "--dry-run", "-o", "f.h5"],
+            ["'wall_m' at 4.1 m is beyond the sensor's 'max_range_m' = 4 m: the sensor reports nothing from there"],
+        ),
+        (FAR_SWEEP, ["plan", "check", "plan.toml"], ["axes.distance_m", "axes.wall_m", "bank_distance_m"]),
+    ],
+)
+def test_distances_that_wrap_or_return_nothing_are_noted(run, tmp_path, monkeypatch, text, arguments, notes):
+    monkeypatch.chdir(tmp_path)
+    if text is not None:
+        (tmp_path / "plan.toml").write_text(text, encoding="utf-8")
+    code, _, err = run(*arguments)
+    assert code == 0
+    lines = err.splitlines()
+    assert len(lines) == len(notes)
+    for line, note in zip(lines, notes, strict=True):
+        assert line.startswith("note: ")
+        assert note in line
+
+
+VGA = """
+sensor = "pmd-16x16"
+sensor_overrides = { rows = 480, cols = 640 }
+layout = "full"
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "words"),
+    [
+        # 4 classes, 141 distances, 180 sides; a phasor, an intensity and a coverage of 4 bytes a number
+        (VGA, ["bank", "build", "plan.toml", "-o", "x.h5"], ["101520 images, 499 GB", "2 GB", "--max-size 549GB"]),
+        (VGA, ["bank", "build", "plan.toml", "-o", "x.h5", "--shard", "1/1000", "--max-size", "498MB"], ["101 images"]),
+        (VGA, ["bank", "build", "plan.toml", "-o", "x.h5", "--distance", "1:9:0.0001", "--delta", "0:9:1e-4"], ["TB"]),
+        (
+            "views = 1000000000",
+            ["frames", "build", "plan.toml", "-o", "x.h5"],
+            ["1000000000 views, 1000000000 frames, 6.49 TB", "'views'"],
+        ),
+        ("views = 1", ["frames", "build", "plan.toml", "-o", "x.h5", "--max-size", "6kB"], ["6.49 kB", "6 kB"]),
+        ("views = 1", ["frames", "build", "plan.toml", "-o", "x.h5", "--max-size", "20 apples"], ["such as 20GB"]),
+    ],
+)
+def test_a_file_that_would_be_too_large_is_refused_before_it_is_begun(
+    run, tmp_path, monkeypatch, text, arguments, words
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plan.toml").write_text(text, encoding="utf-8")
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert all(word in err for word in words), err
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.toml"]
+
+
+def test_a_dry_run_states_a_size_that_would_be_refused(run, tmp_path):
+    (tmp_path / "plan.toml").write_text(VGA, encoding="utf-8")
+    command = ["bank", "build", tmp_path / "plan.toml", "--dry-run", "-o", tmp_path / "x.h5"]
+    code, out, err = run(*command, "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out) == {"images": 101520, "bytes": 101520 * 640 * 480 * 16, "seconds": None}
+    assert "not tried" in run(*command)[1]
+
+
+def test_a_large_file_that_is_allowed_is_announced(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("phasemark.cli._NOTED_BYTES", 100_000)
+    command = ["bank", "build", "--class", "cone", *SMALL, "-o", tmp_path / "b.h5", "--max-size"]
+    assert run(*command, "0.19MB")[0] == 2
+    code, _, err = run(*command, "0.2 MB")
+    assert code == 0
+    # 5 distances from 18 sides of the lower half, and from one of the upper half, of 8 · 16 pixels of 16 bytes
+    announced = rf"note: {re.escape(str(tmp_path / 'b.h5'))}: 95 images, 195 kB; about \d+ s on \d+ processors here\n"
+    assert re.fullmatch(announced, err)
+    code, _, err = run(*command, "0.2 MB")
+    assert code == 4
+    assert err.startswith("error: ")  # without a trial
+
+
 def test_a_hard_render_has_no_mixed_pixel(run, tmp_path):
     run("render", "--class", "cone", "--distance", 1.0, "--variant", "hard", "-o", tmp_path / "f.png")
     with np.load(tmp_path / "f.npz") as data:
@@ -190,8 +300,8 @@ def test_landmarks_are_listed_shown_exported_and_checked(run, tmp_path):
     code, out, _ = run("landmark", "list", "--json")
     assert (code, [spec["name"] for spec in json.loads(out)]) == (0, ["cylinder", "cone", "sphere", "post"])
     assert "180°" in run("landmark", "list")[1]
-    assert run("landmark", "show", "cone", "-o", tmp_path)[0] == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"cone.png", "cone.html"}
+    assert run("landmark", "show", "cone", "-o", tmp_path / "new" / "pictures")[0] == 0
+    assert {path.name for path in (tmp_path / "new" / "pictures").iterdir()} == {"cone.png", "cone.html"}
     for kind in ("stl", "ply", "obj", "off"):
         assert run("landmark", "export", "cone", "-o", tmp_path / f"cone.{kind}")[0] == 0
         code, out, err = run("landmark", "check", tmp_path / f"cone.{kind}", "--unit", "m", "--json")
@@ -427,3 +537,20 @@ def test_force_replaces_an_output(run, folder, tmp_path):
     assert run("bank", "build", "--class", "cone", *SMALL, "-o", target)[0] == 4
     assert run("bank", "build", "--class", "cone", *SMALL, "-o", target, "--force")[0] == 0
     assert run("bank", "info", target)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "arguments"),
+    [
+        ("rosbags.typesys", "ros", ["frames", "export", "f.h5", "--to", "rosbag", "-o", "bag"]),
+        ("distributed", "dask", ["frames", "build", "plan.toml", "--scheduler", "tcp://localhost:1", "-o", "g.h5"]),
+    ],
+)
+def test_a_missing_package_is_installed_from_the_clone(run, tmp_path, monkeypatch, module, extra, arguments):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plan.toml").write_text("views = 1", encoding="utf-8")
+    assert run("frames", "build", "plan.toml", "-o", "f.h5")[0] == 0
+    monkeypatch.setitem(sys.modules, module, None)
+    code, _, err = run(*arguments)
+    assert code == 2
+    assert err.endswith(f": pip install -e '.[{extra}]' in the clone of phasemark\n")

@@ -35,6 +35,14 @@ def test_the_index_leads_to_every_page():
     assert [page for page in pages if f"({page})" not in index] == []
 
 
+def test_no_page_or_message_installs_extras_from_an_index():
+    # The package is on none: extras come from the clone, as in pip install -e '.[ros]'.
+    pages = [ROOT / "README.md", ROOT / "cli.py", *(ROOT / "docs").glob("*.md"), *(ROOT / "examples").glob("*")]
+    pages += [path for room in ("data", "landmarks", "matcher", "render") for path in (ROOT / room).rglob("*.py")]
+    texts = {path.name: path.read_text(encoding="utf-8") for path in pages if path.is_file()}
+    assert [name for name, text in texts.items() if "phasemark[" in text or "pip install phasemark" in text] == []
+
+
 def test_the_tutorials_explain_every_example():
     tutorials = (ROOT / "docs" / "tutorials.md").read_text(encoding="utf-8")
     assert [path.name for path in (ROOT / "examples").glob("*.py") if path.name not in tutorials] == []

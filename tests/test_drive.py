@@ -256,7 +256,7 @@ def test_a_plan_may_name_a_map_file_beside_it(tmp_path):
     (tmp_path / "plan.toml").write_text('map = "map.toml"\n[path]\nwaypoints_m = [[0, 0], [1, 0]]\n')
     assert load_drive_plan(tmp_path / "plan.toml").map.landmark[0].xy_m == (1.0, 2.0)
     (tmp_path / "map.toml").write_text("landmark = 3\n")
-    with pytest.raises(UsageError, match=r"map\.toml: 'landmark' must be a valid tuple, got 3"):
+    with pytest.raises(UsageError, match=r"map\.toml: 'landmark' must be a list, got 3"):
         load_drive_plan(tmp_path / "plan.toml")
 
 

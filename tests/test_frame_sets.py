@@ -22,11 +22,13 @@ from phasemark.data import (
     merge_parts,
     open_frames,
     parse_part,
+    planned_size,
     read_frames,
     verify_bank,
     verify_frames,
     write_checksum,
 )
+from phasemark.data.jobs import job_for
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, capture, preset
@@ -80,6 +82,11 @@ def sha256(path):
         ({"views": 1, "albedo": {"uniform": [0, 1]}}, "'albedo' must be in"),
         ({"views": 1, "splits": {"train": 0.5}}, "'splits' must be shares that add up to 1"),
         ({"views": 1, "colour": "red"}, "unknown key 'colour'"),
+        (
+            {"views": 1, "distance_m": "near"},
+            "'distance_m' must be a number or a table with .*, got 'near'",
+        ),
+        ({"views": 1, "splits": {"a b": 1.0}}, "each key of 'splits' must begin with a letter or digit .*, got 'a b'"),
         ({"views": 1, "delta_deg": {"gauss": [0, 1]}}, "unknown key 'gauss'"),
         ({"views": 1, "delta_deg": {"fixed": 0, "within": [0, 1]}}, "'within' cuts the tails of 'normal'"),
     ],
@@ -194,6 +201,33 @@ def test_resuming_a_finished_set_changes_nothing_and_of_another_plan_is_refused(
     assert sha256(frames_file) == before
     with pytest.raises(OutputExistsError, match=r"plan\.seed: 7 → 8"):
         build_frames(PLAN.model_copy(update={"seed": 8}), frames_file, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("small", "large"),
+    [
+        (FramePlan(views=100, frames_per_view=3), {"views": 300}),
+        (FramePlan(views=100), {"frames_per_view": 4}),
+        (FramePlan(views=100, variants=["shot"], keep_taps=True), {"views": 300}),
+        (FramePlan(views=100, sensor="vl53l5cx-8x8", variants=["mixed"]), {"views": 300}),
+        (BankPlan(classes=["cone"], distance_m=[1, 2], delta_deg=[0, 10], layout="full", harmonics=[3, 5]),
+         {"distance_m": "1:2:0.02"}),
+        (BankPlan(classes=["cone", "cylinder"], distance_m=[1, 2], delta_deg="0:170:5"), {"distance_m": "1:2:0.02"}),
+    ],
+)  # fmt: skip
+def test_a_larger_plan_makes_the_file_larger_by_what_the_arithmetic_says(small, large):
+    large = type(small)(**{**small.model_dump(), **large})
+    files = [job_for(plan).lay_out()[0].size for plan in (small, large)]
+    planned = [planned_size(plan)["bytes"] for plan in (small, large)]
+    # coordinates and the text of the plan are not counted
+    assert files[1] - files[0] == pytest.approx(planned[1] - planned[0], abs=4096)
+    assert 0 < files[0] - planned[0] < 2_000_000  # the meshes of the whole catalogue
+
+
+def test_a_trial_that_has_no_time_still_estimates_the_time():
+    facts = estimate(PLAN, trial_seconds=0.0)
+    assert facts["views"] == 20
+    assert 0 < facts["seconds"] < 600
 
 
 def test_a_dry_run_knows_the_size(frames_file):

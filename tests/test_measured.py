@@ -256,6 +256,41 @@ def test_millimetres_read_as_metres_are_an_error_that_asks_for_the_unit(tmp_path
         read_frames(path, sensor=SMALL, **STATED)
 
 
+DIRECT = SMALL.with_(kind="direct", modulation_hz=1e3, max_range_m=4.0)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "unit", "text", "fitting"),
+    [
+        (DIRECT, "m", "590,700,800,900,1000,1693\n", "--unit mm (dividing by 1000)"),
+        (DIRECT, "m", "59,70,80,90,100,169\n", "--unit cm (dividing by 100) or --unit mm (dividing by 1000)"),
+        (DIRECT, "cm", "590,700,800,900,1000,1693\n", "--unit mm (dividing by 10)"),
+        (SMALL, "m", "1600,2000,3000,4000,5000,6000\n", "--unit mm (dividing by 1000)"),
+    ],
+)
+def test_the_error_names_the_units_in_which_every_range_would_be_possible(tmp_path, sensor, unit, text, fitting):
+    with pytest.raises(InputFileError) as caught:
+        read_frames(csv_file(tmp_path, text), sensor=sensor, unit=unit, quantity="range")
+    assert str(caught.value).endswith(f"is --unit right? All would fit with {fitting}")
+
+
+def test_no_unit_is_proposed_where_none_would_help(tmp_path):
+    with pytest.raises(InputFileError, match=r"is --unit right\?$"):
+        read_frames(csv_file(tmp_path, "-1,-2,-3,-4,-5,1\n"), sensor=SMALL, **STATED)
+
+
+def test_a_direct_sensor_measures_little_beyond_its_largest_range(tmp_path):
+    path = csv_file(tmp_path, "1,2,3,4,4.9,5.1\n")  # the limit is 1.25 · 4 m
+    with pytest.warns(UserWarning, match=r"1 of 6 ranges are not in 0 … 5 m \(1.25 times the sensor's 'max_range_m'\)"):
+        frames = read_frames(path, sensor=DIRECT, **STATED)
+    assert frames.valid[0, 0].tolist() == [[True, True, True], [True, True, False]]
+
+
+def test_a_direct_sensor_without_a_largest_range_takes_far_ones(tmp_path):
+    path = csv_file(tmp_path, "1,2,3,4,5,60\n")
+    assert read_frames(path, sensor=DIRECT.with_(max_range_m=None), **STATED).valid.all()
+
+
 def saved(tmp_path, **arrays):
     np.savez(tmp_path / "a.npz", **arrays)
     return tmp_path / "a.npz"

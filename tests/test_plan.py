@@ -10,6 +10,7 @@ from phasemark import InputFileError, UsageError
 from phasemark.data import BankPlan, MeshPlan, load_plan
 from phasemark.data.plan import factored_refusal
 from phasemark.landmarks import catalog
+from phasemark.matcher.plan_kinds import KINDS, plan_schema
 from phasemark.render import preset
 
 PART = {"name": "part", "path": "part.stl", "unit": "mm"}
@@ -18,6 +19,9 @@ OTHER_BOX = {
     "box": {"length_m": 0.2, "width_m": 0.2, "height_m": 0.15},
     "upper": {"kind": "cylinder", "radius_m": 0.02, "height_m": 0.4},
 }
+
+
+BOX = "box = { length_m = 0.3, width_m = 0.3, height_m = 0.3 }"
 
 
 def plan_file(tmp_path, text):
@@ -108,6 +112,26 @@ def test_a_plan_file_sets_every_key(tmp_path):
         ("harmonics = [1]", "'harmonics.0' must be greater than or equal to 2, got 1"),
         ("[[meshes]]\nname = 'a'\nunit = 'mm'", "meshes.0: 'path' is missing"),
         ("[[meshes]]\nname = 'a/b'\npath = 'a.stl'\nunit = 'm'", "'name'"),
+        ("distanz_m = '1'", "unknown key 'distanz_m': did you mean 'distance_m'?"),
+        (
+            "views = 3",
+            "unknown key 'views': there are classes, landmarks, meshes, sensor, sensor_overrides",
+        ),
+        ("harmonics = 3", "'harmonics' must be a list, got 3"),
+        ("harmonics = ['x']", "'harmonics.0' must be a whole number, got 'x'"),
+        ("albedo = 'bright'", "'albedo' must be a number, got 'bright'"),
+        ("sensor = 3", "'sensor' must be a string, got 3"),
+        ("sensor_overrides = 3", "'sensor_overrides' must be a table, got 3"),
+        (
+            "[[meshes]]\nname = 'a/b'\npath = 'a.stl'",
+            "'name' must begin with a letter or digit and hold only letters, digits, '_', '.' and '-', got 'a/b'",
+        ),
+        (f"[[meshes]]\nname = '{'a' * 101}'\npath = 'a.stl'", "'name' must have at most 100 characters, got 'aaa"),
+        (f"[[landmarks]]\nname = 'a'\n{BOX}\nupper = {{}}", "landmarks.0: 'upper.kind' is missing"),
+        (
+            f"[[landmarks]]\nname = 'a'\n{BOX}\nupper = {{ kind = 'ball' }}",
+            "'upper.kind' must be one of 'cylinder', 'cone', 'sphere', 'revolution', got 'ball'",
+        ),
         (
             "[[meshes]]\nname = 'a'\npath = 'a.stl'\nunit = 'ft'",
             "meshes.0: 'unit' must be 'm', 'cm', 'mm' or 'inch', got 'ft'",
@@ -166,3 +190,16 @@ def test_an_unreadable_plan_is_an_input_error(tmp_path):
 def test_reasons_against_a_factored_bank(fields, reason):
     found = factored_refusal(BankPlan(**fields).resolve())
     assert found is None if reason is None else reason in found
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_pattern_of_a_plan_is_put_into_words(kind):
+    def patterns(schema):
+        found = [schema["pattern"]] if isinstance(schema.get("pattern"), str) else []
+        inner = [value for value in schema.values() if isinstance(value, dict)]
+        inner += [one for value in schema.values() if isinstance(value, list) for one in value if isinstance(one, dict)]
+        return found + [pattern for one in inner for pattern in patterns(one)]
+
+    for pattern in patterns(plan_schema(kind)):
+        message = f"String should match pattern '{pattern}'"  # as pydantic writes it
+        assert "^" not in str(UsageError.of_field(("name",), "string_pattern_mismatch", message, "a b"))

@@ -1,12 +1,16 @@
 """Sweeps as they are run: same numbers for any number of workers, resumed, refused, kept."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from own_matchers import Fails
 
-from phasemark import OutputExistsError, UsageError
+from phasemark import OutputExistsError, UsageError, cli
+from phasemark.cli import main
+from phasemark.matcher.plan_kinds import plan_schema
 from phasemark.matcher.sweep import read_sweep, run_sweep
-from phasemark.matcher.sweep_plan import SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
+from phasemark.matcher.sweep_plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
 
 EXACT = ("condition", "trial", "truth", "estimate", "bound", "covariance", "chi2", "p_value", "found", "accepted")
 
@@ -90,6 +94,15 @@ def test_rounds_go_on_until_the_rmse_is_known(tmp_path):
     ("changes", "message"),
     [
         ({"axes": {"distance_m": [0.8]}}, "'distance_m' must leave its spread"),
+        ({"wall_m": 4.0}, "unknown key 'wall_m': it is an axis and belongs under [axes], as axes.wall_m"),
+        ({"knows": "wall"}, "unknown key 'knows': it belongs to a method, under [[methods]]"),
+        ({"methods": [{"name": "a", "wall_m": 4}]}, "methods.0: unknown key 'wall_m': it is an axis and belongs under"),
+        ({"methods": [{"name": "a", "trials": 4}]}, "'trials': it belongs to the plan itself, above [[methods]]"),
+        ({"methods": []}, "'methods' must have at least 1 item, got []"),
+        (
+            {"methods": [{"name": "a", "method": "own"}]},
+            "'method' must be nearest, refine, or MODULE:NAME of a callable of your own, got 'own'",
+        ),
         ({"trials": 0}, "'trials' must be greater than or equal to 2, got 0"),
         ({"axes": {"colour": [1.0]}}, "unknown axis 'colour'"),
         ({"axes": {"n_frames": [2.5]}}, "'n_frames' must be a whole number"),
@@ -116,6 +129,75 @@ def test_a_bad_matcher_is_told_in_one_line(matcher, message, tmp_path):
         run_sweep(plan(matcher), tmp_path, workers=1)
 
 
+@pytest.mark.parametrize(
+    ("matcher", "got"),
+    [
+        ("returns_integers", ", got an object of type int for frame 0"),
+        ("returns_one_too_few", ", got 4"),
+        ("returns_none", ", got None"),
+        ("returns_a_number", ", got an object of type int"),
+        (
+            "returns_text_for_a_distance",
+            ", but the Match for frame 0 has 'distance_m' of type str: it must be a number",
+        ),
+        (
+            "returns_a_small_covariance",
+            ", but the Match for frame 0 has 'covariance' of shape (1, 1): it must be (2, 2), as 'free' has 2 names",
+        ),
+    ],
+)
+def test_what_a_matcher_must_return_is_told_in_one_line(matcher, got, tmp_path):
+    with pytest.raises(UsageError) as refused:
+        run_sweep(plan(f"own_matchers:{matcher}", trials=5), tmp_path, workers=1)
+    where = "method 'mine', condition 0, trials 0 … 4"
+    due = f"the matcher 'own_matchers:{matcher}' must return a Match for each of the 5 frames"
+    assert str(refused.value) == f"{where}: {due}{got}"
+
+
+@pytest.mark.parametrize(
+    ("matcher", "raised", "scheduler"),
+    [
+        ("no_luck", "ZeroDivisionError: no luck", "threads"),
+        ("no_luck", "ZeroDivisionError: no luck", "local:1"),
+        ("fails_late", "ZeroDivisionError: no luck", "threads"),
+        ("exits", "SystemExit: no licence", "threads"),
+        ("raises_usage_error", "UsageError: of its own", "threads"),
+    ],
+)
+def test_what_a_matcher_raises_is_shown_with_its_own_traceback(
+    matcher, raised, scheduler, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(Path(__file__).parent)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    (tmp_path / "plan.toml").write_text(
+        'name = "small"\ntrials = 2\nclasses = ["cone"]\nbank_distance_m = [0.9, 1.1]\n'
+        f'methods = [{{ name = "mine", method = "own_matchers:{matcher}" }}]\n',
+        encoding="utf-8",
+    )
+    monkeypatch.setattr(cli, "_PROGRESS_SECONDS", 1e6)  # no line of progress among those of the error
+    options = ["--scheduler", scheduler, "-o", str(tmp_path / "out")]
+    assert main(["sweep", "run", str(tmp_path / "plan.toml"), *options]) == 2
+    *traceback, error = capsys.readouterr().err.splitlines()
+    assert error.startswith("error: method 'mine', condition 0, trials 0 … 1: ")
+    assert error.endswith(f"the matcher 'own_matchers:{matcher}' raised {raised}")
+    assert traceback[0] == "Traceback (most recent call last):"
+    assert traceback[-1].endswith(raised)
+    files = {line.split('"')[1] for line in traceback if line.startswith("  File ")}
+    assert {Path(file).name for file in files} == {"own_matchers.py"}
+
+
+def test_a_module_that_fails_when_imported_is_shown_with_its_own_traceback(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "broken_matcher.py").write_text("import sys\nsys.exit(3)\n", encoding="utf-8")
+    assert main(["sweep", "run", "paper", "--matcher", "broken_matcher:match", "-o", "out"]) == 2
+    *traceback, error = capsys.readouterr().err.splitlines()
+    assert error == "error: the matcher 'broken_matcher:match' cannot be imported (SystemExit: 3)"
+    assert [line.split('"')[1] for line in traceback if line.startswith("  File ")] == [
+        str(tmp_path / "broken_matcher.py")
+    ]
+
+
 def test_a_folder_with_a_sweep_is_not_overwritten_unasked(reference):
     with pytest.raises(OutputExistsError, match="--resume"):
         run_sweep(plan(), reference[0])
@@ -131,6 +213,18 @@ def test_star_varies_each_axis_alone_and_sobol_stays_inside():
     assert len(sobol) == 16
     assert all(0.95 <= one.distance_m <= 1.05 and 0.4 <= one.albedo <= 0.8 for one in sobol)
     assert {type(one.n_frames) for one in sobol} == {int}
+
+
+def test_the_schema_names_every_axis():
+    axes = plan_schema("sweep")["properties"]["axes"]
+    assert set(axes["properties"]) == set(AXES) - {"class_name"}
+    assert axes["additionalProperties"] is False
+    for name, schema in axes["properties"].items():
+        value = schema["anyOf"][1]
+        with pytest.raises(UsageError):
+            plan(axes={name: [value["maximum"] * 1.001 + 1]})
+        with pytest.raises(UsageError):
+            plan(axes={name: [value["minimum"] - 1]})
 
 
 def test_shipped_plans_are_plans():

@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from phasemark import UsageError
 from phasemark.data.plan import PlanModel, read_toml
 from phasemark.matcher.landmark_map import LandmarkMap, Point, Std, load_map
+from phasemark.render import Sensor, preset
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Share = Annotated[float, Field(gt=0, lt=1)]
@@ -188,6 +189,20 @@ class DrivePlan(PlanModel):
                     f" got {clearance:.3g} m"
                 )
         return self
+
+    def build_sensor(self) -> Sensor:
+        """Return the sensor.
+
+        Raises
+        ------
+        UsageError
+            The preset is unknown.
+        """
+        return preset(self.camera.sensor)
+
+    def greatest_distances_m(self) -> dict[str, float]:
+        """Return the greatest distance at which a landmark is looked at, metres."""
+        return {"stop.distance_m": self.stop.distance_m[1]}
 
 
 def load_drive_plan(path: str | os.PathLike[str]) -> DrivePlan:

@@ -23,7 +23,7 @@ from phasemark.matcher.filters import kalman_filter
 from phasemark.matcher.landmark_map import MappedLandmark
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
-from phasemark.render import Background, Renderer, Sensor, Views, capture, preset
+from phasemark.render import Background, Renderer, Sensor, Views, capture
 
 FREE = ("distance_m", "delta_rad", "bearing_rad")
 """The robot points the camera by its own wrong estimate, so the bearing is unknown too."""
@@ -154,7 +154,7 @@ class Equipment:
         UsageError
             The catalogue has no such class, or no such camera is shipped.
         """
-        sensor = preset(plan.camera.sensor)
+        sensor = plan.build_sensor()
         specs = catalog()
         names = list(dict.fromkeys(landmark.class_name for landmark in plan.map.landmark))
         for name in names:

@@ -1,0 +1,129 @@
+"""The size of banks and frame sets, from arithmetic alone: known before anything is built."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+
+from phasemark import UsageError
+from phasemark.data.bank import LAYOUT_GROUPS, VIEW_DIMS, group_rows
+from phasemark.data.frame_plan import FramePlan
+from phasemark.data.frames import FRAME_FIELDS, VIEW_FIELDS
+from phasemark.data.plan import BankPlan
+from phasemark.render import Sensor
+
+_UNITS = {"": 1, "B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+_BYTES_OF_A_FRAME = 24  # its number, its view and its seed
+_BYTES_OF_A_VIEW = 67  # its number, class, split and truth
+
+
+def planned_size(plan: BankPlan | FramePlan) -> dict[str, int]:
+    """Return how large a bank or frame set would be, from its plan alone: nothing is rendered, no mesh is read.
+
+    Parameters
+    ----------
+    plan : BankPlan or FramePlan
+
+    Returns
+    -------
+    dict of str to int
+        ``images``, or ``views`` and ``frames``; and ``bytes`` without header and meshes, some 2 MB for the whole
+        catalogue.
+
+    Raises
+    ------
+    UsageError
+        A class or sensor is unknown, or two landmarks have one name.
+    InputFileError
+        The sensor file cannot be read.
+
+    Examples
+    --------
+    >>> from phasemark.data import BankPlan
+    >>> planned_size(BankPlan(classes=["cone"], distance_m="1:2:0.5", delta_deg="0:170:10", layout="full"))
+    {'images': 54, 'bytes': 221184}
+    """
+    plan = plan.resolve()
+    sensor = plan.build_sensor()
+    return _bank_size(plan, sensor) if isinstance(plan, BankPlan) else _frames_size(plan, sensor)
+
+
+def _bank_size(plan: BankPlan, sensor: Sensor) -> dict[str, int]:
+    counts = {
+        "landmark_class": len(plan.landmarks) + len(plan.meshes),
+        "distance": len(plan.distance_m),
+        "delta": len(plan.delta_rad),
+    }
+    numbers = 2 * (1 + len(plan.harmonics)) + 2  # real and imaginary parts; intensity and coverage
+    images = size = 0
+    for group in LAYOUT_GROUPS[plan.layout]:
+        n = math.prod(counts[dim] for dim in VIEW_DIMS[group])
+        first, stop = group_rows(group, sensor)
+        images += n
+        size += n * (stop - first) * sensor.cols * numbers * 4
+    return {"images": images, "bytes": size}
+
+
+def _frames_size(plan: FramePlan, sensor: Sensor) -> dict[str, int]:
+    counts = {
+        "frame": plan.views * plan.frames_per_view, "view": plan.views, "row": sensor.rows, "col": sensor.cols,
+        "phase": 4, "tap": 2,
+    }  # fmt: skip
+    size = _BYTES_OF_A_FRAME * counts["frame"] + _BYTES_OF_A_VIEW * counts["view"]
+    for name in frame_set_fields(plan, sensor):
+        dims, kind, _, _ = {**FRAME_FIELDS, **VIEW_FIELDS}[name]
+        size += math.prod(counts[dim] for dim in dims) * np.dtype(kind).itemsize
+    return {"views": plan.views, "frames": counts["frame"], "bytes": size}
+
+
+def frame_set_fields(plan: FramePlan, sensor: Sensor) -> list[str]:
+    """Return the names of the large datasets of a frame set, in their order in the file."""
+    per_frame = ["range", "flags"] if sensor.kind == "direct" else ["range", "amplitude", "intensity", "flags"]
+    if plan.keep_taps:
+        per_frame.append("taps")
+    if "shot" in plan.variants:
+        per_frame.append("range_shot")
+    return [*per_frame, "coverage", *(f"range_{name}" for name in ("hard", "mixed") if name in plan.variants)]
+
+
+def parse_size(text: str, name: str) -> int:
+    """Return the bytes of a size such as ``20GB`` or ``500 MB``; a number alone is in bytes.
+
+    Parameters
+    ----------
+    text : str
+    name : str
+        The option or key that holds it, for the error.
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    UsageError
+        It is something else.
+
+    Examples
+    --------
+    >>> parse_size("1.5 GB", "--max-size")
+    1500000000
+    """
+    found = re.fullmatch(r"(\d+(?:\.\d+)?) ?([kMGT]?B|)", text.strip())
+    if found is None:
+        raise UsageError(f"{name} must be a number with B, kB, MB, GB or TB, such as 20GB, got '{text}'")
+    return round(float(found[1]) * _UNITS[found[2]])
+
+
+def format_size(size: int) -> str:
+    """Return a number of bytes with three digits and a unit.
+
+    Examples
+    --------
+    >>> format_size(15_234_000_000)
+    '15.2 GB'
+    """
+    unit = next((unit for unit in ("TB", "GB", "MB", "kB") if size >= _UNITS[unit]), "B")
+    return f"{float(f'{size / _UNITS[unit]:.3g}'):g} {unit}"
