@@ -33,8 +33,21 @@ from phasemark.render import Sensor, preset
 DEFAULT_DISTANCE_M = "0.7:2.1:0.01"
 DEFAULT_DELTA_STEP_DEG = 1.0
 
-_YOUNGER_FIELDS = {"bearing_offset_deg", "height_offset_m"}
-"""Of a sensor: what resolved plans in older files lack, and mean 0 by."""
+_YOUNGER_FIELDS = {
+    "bearing_offset_deg",
+    "height_offset_m",
+    "delay_s",
+    "range_shot_std_m",
+    "range_ambient_std_m",
+    "zone_offset_m",
+    "calibration_fields",
+    "calibration_covariance",
+    "systematic_distance_m",
+    "systematic_delta_deg",
+    "systematic_bearing_deg",
+    "systematic_height_m",
+}
+"""Of a sensor: what resolved plans in older files lack, and mean 0 or none by."""
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
 _Albedo = Annotated[float, Field(gt=0, le=1)]

@@ -104,12 +104,12 @@ class FilteredFrames:
         )
 
     def without_offset(self) -> FilteredFrames:
-        """Return the frames with the sensor's range offset taken off, of the same sensor without one."""
-        offset = self.sensor.range_offset_m
-        if offset == 0:
+        """Return the frames with the sensor's offsets of range and zones taken off, of the same sensor without them."""
+        sensor = self.sensor
+        if sensor.range_offset_m == 0 and not sensor.zone_offset_m:
             return self
-        corrected = wrap_range_m(self.range_m - offset, self.sensor)
-        return replace(self, range_m=corrected, sensor=self.sensor.with_(range_offset_m=0.0))
+        corrected = wrap_range_m(self.range_m - (sensor.range_offset_m + sensor.zone_offsets), sensor)
+        return replace(self, range_m=corrected, sensor=sensor.with_(range_offset_m=0.0, zone_offset_m=()))
 
     def with_pooled_noise(self) -> FilteredFrames:
         """Return the frames of a direct sensor with the noise of its law, scaled to the scatter of all pixels together.

@@ -19,7 +19,7 @@ from phasemark import UsageError
 from phasemark.render.capture import capture
 from phasemark.render.flat_field import ExpectedFlatField, expected_flat_field, flat_field
 from phasemark.render.frames import Flag, Frames
-from phasemark.render.noise import exact_phase_moments, predicted_range_std
+from phasemark.render.noise import direct_range_std, exact_phase_moments, predicted_range_std
 from phasemark.render.phasor import wrap_difference_m
 from phasemark.render.sensor import Sensor
 from phasemark.render.unit import camera_unit
@@ -720,17 +720,19 @@ def _direct_range(bench: _Bench) -> _Part:
         error_m = bench.range_errors(bench.frames(distance, albedo / distance**2), distance)
         mean.append(error_m.mean())
         std.append(math.sqrt(error_m.var(axis=0, ddof=1).mean()))
-    true_std, samples = np.full(20, sensor.range_std_m), np.full(20, n)
+    true_std, samples = direct_range_std(albedo / distances**2, sensor), np.full(20, n)
+    curve = np.linspace(0.0, furthest, 60)[1:]
+    offset_m = sensor.range_offset_m + float(sensor.zone_offsets[bench.alive].mean())
     noisy = true_std > 0
     degrees = n - int(bench.alive.sum())
     label = f"albedo {albedo:g}"
     return _Part(
         (
             Comparison("range_noise", label, "distance_m", "range_std_m", distances, true_std, np.array(std),
-                       true_std / math.sqrt(2 * degrees), samples, noisy, ends, np.full(2, sensor.range_std_m)),
-            Comparison("linearity", label, "range_m", "mean_range_error_m", distances,
-                       np.full(20, sensor.range_offset_m), np.array(mean), true_std / math.sqrt(n), samples, noisy,
-                       ends, np.full(2, sensor.range_offset_m)),
+                       true_std / math.sqrt(2 * degrees), samples, noisy, curve,
+                       direct_range_std(albedo / curve**2, sensor)),
+            Comparison("linearity", label, "range_m", "mean_range_error_m", distances, np.full(20, offset_m),
+                       np.array(mean), true_std / math.sqrt(n), samples, noisy, ends, np.full(2, offset_m)),
         )
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ def predicted_range_std(amplitude: ArrayLike, intensity: ArrayLike, sensor: Sens
 
     σ = (c / 4πf) · √(N₀·intensity + N_amb + N_dark + 2σ_r² + q²/6) / (√2 · K · N₀ · |S_1|), PHYSICS section 4. It is
     the limit of high signal: 0.5 % low at a phase noise of 0.1 rad, 1 % at 0.14 rad. Patterns (PRNU, DSNU) and stray
-    light are not in it. For a direct sensor, which has no law, it is the figure the sensor states, `range_std_m`.
+    light are not in it. A direct sensor has a law of its own, :func:`direct_range_std`.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def predicted_range_std(amplitude: ArrayLike, intensity: ArrayLike, sensor: Sens
     Returns
     -------
     ndarray
-        Metres; infinite where the amplitude is zero.
+        Metres; infinite where the amplitude is zero, for a direct sensor where amplitude or intensity is.
 
     Examples
     --------
@@ -50,6 +50,7 @@ def measured_range_std(amplitude_e: ArrayLike, intensity_e: ArrayLike, sensor: S
 
     The law of :func:`predicted_range_std` in the electrons a frame reports, whose means are amplitude_e = K·N₀·|S_1|
     and intensity_e = N₀·intensity + N_amb + N_dark: σ = (c / 4πf) · √(intensity_e + 2σ_r² + q²/6) / (√2 · amplitude_e).
+    For a direct sensor intensity_e over N₀ = `signal_e` is the relative intensity of :func:`direct_range_std`.
 
     Parameters
     ----------
@@ -60,9 +61,34 @@ def measured_range_std(amplitude_e: ArrayLike, intensity_e: ArrayLike, sensor: S
     Returns
     -------
     ndarray
-        Metres; infinite where the amplitude is zero.
+        Metres; infinite where the amplitude is zero, for a direct sensor where amplitude or intensity is.
     """
     return sensor.metres_per_radian * measured_phase_std(amplitude_e, intensity_e, sensor)
+
+
+def direct_range_std(intensity: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
+    """Return the standard deviation of a direct sensor's range in one frame (PHYSICS section 4).
+
+    σ² = range_std_m² + range_shot_std_m² / I + range_ambient_std_m² / I² with the relative intensity I: a constant
+    part, shot noise of the signal, and shot noise of ambient light, which makes σ grow with the square of the range.
+
+    Parameters
+    ----------
+    intensity : array_like
+        Relative intensity I; 1 for albedo 1 facing the camera at 1 m.
+    sensor : Sensor
+        Of kind "direct".
+
+    Returns
+    -------
+    ndarray
+        Metres; infinite where the intensity is not positive.
+    """
+    relative = np.asarray(intensity, dtype=np.float64)
+    lit = relative > 0
+    inverse = np.divide(1.0, relative, out=np.zeros(relative.shape), where=lit)
+    variance = sensor.range_std_m**2 + inverse * (sensor.range_shot_std_m**2 + sensor.range_ambient_std_m**2 * inverse)
+    return np.where(lit, np.sqrt(variance), np.inf)
 
 
 def measured_phase_std(amplitude_e: ArrayLike, intensity_e: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
@@ -71,7 +97,8 @@ def measured_phase_std(amplitude_e: ArrayLike, intensity_e: ArrayLike, sensor: S
         np.asarray(amplitude_e, dtype=np.float64), phase_image_variance(intensity_e, sensor)
     )
     if sensor.kind == "direct":
-        return np.full(amplitude.shape, sensor.range_std_m / sensor.metres_per_radian)
+        law = direct_range_std(np.asarray(intensity_e, dtype=np.float64) / sensor.signal_e, sensor)
+        return np.where(amplitude > 0, law / sensor.metres_per_radian, np.inf)
     std = np.full(amplitude.shape, np.inf)
     np.divide(np.sqrt(variance), math.sqrt(2) * amplitude, out=std, where=np.not_equal(amplitude, 0))
     return std

@@ -35,6 +35,7 @@ _Share = Annotated[float, Field(ge=0, lt=1)]
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Order = Annotated[int, Field(ge=2, le=199)]
 _Pixel = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
+_Row = tuple[_Finite, ...]
 _PulseShape = tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...]
 
 PATTERN_BOUND = 3.0
@@ -97,7 +98,29 @@ _PHASE_ONLY = (
     "min_amplitude_e",
     "wrap_guard_m",
 )
-_DIRECT_ONLY = ("max_range_m", "min_intensity", "range_std_m")
+_DIRECT_ONLY = (
+    "max_range_m",
+    "min_intensity",
+    "range_std_m",
+    "range_shot_std_m",
+    "range_ambient_std_m",
+    "zone_offset_m",
+)
+
+# What a calibration leaves: it moves no image and adds no noise to a frame.
+_CALIBRATION = (
+    "calibration_fields",
+    "calibration_covariance",
+    "systematic_distance_m",
+    "systematic_delta_deg",
+    "systematic_bearing_deg",
+    "systematic_height_m",
+)
+
+_DIRECT_NOISE = ("range_std_m", "range_shot_std_m", "range_ambient_std_m", "zone_offset_m")
+
+_SEMIDEFINITE = 1e-5
+"""Negative eigenvalue of a correlation matrix that rounding to the digits of a file may cause."""
 
 _ROUNDING = 1e-9  # of a limit that files state in decimals
 
@@ -199,8 +222,24 @@ class Sensor(BaseModel):
         "direct" only: nothing returns from beyond.
     min_intensity : float
         "direct" only: nothing returns from a pixel that gets less light than this; 1 is albedo 1 facing at 1 m.
-    range_std_m : float
-        "direct" only: standard deviation of a range. A figure to weight measurements with, not a model of the chip.
+    range_std_m, range_shot_std_m, range_ambient_std_m : float
+        "direct" only: noise of a range, σ² = range_std_m² + range_shot_std_m² / I + range_ambient_std_m² / I², where
+        I is the relative intensity, 1 for albedo 1 facing the camera at 1 m. The three terms are constant, grow
+        as under shot noise of the signal, and grow as under shot noise of ambient light.
+    zone_offset_m : tuple of rows of float
+        "direct" only: measured offset of each pixel, rows × cols, added to its range beside `range_offset_m`. Empty:
+        no offsets.
+    delay_s : float
+        Added to the time stamp of a frame to get the time at which the camera was where the frame shows it; -0.075
+        for frames that show the pose 75 ms before their stamp.
+    calibration_fields : tuple of str
+        Names of the fields that a calibration estimated, e.g. "pitch_deg".
+    calibration_covariance : tuple of rows of float
+        Covariance of these fields in their own units, symmetric and positive semidefinite. Its errors are common to
+        all frames of the camera.
+    systematic_distance_m, systematic_delta_deg, systematic_bearing_deg, systematic_height_m : float
+        Standard deviation of what noise and calibration do not explain of a pose: an error that averaging frames does
+        not reduce.
 
     Raises
     ------
@@ -227,6 +266,7 @@ class Sensor(BaseModel):
     modulation_hz: _Positive = 10e6
     frame_rate_hz: _Positive = 3.0
     phase_interval_s: _Positive | None = None
+    delay_s: Annotated[float, Field(ge=-10, le=10)] = 0.0
     contrast: _Fraction = 0.5
     modulation: Literal["sine", "square", "harmonics", "pulse"] = "sine"
     max_harmonic: _Order = 49
@@ -270,6 +310,16 @@ class Sensor(BaseModel):
     max_range_m: _Positive | None = None
     min_intensity: _NonNegative = 0.0
     range_std_m: _NonNegative = 0.0
+    range_shot_std_m: _NonNegative = 0.0
+    range_ambient_std_m: _NonNegative = 0.0
+    zone_offset_m: tuple[_Row, ...] = ()
+    # what a calibration leaves
+    calibration_fields: tuple[str, ...] = ()
+    calibration_covariance: tuple[_Row, ...] = ()
+    systematic_distance_m: _NonNegative = 0.0
+    systematic_delta_deg: _NonNegative = 0.0
+    systematic_bearing_deg: _NonNegative = 0.0
+    systematic_height_m: _NonNegative = 0.0
 
     def __init__(self, **data: Any) -> None:
         try:
@@ -421,6 +471,36 @@ class Sensor(BaseModel):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _tables_have_their_size(self) -> Self:
+        if self.zone_offset_m:
+            _check_table("zone_offset_m", self.zone_offset_m, self.rows, self.cols, "rows x cols of the sensor")
+        names = self.calibration_fields
+        for name in names:
+            number = name in type(self).model_fields and isinstance(getattr(self, name), float)
+            if not number or name in _CALIBRATION:
+                raise ValueError(f"'calibration_fields' must name fields of the sensor that are numbers, got '{name}'")
+            if names.count(name) > 1:
+                raise ValueError(f"'calibration_fields' must name each field once, got '{name}' twice")
+        covariance = self.calibration_covariance
+        _check_table("calibration_covariance", covariance, len(names), len(names), "one for each of calibration_fields")
+        matrix = np.array(covariance, dtype=np.float64).reshape(len(names), len(names))
+        variance = np.diag(matrix)
+        if (variance < 0).any():
+            k = int((variance < 0).argmax())
+            raise ValueError(f"'calibration_covariance' must have no negative variance, got {variance[k]:g}")
+        root = np.sqrt(np.where(variance > 0, variance, 1.0))
+        correlation = matrix / np.outer(root, root)
+        if not np.allclose(correlation, correlation.T, rtol=0, atol=_SEMIDEFINITE):
+            raise ValueError("'calibration_covariance' must be symmetric")
+        lowest = float(np.linalg.eigvalsh(correlation).min()) if names else 0.0
+        if lowest < -_SEMIDEFINITE:
+            raise ValueError(
+                f"'calibration_covariance' must be positive semidefinite, but its correlation matrix has the eigenvalue"
+                f" {lowest:.3g}"
+            )
+        return self
+
     def with_(self, **changes: Any) -> Sensor:
         """Return a copy with some fields changed, validated again."""
         return Sensor(**{**self.model_dump(), **changes})
@@ -434,7 +514,8 @@ class Sensor(BaseModel):
             Whether the light still arrives as a Poisson process; then the validity threshold stays as well.
         """
         if self.kind == "direct":
-            return self.with_(range_std_m=0.0, range_offset_m=0.0, dead_share=0.0, dead_pixels=())
+            neutral = ("range_offset_m", "dead_share", "dead_pixels", "delay_s", *_DIRECT_NOISE, *_CALIBRATION)
+            return self.with_(**{name: type(self).model_fields[name].default for name in neutral})
         kept = {name: getattr(self, name) for name in (*_OPTICS, *_WITHOUT_ERRORS) if name != "centre_px"}
         threshold = self.max_phase_std_rad if shot_noise else None
         return Sensor(
@@ -544,6 +625,7 @@ class Sensor(BaseModel):
             "dead_share": "defects",
             "max_phase_std_rad": "validity",
             "max_range_m": "direct time of flight only",
+            "calibration_fields": "what a calibration leaves",
         }
         groups: dict[str, tuple[str, ...]] = {}
         title = ""
@@ -551,6 +633,18 @@ class Sensor(BaseModel):
             title = titles.get(name, title)
             groups[title] = (*groups.get(title, ()), name)
         return groups
+
+    @property
+    def zone_offsets(self) -> NDArray[np.float64]:
+        """Offsets of the pixels beside `range_offset_m`, (rows, cols) metres; zero where none are stated."""
+        table = self.zone_offset_m or ((0.0,) * self.cols,) * self.rows
+        return np.array(table, dtype=np.float64)
+
+    @property
+    def calibration_matrix(self) -> NDArray[np.float64]:
+        """Covariance of `calibration_fields` in their units, (p, p); (0, 0) without a calibration."""
+        p = len(self.calibration_fields)
+        return np.array(self.calibration_covariance, dtype=np.float64).reshape(p, p)
 
     @property
     def quantity(self) -> Literal["range", "z"]:
@@ -665,6 +759,14 @@ class Sensor(BaseModel):
         z = range · cosine. Tilting the camera turns both, so mounting does not enter.
         """
         return np.asarray(self.pixel_directions() @ self.cam2level[:, 0])
+
+
+def _check_table(name: str, table: tuple[_Row, ...], rows: int, cols: int, what: str) -> None:
+    """Refuse a table that does not have so many rows and columns."""
+    lengths = {len(row) for row in table}
+    if len(table) != rows or lengths - {cols}:
+        got = f"{len(table)} rows of {' or '.join(map(str, sorted(lengths))) or 'no'} numbers"
+        raise ValueError(f"'{name}' must have {rows} rows of {cols} numbers, {what}, got {got}")
 
 
 def preset_names() -> list[str]:

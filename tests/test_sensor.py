@@ -1,6 +1,7 @@
 """The fields of a sensor: ranges, contradictions, presets."""
 
 import math
+import re
 import tomllib
 from importlib import resources
 
@@ -10,10 +11,14 @@ from chain_cells import FALSE_ALARM, pure_image
 from scipy import stats
 
 from phasemark import UsageError
+from phasemark.matcher import kalman_filter
+from phasemark.matcher.coarse import assumed_std_m
+from phasemark.matcher.likelihood import counts
 from phasemark.render import (
     Background,
     Flag,
     Renderer,
+    Sensor,
     ablate,
     capture,
     measured_range_std,
@@ -21,6 +26,7 @@ from phasemark.render import (
     preset,
     preset_names,
 )
+from phasemark.render.sensor_file import sensor_toml
 
 PMD = preset("pmd-16x16")
 DIRECT = preset("vl53l5cx-8x8")
@@ -166,6 +172,95 @@ def test_a_direct_sensor_has_the_spread_it_states():
     z = stats.norm.ppf(1 - FALSE_ALARM / 2)
     assert np.std(frames.range_m) == pytest.approx(0.004, rel=z / math.sqrt(2 * 64 * n))
     assert predicted_range_std(0.5, 0.5, DIRECT) == pytest.approx(0.004)
+
+
+def test_the_noise_of_a_direct_sensor_grows_with_range_as_its_three_terms_say():
+    """With I = 0.8 / r² the terms are constant, proportional to r² / 0.8 and to r⁴ / 0.64 in the variance."""
+    sensor = DIRECT.with_(range_std_m=0.003, range_shot_std_m=0.002, range_ambient_std_m=0.004)
+    r = np.array([0.5, 1.0, 2.0])
+    variance = 0.003**2 + 0.002**2 * r**2 / 0.8 + 0.004**2 * r**4 / 0.64
+    intensity = 0.8 / r**2
+    np.testing.assert_allclose(predicted_range_std(intensity, intensity, sensor), np.sqrt(variance), rtol=1e-12)
+    np.testing.assert_allclose(assumed_std_m(r, sensor), np.sqrt(variance), rtol=1e-12)
+    n = 2000
+    image = pure_image(r, sensor, 1.0)
+    image.intensity[:] = intensity[:, None, None]
+    frames = capture(image, sensor, rng=np.random.default_rng(0), n_frames=n)
+    z = stats.norm.ppf(1 - FALSE_ALARM / 6)
+    spread = frames.range_m.std(axis=(1, 2, 3))
+    np.testing.assert_allclose(spread, np.sqrt(variance), rtol=z / math.sqrt(2 * 64 * n))
+
+
+def test_what_returns_no_light_is_not_measured():
+    for sensor in (PMD, DIRECT):
+        assert np.isinf(predicted_range_std(0.0, 0.0, sensor))
+    assert not counts(np.zeros((1, 2, 2), complex), np.zeros((1, 2, 2)), DIRECT).any()
+
+
+def test_the_noise_of_a_direct_sensor_draws_the_same_random_numbers_whatever_its_terms():
+    image = pure_image(1.0, DIRECT, 1.0)
+    one, other = (
+        capture(image, sensor, rng=np.random.default_rng(5), n_frames=3).range_m - image.range_m
+        for sensor in (DIRECT, DIRECT.with_(range_std_m=0.0, range_ambient_std_m=0.02))
+    )
+    np.testing.assert_allclose(other / 0.02, one / 0.004, rtol=1e-9)
+
+
+def test_offsets_of_zones_are_added_by_the_sensor_and_taken_off_measured_frames():
+    table = np.random.default_rng(4).normal(0, 0.01, (8, 8))
+    sensor = DIRECT.with_(range_std_m=0.0, range_offset_m=0.02, zone_offset_m=tuple(map(tuple, table.tolist())))
+    frames = capture(pure_image(1.0, sensor, 0.5), sensor, rng=np.random.default_rng(0), n_frames=2)
+    np.testing.assert_allclose(frames.range_m[0, 1], 1.02 + table, rtol=0, atol=1e-12)
+    plain = kalman_filter(frames).without_offset()
+    np.testing.assert_allclose(plain.range_m[0], 1.0, rtol=0, atol=1e-12)
+    assert (plain.sensor.range_offset_m, plain.sensor.zone_offset_m) == (0.0, ())
+
+
+def test_what_a_calibration_leaves_is_written_and_read_and_changes_no_image(tmp_path):
+    mounted = DIRECT.with_(
+        delay_s=-0.075, calibration_fields=("pitch_deg", "delay_s"),
+        calibration_covariance=((0.04, 1e-4), (1e-4, 4e-6)), systematic_distance_m=0.003, systematic_delta_deg=0.6,
+        systematic_bearing_deg=0.5, systematic_height_m=0.01, zone_offset_m=((0.001,) * 8,) * 8,
+    )  # fmt: skip
+    path = tmp_path / "mounted.toml"
+    path.write_text(sensor_toml(mounted, {}, header=[], otherwise="assumed"))
+    assert Sensor.from_toml(path) == mounted
+    assert mounted.optics_difference(DIRECT) is None
+    np.testing.assert_allclose(mounted.calibration_matrix, [[0.04, 1e-4], [1e-4, 4e-6]])
+    assert PMD.with_(delay_s=-0.1, systematic_distance_m=0.001).kind == "phase"
+
+
+@pytest.mark.parametrize(
+    ("fields", "part"),
+    [
+        ({"zone_offset_m": ((0.0,) * 8,) * 7}, "'zone_offset_m' must have 8 rows of 8 numbers"),
+        ({"calibration_fields": ("pitch",)}, "must name fields of the sensor that are numbers, got 'pitch'"),
+        ({"calibration_fields": ("rows",)}, "must name fields of the sensor that are numbers, got 'rows'"),
+        ({"calibration_fields": ("pitch_deg",)}, "'calibration_covariance' must have 1 rows of 1 numbers"),
+        (
+            {"calibration_fields": ("pitch_deg", "roll_deg"), "calibration_covariance": ((1.0, 2.0), (2.0, 1.0))},
+            "must be positive semidefinite",
+        ),
+        (
+            {"calibration_fields": ("pitch_deg", "roll_deg"), "calibration_covariance": ((1.0, 0.5), (0.2, 1.0))},
+            "must be symmetric",
+        ),
+        ({"calibration_fields": ("pitch_deg",), "calibration_covariance": ((-1.0,),)}, "no negative variance"),
+        ({"systematic_distance_m": -0.1}, "'systematic_distance_m'"),
+        ({"delay_s": 75.0}, "'delay_s'"),
+    ],
+)
+def test_what_no_calibration_can_leave_is_refused(fields, part):
+    with pytest.raises(UsageError, match=re.escape(part)):
+        DIRECT.with_(**fields)
+
+
+@pytest.mark.parametrize(
+    "fields", [{"zone_offset_m": ((0.0,) * 16,) * 16}, {"range_shot_std_m": 0.1}, {"range_ambient_std_m": 0.1}]
+)
+def test_noise_of_direct_sensors_is_refused_for_others(fields):
+    with pytest.raises(UsageError, match="it belongs to 'kind' = 'direct'"):
+        PMD.with_(**fields)
 
 
 def test_a_direct_sensor_has_no_taps_to_keep():
