@@ -103,16 +103,7 @@ def summary(trials: SweepTrials, cells: Sequence[Cell]) -> list[str]:
             )
     if worst:
         sentences.append(f"The worst cells are, {'; '.join(worst)}.")
-    strangers = [cell for cell in cells if cell.stranger]
-    parts = []
-    for method in methods:
-        right, n = _count([cell for cell in landmarks if cell.method == method])
-        part = f"{method} found the right class in {right} of {n} trials"
-        if strangers:
-            refused, of = _count([cell for cell in strangers if cell.method == method])
-            part += f" and refused {refused} of {of} strangers"
-        parts.append(part)
-    classes = "; ".join(parts)
+    classes = "; ".join(_classes(trials, m) for m in range(len(methods)))
     return [*sentences, f"{classes[:1].upper()}{classes[1:]}."]
 
 
@@ -126,8 +117,17 @@ def _accuracy(cells: Sequence[Cell]) -> str:
     return " and ".join(parts) or "no answer"
 
 
-def _count(cells: Sequence[Cell]) -> tuple[int, int]:
-    return sum(round(cell.class_right.value * cell.n) for cell in cells), sum(cell.n for cell in cells)
+def _classes(trials: SweepTrials, m: int) -> str:
+    """Say what the confusion matrix of method m shows: right among the answers, and what was refused."""
+    refused, strange = trials.refused[:, m], trials.true_class < 0
+    answers = ~refused & ~strange
+    right = int((trials.found[answers, m] == trials.true_class[answers]).sum())
+    n, silent = int((~strange).sum()), int((refused & ~strange).sum())
+    text = f"{trials.methods[m]} named the right class in {right} of {int(answers.sum())} answers and refused"
+    text += f" {silent} of {n} trials ({100 * silent / max(n, 1):.2g} %)"
+    if strange.any():
+        text += f" and {int((refused & strange).sum())} of {int(strange.sum())} strangers"
+    return text
 
 
 def _where(cell: Cell, cells: Sequence[Cell]) -> str:
