@@ -346,7 +346,7 @@ def _sensor_fit(
     fields = fit.sensor.model_dump(mode="json")
     _echo_table(
         ("field", "value", "std error", "from"),
-        ((name, _short(fields[name]), _error_of(one), one.note) for name, one in fit.estimates.items()),
+        ((name, *_value_and_error_of(fields[name], one), one.note) for name, one in fit.estimates.items()),
     )
     for note in fit.notes:
         typer.echo(note)
@@ -476,11 +476,13 @@ def _landmark_design(
 
 def _echo_design(facts: Mapping[str, Any]) -> None:
     """Print a design beside the catalogue."""
+    from phasemark.render.rounding import with_interval
 
-    def within(interval: Mapping[str, float | None], scale: float, digits: int) -> str:
-        numbers = [interval[key] for key in ("value", "low", "high")]
-        value, low, high = ("" if number is None else f"{scale * number:.{digits}f}" for number in numbers)
-        return f"{value} [{low}, {high}]" if value else "nothing found"
+    def within(interval: Mapping[str, float | None], scale: float) -> str:
+        value, low, high = (
+            math.nan if number is None else scale * number for number in map(interval.get, ("value", "low", "high"))
+        )
+        return with_interval(value, low, high) if math.isfinite(value) else "nothing found"
 
     sets = [facts["result"], facts["catalogue"]]
     rows = [
@@ -495,14 +497,14 @@ def _echo_design(facts: Mapping[str, Any]) -> None:
     if confirmation:
         tried = [confirmation["result"], confirmation["catalogue"]]
         for title, key in (("worst side", "worst"), ("anywhere", "anywhere")):
-            found = (f"{within(one[key]['rmse_m'], 1000, 1)}, N = {one[key]['n']}" for one in tried)
+            found = (f"{within(one[key]['rmse_m'], 1000)}, N = {one[key]['n']}" for one in tried)
             rows.append((f"r.m.s. error, {title} (mm)", *found))
-        rows.append(("r.m.s. error / bound, all sides", *(within(one["rmse_over_bound"], 1, 3) for one in tried)))
-        rows.append(("class errors, all sides (%)", *(within(one["class_errors"], 100, 2) for one in tried)))
+        rows.append(("r.m.s. error / bound, all sides", *(within(one["rmse_over_bound"], 1) for one in tried)))
+        rows.append(("class errors, all sides (%)", *(within(one["class_errors"], 100) for one in tried)))
     _echo_table(("", "new set", "catalogue"), rows)
     typer.echo(f"worst position bound {facts['bound_factor']:.2f} times lower than the catalogue's")
     if confirmation:
-        typer.echo(f"worst r.m.s. error {within(confirmation['worst_rmse_factor'], 1, 2)} times lower, 95 % interval")
+        typer.echo(f"worst r.m.s. error {within(confirmation['worst_rmse_factor'], 1)} times lower, 95 % interval")
 
 
 def _number(value: float | None) -> str:
@@ -1716,8 +1718,10 @@ def _plus_minus(answer: dict[str, Any], name: str, scale: float, digits: int) ->
     """Return the standard deviation of one parameter of a match as text; nothing if there is none."""
     if answer["covariance"] is None:
         return ""
+    from phasemark.render.rounding import error_text
+
     k = answer["free"].index(name)
-    return f" ± {scale * math.sqrt(answer['covariance'][k][k]):.{digits}f}"
+    return f" ± {error_text(scale * math.sqrt(answer['covariance'][k][k]))}"
 
 
 def _echo_matches(answers: Sequence[dict[str, Any]]) -> None:
@@ -1868,11 +1872,14 @@ def _sensor_facts(sensor: Sensor) -> dict[str, Any]:
     return {**sensor.model_dump(mode="json"), "unambiguous_range_m": sensor.unambiguous_range_m}
 
 
-def _error_of(estimate: Estimate) -> str:
-    """Write the standard error of an estimate; pixels are counted and have none."""
+def _value_and_error_of(value: object, estimate: Estimate) -> tuple[str, str]:
+    """Write a fitted field and its standard error, rounded alike; pixels are counted and have no error."""
+    from phasemark.render.rounding import value_and_error
+
     if estimate.std_error is None:
-        return "assumed"
-    return f"{estimate.std_error:.2g}" if estimate.std_error > 0 else ""
+        return _short(value), "assumed"
+    text, error = value_and_error(value if isinstance(value, float) else estimate.value, estimate.std_error)
+    return (text if isinstance(value, float) and error else _short(value)), error
 
 
 def _short(value: object) -> str:

@@ -21,6 +21,7 @@ from phasemark.matcher.sweep_examples import worst_examples
 from phasemark.matcher.sweep_figures import sweep_figures
 from phasemark.matcher.sweep_plan import SweepPlan
 from phasemark.matcher.sweep_tables import Cell, SweepTrials, condition_axes
+from phasemark.render.rounding import with_interval
 
 _MOST_ROWS = 80
 _READABLE_IN = 6.5
@@ -153,7 +154,7 @@ def _worst_first(cells: Sequence[Cell]) -> list[Cell]:
 def _with_interval(value: Estimate, scale: float = 1.0) -> str:
     if not math.isfinite(value.value):
         return "–"
-    return f"{value.value * scale:.3g} [{value.low * scale:.3g}, {value.high * scale:.3g}]"
+    return with_interval(value.value * scale, value.low * scale, value.high * scale)
 
 
 def _row(cell: Cell, axes: Sequence[str]) -> list[str]:

@@ -22,6 +22,7 @@ from phasemark.render.flat_field import board_image
 from phasemark.render.frames import Frames
 from phasemark.render.noise import exact_phase_moments
 from phasemark.render.phasor import wrap_difference_m
+from phasemark.render.rounding import error_text, with_error
 from phasemark.render.sensor import Sensor
 from phasemark.render.sensor_file import rounded, sensor_toml
 
@@ -77,7 +78,7 @@ class Estimate:
         """The note with its standard error, as it stands in a sensor file."""
         if self.std_error is None:
             return f"assumed: {self.note}"
-        error = f", ± {self.std_error:.2g} (standard error)" if self.std_error > 0 else ""
+        error = f", ± {error_text(self.std_error)} (standard error)" if self.std_error > 0 else ""
         return f"measured{error}: {self.note}"
 
 
@@ -220,9 +221,9 @@ def fit_sensor(
     correlation, correlation_error = data.frame_correlation()
     if abs(correlation) > _CORRELATED_SIGMAS * correlation_error:
         notes.append(
-            f"Frames are not independent: the noise of a pixel correlates by {correlation:.3f} ± "
-            f"{correlation_error:.2g} from one frame to the next, as behind a filter in time; standard errors allow "
-            "for it, σ may be too small."
+            "Frames are not independent: the noise of a pixel correlates by "
+            f"{with_error(correlation, correlation_error)} from one frame to the next, as behind a filter in time; "
+            "standard errors allow for it, σ may be too small."
         )
     widening = math.sqrt(max((1 + correlation) / (1 - correlation), 1.0)) if abs(correlation) < 1 else 1.0
     changes = _fit_offsets(data, base, estimates, notes, widening)
@@ -550,7 +551,7 @@ def _fit_wiggling(
         own = covariance[1 + 2 * j : 3 + 2 * j, 1 + 2 * j : 3 + 2 * j]
         parts.append(math.sqrt(float(gradient @ own @ gradient)))
     described = ", ".join(
-        f"a_{h.order} = {h.amplitude:.2g} ± {e:.2g}" for h, e in zip(found_harmonics, parts, strict=True)
+        f"a_{h.order} = {with_error(h.amplitude, e)}" for h, e in zip(found_harmonics, parts, strict=True)
     )
     if all(h.amplitude < _SEEN_SIGMAS * e for h, e in zip(found_harmonics, parts, strict=True)):
         notes.append(f"No wiggling is seen at {m} distances: {described}.")
@@ -644,7 +645,7 @@ def _fit_noise(
         else:
             scale, error = electrons
             notes.append(
-                f"Photon transfer gives {scale:.4g} ± {error:.2g} electrons a unit of amplitude and intensity."
+                f"Photon transfer gives {with_error(scale, error)} electrons a unit of amplitude and intensity."
             )
             amplitude, scale_error = amplitude * scale, error / scale
             intensity = None if intensity is None else intensity * scale
@@ -803,8 +804,8 @@ def _noise_of_electrons(
         )
     if signal <= 2 * signal_error:
         raise UsageError(
-            f"the frames do not show the signal: {what} rises by {signal:.3g} ± {signal_error:.2g} electrons a unit of "
-            "light; are amplitude and intensity in electrons (--amplitude-unit)?"
+            f"the frames do not show the signal: {what} rises by {with_error(signal, signal_error)} electrons a "
+            "unit of light; are amplitude and intensity in electrons (--amplitude-unit)?"
         )
     contrast = modulated / signal
     contrast_error = contrast * math.hypot(modulated_error / modulated, signal_error / signal)
