@@ -289,6 +289,14 @@ def _sensor_fit(
         list[float] | None,
         typer.Option("--albedo", help="Albedo of the board, one for all or one for each; 0.8 is assumed."),
     ] = None,
+    distance_std: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--distance-std",
+            metavar="M",
+            help="Standard deviation of the distances, one for all or one for each; 0.001 is assumed.",
+        ),
+    ] = None,
     sensor: _SensorOption = "pmd-16x16",
     amplitude_unit: Annotated[
         str,
@@ -338,6 +346,7 @@ def _sensor_fit(
         base=base,
         albedo=albedo or None,
         amplitude_unit=amplitude_unit,  # type: ignore[arg-type]  # fit_sensor says what is right
+        distance_std_m=distance_std or None,
     )
     write_atomically(out, fit.to_toml(base_name=sensor).encode(), force=force)
     if as_json:
