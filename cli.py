@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
     from trimesh import Trimesh
 
-    from phasemark.data import Bank, BankPlan, FramePlan
+    from phasemark.data import Bank, BankPlan, FramePlan, MeshPlan
     from phasemark.landmarks import LandmarkSpec
     from phasemark.matcher import Calibration, FilteredFrames, LandmarkMap, Match, Matches, RobotPose
     from phasemark.render import Background, Estimate, Sensor
@@ -531,7 +531,7 @@ def _landmark_check(
     """Check a mesh file and say what it holds."""
     import dataclasses
 
-    from phasemark.landmarks import check_mesh
+    from phasemark.landmarks import MAX_SYMMETRY, check_mesh
 
     _, mesh = _load_landmark(str(file), unit, up, origin)
     report = dataclasses.asdict(check_mesh(mesh))
@@ -539,6 +539,10 @@ def _landmark_check(
         _echo_json({"file": str(file), **report})
         return
     del report["warnings"]  # reading the file has put them on stderr
+    n = report["symmetry"]
+    report["symmetry"] = {1: "1 (none)", MAX_SYMMETRY: f"{n} (a body of revolution)"}.get(
+        n, f"{n} (looks the same every {360 / n:g}° about z')"
+    )
     _echo_facts({"file": file, **report})
 
 
@@ -637,7 +641,10 @@ def _bank_build(
     unit: _Unit = None,
     up: _Up = "z",
     origin: _Origin = "file",
-    symmetry: Annotated[int, typer.Option("--symmetry", help="Turns that leave the mesh as it is.")] = 1,
+    symmetry: Annotated[
+        int | None,
+        typer.Option("--symmetry", help="Turns that leave the mesh as it is; found from the mesh if not given."),
+    ] = None,
     sensor: Annotated[
         str | None,
         typer.Option("--sensor", metavar="NAME|FILE", help="A preset or sensor file.", autocompletion=_a_preset),
@@ -696,6 +703,7 @@ def _bank_build(
     if full:
         changes["layout"] = "full"
     plan = BankPlan(**{**plan.model_dump(), **changes})
+    plan = plan.model_copy(update={"meshes": _with_symmetry(plan.meshes)})
     if not layout_stated and (reason := factored_refusal(plan.resolve())) is not None:
         plan = plan.model_copy(update={"layout": "full"})
         if not plan.meshes:
@@ -1773,6 +1781,28 @@ def _name_and_file(text: str) -> tuple[str, str]:
     if not (name and separator and path):
         raise UsageError(f"--mesh must be NAME=FILE, got '{text}'")
     return name, path
+
+
+def _with_symmetry(meshes: Sequence[MeshPlan]) -> tuple[MeshPlan, ...]:
+    """Return the meshes of a plan with their symmetry, and say what was found where none was stated."""
+    from phasemark.data.plan import find_symmetries
+    from phasemark.landmarks import MAX_SYMMETRY
+
+    found = find_symmetries(meshes)
+    for before, after in zip(meshes, found, strict=True):
+        if before.symmetry is not None or after.symmetry is None:
+            continue
+        if after.symmetry == MAX_SYMMETRY:
+            what = "is a body of revolution: no side of it can be told from another, and one δ is enough"
+        elif after.symmetry > 1:
+            what = f"looks the same every {360 / after.symmetry:g}° (symmetry {after.symmetry}): δ is known modulo that"
+        else:
+            what = (
+                "has no symmetry about its axis z' (if it has one about another, --origin base brings z' into the"
+                " middle of its bounding box)"
+            )
+        typer.echo(f"note: '{after.name}' {what}; --symmetry N, or 'symmetry' in a plan, overrides this", err=True)
+    return tuple(found)
 
 
 def _stated_unit(path: str, unit: str | None) -> Any:
