@@ -703,8 +703,9 @@ def _bank_build(
     if full:
         changes["layout"] = "full"
     plan = BankPlan(**{**plan.model_dump(), **changes})
-    plan = plan.model_copy(update={"meshes": _with_symmetry(plan.meshes)})
-    if not layout_stated and (reason := factored_refusal(plan.resolve())) is not None:
+    resolved = plan.resolve()
+    plan = plan.model_copy(update={"meshes": _with_symmetry(plan.meshes, resolved.meshes)})
+    if not layout_stated and (reason := factored_refusal(resolved)) is not None:
         plan = plan.model_copy(update={"layout": "full"})
         if not plan.meshes:
             typer.echo(f"note: a full bank, every class at every D and δ: {reason}", err=True)
@@ -1783,12 +1784,10 @@ def _name_and_file(text: str) -> tuple[str, str]:
     return name, path
 
 
-def _with_symmetry(meshes: Sequence[MeshPlan]) -> tuple[MeshPlan, ...]:
-    """Return the meshes of a plan with their symmetry, and say what was found where none was stated."""
-    from phasemark.data.plan import find_symmetries
+def _with_symmetry(meshes: Sequence[MeshPlan], found: Sequence[MeshPlan]) -> tuple[MeshPlan, ...]:
+    """Return the meshes of a plan with the symmetry found for each, and say it where none was stated."""
     from phasemark.landmarks import MAX_SYMMETRY
 
-    found = find_symmetries(meshes)
     for before, after in zip(meshes, found, strict=True):
         if before.symmetry is not None or after.symmetry is None:
             continue
@@ -1802,7 +1801,7 @@ def _with_symmetry(meshes: Sequence[MeshPlan]) -> tuple[MeshPlan, ...]:
                 " middle of its bounding box)"
             )
         typer.echo(f"note: '{after.name}' {what}; --symmetry N, or 'symmetry' in a plan, overrides this", err=True)
-    return tuple(found)
+    return tuple(one.model_copy(update={"symmetry": other.symmetry}) for one, other in zip(meshes, found, strict=True))
 
 
 def _stated_unit(path: str, unit: str | None) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -125,7 +126,7 @@ class _Surface:
         u, v = np.where(u + v > 1, 1 - u, u)[:, None], np.where(u + v > 1, 1 - v, v)[:, None]
         return np.asarray(a[face] + u * (b - a)[face] + v * (c - a)[face])
 
-    def _lies_on_itself(self, angle_rad: _Float) -> bool:
+    def _lies_on_itself(self, angle_rad: NDArray[np.floating[Any]]) -> bool:
         """Return True if every point, turned by its angle, lies on the surface; stop at the first that does not."""
         start, size = 0, _FIRST_POINTS
         while start < len(self.points):
