@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
     from trimesh import Trimesh
 
-    from phasemark.data import Bank, BankPlan, FramePlan
+    from phasemark.data import Bank, BankPlan, FramePlan, MeshPlan
     from phasemark.data.plan import ScenePlan
     from phasemark.landmarks import LandmarkSpec
     from phasemark.matcher import Calibration, FilteredFrames, LandmarkMap, Match, Matches, RobotPose
@@ -297,6 +297,14 @@ def _sensor_fit(
         list[float] | None,
         typer.Option("--albedo", help="Albedo of the board, one for all or one for each; 0.8 is assumed."),
     ] = None,
+    distance_std: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--distance-std",
+            metavar="M",
+            help="Standard deviation of the distances, one for all or one for each; 0.001 is assumed.",
+        ),
+    ] = None,
     sensor: _SensorOption = "pmd-16x16",
     amplitude_unit: Annotated[
         str,
@@ -347,6 +355,7 @@ def _sensor_fit(
         base=base,
         albedo=albedo or None,
         amplitude_unit=amplitude_unit,  # type: ignore[arg-type]  # fit_sensor says what is right
+        distance_std_m=distance_std or None,
     )
     write_atomically(out, fit.to_toml(base_name=sensor).encode(), force=force)
     if as_json:
@@ -355,7 +364,7 @@ def _sensor_fit(
     fields = fit.sensor.model_dump(mode="json")
     _echo_table(
         ("field", "value", "std error", "from"),
-        ((name, _short(fields[name]), _error_of(one), one.note) for name, one in fit.estimates.items()),
+        ((name, *_value_and_error_of(fields[name], one), one.note) for name, one in fit.estimates.items()),
     )
     for note in fit.notes:
         typer.echo(note)
@@ -487,11 +496,13 @@ def _landmark_design(
 
 def _echo_design(facts: Mapping[str, Any]) -> None:
     """Print a design beside the catalogue."""
+    from phasemark.render.rounding import with_interval
 
-    def within(interval: Mapping[str, float | None], scale: float, digits: int) -> str:
-        numbers = [interval[key] for key in ("value", "low", "high")]
-        value, low, high = ("" if number is None else f"{scale * number:.{digits}f}" for number in numbers)
-        return f"{value} [{low}, {high}]" if value else "nothing found"
+    def within(interval: Mapping[str, float | None], scale: float) -> str:
+        value, low, high = (
+            math.nan if number is None else scale * number for number in map(interval.get, ("value", "low", "high"))
+        )
+        return with_interval(value, low, high) if math.isfinite(value) else "nothing found"
 
     sets = [facts["result"], facts["catalogue"]]
     rows = [
@@ -506,14 +517,14 @@ def _echo_design(facts: Mapping[str, Any]) -> None:
     if confirmation:
         tried = [confirmation["result"], confirmation["catalogue"]]
         for title, key in (("worst side", "worst"), ("anywhere", "anywhere")):
-            found = (f"{within(one[key]['rmse_m'], 1000, 1)}, N = {one[key]['n']}" for one in tried)
+            found = (f"{within(one[key]['rmse_m'], 1000)}, N = {one[key]['n']}" for one in tried)
             rows.append((f"r.m.s. error, {title} (mm)", *found))
-        rows.append(("r.m.s. error / bound, all sides", *(within(one["rmse_over_bound"], 1, 3) for one in tried)))
-        rows.append(("class errors, all sides (%)", *(within(one["class_errors"], 100, 2) for one in tried)))
+        rows.append(("r.m.s. error / bound, all sides", *(within(one["rmse_over_bound"], 1) for one in tried)))
+        rows.append(("class errors, all sides (%)", *(within(one["class_errors"], 100) for one in tried)))
     _echo_table(("", "new set", "catalogue"), rows)
     typer.echo(f"worst position bound {facts['bound_factor']:.2f} times lower than the catalogue's")
     if confirmation:
-        typer.echo(f"worst r.m.s. error {within(confirmation['worst_rmse_factor'], 1, 2)} times lower, 95 % interval")
+        typer.echo(f"worst r.m.s. error {within(confirmation['worst_rmse_factor'], 1)} times lower, 95 % interval")
 
 
 def _number(value: float | None) -> str:
@@ -531,7 +542,7 @@ def _landmark_check(
     """Check a mesh file and say what it holds."""
     import dataclasses
 
-    from phasemark.landmarks import check_mesh
+    from phasemark.landmarks import MAX_SYMMETRY, check_mesh
 
     _, mesh = _load_landmark(str(file), unit, up, origin)
     report = dataclasses.asdict(check_mesh(mesh))
@@ -539,6 +550,10 @@ def _landmark_check(
         _echo_json({"file": str(file), **report})
         return
     del report["warnings"]  # reading the file has put them on stderr
+    n = report["symmetry"]
+    report["symmetry"] = {1: "1 (none)", MAX_SYMMETRY: f"{n} (a body of revolution)"}.get(
+        n, f"{n} (looks the same every {360 / n:g}° about z')"
+    )
     _echo_facts({"file": file, **report})
 
 
@@ -639,7 +654,10 @@ def _bank_build(
     unit: _Unit = None,
     up: _Up = "z",
     origin: _Origin = "file",
-    symmetry: Annotated[int, typer.Option("--symmetry", help="Turns that leave the mesh as it is.")] = 1,
+    symmetry: Annotated[
+        int | None,
+        typer.Option("--symmetry", help="Turns that leave the mesh as it is; found from the mesh if not given."),
+    ] = None,
     sensor: Annotated[
         str | None,
         typer.Option("--sensor", metavar="NAME|FILE", help="A preset or sensor file.", autocompletion=_a_preset),
@@ -699,7 +717,9 @@ def _bank_build(
     if full:
         changes["layout"] = "full"
     plan = BankPlan(**{**plan.model_dump(), **changes})
-    if not layout_stated and (reason := factored_refusal(plan.resolve())) is not None:
+    resolved = plan.resolve()
+    plan = plan.model_copy(update={"meshes": _with_symmetry(plan.meshes, resolved.meshes)})
+    if not layout_stated and (reason := factored_refusal(resolved)) is not None:
         plan = plan.model_copy(update={"layout": "full"})
         if not plan.meshes:
             typer.echo(f"note: a full bank, every class at every D and δ: {reason}", err=True)
@@ -1780,8 +1800,10 @@ def _plus_minus(answer: dict[str, Any], name: str, scale: float, digits: int) ->
     """Return the standard deviation of one parameter of a match as text; nothing if there is none."""
     if answer["covariance"] is None:
         return ""
+    from phasemark.render.rounding import error_text
+
     k = answer["free"].index(name)
-    return f" ± {scale * math.sqrt(answer['covariance'][k][k]):.{digits}f}"
+    return f" ± {error_text(scale * math.sqrt(answer['covariance'][k][k]))}"
 
 
 def _echo_matches(answers: Sequence[dict[str, Any]]) -> None:
@@ -1824,6 +1846,26 @@ def _name_and_file(text: str) -> tuple[str, str]:
     if not (name and separator and path):
         raise UsageError(f"--mesh must be NAME=FILE, got '{text}'")
     return name, path
+
+
+def _with_symmetry(meshes: Sequence[MeshPlan], found: Sequence[MeshPlan]) -> tuple[MeshPlan, ...]:
+    """Return the meshes of a plan with the symmetry found for each, and say it where none was stated."""
+    from phasemark.landmarks import MAX_SYMMETRY
+
+    for before, after in zip(meshes, found, strict=True):
+        if before.symmetry is not None or after.symmetry is None:
+            continue
+        if after.symmetry == MAX_SYMMETRY:
+            what = "is a body of revolution: no side of it can be told from another, and one δ is enough"
+        elif after.symmetry > 1:
+            what = f"looks the same every {360 / after.symmetry:g}° (symmetry {after.symmetry}): δ is known modulo that"
+        else:
+            what = (
+                "has no symmetry about its axis z' (if it has one about another, --origin base brings z' into the"
+                " middle of its bounding box)"
+            )
+        typer.echo(f"note: '{after.name}' {what}; --symmetry N, or 'symmetry' in a plan, overrides this", err=True)
+    return tuple(one.model_copy(update={"symmetry": other.symmetry}) for one, other in zip(meshes, found, strict=True))
 
 
 def _stated_unit(path: str, unit: str | None) -> Any:
@@ -1981,11 +2023,14 @@ def _sensor_facts(sensor: Sensor) -> dict[str, Any]:
     return {**sensor.model_dump(mode="json"), "unambiguous_range_m": sensor.unambiguous_range_m}
 
 
-def _error_of(estimate: Estimate) -> str:
-    """Write the standard error of an estimate; pixels are counted and have none."""
+def _value_and_error_of(value: object, estimate: Estimate) -> tuple[str, str]:
+    """Write a fitted field and its standard error, rounded alike; pixels are counted and have no error."""
+    from phasemark.render.rounding import value_and_error
+
     if estimate.std_error is None:
-        return "assumed"
-    return f"{estimate.std_error:.2g}" if estimate.std_error > 0 else ""
+        return _short(value), "assumed"
+    text, error = value_and_error(value if isinstance(value, float) else estimate.value, estimate.std_error)
+    return (text if isinstance(value, float) and error else _short(value)), error
 
 
 def _short(value: object) -> str:

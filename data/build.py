@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +35,16 @@ from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.progress import Progress
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.shards import Place
-from phasemark.landmarks import LandmarkSpec, Revolution, build_mesh, read_mesh
+from phasemark.landmarks import (
+    LandmarkSpec,
+    MeshWarning,
+    Revolution,
+    build_mesh,
+    has_symmetry,
+    mesh_symmetry,
+    read_mesh,
+    symmetry_tolerance_m,
+)
 from phasemark.render import PhasorImages, PlanarLandmark, Renderer, Sensor, Views, planar_images
 from phasemark.render.renderer import Variant
 
@@ -253,10 +263,23 @@ def read_landmarks(
     for part in meshes:
         if stored_mesh is None:
             mesh = read_mesh(part.path, unit=part.unit, up=part.up, origin=part.origin)
+            _doubt_symmetry(part, mesh)
         else:
             mesh = stored_mesh(part.name)
-        found.append(Landmark(part.name, mesh, part.symmetry, part.albedo))
+        found.append(Landmark(part.name, mesh, part.symmetry or 1, part.albedo))
     return found
+
+
+def _doubt_symmetry(part: MeshPlan, mesh: trimesh.Trimesh) -> None:
+    """Warn of a stated symmetry that the mesh has not."""
+    if part.symmetry is not None and not has_symmetry(mesh, part.symmetry):
+        warnings.warn(
+            f"{part.path}: symmetry {part.symmetry} is stated for '{part.name}', but turned by"
+            f" {360 / part.symmetry:g}° it differs from itself by more than {1e3 * symmetry_tolerance_m(mesh):.2g} mm;"
+            f" found: {mesh_symmetry(mesh)}",
+            MeshWarning,
+            stacklevel=2,
+        )
 
 
 def _images_of(

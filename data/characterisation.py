@@ -12,6 +12,7 @@ from phasemark.data.provenance import versions
 from phasemark.data.store import write_atomically
 from phasemark.render.characterise import ALBEDOS, Z95, Characterisation, Quantity
 from phasemark.render.noise import predicted_range_std
+from phasemark.render.rounding import value_and_error
 
 REPORT = "report.html"
 FIGURES = ("photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold")
@@ -177,12 +178,12 @@ def _report(found: Characterisation, name: str, seed: int, pictures: dict[str, b
 
 
 def _quantity_row(one: Quantity) -> dict[str, str]:
-    half = Z95 * one.std_error
+    simulated, half = value_and_error(one.simulated, Z95 * one.std_error)
     return {
         "title": one.title,
-        "predicted": f"{one.predicted:.5g}",
-        "simulated": f"{one.simulated:.5g}",
-        "half": f"{half:.2g}",
+        "predicted": value_and_error(one.predicted, Z95 * one.std_error)[0],
+        "simulated": simulated,
+        "half": half or "0",
         "samples": f"{one.samples:,}".replace(",", " "),
     }
 

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, Wi
 from scipy import special
 
 from phasemark import UsageError
-from phasemark.data.plan import MeshPlan, PlanModel, ScenePlan
+from phasemark.data.plan import MeshPlan, PlanModel, ScenePlan, find_symmetries
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec
 
@@ -244,7 +244,7 @@ class FramePlan(ScenePlan):
             update={
                 "classes": (),
                 "landmarks": tuple(specs),
-                "meshes": tuple(meshes),
+                "meshes": tuple(find_symmetries(meshes)),
                 "sensor_overrides": sensor.model_dump(mode="json"),
                 "variants": tuple(name for name in order if name in self.variants),
             }

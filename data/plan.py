@@ -6,7 +6,9 @@ import difflib
 import math
 import os
 import tomllib
+import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -25,9 +27,9 @@ from pydantic import (
     model_validator,
 )
 
-from phasemark import InputFileError, UsageError
+from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.data.grid import drop_repeated_stop, format_grid, parse_grid
-from phasemark.landmarks import LandmarkSpec, catalog
+from phasemark.landmarks import MAX_SYMMETRY, LandmarkSpec, MeshWarning, catalog, mesh_symmetry, read_mesh
 from phasemark.render import Sensor, preset
 
 DEFAULT_DISTANCE_M = "0.7:2.1:0.01"
@@ -107,8 +109,9 @@ class MeshPlan(PlanModel):
         Axis of the file that points up.
     origin : {"file", "base", "center"}
         What becomes the origin: the file's own, the centre of the foot, or the centre of the bounding box.
-    symmetry : int
-        How many turns about the vertical axis leave the landmark as it is.
+    symmetry : int, optional
+        How many turns about the vertical axis leave the landmark as it is. Without it, it is found from the mesh when
+        the plan is resolved (:func:`phasemark.landmarks.mesh_symmetry`).
     albedo : float
         Share of light that the surface returns, in (0, 1].
     """
@@ -118,7 +121,7 @@ class MeshPlan(PlanModel):
     unit: Literal["m", "cm", "mm", "inch"] | None = None
     up: Literal["z", "-z", "y", "-y", "x", "-x"] = "z"
     origin: Literal["file", "base", "center"] = "file"
-    symmetry: Annotated[int, Field(ge=1, le=360)] = 1
+    symmetry: Annotated[int, Field(ge=1, le=MAX_SYMMETRY)] | None = None
     albedo: _Albedo = 0.8
 
 
@@ -185,6 +188,31 @@ class ScenePlan(PlanModel, ABC):
                 problem = "stands for no landmark" if name == "none" else "names two landmarks"
                 raise UsageError(f"the class name {name!r} {problem}: give each landmark a name of its own")
         return specs, list(self.meshes)
+
+
+def find_symmetries(meshes: Sequence[MeshPlan]) -> list[MeshPlan]:
+    """Return landmarks from mesh files, each with its symmetry: that stated, or else that of the mesh.
+
+    A file that cannot be read stays without one: reading it for its images says what is wrong.
+    """
+    found = []
+    for part in meshes:
+        if part.symmetry is None:
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", MeshWarning)  # reading it for its images warns once
+                    mesh = read_mesh(part.path, unit=part.unit, up=part.up, origin=part.origin)
+            except PhasemarkError:
+                found.append(part)
+                continue
+            part = part.model_copy(update={"symmetry": mesh_symmetry(mesh)})
+        found.append(part)
+    return found
+
+
+def common_symmetry(parts: Sequence[LandmarkSpec | MeshPlan]) -> int:
+    """Return the largest symmetry that all landmarks have."""
+    return math.gcd(*(part.symmetry or 1 for part in parts))
 
 
 class BankPlan(ScenePlan):
@@ -255,8 +283,8 @@ class BankPlan(ScenePlan):
         if self.albedo is not None:
             specs = [LandmarkSpec(**{**spec.model_dump(), "albedo": self.albedo}) for spec in specs]
             meshes = [MeshPlan(**{**mesh.model_dump(), "albedo": self.albedo}) for mesh in meshes]
-        parts: list[LandmarkSpec | MeshPlan] = [*specs, *meshes]
-        period_deg = 360 / math.gcd(*(part.symmetry for part in parts))
+        meshes = find_symmetries(meshes)
+        period_deg = 360 / common_symmetry([*specs, *meshes])
         delta_deg = parse_grid(self.delta_deg or f"0:{period_deg!r}:{DEFAULT_DELTA_STEP_DEG}", "delta_deg")
         return type(self)(
             landmarks=tuple(specs),

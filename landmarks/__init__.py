@@ -6,6 +6,7 @@ from phasemark.landmarks.catalog import catalog
 from phasemark.landmarks.mesh import DEFAULT_TOLERANCE_M, LOWER, MAX_FACES, UPPER, build_mesh
 from phasemark.landmarks.reading import MeshReport, MeshWarning, check_mesh, export_mesh, read_mesh
 from phasemark.landmarks.spec import Box, Cone, Cylinder, LandmarkSpec, Revolution, Sphere
+from phasemark.landmarks.symmetry import MAX_SYMMETRY, has_symmetry, mesh_symmetry, symmetry_tolerance_m
 
 if TYPE_CHECKING:
     from phasemark.landmarks.picture import mesh_html, mesh_picture
@@ -14,6 +15,7 @@ __all__ = [
     "DEFAULT_TOLERANCE_M",
     "LOWER",
     "MAX_FACES",
+    "MAX_SYMMETRY",
     "UPPER",
     "Box",
     "Cone",
@@ -27,9 +29,12 @@ __all__ = [
     "catalog",
     "check_mesh",
     "export_mesh",
+    "has_symmetry",
     "mesh_html",
     "mesh_picture",
+    "mesh_symmetry",
     "read_mesh",
+    "symmetry_tolerance_m",
 ]
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.landmarks.mesh import MAX_FACES
+from phasemark.landmarks.symmetry import mesh_symmetry
 
 # Without a handler of its own, what trimesh logs about a damaged file, tracebacks included, would go to stderr.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -56,6 +57,9 @@ class MeshReport:
         Size of the bounding box.
     area_m2, volume_m3 : float
         Volume is that of a watertight mesh, negative if it is inside out; NaN of an open one.
+    symmetry : int
+        How many turns about z' leave the mesh as it is (:func:`phasemark.landmarks.mesh_symmetry`); 360 for a body of
+        revolution.
     warnings : tuple of str
         What may be wrong, one line each.
     """
@@ -68,6 +72,7 @@ class MeshReport:
     extents_m: tuple[float, float, float]
     area_m2: float
     volume_m3: float | None
+    symmetry: int
     warnings: tuple[str, ...]
 
 
@@ -99,8 +104,8 @@ def read_mesh(
     Returns
     -------
     trimesh.Trimesh
-        Vertices at one point are merged, faces without area dropped. ``metadata`` has ``name``, ``symmetry`` (1) and
-        ``albedo`` (0.8).
+        Vertices at one point are merged, faces without area dropped. ``metadata`` has ``name``, ``symmetry`` (1:
+        :func:`phasemark.landmarks.mesh_symmetry` finds it) and ``albedo`` (0.8).
 
     Raises
     ------
@@ -152,7 +157,7 @@ def read_mesh(
         process=False,
         metadata={"name": Path(name).stem, "symmetry": 1, "albedo": 0.8},
     )
-    for warning in check_mesh(mesh).warnings:
+    for warning in _doubts(mesh):
         warnings.warn(f"{name}: {warning}", MeshWarning, stacklevel=2)
     return mesh
 
@@ -170,27 +175,35 @@ def check_mesh(mesh: trimesh.Trimesh) -> MeshReport:
     MeshReport
     """
     watertight = bool(mesh.is_watertight)
-    volume = float(mesh.volume) if watertight else None
-    outward = watertight and bool(mesh.is_winding_consistent) and float(mesh.volume) > 0
-    found = []
-    if not watertight:
-        found.append("the surface is open; it is rendered two-sided")
-    elif not outward:
-        found.append("the surface is inside out or wound inconsistently; it is rendered two-sided")
-    largest = float(max(mesh.extents))
-    if largest > 5 or largest < 0.01:
-        found.append(f"it is {largest:.3g} m large: is the unit right?")
     return MeshReport(
         faces=len(mesh.faces),
         vertices=len(mesh.vertices),
         bodies=int(mesh.body_count),
         watertight=watertight,
-        outward=outward,
+        outward=_is_outward(mesh),
         extents_m=(float(mesh.extents[0]), float(mesh.extents[1]), float(mesh.extents[2])),
         area_m2=float(mesh.area),
-        volume_m3=volume,
-        warnings=tuple(found),
+        volume_m3=float(mesh.volume) if watertight else None,
+        symmetry=mesh_symmetry(mesh),
+        warnings=tuple(_doubts(mesh)),
     )
+
+
+def _is_outward(mesh: trimesh.Trimesh) -> bool:
+    return bool(mesh.is_watertight) and bool(mesh.is_winding_consistent) and float(mesh.volume) > 0
+
+
+def _doubts(mesh: trimesh.Trimesh) -> list[str]:
+    """Return what may be wrong with a mesh."""
+    found = []
+    if not mesh.is_watertight:
+        found.append("the surface is open; it is rendered two-sided")
+    elif not _is_outward(mesh):
+        found.append("the surface is inside out or wound inconsistently; it is rendered two-sided")
+    largest = float(max(mesh.extents))
+    if largest > 5 or largest < 0.01:
+        found.append(f"it is {largest:.3g} m large: is the unit right?")
+    return found
 
 
 def export_mesh(mesh: trimesh.Trimesh, file_type: str) -> bytes:

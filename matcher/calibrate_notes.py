@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from phasemark.matcher.calibrate_model import PARAMETERS
 from phasemark.matcher.calibrate_poses import KnownPoses
+from phasemark.render.rounding import error_text
 
 TITLES = {
     "pitch": "pitch",
@@ -87,9 +88,8 @@ def observability_notes(
     ]
     for name in poor:
         parameter = PARAMETERS[name]
-        value = (
-            f"± {parameter.shown * std[free.index(name)]:.2g}{' ' if parameter.unit == 'mm' else ''}{parameter.unit}"
-        )
+        error = error_text(parameter.shown * float(std[free.index(name)]))
+        value = f"± {error}{' ' if parameter.unit == 'mm' else ''}{parameter.unit}"
         others = [b if a == name else a for a, b, _ in pairs if name in (a, b)]
         trades = f", for it trades with the {named(others)}" if others else ""
         notes.append(f"The {TITLES[name]} is poorly known, {value}{trades}: {advice([name, *others], poses)}.")

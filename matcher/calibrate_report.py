@@ -14,6 +14,7 @@ from phasemark.matcher.calibrate import Calibration
 from phasemark.matcher.calibrate_model import NAMES, PARAMETERS
 from phasemark.matcher.calibrate_poses import POSE_UNITS
 from phasemark.render.plot import draw_difference
+from phasemark.render.rounding import error_text, value_and_error
 from phasemark.render.sensor_file import sensor_toml
 
 USES = {"albedo": "of the landmark: phasemark bank build --albedo, or 'albedo' in a plan"}
@@ -34,7 +35,7 @@ def calibration_toml(found: Calibration, *, base_name: str) -> str:
     for name in found.free:
         parameter = PARAMETERS[name]
         if parameter.field is not None:
-            comments[parameter.field] = f"calibrated, ± {_file_std(found, name):.2g} (standard deviation)"
+            comments[parameter.field] = f"calibrated, ± {error_text(_file_std(found, name))} (standard deviation)"
     header = [
         f"Calibrated by phasemark calibrate from {len(found.poses)} known poses, on {found.on}; covariance from"
         f" {found.covariance_from}.",
@@ -49,15 +50,19 @@ def calibration_toml(found: Calibration, *, base_name: str) -> str:
 
 
 def shown(found: Calibration, name: str) -> str:
-    """Return one number of a mounting as people read it, to a tenth of its standard deviation."""
-    value, std = PARAMETERS[name].shown * found.value(name), PARAMETERS[name].shown * found.std(name)
-    digits = 3 if not std > 0 else max(0, min(6, 1 - math.floor(math.log10(std))))
-    return f"{value:.{digits}f}"
+    """Return one number of a mounting as people read it, to the digits of its standard deviation."""
+    return _value_and_std(found, name)[0]
 
 
 def shown_std(found: Calibration, name: str) -> str:
     """Return its standard deviation."""
-    return f"{PARAMETERS[name].shown * found.std(name):.2g}" if name in found.free else "fixed"
+    return _value_and_std(found, name)[1] if name in found.free else "fixed"
+
+
+def _value_and_std(found: Calibration, name: str) -> tuple[str, str]:
+    value, std = PARAMETERS[name].shown * found.value(name), PARAMETERS[name].shown * found.std(name)
+    text, error = value_and_error(value, std)
+    return (text, error) if error else (f"{value:.3f}", error_text(std))
 
 
 def calibration_dict(found: Calibration) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from phasemark.data.notebook import table_html
 from phasemark.render import Background
+from phasemark.render.rounding import with_error
 
 Reason = Literal["", "no landmark", "poor fit", "undetermined", "ambiguous"]
 """Why an answer is refused; empty if it is accepted."""
@@ -152,11 +153,11 @@ def _cells(match: Match) -> tuple[str, ...]:
         ("distance_m", match.distance_m, 1.0, ".4f"),
         ("delta_rad", match.delta_rad, 180 / math.pi, ".2f"),
     ):
-        spread = ""
+        std = 0.0
         if match.accepted and match.covariance is not None and name in match.free:
             k = match.free.index(name)
-            spread = f" ± {scale * math.sqrt(max(float(match.covariance[k, k]), 0.0)):{form}}"
-        cells.append(_number(scale * value, form) + spread)
+            std = scale * math.sqrt(max(float(match.covariance[k, k]), 0.0))
+        cells.append(with_error(scale * value, std) if 0 < std < math.inf else _number(scale * value, form))
     verdict = "yes" if match.accepted else f"refused: {match.reason}" if match.reason else "refused"
     return (match.class_name, *cells, verdict, _number(match.p_value, ".3g"))
 

@@ -229,7 +229,7 @@ def _read(plan: SweepPlan, folder: Path, n_rounds: int) -> SweepTrials:
         methods=tuple(method.name for method in plan.methods),
         free=tuple(method.parameters for method in plan.methods),
         classes=plan.class_names,
-        symmetry=tuple(part.symmetry for part in plan.parts()),
+        symmetry=tuple(part.symmetry or 1 for part in plan.parts()),
         outlier=plan.outlier,
         **{**arrays, "accepted": arrays["accepted"].astype(np.bool_)},
     )

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, parse_grid
-from phasemark.data.plan import MeshPlan, PlanModel, ScenePlan, factored_refusal, read_plan
+from phasemark.data.plan import MeshPlan, PlanModel, ScenePlan, common_symmetry, factored_refusal, read_plan
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec
 
@@ -338,7 +338,7 @@ class SweepPlan(ScenePlan):
             distance_m=f"{low!r}:{high!r}:{method.bank_step[0]!r}",  # type: ignore[arg-type]  # a grid's text
             model=method.bank_model,
         ).resolve()
-        symmetry = math.gcd(*(part.symmetry for part in self.parts()))
+        symmetry = common_symmetry([*plan.landmarks, *plan.meshes])
         fields = {**plan.model_dump(), "delta_deg": f"0:{360 / symmetry!r}:{method.bank_step[1]!r}"}
         if factored_refusal(plan) is not None:
             fields["layout"] = "full"

@@ -21,6 +21,7 @@ from phasemark.matcher.sweep_examples import worst_examples
 from phasemark.matcher.sweep_figures import sweep_figures
 from phasemark.matcher.sweep_plan import SweepPlan
 from phasemark.matcher.sweep_tables import Cell, SweepTrials, condition_axes
+from phasemark.render.rounding import with_interval
 
 _MOST_ROWS = 80
 _READABLE_IN = 6.5
@@ -103,16 +104,7 @@ def summary(trials: SweepTrials, cells: Sequence[Cell]) -> list[str]:
             )
     if worst:
         sentences.append(f"The worst cells are, {'; '.join(worst)}.")
-    strangers = [cell for cell in cells if cell.stranger]
-    parts = []
-    for method in methods:
-        right, n = _count([cell for cell in landmarks if cell.method == method])
-        part = f"{method} found the right class in {right} of {n} trials"
-        if strangers:
-            refused, of = _count([cell for cell in strangers if cell.method == method])
-            part += f" and refused {refused} of {of} strangers"
-        parts.append(part)
-    classes = "; ".join(parts)
+    classes = "; ".join(_classes(trials, m) for m in range(len(methods)))
     return [*sentences, f"{classes[:1].upper()}{classes[1:]}."]
 
 
@@ -126,8 +118,17 @@ def _accuracy(cells: Sequence[Cell]) -> str:
     return " and ".join(parts) or "no answer"
 
 
-def _count(cells: Sequence[Cell]) -> tuple[int, int]:
-    return sum(round(cell.class_right.value * cell.n) for cell in cells), sum(cell.n for cell in cells)
+def _classes(trials: SweepTrials, m: int) -> str:
+    """Say what the confusion matrix of method m shows: right among the answers, and what was refused."""
+    refused, strange = trials.refused[:, m], trials.true_class < 0
+    answers = ~refused & ~strange
+    right = int((trials.found[answers, m] == trials.true_class[answers]).sum())
+    n, silent = int((~strange).sum()), int((refused & ~strange).sum())
+    text = f"{trials.methods[m]} named the right class in {right} of {int(answers.sum())} answers and refused"
+    text += f" {silent} of {n} trials ({100 * silent / max(n, 1):.2g} %)"
+    if strange.any():
+        text += f" and {int((refused & strange).sum())} of {int(strange.sum())} strangers"
+    return text
 
 
 def _where(cell: Cell, cells: Sequence[Cell]) -> str:
@@ -153,7 +154,7 @@ def _worst_first(cells: Sequence[Cell]) -> list[Cell]:
 def _with_interval(value: Estimate, scale: float = 1.0) -> str:
     if not math.isfinite(value.value):
         return "–"
-    return f"{value.value * scale:.3g} [{value.low * scale:.3g}, {value.high * scale:.3g}]"
+    return with_interval(value.value * scale, value.low * scale, value.high * scale)
 
 
 def _row(cell: Cell, axes: Sequence[str]) -> list[str]:

@@ -89,6 +89,11 @@ class SweepTrials:
         return np.asarray(of_condition[self.condition])
 
     @property
+    def refused(self) -> NDArray[np.bool_]:
+        """Whether each method saw no landmark, or its fit failed its test; (n, m)."""
+        return (self.found < 0) | ~self.accepted
+
+    @property
     def error(self) -> NDArray[np.float64]:
         """Estimate less truth, δ wrapped by the true landmark's symmetry; (n, m, 4), NaN for strangers."""
         return self.error_of(slice(None))

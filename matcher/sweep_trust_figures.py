@@ -83,8 +83,7 @@ def confusion(trials: SweepTrials) -> Figure:
     of_trial = np.array([present.index(name) for name in shown])[trials.condition]
     every = [panel for row in rows for panel in row]
     for m, panel in zip(range(methods), every, strict=False):
-        refused = (trials.found[:, m] < 0) | ~trials.accepted[:, m]
-        found = np.where(refused, len(trials.classes), trials.found[:, m])
+        found = np.where(trials.refused[:, m], len(trials.classes), trials.found[:, m])
         table = np.array([[np.mean(found[of_trial == k] == j) for j in range(len(names))] for k in range(len(present))])
         panel.imshow(table, cmap="cividis", vmin=0, vmax=1, aspect="auto")
         for i, j in np.ndindex(table.shape):

@@ -22,6 +22,7 @@ from phasemark.render.flat_field import board_image
 from phasemark.render.frames import Frames
 from phasemark.render.noise import exact_phase_moments
 from phasemark.render.phasor import wrap_difference_m
+from phasemark.render.rounding import error_text, with_error
 from phasemark.render.sensor import Sensor
 from phasemark.render.sensor_file import rounded, sensor_toml
 
@@ -41,6 +42,11 @@ _NOISE_LEVELS_RATIO = 1.5  # largest light over smallest that tells two terms of
 _CORRELATED_SIGMAS = 4.0
 _WIGGLING_ORDERS = ((3, 7), (3,))  # most first; each order is two numbers
 _WORST_CONDITION = 20.0  # of the wiggling's design: beyond, the distances cover too little of its period
+
+DISTANCE_STD_M = 1e-3
+"""Assumed standard deviation of a board's distance: that of a laser distance meter or a steel tape, read with care."""
+_MOST_DISTANCE_STD = 0.1  # of the distance: the propagation is linear
+_DISTANCE_STEP = 1e-4  # of the distance, for derivatives of the noise's numbers
 
 _SEEN_SIGMAS = 4.0  # below, an order of the correlation is not there
 _SINE: dict[str, Any] = {
@@ -77,7 +83,7 @@ class Estimate:
         """The note with its standard error, as it stands in a sensor file."""
         if self.std_error is None:
             return f"assumed: {self.note}"
-        error = f", ± {self.std_error:.2g} (standard error)" if self.std_error > 0 else ""
+        error = f", ± {error_text(self.std_error)} (standard error)" if self.std_error > 0 else ""
         return f"measured{error}: {self.note}"
 
 
@@ -96,13 +102,15 @@ class SensorFit:
     pixel_offset_m : (rows, cols) float64
         Range offset of each pixel beside the global one; NaN for pixels left out.
     pixel_offset_std_error_m : (rows, cols) float64
-        Its temporal standard error.
+        Its standard error, from noise in time and from the boards' distances.
     range_std_m : (distances, rows, cols) float64
         Measured σ of one frame.
     frame_correlation, frame_correlation_std_error : float
         Correlation of a pixel's noise from one frame to the next.
     n_frames : tuple of int
         Frames at each distance.
+    distance_std_m : tuple of float
+        Standard deviation that each distance was taken to have; it is in all standard errors.
     """
 
     sensor: Sensor
@@ -114,6 +122,7 @@ class SensorFit:
     frame_correlation: float
     frame_correlation_std_error: float
     n_frames: tuple[int, ...]
+    distance_std_m: tuple[float, ...]
 
     def to_toml(self, *, base_name: str) -> str:
         """Return the sensor as a file, each number with what it was measured from, or that it is assumed.
@@ -139,6 +148,7 @@ class SensorFit:
             },
             "notes": list(self.notes),
             "n_frames": list(self.n_frames),
+            "distance_std_m": list(self.distance_std_m),
             "frame_correlation": self.frame_correlation,
             "frame_correlation_std_error": self.frame_correlation_std_error,
             "pixel_offset_m": [
@@ -154,6 +164,7 @@ def fit_sensor(
     base: Sensor,
     albedo: Sequence[float] | None = None,
     amplitude_unit: AmplitudeUnit = "electrons",
+    distance_std_m: float | Sequence[float] | None = None,
 ) -> SensorFit:
     """Estimate a camera from frames of a flat board that fills the image, square to the optical axis.
 
@@ -168,6 +179,8 @@ def fit_sensor(
       I = N₀S + N_amb + N_dark and V = 2σ_φ²A² − I;
     - from amplitude and intensity in arbitrary units, g = slope of 2σ_φ²A² over I turns both into electrons.
 
+    The errors of the distances are propagated to first order: they move ranges directly and the light by −2σ_r / r.
+
     Parameters
     ----------
     frames : sequence of Frames
@@ -180,6 +193,9 @@ def fit_sensor(
         Albedo of each board, or one for all; without it 0.8 is assumed.
     amplitude_unit : {"electrons", "arbitrary"}
         Unit of the frames' amplitude and intensity.
+    distance_std_m : float or sequence of float, optional
+        Standard deviation of the distances, one for all or one for each, independent from board to board; without it
+        `DISTANCE_STD_M`, 1 mm, is assumed. 0: exact.
 
     Returns
     -------
@@ -188,7 +204,8 @@ def fit_sensor(
     Raises
     ------
     UsageError
-        Numbers of frames, distances and albedos do not fit; there are too few frames; no pixel is valid often enough.
+        Numbers of frames, distances, albedos and standard deviations do not fit; there are too few frames; no pixel is
+        valid often enough; a standard deviation is negative or more than a tenth of its distance.
     """
     if len(frames) != len(distance_m) or not frames:
         raise UsageError(
@@ -212,17 +229,19 @@ def fit_sensor(
             )
     notes: list[str] = []
     estimates: dict[str, Estimate] = {}
-    data = _Data.of(frames, distance_m, albedos, base).of_usable_boards(distance_m, notes)
+    distance_std = _distance_std(distance_m, distance_std_m)
+    data = _Data.of(frames, distance_m, distance_std, albedos, base).of_usable_boards(distance_m, notes)
     if assumed_albedo and base.kind == "phase":
         notes.append("The board's albedo was assumed to be 0.8: signal_e times albedo is what was measured.")
     if not (data.variance_m2[:, data.good] > 0).any():
         raise UsageError("the frames have no noise: every range is the same in all of them; is one frame repeated?")
+    notes.append(_said_of_distances(distance_std, assumed=distance_std_m is None))
     correlation, correlation_error = data.frame_correlation()
     if abs(correlation) > _CORRELATED_SIGMAS * correlation_error:
         notes.append(
-            f"Frames are not independent: the noise of a pixel correlates by {correlation:.3f} ± "
-            f"{correlation_error:.2g} from one frame to the next, as behind a filter in time; standard errors allow "
-            "for it, σ may be too small."
+            "Frames are not independent: the noise of a pixel correlates by "
+            f"{with_error(correlation, correlation_error)} from one frame to the next, as behind a filter in time; "
+            "standard errors allow for it, σ may be too small."
         )
     widening = math.sqrt(max((1 + correlation) / (1 - correlation), 1.0)) if abs(correlation) < 1 else 1.0
     changes = _fit_offsets(data, base, estimates, notes, widening)
@@ -233,7 +252,8 @@ def fit_sensor(
         data = data.without(odd)
         changes = _fit_offsets(data, base, estimates, [], widening)
         offset, offset_error = data.pattern(changes)
-    changes |= _pattern_fields(data, base, offset, offset_error * widening, odd, estimates)
+    offset_error, moved = offset_error * widening, data.pattern_moved(changes)
+    changes |= _pattern_fields(data, base, offset, offset_error, moved, odd, estimates)
     changes |= _fit_noise(data, base, amplitude_unit, estimates, notes)
     fields = {**base.model_dump(), **{name: rounded(value) for name, value in changes.items()}}
     if base.kind == "phase":
@@ -245,11 +265,44 @@ def fit_sensor(
         {name: estimates[name] for name in sorted(estimates, key=order.__getitem__)},
         tuple(notes),
         offset,
-        offset_error * widening,
+        np.sqrt(offset_error**2 + (moved**2).sum(axis=0)),
         np.sqrt(data.variance_m2),
         correlation,
         correlation_error,
         tuple(one.n_frames for one in frames),
+        tuple(distance_std),
+    )
+
+
+def _distance_std(distance_m: Sequence[float], stated: float | Sequence[float] | None) -> list[float]:
+    """Return the standard deviation of each distance."""
+    std = np.atleast_1d(np.asarray(DISTANCE_STD_M if stated is None else stated, np.float64)).ravel().tolist()
+    if len(std) == 1:
+        std *= len(distance_m)
+    if len(std) != len(distance_m):
+        raise UsageError(
+            f"give one 'distance_std_m', or one for each of the {len(distance_m)} distances, got {len(std)}"
+        )
+    if stated is None:  # of a board a few millimetres away it would be no small error
+        return [min(one, _MOST_DISTANCE_STD * d) for one, d in zip(std, distance_m, strict=True)]
+    for one, distance in zip(std, distance_m, strict=True):
+        if distance > 0 and not 0 <= one <= _MOST_DISTANCE_STD * distance:
+            raise UsageError(
+                f"'distance_std_m' must be a number of metres from 0 to a tenth of the distance, "
+                f"{_MOST_DISTANCE_STD * distance:g} at {distance:g} m, got {one:g}"
+            )
+    return std
+
+
+def _said_of_distances(std_m: Sequence[float], *, assumed: bool) -> str:
+    """Say how well the distances were taken to be known."""
+    if not any(std_m):
+        return "The distances were taken to be exact; standard errors hold only as far as they are."
+    shown = dict.fromkeys(f"{1e3 * one:.3g}" for one in std_m)
+    source = "assumed" if assumed else "stated"
+    return (
+        f"The distances were {source} to have a standard deviation of {', '.join(shown)} mm, "
+        "independent of one another; the standard errors allow for it."
     )
 
 
@@ -258,6 +311,8 @@ class _Data:
     """Measured frames reduced to moments, beside what the board sends; (boards, rows, cols), NaN where unused."""
 
     sensor: Sensor
+    distance_m: _Float  # (boards,)
+    distance_std_m: _Float  # (boards,)
     n: _Float  # valid frames
     error_m: _Float  # mean range less true range
     variance_m2: _Float  # of one frame
@@ -270,7 +325,14 @@ class _Data:
     good: NDArray[np.bool_]  # (rows, cols), pixels that every number is made of
 
     @classmethod
-    def of(cls, frames: Sequence[Frames], distance_m: Sequence[float], albedo: Sequence[float], base: Sensor) -> _Data:
+    def of(
+        cls,
+        frames: Sequence[Frames],
+        distance_m: Sequence[float],
+        distance_std_m: Sequence[float],
+        albedo: Sequence[float],
+        base: Sensor,
+    ) -> _Data:
         """Reduce the frames; no pixel is called good yet."""
         images = [board_image(base, d, rho) for d, rho in zip(distance_m, albedo, strict=True)]
         truth = np.concatenate([image.range_m for image in images])
@@ -295,6 +357,8 @@ class _Data:
         share = np.array([n / one.n_frames for n, one in zip(count, frames, strict=True)])
         return cls(
             base,
+            np.array(distance_m, np.float64),
+            np.array(distance_std_m, np.float64),
             np.array(count),
             np.array(error),
             np.array(variance),
@@ -341,6 +405,8 @@ class _Data:
 
         return replace(
             self,
+            distance_m=self.distance_m[kept],
+            distance_std_m=self.distance_std_m[kept],
             n=self.n[kept],
             error_m=self.error_m[kept],
             variance_m2=self.variance_m2[kept],
@@ -360,6 +426,21 @@ class _Data:
     def without(self, odd: NDArray[np.bool_]) -> _Data:
         """Leave out some pixels."""
         return replace(self, good=self.good & ~odd)
+
+    def shifted(self, board: int, change_m: float) -> _Data:
+        """Take a board to have stood further away; the measured ranges stay."""
+        factor = 1 + change_m / self.distance_m[board]
+        truth, error, light = self.truth_m.copy(), self.error_m.copy(), self.light.copy()
+        truth[board] *= factor
+        error[board] = wrap_difference_m(error[board] - (truth[board] - self.truth_m[board]), self.sensor)
+        light[board] /= factor**2
+        return replace(
+            self,
+            distance_m=self.distance_m + change_m * (np.arange(len(self.distance_m)) == board),
+            truth_m=truth,
+            error_m=error,
+            light=light,
+        )
 
     @property
     def phase_rad(self) -> _Float:
@@ -403,6 +484,19 @@ class _Data:
         offset[self.good] = (weight * slope * residual).sum(axis=0) / information
         error[self.good] = np.sqrt((weight**2 * slope**2 * noise).sum(axis=0)) / information
         return offset, error
+
+    def pattern_moved(self, changes: dict[str, Any]) -> _Float:
+        """Return how the pattern moves with one standard deviation of each board's distance, (boards, rows, cols).
+
+        Ranges grow from the middle to the corners, so an error of the distance does too; its mean is in the offset.
+        """
+        before, _ = self.pattern(changes)
+        moved = np.array(
+            [self.shifted(k, std).pattern(changes)[0] - before for k, std in enumerate(self.distance_std_m)]
+        )
+        if self.good.any():
+            moved -= moved[:, self.good].mean(axis=1)[:, None, None]
+        return moved
 
     def odd_pixels(self, offset_m: _Float) -> NDArray[np.bool_]:
         """Return pixels that are stuck, far noisier than the rest at their light, or far off; (rows, cols)."""
@@ -456,7 +550,9 @@ def _fit_offsets(
     mean = data.error_m[:, good].mean(axis=1)
     # the same pixels see every board, so their own offsets move all means alike
     temporal = np.sqrt((data.variance_m2 / np.maximum(data.n, 1))[:, good].mean(axis=1) / good.sum()) * widening
-    temporal = np.maximum(temporal, 1e-9)
+    # an error of the distance is one of the mean; its lever on the wiggling's phase is small beside that
+    obliquity = (data.truth_m[:, good] / data.distance_m[:, None]).mean(axis=1)
+    std = np.maximum(np.hypot(temporal, data.distance_std_m * obliquity), 1e-9)
     m, known, none_seen = len(mean), base.correlation_harmonics, False
     wiggles = [orders for orders in _WIGGLING_ORDERS if m >= 2 + 2 * len(orders)] if base.kind == "phase" else []
     for orders in wiggles:
@@ -465,7 +561,7 @@ def _fit_offsets(
             + [part((k + 1) * data.phase_rad).mean(axis=1) for k in orders for part in (np.cos, np.sin)]
         )  # fmt: skip
         if np.linalg.cond(design / np.linalg.norm(design, axis=0)) <= _WORST_CONDITION:
-            changes = _fit_wiggling(data, orders, mean, temporal, estimates, notes)
+            changes = _fit_wiggling(data, orders, mean, std, estimates, notes)
             if changes is not None:
                 return changes
             none_seen, known = True, ()
@@ -477,10 +573,10 @@ def _fit_offsets(
         else:
             delay = float(parameters[0]) / base.metres_per_radian
             model = _range_error_m(data.phase_rad, delay, known, base).mean(axis=1)
-        return np.asarray(wrap_difference_m(mean - model, base) / temporal)
+        return np.asarray(wrap_difference_m(mean - model, base) / std)
 
     centre = _circular_mean(mean, base)
-    found = optimize.least_squares(residual, [centre], x_scale=max(float(temporal.min()), 1e-6))
+    found = optimize.least_squares(residual, [centre], x_scale=max(float(std.min()), 1e-6))
     error = 1 / float(np.linalg.norm(_jacobian(found)))
     if m > 1:
         error *= math.sqrt(max(2 * found.cost / (m - 1), 1.0))
@@ -516,7 +612,7 @@ def _fit_wiggling(
     data: _Data,
     orders: tuple[int, ...],
     mean: _Float,
-    temporal: _Float,
+    std: _Float,
     estimates: dict[str, Estimate],
     notes: list[str],
 ) -> dict[str, Any] | None:
@@ -533,7 +629,7 @@ def _fit_wiggling(
 
     def residual(parameters: _Float) -> _Float:
         model = _range_error_m(data.phase_rad, float(parameters[0]), harmonics(parameters), sensor).mean(axis=1)
-        return np.asarray(wrap_difference_m(mean - model, sensor) / temporal)
+        return np.asarray(wrap_difference_m(mean - model, sensor) / std)
 
     start = np.zeros(1 + 2 * len(orders))
     start[0] = _circular_mean(mean, sensor) / sensor.metres_per_radian
@@ -550,7 +646,7 @@ def _fit_wiggling(
         own = covariance[1 + 2 * j : 3 + 2 * j, 1 + 2 * j : 3 + 2 * j]
         parts.append(math.sqrt(float(gradient @ own @ gradient)))
     described = ", ".join(
-        f"a_{h.order} = {h.amplitude:.2g} ± {e:.2g}" for h, e in zip(found_harmonics, parts, strict=True)
+        f"a_{h.order} = {with_error(h.amplitude, e)}" for h, e in zip(found_harmonics, parts, strict=True)
     )
     if all(h.amplitude < _SEEN_SIGMAS * e for h, e in zip(found_harmonics, parts, strict=True)):
         notes.append(f"No wiggling is seen at {m} distances: {described}.")
@@ -577,6 +673,7 @@ def _pattern_fields(
     base: Sensor,
     offset_m: _Float,
     offset_error_m: _Float,
+    moved_m: _Float,
     odd: NDArray[np.bool_],
     estimates: dict[str, Estimate],
 ) -> dict[str, Any]:
@@ -602,9 +699,13 @@ def _pattern_fields(
     if count < 3:
         return changes
     noise = float((offset_error_m[good] ** 2).mean())
-    variance = max(float(offset_m[good].var(ddof=1)) - noise, 0.0)
-    # of a normal pattern's variance, its own and the noise's spread alike
-    of_variance = math.sqrt(2 / (count - 1)) * (variance + noise)
+    own, moved = offset_m[good] - offset_m[good].mean(), moved_m[:, good]
+    by_distance = moved.var(axis=1, ddof=1)  # of each board
+    variance = max(float(offset_m[good].var(ddof=1)) - noise - float(by_distance.sum()), 0.0)
+    # of a normal pattern's variance, its own and the noise's spread alike; a distance's error δ adds 2δ·cov + δ²·var
+    levers = 2 * (moved * own).sum(axis=1) / (count - 1)
+    of_distances = float((levers**2).sum() + 2 * (by_distance**2).sum())
+    of_variance = math.hypot(math.sqrt(2 / (count - 1)) * (variance + noise), math.sqrt(of_distances))
     std_m = math.sqrt(variance)
     error_m = of_variance / (2 * std_m) if variance > of_variance else math.sqrt(of_variance)
     scale = base.metres_per_radian
@@ -620,7 +721,7 @@ def _pattern_fields(
 def _fit_noise(
     data: _Data, base: Sensor, amplitude_unit: AmplitudeUnit, estimates: dict[str, Estimate], notes: list[str]
 ) -> dict[str, Any]:
-    """Return the fields that the noise of single frames tells."""
+    """Return the fields that the noise of single frames tells, the errors of the distances in their standard errors."""
     good = data.good
     if base.kind == "direct":
         variance = data.variance_m2[:, good]
@@ -628,6 +729,45 @@ def _fit_noise(
         std = math.sqrt(float(variance.mean()))
         estimates["range_std_m"] = Estimate(std, std / math.sqrt(2 * degrees), "noise of single frames")
         return {"range_std_m": std}
+    found: dict[str, Estimate] = {}
+    changes = _fit_light(data, base, amplitude_unit, found, notes)
+    variance_of = dict.fromkeys(found, 0.0)
+    for board, (distance, std) in enumerate(zip(data.distance_m, data.distance_std_m, strict=True)):
+        step = _DISTANCE_STEP * float(distance)
+        sides = [_refitted(data.shifted(board, side), base, amplitude_unit) for side in (step, -step)] if std else []
+        for name, one in found.items():
+            # a side on which other numbers can be told apart says nothing of the slope
+            slopes = [
+                (side[name].value - one.value) / (sign * step)
+                for sign, side in zip((1, -1), sides, strict=False)
+                if side.keys() == found.keys()
+            ]
+            variance_of[name] += (float(np.mean(slopes)) * float(std)) ** 2 if slopes else 0.0
+    for name, one in found.items():
+        if one.std_error is not None:
+            one = replace(one, std_error=math.hypot(one.std_error, math.sqrt(variance_of[name])))
+        # less light than none is chance
+        estimates[name] = replace(one, value=max(one.value, 0.0)) if name == "ambient_e" else one
+    if "ambient_e" in changes:
+        changes["ambient_e"] = max(changes["ambient_e"], 0.0)
+    return changes
+
+
+def _refitted(data: _Data, base: Sensor, amplitude_unit: AmplitudeUnit) -> dict[str, Estimate]:
+    """Return the estimates of other data; none if these do not show the signal."""
+    found: dict[str, Estimate] = {}
+    try:
+        _fit_light(data, base, amplitude_unit, found, [])
+    except UsageError:
+        return {}
+    return found
+
+
+def _fit_light(
+    data: _Data, base: Sensor, amplitude_unit: AmplitudeUnit, estimates: dict[str, Estimate], notes: list[str]
+) -> dict[str, Any]:
+    """Fit signal, contrast, ambient light and read noise to given distances; ambient light may come out negative."""
+    good = data.good
     law, scale_error = _NoiseData.of(data), 0.0
     amplitude = None if data.amplitude is None else data.amplitude[:, good]
     intensity = None if data.intensity is None else data.intensity[:, good]
@@ -644,7 +784,7 @@ def _fit_noise(
         else:
             scale, error = electrons
             notes.append(
-                f"Photon transfer gives {scale:.4g} ± {error:.2g} electrons a unit of amplitude and intensity."
+                f"Photon transfer gives {with_error(scale, error)} electrons a unit of amplitude and intensity."
             )
             amplitude, scale_error = amplitude * scale, error / scale
             intensity = None if intensity is None else intensity * scale
@@ -658,6 +798,7 @@ class _NoiseData:
     """Phase variances (boards, pixels) beside the light, |S|, with their degrees of freedom."""
 
     light: _Float
+    light_std: _Float  # (boards,), relative, of the boards' distances
     phase_variance: _Float
     degrees: _Float
 
@@ -670,7 +811,8 @@ class _NoiseData:
         # the law is a little low where noise is high: by what the exact density says
         above_law = np.ones_like(mean)
         np.divide(exact_phase_moments(np.sqrt(mean))[0], mean, out=above_law, where=mean > 0)
-        return cls(data.light[:, good], variance / above_law, data.n[:, good] - 1)
+        light_std = 2 * data.distance_std_m / data.distance_m
+        return cls(data.light[:, good], light_std, variance / above_law, data.n[:, good] - 1)
 
     @property
     def levels_differ(self) -> bool:
@@ -732,7 +874,7 @@ def _noise_of_ranges(law: _NoiseData, base: Sensor, estimates: dict[str, Estimat
             noise = to_electrons * b
             gradient = np.array([-2 * noise / a, to_electrons])
             noise_error = math.sqrt(float(gradient @ covariance @ gradient))
-            ambient = max(noise - base.dark_e - base.read_variance_e2, 0.0)
+            ambient = noise - base.dark_e - base.read_variance_e2
             notes.append(
                 "Ranges alone tell signal_e · contrast² and the noise that does not follow the light; the latter is "
                 "put down to ambient light, beside the assumed dark current and read noise."
@@ -771,7 +913,7 @@ def _noise_of_electrons(
     """
     boards = len(amplitude_e)
     # wiggling and stray light scale A/S from board to board, patterns from pixel to pixel
-    modulated, modulated_error = _mean_of_boards(amplitude_e / law.light)
+    modulated, modulated_error = _mean_of_boards(amplitude_e / law.light, law.light_std)
     variance_e2 = 2 * law.phase_variance * amplitude_e**2  # N₀S + N_amb + N_dark + V
     light = intensity_e if intensity_e is not None else variance_e2
     what = "intensity" if intensity_e is not None else "noise · amplitude²"
@@ -779,11 +921,11 @@ def _noise_of_electrons(
     changes: dict[str, Any] = {}
     if law.levels_differ:
         if intensity_e is not None:
-            (signal, offset), covariance = _line_over_boards(law.light, intensity_e)
+            (signal, offset), covariance = _line_over_boards(law, intensity_e)
         else:
             (signal, offset), covariance = law.two_terms(variance_e2, law.light, np.ones_like(law.light))
         signal_error, offset_error = np.sqrt(np.diag(covariance))
-        ambient = max(offset - (constant - base.ambient_e), 0.0)
+        ambient = offset - (constant - base.ambient_e)
         note = f"{what} without light, less the assumed dark current"
         estimates["ambient_e"] = Estimate(
             float(ambient),
@@ -792,7 +934,7 @@ def _noise_of_electrons(
         )
         changes["ambient_e"] = float(ambient)
     else:
-        mean, mean_error = _mean_of_boards(light / law.light) if intensity_e is not None else (
+        mean, mean_error = _mean_of_boards(light / law.light, law.light_std) if intensity_e is not None else (
             (float(((variance_e2 - constant) / law.light).mean()), law.one_term(variance_e2 / law.light)[1])
         )  # fmt: skip
         signal = mean - (constant / float(law.light.mean()) if intensity_e is not None else 0.0)
@@ -803,8 +945,8 @@ def _noise_of_electrons(
         )
     if signal <= 2 * signal_error:
         raise UsageError(
-            f"the frames do not show the signal: {what} rises by {signal:.3g} ± {signal_error:.2g} electrons a unit of "
-            "light; are amplitude and intensity in electrons (--amplitude-unit)?"
+            f"the frames do not show the signal: {what} rises by {with_error(signal, signal_error)} electrons a "
+            "unit of light; are amplitude and intensity in electrons (--amplitude-unit)?"
         )
     contrast = modulated / signal
     contrast_error = contrast * math.hypot(modulated_error / modulated, signal_error / signal)
@@ -831,19 +973,27 @@ def _noise_of_electrons(
     return changes
 
 
-def _mean_of_boards(values: _Float) -> tuple[float, float]:
-    """Return the mean over boards and pixels, and its standard error from their spread, boards as a whole included."""
+def _mean_of_boards(values: _Float, light_std: _Float) -> tuple[float, float]:
+    """Return the mean over boards and pixels, and its standard error from their spread, boards as a whole included.
+
+    What the distances let boards spread, `light_std` of the mean, is left out: it is added to every number later.
+    """
     own = values.std(ddof=1) / math.sqrt(values.size) if values.size > 1 else 0.0
     boards = values.mean(axis=1)
-    between = float(boards.std(ddof=1)) / math.sqrt(len(boards)) if len(boards) > 1 else 0.0
+    between = 0.0
+    if len(boards) > 1:
+        excess = float(boards.var(ddof=1)) - float(((light_std * boards.mean()) ** 2).mean())
+        between = math.sqrt(max(excess, 0.0) / len(boards))
     return float(values.mean()), float(max(own, between))
 
 
-def _line_over_boards(light: _Float, intensity_e: _Float) -> tuple[_Float, _Float]:
+def _line_over_boards(law: _NoiseData, intensity_e: _Float) -> tuple[_Float, _Float]:
     """Fit I = N₀S + B to every pixel by least squares of relative errors; return the means and their covariance.
 
-    It follows from the scatter of the pixels, whose sensitivities and dark signals differ, and of whole boards.
+    It follows from the scatter of the pixels, whose sensitivities and dark signals differ, and of whole boards, less
+    what the distances let boards scatter: that is added to every number later.
     """
+    light = law.light
     y = intensity_e.mean(axis=1)
     lines = []
     for x, values in zip(light.T, intensity_e.T, strict=True):
@@ -855,7 +1005,9 @@ def _line_over_boards(light: _Float, intensity_e: _Float) -> tuple[_Float, _Floa
     own = np.atleast_2d(np.cov(solutions.T)) / len(solutions) if len(solutions) > 1 else np.zeros((2, 2))
     if len(y) > 2:
         residual = (light.mean(axis=1) * mean[0] + mean[1]) / y - 1
-        own = own + covariance * float((residual**2).sum()) / (len(y) - 2)
+        expected = law.light_std * light.mean(axis=1) * mean[0] / y
+        excess = float((residual**2).sum()) / (len(y) - 2) - float((expected**2).mean())
+        own = own + covariance * max(excess, 0.0)
     return mean, own
 
 

@@ -30,7 +30,13 @@ if TYPE_CHECKING:
     from phasemark.render.phasor import PhasorImages
 
 PAPER_CMAP = LinearSegmentedColormap.from_list("paper", ["#ffffff", "#2f6fe4", "#000000"])
-"""The colours of the paper's figure 4: near is white, far is black, between them lies blue."""
+"""The colours of the paper's figure 4, as :data:`RANGE_COLOURS` explains them."""
+
+RANGE_COLOURS = (
+    "White is the nearest, black the farthest, and blue in between: a surface there, or a pixel at an edge that mixes "
+    "near and far."
+)
+"""What the colours of a range image say, for captions."""
 
 _NOTHING = "#efe3d0"
 _NOTHING_HATCH = "#b58a55"

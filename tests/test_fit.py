@@ -36,7 +36,7 @@ def take(sensor, distance_m, n=50, *, seed=0, albedo=0.8, amplitude=True, intens
 
 def fitted(sensor, distances, n=50, *, base=PMD, amplitude_unit="electrons", **options):
     boards = [take(sensor, d, n, **options) for d in distances]
-    fit = fit_sensor(boards, distances, base=base, albedo=[0.8], amplitude_unit=amplitude_unit)
+    fit = fit_sensor(boards, distances, base=base, albedo=[0.8], amplitude_unit=amplitude_unit, distance_std_m=0)
     for name, one in fit.estimates.items():
         print(f"{name} = {one.value:.6g} ± {one.std_error}: {one.note}")
     return fit
@@ -138,7 +138,7 @@ def test_standard_errors_are_those_of_repeated_fits():
     found = {name: [] for name in names}
     for seed in range(n):
         boards = [take(camera, d, 20, seed=100 + seed) for d in (0.8, 2.0, 3.0)]
-        fit = fit_sensor(boards, (0.8, 2.0, 3.0), base=PMD, albedo=[0.8])
+        fit = fit_sensor(boards, (0.8, 2.0, 3.0), base=PMD, albedo=[0.8], distance_std_m=0)
         for name in names:
             one = fit.estimates[name]
             truth = 0.0 if name == "range_offset_m" else getattr(camera, name)
@@ -148,6 +148,67 @@ def test_standard_errors_are_those_of_repeated_fits():
         pulls = np.array(found[name])
         print(f"{name}: mean of pulls {pulls.mean():.2f}, r.m.s. {np.sqrt((pulls**2).mean()):.2f}")
         assert (pulls**2).sum() < high  # errors may be stated too large, never too small
+
+
+@pytest.mark.parametrize(
+    ("given", "distances"),
+    [
+        ("ranges", (1.0,)),
+        ("ranges", (0.8, 2.0, 3.0)),
+        ("amplitude", (1.0, 1.1)),
+        ("intensity", (0.8, 2.0, 3.0)),
+    ],
+)
+def test_errors_of_the_distances_are_in_the_standard_errors(given, distances):
+    # N = 100 sets of distances, each 5 mm (1 σ) off the truth, which the fit is told; 99.9 % intervals over the 4 cases
+    n, std_m, camera, rng = 100, 0.005, PMD.with_(ambient_e=4000.0), np.random.default_rng(len(given + str(distances)))
+    if len(distances) == 1 or given == "amplitude":
+        camera = PMD  # the assumed ambient light has to be right
+    seen = {"amplitude": given != "ranges", "intensity": given == "intensity"}
+    boards = [[take(camera, d, 20, seed=seed, **seen) for d in distances] for seed in range(n)]
+    names = ["range_offset_m", "signal_e", *(["ambient_e", "contrast"] if seen["intensity"] else [])]
+    pulls, blind = {name: [] for name in names}, []
+    for k in range(n):
+        stated = np.asarray(distances) + rng.normal(0, std_m, len(distances))
+        fit = fit_sensor(boards[k], stated, base=PMD, albedo=[0.8], distance_std_m=std_m)
+        exact = fit_sensor(boards[k], stated, base=PMD, albedo=[0.8], distance_std_m=0) if k < 20 else None
+        for name in names:
+            truth = 0.0 if name == "range_offset_m" else getattr(camera, name)
+            pulls[name].append((fit.estimates[name].value - truth) / fit.estimates[name].std_error)
+            if exact is not None and name == "range_offset_m":
+                blind.append((exact.estimates[name].value - truth) / exact.estimates[name].std_error)
+    level = 1 - 1e-3 / 4
+    for name in names:
+        inside = int((np.abs(pulls[name]) < stats.norm.ppf(0.975)).sum())
+        print(
+            f"{given} at {distances}: {name} in {inside} of {n}, r.m.s. {np.sqrt(np.mean(np.square(pulls[name]))):.2f}"
+        )
+        assert inside >= stats.binom.ppf(1 - level, n, 0.95)
+        # nor are they wider than need be: noise of 20 frames beside 5 mm, and scatter between three boards
+        assert np.mean(np.square(pulls[name])) > 0.4
+    if len(distances) == 1:
+        assert np.mean(np.square(blind)) > 100  # what a fit that takes the distance as exact states
+
+
+def test_the_distances_standard_deviation_is_stated_assumed_or_none():
+    boards = [take(PMD, d) for d in (1.0, 2.0)]
+    fits = {
+        std: fit_sensor(boards, (1.0, 2.0), base=PMD, albedo=[0.8], distance_std_m=std)
+        for std in (None, 0.0, 0.001, (0.001, 0.004))
+    }
+    assert fits[None].as_dict()["distance_std_m"] == [0.001, 0.001]
+    assert any("assumed to have a standard deviation of 1 mm" in note for note in fits[None].notes)
+    assert any("taken to be exact" in note for note in fits[0.0].notes)
+    assert any("stated to have a standard deviation of 1, 4 mm" in note for note in fits[0.001, 0.004].notes)
+    assert fits[None].estimates["signal_e"].std_error == fits[0.001].estimates["signal_e"].std_error
+    errors = [fits[std].estimates["range_offset_m"].std_error for std in (0.0, 0.001, (0.001, 0.004))]
+    # ranges grow from the middle to the corners, 5 % on the mean, and so does what an error of the distance does
+    longer = float(board_image(PMD, 1.0, 0.8).range_m.mean())
+    assert errors[1] == pytest.approx(longer * 1e-3 / math.sqrt(2), rel=0.05)  # noise of 50 frames adds to it
+    assert errors[0] < 0.2e-3 < errors[1]
+    for wrong, message in ((-0.001, "got -0.001"), (5.0, "0.1 at 1 m, got 5"), ((0.001,) * 3, "one for each of the 2")):
+        with pytest.raises(UsageError, match=message):
+            fit_sensor(boards, (1.0, 2.0), base=PMD, distance_std_m=wrong)
 
 
 def test_a_direct_sensor_has_an_offset_and_one_figure_of_noise():
@@ -188,10 +249,10 @@ def test_frames_behind_a_filter_in_time_are_noticed():
     rng = np.random.default_rng(2)
     white = rng.normal(0, 0.02, (201, 16, 16))
     board = board_image(PMD, 1.0, 0.8).range_m[0]
-    smooth = fit_sensor([Frames(board + (white[1:] + white[:-1]) / 2, sensor=PMD)], [1.0], base=PMD)
+    smooth = fit_sensor([Frames(board + (white[1:] + white[:-1]) / 2, sensor=PMD)], [1.0], base=PMD, distance_std_m=0)
     assert smooth.frame_correlation == pytest.approx(0.5, abs=4 * smooth.frame_correlation_std_error)
     assert any("not independent" in note for note in smooth.notes)
-    plain = fit_sensor([Frames(board + white, sensor=PMD)], [1.0], base=PMD)
+    plain = fit_sensor([Frames(board + white, sensor=PMD)], [1.0], base=PMD, distance_std_m=0)
     assert abs(plain.frame_correlation) < 4 * plain.frame_correlation_std_error
     assert not any("not independent" in note for note in plain.notes)
     errors = [fit.estimates["range_offset_m"].std_error / fit.range_std_m.mean() for fit in (smooth, plain)]
@@ -298,6 +359,11 @@ def test_positions_of_one_file_take_their_distances_in_order(folder, tmp_path):
         (["short.csv", "--distance", "1"], 2, f"at least {FEWEST_FRAMES} are needed"),
         (["1.npz", "--distance", "-1"], 2, "must be a positive number of metres, got -1"),
         (["1.npz", "--distance", "near"], 2, "--distance"),
+        (
+            ["1.npz", "--distance", "1", "--distance-std", "5"],
+            2,
+            "'distance_std_m' must be a number of metres from 0 to",
+        ),
         (["1.npz"], 2, "--distance"),
         (["1.npz", "2.npz", "--distance", "1"], 2, "each set of frames needs its distance"),
         (["narrow.csv", "--distance", "1"], 3, "12 values, must have 256"),

@@ -1,6 +1,7 @@
 import io
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from rich.console import Console
 
 from phasemark import UsageError
 from phasemark.render import PAPER_CMAP, Flag, Frames, PhasorImages, Views, preset, range_picture, terminal_picture
+from phasemark.render.plot import RANGE_COLOURS
 
 SENSOR = preset("ideal")
 
@@ -47,6 +49,19 @@ def test_near_is_white_far_is_black_and_between_is_blue():
     np.testing.assert_allclose(PAPER_CMAP(1.0)[:3], 0)
     red, green, blue, _ = PAPER_CMAP(0.5)
     assert blue > 1.5 * green > 1.5 * red
+
+
+def test_a_surface_half_way_is_blue_too_and_every_caption_says_so():
+    range_m = np.array([[1.0, 1.0, 2.0, 2.0, 3.0, 3.0]])  # three surfaces, no pixel that mixes two of them
+    red, _, blue = (int(c) for c in pixel_colour(range_picture(range_m), 0, 2))
+    assert blue > red + 100
+    root = Path(__file__).resolve().parent.parent
+    readme = " ".join((root / "README.md").read_text(encoding="utf-8").split())
+    assert RANGE_COLOURS in readme
+    for page in (root / "README.md", *root.glob("docs/*.md"), *root.glob("matcher/*.j2")):
+        text = " ".join(page.read_text(encoding="utf-8").replace(RANGE_COLOURS, "").split())
+        assert "blue is a pixel" not in text, page.name
+        assert "lies blue" not in text, page.name
 
 
 def test_row_zero_is_drawn_at_the_top_and_column_zero_at_the_left():

@@ -1,5 +1,6 @@
 """What is made of a finished sweep: report, figures, single trials taken again, comparison, and the command line."""
 
+import dataclasses
 import json
 import math
 import re
@@ -22,6 +23,7 @@ from phasemark.matcher.sweep_examples import sweep_frames
 from phasemark.matcher.sweep_job import Round, SweepJob
 from phasemark.matcher.sweep_plan import Method, SweepPlan
 from phasemark.matcher.sweep_report import summary, write_report
+from phasemark.matcher.sweep_trust_figures import confusion
 from phasemark.render import Renderer, preset
 
 BOX = {"length_m": 0.24, "width_m": 0.16, "height_m": 0.15}
@@ -109,12 +111,24 @@ def test_three_sentences_say_what_was_found(folder):
     sentences = summary(trials, trials.cells())
     assert len(sentences) == 3
     n = int((trials.true_class >= 0).sum())
-    right = int((trials.found[:, 0] == trials.true_class)[trials.true_class >= 0].sum())
-    refused = int((~trials.accepted[:, 0])[trials.true_class < 0].sum())
-    strangers = int((trials.true_class < 0).sum())
-    assert strangers == 5 * 4  # stranger_trials, not trials
-    expected = f"Nearest found the right class in {right} of {n} trials and refused {refused} of {strangers} strangers"
-    assert sentences[2].startswith(expected)
+    assert int((trials.true_class < 0).sum()) == 5 * 4  # stranger_trials, not trials
+    accepted = trials.accepted.copy()
+    accepted[np.flatnonzero(trials.true_class >= 0)[:7], 0] = False
+    trials = dataclasses.replace(trials, accepted=accepted)
+    sentences = summary(trials, trials.cells())
+    # the numbers of the picture beside it, whose cells are shares: classes, then "refused"
+    panel = confusion(trials).axes[0]
+    table = np.asarray(panel.images[0].get_array())
+    shown = [label.get_text() for label in panel.get_yticklabels()]
+    found = [label.get_text() for label in panel.get_xticklabels()]
+    of_class = {name: sum(trials.conditions[c].class_name == name for c in trials.condition) for name in shown}
+    right = sum(round(table[shown.index(name), found.index(name)] * of_class[name]) for name in trials.classes)
+    refused = {name: round(table[shown.index(name), -1] * of_class[name]) for name in shown}
+    strangers = refused.pop("bare-box")
+    missed = sum(refused.values())
+    assert missed >= 7
+    expected = f"Nearest named the right class in {right} of {n - missed} answers and refused {missed} of {n} trials "
+    assert sentences[2].startswith(f"{expected}({100 * missed / n:.2g} %) and {strangers} of 20 strangers")
 
 
 def test_the_frames_of_a_trial_are_those_that_were_judged(folder, tmp_path):

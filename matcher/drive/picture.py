@@ -25,6 +25,7 @@ _ENLARGED = 10.0
 _LEVEL = 0.95
 _MOVING_FRAMES, _MOVING_MS, _STANDING_MS = 100, 80, 1500
 _COLOURS = 64
+_COLOURS_SAY = "range: white near, blue between, black far"
 
 
 def drive_picture(drive: Drive) -> Figure:
@@ -179,12 +180,12 @@ def _draw_frame(axes: Axes, stop: Stop) -> None:
     found = stop.match.class_name or "nothing"
     verdict = "used" if stop.used else "refused"
     text = f"{found} at {stop.match.distance_m:.2f} m" if stop.match.class_name else found
-    axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    axes.set(xticks=[], yticks=[], xlabel=_COLOURS_SAY, ylabel="")
     axes.set_title(f"{stop.landmark.name}: {text}\n{verdict}", fontsize=9)
 
 
 def _no_frame(axes: Axes) -> None:
-    axes.set(xticks=[], yticks=[], aspect="equal", xlim=(0, 16), ylim=(16, 0))
+    axes.set(xticks=[], yticks=[], aspect="equal", xlim=(0, 16), ylim=(16, 0), xlabel=_COLOURS_SAY)
     axes.set_title("what the camera sees at a stop\n", fontsize=9)
 
 
