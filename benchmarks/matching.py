@@ -14,6 +14,7 @@ import numpy as np
 from phasemark.data import Bank, BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, cramer_rao, efficiency, kalman_filter
+from phasemark.matcher.models import VIEW
 from phasemark.render import Background, Renderer, Sensor, Views, capture
 
 N_VIEWS = 1000
@@ -40,7 +41,7 @@ def matching(sensor: Sensor, seed: int) -> dict[str, Any]:
             bound = cramer_rao(renderer, views, background=background, workers=2)
             std = np.column_stack([bound.std("distance_m"), bound.std("delta_rad")])
             methods = [
-                ("phasemark, refine", ours(Matcher(bank, "refine", background=background), frames)),
+                ("phasemark, refine", ours(Matcher(bank, "refine", free=VIEW[:2], background=background), frames)),
                 ("phasemark, nearest", ours(Matcher(bank, background=background), frames)),
                 ("scikit-learn, nearest neighbour", neighbours(bank, frames, background)),
                 ("Open3D, point-to-plane ICP", registration(mesh, frames, started_at)),

@@ -280,12 +280,14 @@ def chain() -> Table:
                 ("match, nearest of 25 380 + 564 images", len(several), lambda: plain.match(several)),
                 ("the same before a wall", len(many), lambda: matcher.match(many)),
             ]
-            free = ("distance_m", "delta_rad", "bearing_rad")
+            free, wall = ("distance_m", "delta_rad", "bearing_rad"), Background(wall_m=3.0)
+            fixed = free[:2]
             likely = [
-                ("most likely D, δ on ranges", Matcher(opened, "refine"), several),
-                ("on phasors", Matcher(opened, "refine", on="phasors"), several[:100]),
+                ("most likely D, δ on ranges", Matcher(opened, "refine", free=fixed), several),
+                ("on phasors", Matcher(opened, "refine", free=fixed, on="phasors"), several[:100]),
+                ("bearing near 0, the default", Matcher(opened, "refine"), several[:500]),
                 ("and bearing, on ranges", Matcher(opened, "refine", free=free), several[:100]),
-                ("D, δ before a wall", Matcher(opened, "refine", background=Background(wall_m=3.0)), many[:100]),
+                ("D, δ before a wall", Matcher(opened, "refine", free=fixed, background=wall), many[:100]),
             ]
             rows += [(name, len(some), partial(likeliest.match, some)) for name, likeliest, some in likely]
             measured = [(name, n / median_seconds(work), n / processor_seconds(work)) for name, n, work in rows]

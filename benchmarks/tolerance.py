@@ -59,7 +59,9 @@ def tolerance(sensor: Sensor, seed: int) -> dict[str, Any]:
             frames = capture(image, made_with, rng=rng, n_frames=50, workers=2)
             # the matcher believes in the bank's sensor
             believed = replace(kalman_filter(frames), sensor=sensor)
-            rows.append(judged(title, Matcher(bank, "refine", **options).match(believed), image.views))
+            rows.append(
+                judged(title, Matcher(bank, "refine", **{"free": FREE[:2], **options}).match(believed), image.views)
+            )
     return {
         "rows": rows,
         "note": f"{CLASS}, D {DISTANCE_M[0]} to {DISTANCE_M[1]} m, any δ, nothing behind, {N_VIEWS} views",

@@ -64,8 +64,8 @@ class Search:
         What stands behind the landmark.
     stride : (distance, delta)
         Every how many steps of the bank's grid an image is compared.
-    bearings : bool
-        Whether the landmark may be off to a side.
+    widest_rad : float
+        How far the landmark may be off to a side; at most a quarter of the image.
     capped : bool
         Whether no pixel costs more than a disagreement: other things may stand in view.
     """
@@ -75,7 +75,7 @@ class Search:
         bank: Bank,
         behind: PhasorImages | None,
         stride: tuple[int, int],
-        bearings: bool,
+        widest_rad: float,
         *,
         capped: bool = False,
     ) -> None:
@@ -86,7 +86,7 @@ class Search:
         self._closes = closing_period(bank.delta_rad) is not None
         sensor = bank.sensor
         self.column_rad = 2 * math.atan(sensor.tan_half_angles[0]) / sensor.cols
-        most = sensor.cols // 4 if bearings else 0
+        most = min(sensor.cols // 4, math.ceil(min(widest_rad / self.column_rad, sensor.cols)))
         self._shifts = range(-most, most + 1)
         thin = slice(None, None, stride[0]), slice(None, None, stride[1])
         self._parts: list[tuple[Templates, tuple[int, int], bool]] = []

@@ -44,6 +44,10 @@ _FINE, _COARSE = (0.011, math.radians(1.1)), (0.022, math.radians(2.2))
 _SAME_M, _SAME_RAD = 2e-3, math.radians(0.2)
 TOLERANCE_M, TOLERANCE_RAD = 0.03, math.radians(6.0)
 """An accepted answer is right to within these at three standard deviations."""
+BEARING_STD_RAD = math.radians(1.5)
+"""How well a mount is thought to point at the landmark, unless the matcher is told."""
+_PRIOR_SIGMA = 3.0
+"""Bearings up to so many standard deviations of the prior are searched."""
 _TOLERATED_SIGMA = 3.0
 _STRANGE_SIGMA = 5.0
 """A return farther from the model than this sees something else."""
@@ -59,6 +63,8 @@ edge costs half as much."""
 _MOST_REFINED = 3
 _WALLS_BEYOND_M = (0.5, 1.0, 2.0, 4.0)
 """How far behind the landmark a wall is tried that no pixel sees alone."""
+_LONG_STEP = 1.0
+"""The same where a scout did not know the bearing."""
 _BACKGROUND_ROUNDS = 4
 """How often background and views are fitted in turn."""
 _SHORT_STEP = 0.1
@@ -92,12 +98,13 @@ class MaximumLikelihood:
         self,
         bank: Bank,
         *,
-        free: Sequence[str] = ("distance_m", "delta_rad"),
+        free: Sequence[str] | None = None,
         background: Background | Literal["auto", "unknown"] | None = None,
         false_alarm: float = 0.01,
         on: Quantity = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
+        bearing_std_rad: float = BEARING_STD_RAD,
         tolerance_m: float = TOLERANCE_M,
         tolerance_rad: float = TOLERANCE_RAD,
         workers: int | None = None,
@@ -111,7 +118,8 @@ class MaximumLikelihood:
                 f"the bank's model is '{bank.plan.model}', which knows no mixed pixels: refine needs 'ray'"
             )
         self.bank = bank
-        self.free = check_free(free)
+        self.free = check_free((*VIEW[:2], "bearing_rad") if free is None else free)
+        self._prior_std = (math.inf, math.inf, bearing_std_rad) if free is None else ()
         self.on: Quantity = on
         self.false_alarm = false_alarm
         self._tolerance = {name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW}
@@ -127,24 +135,32 @@ class MaximumLikelihood:
         self._used = used.ravel()
         self._huber = ROBUST_FROM if robust or self.unknown else None
         self._behind = None if self.background is None else _behind(bank, self.background)
-        on_grid = self.free == VIEW[:2]
-        exact = on_grid and on == "ranges" and self.background is None and BankModel.fits(bank, *_FINE)
-        scouts = on_grid and BankModel.fits(bank, *_COARSE)
+        fixed, near = self.free == VIEW[:2], bool(self._prior_std)
+        exact = fixed and on == "ranges" and self.background is None and BankModel.fits(bank, *_FINE)
+        scouts = (fixed or near) and BankModel.fits(bank, *_COARSE)
         self._bank_model = BankModel(bank) if exact else None
         self._scout = BankModel(bank, self._behind, smooth_only=True) if scouts else None
         self._rendered: RenderedModel | None = None
         if self.auto or not exact:
             self._rendered = RenderedModel(bank, self.background, workers or _usual_workers())
-        fine = (1, 1) if self.background is not None and "bearing_rad" not in self.free else (2, 3)
+        aside = "bearing_rad" in self.free
+        fine = (1, 1) if self.background is not None and not aside else (2, 3)
         along, around = (
             max(1, min(step, (len(grid) - 1) // 4))
             for step, grid in zip(fine, (bank.distance_m, bank.delta_rad), strict=True)
         )
         self._stride = (along, around)
-        self._search = Search(bank, self._behind, self._stride, "bearing_rad" in self.free, capped=self.unknown)
+        self._widest = _PRIOR_SIGMA * bearing_std_rad if near else math.inf
+        self._search = self._new_search(self._behind, 0.0 if near else self._widest)
+        self._wide_search = self._new_search(self._behind, self._widest) if near else self._search
         meshes = [bank.mesh(name) for name in bank.classes]
         self._symmetry = [int(mesh.metadata["symmetry"]) for mesh in meshes]
         self._middle = np.array([mesh.centroid for mesh in meshes])
+
+    def _new_search(self, behind: PhasorImages | None, widest_rad: float) -> Search:
+        """Return a search before some background, over bearings up to a widest where they are free."""
+        widest = widest_rad if "bearing_rad" in self.free else 0.0
+        return Search(self.bank, behind, self._stride, widest, capped=self.unknown)
 
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Match filtered frames."""
@@ -169,7 +185,7 @@ class MaximumLikelihood:
         for k in range(len(frames)):
             one = frames[k : k + 1]
             evidence = Evidence.from_frames(one, self.on)
-            around = estimate_surroundings(one, bearing_known="bearing_rad" not in self.free)
+            around = estimate_surroundings(one, bearing_known="bearing_rad" not in self.free or bool(self._prior_std))
             background = around.background
             bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(one, evidence))
             assert self._rendered is not None
@@ -188,7 +204,7 @@ class MaximumLikelihood:
                 # what was taken for background, or lies beside it, may be landmark: search with both in the images
                 behind = _behind(self.bank, background)
                 models = _Models(self._rendered.with_background(background), models.scout)
-                search = Search(self.bank, behind, self._stride, "bearing_rad" in self.free)
+                search = self._new_search(behind, self._widest)
                 again = self._searched(models, evidence, evidence.seen, bare, background, behind, search)
                 fits = Fits.joined([fits, again])
                 if self._is_doubtful(fits):
@@ -260,7 +276,7 @@ class MaximumLikelihood:
         search: Search | None = None,
     ) -> Fits:
         """Search and fit; where nothing fits, search again from many more places."""
-        search = search or self._search
+        search, wide = (search, search) if search else (self._search, self._wide_search)
         enough = self._worth_a_search(evidence, bare)
         side_peaks = evidence.on == "phasors" or background is not None
         n_modes = _MODES if background is None else _MODES_BEFORE_BACKGROUND
@@ -284,11 +300,13 @@ class MaximumLikelihood:
         fits = [self._fit(models, evidence, enough, starts, sides, behind)]
         poor = doubtful(fits[0])
         if poor.size:
-            starts = search.starts(_some(seen, poor), _MODES_AGAIN, all_classes=all_classes)
-            fits.append(self._fit(models, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True))
+            starts = wide.starts(_some(seen, poor), _MODES_AGAIN, all_classes=all_classes)
+            thorough = _Models(models.final, None) if self._prior_std else models  # a scout knows no bearing
+            fits.append(self._fit(thorough, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True))
             poor = doubtful(fits[-1])
-        if poor.size and models.scout is not None:  # too little may be smooth for the scout to see the way
-            starts = search.starts(_some(seen, poor), n_modes, all_classes=all_classes)
+        if poor.size and models.scout is not None and not self._prior_std:
+            # too little may be smooth for the scout to see the way
+            starts = wide.starts(_some(seen, poor), n_modes, all_classes=all_classes)
             direct = _Models(models.final, None)
             fits.append(self._fit(direct, evidence, poor, starts, (-_BESIDE_RAD, _BESIDE_RAD), behind))
         if self._huber is not None and not self.unknown:
@@ -415,8 +433,11 @@ class MaximumLikelihood:
             view = np.concatenate([view, *beside])
         lead = models.scout or models.final
         assert lead is not None
-        fits = self._modes(lead, evidence, frame, class_index, view, settings, np.inf if patient else _MARGIN)
-        fits = Fits.joined([fits, self._other_classes(lead, evidence, fits, settings)])
+        leading = settings
+        if models.scout is not None and self._prior_std:
+            leading = replace(settings, free=VIEW[:2], prior_std=())
+        fits = self._modes(lead, evidence, frame, class_index, view, leading, np.inf if patient else _MARGIN)
+        fits = Fits.joined([fits, self._other_classes(lead, evidence, fits, leading)])
         if models.scout is None:
             return fits
         assert models.final is not None
@@ -433,13 +454,14 @@ class MaximumLikelihood:
         if patient:
             again = _spread(again)
         side_peaks = evidence.on == "phasors" or behind is not None
-        close = replace(settings, longest_step=_SHORT_STEP, look_beside_rad=_CLOSE_BY_RAD if side_peaks else ())
+        step = _LONG_STEP if self._prior_std else _SHORT_STEP
+        close = replace(settings, longest_step=step, look_beside_rad=_CLOSE_BY_RAD if side_peaks else ())
         final = refine(models.final, evidence, again.frame, again.class_index, again.view, close)
         rest = np.setdiff1d(order, likely)
         others = fits[rest]
         gap = others.cost - least[others.frame]
         others.cost[:] = _least_of_frame(final, len(evidence.weight))[others.frame] + gap
-        return Fits.joined([final, others])
+        return Fits.joined([final, others.with_free(len(self.free))])
 
     def _settings(self, behind: PhasorImages | None) -> Settings:
         """Return what is estimated, before some background."""
@@ -448,6 +470,7 @@ class MaximumLikelihood:
             self._used,
             self._huber,
             None if behind is None else behind.phasor.reshape(-1),
+            prior_std=self._prior_std,
             unknown_around=self.unknown,
             returns_behind=None
             if behind is None

@@ -19,7 +19,14 @@ from phasemark.data import Bank
 from phasemark.data.bank import BankGroup
 from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.coarse import Observation, Templates
-from phasemark.matcher.estimator import TOLERANCE_M, TOLERANCE_RAD, MaximumLikelihood, Pixels, p_values_of
+from phasemark.matcher.estimator import (
+    BEARING_STD_RAD,
+    TOLERANCE_M,
+    TOLERANCE_RAD,
+    MaximumLikelihood,
+    Pixels,
+    p_values_of,
+)
 from phasemark.matcher.filters import FilteredFrames
 from phasemark.matcher.likelihood import Quantity
 from phasemark.matcher.match import Candidate, Match, Matches, Reason
@@ -55,9 +62,10 @@ class Matcher:
         "nearest" is the paper's minimum-distance classifier: the answer is the nearest model image. In a factored
         bank the lower pixels choose distance and angle, and the upper pixels the class at that distance; in a full
         bank all pixels choose all three. "refine" is maximum likelihood over a continuous view, with its covariance.
-    free : sequence of str
+    free : sequence of str, optional
         What "refine" estimates: distance_m and delta_rad, and on request bearing_rad and height_m; what is not free
-        is 0.
+        is 0. None: distance, delta and the bearing, which is thought to be 0 with the standard deviation
+        `bearing_std_rad` before the frame is seen. ``("distance_m", "delta_rad")`` fixes the bearing at 0.
     background : Background, "auto", "unknown" or None
         What stands behind the landmark. None: nothing is expected to return beside it. "auto", with "refine": wall and
         floor are estimated from each frame's own far pixels. "unknown", with "refine" on ranges: other things may stand
@@ -72,6 +80,8 @@ class Matcher:
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool
         Whether "refine" counts residuals beyond 3 σ linearly (Huber); the covariance is then the sandwich.
+    bearing_std_rad : float
+        How well the mount points at the landmark, where `free` is None: the standard deviation of a Gaussian prior.
     tolerance_m, tolerance_rad : float
         How far off an accepted answer of "refine" may be. It is refused as "undetermined" where three standard
         deviations of a free length or angle exceed this, and as "ambiguous" where other classes keep a probability of
@@ -97,12 +107,13 @@ class Matcher:
         bank: Bank,
         method: str = "nearest",
         *,
-        free: Sequence[str] = VIEW[:2],
+        free: Sequence[str] | None = None,
         background: Background | Literal["auto", "unknown"] | None = None,
         false_alarm: float = 0.01,
         on: Quantity = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
+        bearing_std_rad: float = BEARING_STD_RAD,
         tolerance_m: float = TOLERANCE_M,
         tolerance_rad: float = TOLERANCE_RAD,
         workers: int | None = None,
@@ -111,9 +122,10 @@ class Matcher:
             raise UsageError(f"unknown method {method!r}: the methods are {', '.join(METHODS)}")
         if isinstance(background, str) and background not in ("auto", "unknown"):
             raise UsageError(f'\'background\' must be a Background, "auto", "unknown" or None, got {background!r}')
-        for name, tolerance in (("tolerance_m", tolerance_m), ("tolerance_rad", tolerance_rad)):
-            if not tolerance > 0:
-                raise UsageError(f"'{name}' must be positive, got {tolerance!r}")
+        stated = {"bearing_std_rad": bearing_std_rad, "tolerance_m": tolerance_m, "tolerance_rad": tolerance_rad}
+        for name, value in stated.items():
+            if not value > 0:
+                raise UsageError(f"'{name}' must be positive, got {value!r}")
         if not 0 < false_alarm < 1:
             raise UsageError(f"'false_alarm' must be in (0, 1), got {false_alarm!r}")
         self.bank = bank
@@ -128,12 +140,14 @@ class Matcher:
                 on=on,
                 pixels=pixels,
                 robust=robust,
+                bearing_std_rad=bearing_std_rad,
                 tolerance_m=tolerance_m,
                 tolerance_rad=tolerance_rad,
                 workers=workers,
             )
             return
-        if tuple(free) != VIEW[:2] or on != "ranges" or pixels != "all" or robust or isinstance(background, str):
+        fixed = free is None or tuple(free) == VIEW[:2]
+        if not fixed or on != "ranges" or pixels != "all" or robust or isinstance(background, str):
             raise UsageError(
                 "'free', 'on', 'pixels', 'robust' and an automatic background belong to method 'refine', not 'nearest'"
             )

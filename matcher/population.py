@@ -23,7 +23,7 @@ from phasemark.matcher.bounds import cramer_rao
 from phasemark.matcher.filters import noise_free
 from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
-from phasemark.matcher.models import closing_period
+from phasemark.matcher.models import VIEW, closing_period
 from phasemark.render import PhasorImages, Renderer, Views
 from phasemark.render.noise import phase_image_variance
 
@@ -124,7 +124,7 @@ def grid_loss(bank: Bank, n: int, *, seed: int = 0, workers: int | None = None) 
         raise UsageError(f"{bank.path}: has one distance or one angle only: there is no spacing to test")
     methods = {"nearest": Matcher(bank, "nearest")}
     if bank.plan.model == "ray":
-        methods["refined"] = Matcher(bank, "refine", workers=workers)
+        methods["refined"] = Matcher(bank, "refine", free=VIEW[:2], workers=workers)
     job = BankJob(bank.plan, bank.mesh)
     rng = stream(seed, "population", 0)
     first, last = float(bank.delta_rad[0]), float(bank.delta_rad[-1])

@@ -140,6 +140,17 @@ class Fits:
     def __getitem__(self, index: NDArray[Any]) -> Fits:
         return Fits(**{name: values[index] for name, values in vars(self).items()})
 
+    def with_free(self, p: int) -> Fits:
+        """Return the fits as those of more free parameters, which were not moved and of which nothing is known."""
+        more = p - self.covariance.shape[1]
+        square = ((0, 0), (0, more), (0, more))
+        return replace(
+            self,
+            covariance=np.pad(self.covariance, square, constant_values=np.nan),
+            information=np.pad(self.information, square, constant_values=np.nan),
+            std_without_one=np.pad(self.std_without_one, ((0, 0), (0, more)), constant_values=np.inf),
+        )
+
     @classmethod
     def joined(cls, parts: list[Fits]) -> Fits:
         """Put batches behind one another."""

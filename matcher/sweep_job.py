@@ -325,7 +325,7 @@ class SweepJob:
             if wall_m not in self._references:
                 background = Background(wall_m=wall_m) if wall_m else None
                 bank = self._bank(Method(name="reference"))
-                self._references[wall_m] = Matcher(bank, "refine", background=background, workers=1)
+                self._references[wall_m] = Matcher(bank, "refine", free=VIEW[:2], background=background, workers=1)
             return self._references[wall_m]
 
     def matcher(self, number: int, m: int) -> Callable[[FilteredFrames], Sequence[Match]]:

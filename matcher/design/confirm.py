@@ -24,6 +24,7 @@ from phasemark.matcher.bounds import Estimate, cramer_rao, efficiency, share
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.search import Design, Scored
 from phasemark.matcher.matcher import Matcher
+from phasemark.matcher.models import VIEW
 from phasemark.matcher.trials import Conditions, noisy_frames
 from phasemark.render import Renderer, Sensor, Views
 
@@ -152,7 +153,7 @@ def confirm(
         sensor_overrides=plan.sensor_overrides,
         distance_m=tuple(parse_grid(f"{0.9 * near:.4f}:{1.1 * far:.4f}:{step:.4f}", "distance_m").tolist()),
     )
-    matcher = Matcher(build_bank(bank_plan, workers=workers), method="refine", workers=workers)
+    matcher = Matcher(build_bank(bank_plan, workers=workers), method="refine", free=VIEW[:2], workers=workers)
     period = scored.specs[0].delta_period_rad
     distance, side = scored.bound.worst_view
     steps = round(math.degrees(period / 2) / SIDE_STEP_DEG)
