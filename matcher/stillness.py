@@ -1,8 +1,8 @@
 """Test whether camera and scene stood still while the frames at a position were taken.
 
-Two findings speak against it. *Order*: at rest the frames of a pixel could have come in any order. While something moves,
-neighbours in time are alike, and successive differences are small compared with the total scatter (von Neumann's ratio).
-This needs no noise level. *Scatter*: most pixels scatter far more than the noise law of the sensor says.
+Two findings speak against it. *Order*: at rest the frames of a pixel could have come in any order. While something
+moves, neighbours in time are alike, and successive differences are small compared with the total scatter (von Neumann's
+ratio). This needs no noise level. *Scatter*: most pixels scatter far more than the noise law of the sensor says.
 """
 
 from __future__ import annotations
