@@ -15,7 +15,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -32,12 +32,17 @@ if TYPE_CHECKING:
 
     from phasemark.data import Bank, BankPlan, FramePlan
     from phasemark.landmarks import LandmarkSpec
-    from phasemark.matcher import Calibration, FilteredFrames, LandmarkMap, Match, Matches, RobotPose
-    from phasemark.render import Background, Estimate, Sensor
+    from phasemark.matcher import Calibration, FilteredFrames, LandmarkMap, Match, RobotPose
+    from phasemark.render import Background, Estimate, Frames, Sensor
 
 __all__ = ["app", "main"]
 
 _ORIGIN_HELP = "What becomes the origin: file (its own), base (centre of its foot) or center (of its bounding box)."
+
+_DRAWN_ALL = 4
+"""Most positions that are drawn unless the user says which; a picture takes two seconds."""
+_NEAREST_AT_ONCE, _REFINED_AT_ONCE = 256, 64
+"""Positions matched before their answers are printed; refinement takes up to 50 ms each."""
 
 _COMPLETION = "_PHASEMARK_COMPLETE"
 """Set by the script that ``--install-completion`` gives to a shell."""
@@ -1075,18 +1080,42 @@ def _match(
         Path | None,
         typer.Option("--map", metavar="MAP", help="Where the landmarks stand (.toml), instead of --landmark-xy."),
     ] = None,
+    moving: Annotated[
+        bool, typer.Option("--moving", help="The camera moves: match every frame by itself instead of their mean.")
+    ] = False,
+    estimates: Annotated[
+        Path | None,
+        typer.Option("--estimates", metavar="FILE", help="Write a line for each position into this .csv."),
+    ] = None,
     plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw measured, model and residual into this .png.")
+        Path | None,
+        typer.Option(
+            "--plot", help="Draw measured, model and residual into this .png; of several positions, number K into -K."
+        ),
+    ] = None,
+    plot_index: Annotated[
+        str | None,
+        typer.Option(
+            "--plot-index",
+            metavar="LIST",
+            help=f"Positions to draw, such as 0,17,200:210. By default all, or the first of more than {_DRAWN_ALL}.",
+        ),
     ] = None,
     as_json: _Json = False,
+    as_jsonl: Annotated[
+        bool, typer.Option("--jsonl", help="Print each match as a line of JSON as soon as it is known.")
+    ] = False,
     force: _Force = False,
 ) -> None:
     """Match measured frames against a bank, and place the robot.
 
     All frames of a file are averaged: the camera stands still. A file of shape (n, frames, rows, cols) has n positions.
+    With --moving every frame is a position of its own. A CSV file may have a header that names its columns: t_ms or
+    t_s, mm_0 ... (or range_0 ..., z_0 ...), status_0 ...; for a VL53L5CX or VL53L8CX give --valid-status 5.
     """
-    from phasemark.data import read_frames
+    from phasemark.data import read_frames, write_atomically
     from phasemark.matcher import Matcher, kalman_filter, load_map, phasor_mean
+    from phasemark.matcher.recording import EstimateTable, match_in_batches
 
     filters = {"kalman": kalman_filter, "phasor-mean": phasor_mean}
     if filter_name not in filters:
@@ -1104,6 +1133,12 @@ def _match(
         landmarks = load_map(map_file)
     if plot is not None and plot.suffix.lower() != ".png":
         raise UsageError(f"the picture must be a .png file, got '{plot}'")
+    if plot is None and plot_index is not None:
+        raise UsageError("--plot-index needs --plot, the file to draw into")
+    if estimates is not None and estimates.suffix.lower() != ".csv":
+        raise UsageError(f"the estimates must be a .csv file, got '{estimates}'")
+    if as_json and as_jsonl:
+        raise UsageError("--json and --jsonl are two forms of the same output: give one of them")
     background = _background(wall, floor)
     if auto_background and background is not None:
         raise UsageError("--auto-background estimates wall and floor: leave --wall and --floor out")
@@ -1132,10 +1167,10 @@ def _match(
             rotate=rotate,
             untrusted=True,
         )
-        plots = [] if plot is None else _numbered(plot, len(measured.range_m))
-        _refuse_existing(plots, force)
-        filtered = filters[filter_name](measured)
-        matches = Matcher(
+        positions = measured.each_a_position() if moving else measured
+        plots = {} if plot is None else _plots_by_position(plot, plot_index, len(positions))
+        _refuse_unwritable([*plots.values(), *([] if estimates is None else [estimates])], force)
+        matcher = Matcher(
             opened,
             method,
             free=parameters,
@@ -1144,23 +1179,56 @@ def _match(
             on=on,  # type: ignore[arg-type]  # Matcher says what is right
             pixels=pixels,  # type: ignore[arg-type]
             robust=robust,
-        ).match(filtered)
-        _save_match_pictures(plots, filtered, matches, opened, background, force)
-        missed = next((k for k, match in enumerate(matches) if match.class_name is None), None)
+        )
+        if not moving:
+            _note_motion(measured, frames)
+        answers: list[dict[str, Any]] = []  # all of them only for --json, whose answers are one list
+        table, estimated = _Table(), EstimateTable(parameters)
+        drawn: dict[int, tuple[FilteredFrames, Match]] = {}
+        missed: FilteredFrames | None = None
+        at_once = _NEAREST_AT_ONCE if method == "nearest" else _REFINED_AT_ONCE
+        with _Progress("matching") if len(positions) > at_once else nullcontext() as progress:
+            for batch in match_in_batches(matcher, positions, filters[filter_name], at_once=at_once):
+                some = []
+                for k, match in enumerate(batch.matches):
+                    answer = match.as_dict()
+                    if batch.filtered.time_s is not None:
+                        answer["time_s"] = float(batch.filtered.time_s[k])
+                    if landmarks is not None:
+                        answer["poses"] = _poses(
+                            match, landmarks, map_file is None, math.radians(pan), prior, prior_std
+                        )
+                    some.append(answer)
+                    if batch.start + k in plots:
+                        drawn[batch.start + k] = batch.filtered[k : k + 1], match
+                    if missed is None and match.class_name is None:
+                        missed = batch.filtered[k : k + 1]
+                if estimates is not None:
+                    estimated.add(batch)
+                if as_json:
+                    answers += some
+                elif as_jsonl:
+                    for k, answer in enumerate(some):
+                        typer.echo(
+                            json.dumps({"index": batch.start + k, **answer}, ensure_ascii=False, allow_nan=False)
+                        )
+                else:
+                    table.echo(_match_rows(some, batch.start, moving))
+                sys.stdout.flush()
+                if progress is not None:
+                    progress(batch.start + len(some), len(positions))
+        if as_json:
+            _echo_json({"bank": str(bank), "frames": str(frames), "matches": answers})
         if missed is not None:
-            _note_why_nothing(filtered[missed : missed + 1], opened, auto_background or background is not None)
-    answers = []
-    for match in matches:
-        answer = match.as_dict()
-        if landmarks is not None:
-            answer["poses"] = _poses(match, landmarks, map_file is None, math.radians(pan), prior, prior_std)
-        answers.append(answer)
-    if as_json:
-        _echo_json({"bank": str(bank), "frames": str(frames), "matches": answers})
-        return
-    _echo_matches(answers)
-    for path in plots:
-        typer.echo(path)
+            _note_why_nothing(missed, opened, auto_background or background is not None)
+        if estimates is not None:
+            write_atomically(estimates, estimated.to_csv().encode(), force=force)
+        for k, path in plots.items():
+            _save_match_picture(path, *drawn[k], opened, background, force)
+    if not (as_json or as_jsonl):
+        for path in [*([] if estimates is None else [estimates]), *plots.values()]:
+            typer.echo(path)
+        _note_plots(plots, plot_index, len(positions))
 
 
 @app.command("calibrate")
@@ -1591,29 +1659,56 @@ def _drive(
         typer.echo(path)
 
 
-def _numbered(path: Path, n: int) -> list[Path]:
-    """Return the names of n pictures; more than one get a number before the suffix."""
-    return [path] if n == 1 else [path.with_stem(f"{path.stem}-{k}") for k in range(n)]
+def _plots_by_position(plot: Path, chosen: str | None, n: int) -> dict[int, Path]:
+    """Return which of n positions to draw, and into which files; those of several have a number before the suffix."""
+    from phasemark.data.grid import parse_indices
+
+    if chosen is not None:
+        indices = parse_indices(chosen, n, "--plot-index")
+    else:
+        indices = list(range(n if n <= _DRAWN_ALL else 1))
+    return {k: plot if n == 1 else plot.with_stem(f"{plot.stem}-{k}") for k in indices}
 
 
-def _save_match_pictures(
-    paths: Sequence[Path],
-    filtered: FilteredFrames,
-    matches: Matches,
-    bank: Bank,
-    background: Background | None,
-    force: bool,
+def _note_plots(plots: Mapping[int, Path], chosen: str | None, n: int) -> None:
+    """Say how to have more positions drawn than the first."""
+    if plots and chosen is None and len(plots) < n:
+        typer.echo(
+            f"note: drew the first of {n} positions; --plot-index 0,{n // 2}:{min(n // 2 + 9, n - 1)} draws others"
+            " (some seconds each)",
+            err=True,
+        )
+
+
+def _note_motion(measured: Frames, file: Path) -> None:
+    """Say that frames which are about to be averaged were not taken at rest."""
+    import numpy as np
+
+    from phasemark.matcher import motion_test
+
+    moved = np.flatnonzero(motion_test(measured).moved())
+    if moved.size:
+        n = len(measured)
+        where = "the file" if n == 1 else f"{len(moved)} of {n} positions, the first being {moved[0]}"
+        typer.echo(
+            f"note: {file}: the camera or the scene moved during {where}, so that the mean of the frames is no single"
+            " view; --moving matches every frame by itself",
+            err=True,
+        )
+
+
+def _save_match_picture(
+    path: Path, filtered: FilteredFrames, match: Match, bank: Bank, background: Background | None, force: bool
 ) -> None:
-    """Draw one picture a match; none if there are no paths."""
+    """Draw one position."""
     import io as bytes_io
 
     from phasemark.data import write_atomically
     from phasemark.matcher.picture import match_picture
 
-    for k, path in enumerate(paths):
-        buffer = bytes_io.BytesIO()
-        match_picture(filtered, matches[k], bank, background, k).savefig(buffer, format="png", dpi=120)
-        write_atomically(path, buffer.getvalue(), force=force)
+    buffer = bytes_io.BytesIO()
+    match_picture(filtered, match, bank, background).savefig(buffer, format="png", dpi=120)
+    write_atomically(path, buffer.getvalue(), force=force)
 
 
 _FAR_FROM_BANK = 3.0
@@ -1720,23 +1815,24 @@ def _plus_minus(answer: dict[str, Any], name: str, scale: float, digits: int) ->
     return f" ± {scale * math.sqrt(answer['covariance'][k][k]):.{digits}f}"
 
 
-def _echo_matches(answers: Sequence[dict[str, Any]]) -> None:
-    """Print one line a match, and one a pose."""
+def _match_rows(answers: Sequence[dict[str, Any]], start: int, moving: bool) -> list[dict[str, str]]:
+    """Return one row of the table a match, by column."""
     rows = []
-    for k, answer in enumerate(answers):
+    for k, answer in enumerate(answers, start):
         found = answer["class"] is not None
-        rows.append(
-            (
-                str(k),
-                answer["class"] or "no landmark",
-                f"{answer['distance_m']:.3f}{_plus_minus(answer, 'distance_m', 1.0, 4)}" if found else "",
-                f"{answer['delta_deg']:.2f}{_plus_minus(answer, 'delta_rad', 180 / math.pi, 3)}" if found else "",
-                "yes" if answer["accepted"] else "no",
-                "" if answer["p_value"] is None else f"{answer['p_value']:.3g}",
-                "  or  ".join(_pose_text(pose) for pose in answer.get("poses", ())),
-            )
-        )
-    _echo_table(("position", "class", "D (m)", "δ (°)", "accepted", "p", "robot"), rows)
+        row = {"frame" if moving else "position": str(k)}
+        if "time_s" in answer:
+            row["time (s)"] = f"{answer['time_s']:.3f}"
+        row |= {
+            "class": answer["class"] or "no landmark",
+            "D (m)": f"{answer['distance_m']:.3f}{_plus_minus(answer, 'distance_m', 1.0, 4)}" if found else "",
+            "δ (°)": f"{answer['delta_deg']:.2f}{_plus_minus(answer, 'delta_rad', 180 / math.pi, 3)}" if found else "",
+            "accepted": "yes" if answer["accepted"] else "no",
+            "p": "" if answer["p_value"] is None else f"{answer['p_value']:.3g}",
+            "robot": "  or  ".join(_pose_text(pose) for pose in answer.get("poses", ())),
+        }
+        rows.append(row)
+    return rows
 
 
 def _load_landmark(
@@ -1794,6 +1890,15 @@ def _refuse_existing(paths: Iterable[Path], force: bool) -> None:
             raise OutputExistsError(f"{path}: exists already; --force replaces it")
 
 
+def _refuse_unwritable(paths: Iterable[Path], force: bool) -> None:
+    """Refuse outputs that exist or cannot be written, before any work is done."""
+    from phasemark.data.store import refuse_unwritable
+
+    _refuse_existing(paths := list(paths), force)
+    for path in paths:
+        refuse_unwritable(path, force=force)
+
+
 class _Progress:
     """A progress bar on stderr, called with (done, total); nothing if stderr is not a terminal."""
 
@@ -1808,7 +1913,9 @@ class _Progress:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+        # results printed meanwhile go above the bar, but not where standard output is no terminal
+        redirect = sys.stdout.isatty()
+        self._bar = Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=redirect)
         self._bar.start()
         task = self._bar.add_task(self._what, total=None)
         bar = self._bar
@@ -1898,6 +2005,25 @@ def _echo_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     for row in table:
         typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+class _Table:
+    """Aligned columns that are printed in pieces: the header with the first, and later ones as wide at least."""
+
+    def __init__(self) -> None:
+        self._widths: list[int] = []
+
+    def echo(self, rows: Sequence[Mapping[str, str]]) -> None:
+        """Print some rows."""
+        table = [list(row.values()) for row in rows]
+        if not self._widths:
+            table.insert(0, list(rows[0]))
+            self._widths = [0] * len(table[0])
+        self._widths = [
+            max(width, *map(len, column)) for width, column in zip(self._widths, zip(*table, strict=True), strict=True)
+        ]
+        for row in table:
+            typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, self._widths, strict=True)).rstrip())
 
 
 def _report_error(message: str) -> None:
