@@ -876,6 +876,89 @@ def _frames_import(
     typer.echo(write_measured(frames, out, force=force))
 
 
+@_frames_app.command("simulate")
+def _frames_simulate(
+    out: Annotated[Path, typer.Option("-o", "--out", help="The recording to write: .csv, .npz or .h5.")],
+    class_name: Annotated[
+        str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=_a_class)
+    ] = None,
+    mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
+    unit: _Unit = None,
+    up: _Up = "z",
+    origin: _Origin = "file",
+    sensor: _SensorOption = "pmd-16x16",
+    distance: Annotated[
+        float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis, in the first frame.")
+    ] = 1.0,
+    delta: Annotated[
+        float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen, in the first frame.")
+    ] = 0.0,
+    bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
+    height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the optical axis.")] = 0.0,
+    wall: _Wall = None,
+    floor: _Floor = None,
+    moving: Annotated[
+        bool, typer.Option("--moving/--still", help="Whether D and δ change evenly until the last frame.")
+    ] = False,
+    to_distance: Annotated[
+        float | None,
+        typer.Option("--to-distance", metavar="M", help="With --moving, D in the last frame; 0.8 of the first."),
+    ] = None,
+    to_delta: Annotated[
+        float | None, typer.Option("--to-delta", metavar="DEG", help="With --moving, δ in the last frame; 40 more.")
+    ] = None,
+    n_frames: Annotated[int, typer.Option("--frames", min=1, help="How many frames.")] = 20,
+    seed: _Seed = 0,
+    force: _Force = False,
+) -> None:
+    """Simulate a recording in the form that sensors write, with time stamps and the truth, to try match with.
+
+    The file says that it is simulated. A direct sensor writes z in millimetres and status codes (5: valid), another one
+    ranges in metres with amplitudes. The truth of each frame stands in columns truth_..., which other commands ignore.
+    """
+    import numpy as np
+
+    from phasemark.data import simulate_recording, write_recording
+    from phasemark.data.simulated import recording_format
+    from phasemark.render import Views
+
+    if (class_name is None) == (mesh_file is None):
+        raise UsageError("say what to record: either --class NAME or --mesh NAME=FILE")
+    if class_name is not None and unit is not None:
+        raise UsageError("--unit belongs to --mesh: the catalogue is in metres")
+    for option, value in (("--to-distance", to_distance), ("--to-delta", to_delta)):
+        if value is not None and not moving:
+            raise UsageError(f"{option} goes with --moving: a camera at rest keeps its view")
+    recording_format(out)
+    _refuse_unwritable([out], force)
+    if class_name is not None:
+        name, mesh = _load_landmark(class_name, None, "z", "file", from_catalog=True)
+    else:
+        assert mesh_file is not None
+        name, path = _name_and_file(mesh_file)
+        _, mesh = _load_landmark(path, unit, up, origin)
+    way = np.linspace(0.0, 1.0, n_frames) if moving else np.zeros(n_frames)
+    last_distance = 0.8 * distance if to_distance is None else to_distance
+    last_delta = delta + 40.0 if to_delta is None else to_delta
+    views = Views.broadcast(
+        distance + way * (last_distance - distance),
+        np.radians(delta + way * (last_delta - delta)),
+        math.radians(bearing),
+        height,
+    )
+    recording = simulate_recording(
+        mesh,
+        name,
+        _load_sensor(sensor),
+        views,
+        seed=seed,
+        albedo=mesh.metadata.get("albedo", 0.8),
+        background=_background(wall, floor),
+    )
+    description = f"landmark={name} sensor={Path(sensor).name} seed={seed} {'moving' if moving else 'still'}"
+    typer.echo(write_recording(recording, out, description=description, force=force))
+
+
 @_frames_app.command("show")
 def _frames_show(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, or measured frames.")],
