@@ -122,10 +122,10 @@ def write_recording(
 ) -> Path:
     """Write a simulated recording in a form that :func:`~phasemark.data.read_frames` reads.
 
-    The recording of a direct sensor has z in whole millimetres, 0 where there is no reading, and status codes (5: valid).
-    That of another sensor has ranges in metres, amplitudes and intensities; a pixel without a valid range is empty in
-    CSV and has ``valid`` 0 in arrays. All have time stamps, the truth of each frame as ``truth_*``, and say that they
-    are simulated: in the first line of CSV, as the array ``simulated`` in NPZ, as the attribute ``simulated`` in HDF5.
+    The recording of a direct sensor has z in whole millimetres, 0 where there is no reading, and status codes (5:
+    valid). That of another sensor has ranges in metres, amplitudes and intensities; a pixel without a valid range is
+    empty in CSV and has ``valid`` 0 in arrays. All have time stamps and the truth of each frame as ``truth_*``. All say
+    that they are simulated: the first line of CSV, the array ``simulated`` of NPZ, the attribute ``simulated`` of HDF5.
 
     Parameters
     ----------
