@@ -59,6 +59,7 @@ Then, by task:
   see what it sees       phasemark render --class cylinder --distance 1.0 --delta 30 --wall 4 -o frame.png
   build a bank           phasemark bank build -o bank.h5
   match your frames      phasemark match bank.h5 measured.csv --unit m --quantity range
+  try it without camera  phasemark frames simulate --class cylinder --distance 1.0 -o recording.csv
   know the mounting      phasemark calibrate cylinder frames.npz --poses poses.csv -o mounted.toml
   make labelled frames   phasemark plan example frames > frames.toml; phasemark frames build frames.toml -o frames.h5
   know the accuracy      phasemark sweep run paper -o out/paper
@@ -967,6 +968,7 @@ def _frames_show(
     sensor: _SensorOption = "pmd-16x16",
     unit: _FramesUnit = None,
     quantity: _Quantity = None,
+    valid_status: _ValidStatus = None,
     force: _Force = False,
 ) -> None:
     """Draw one frame."""
@@ -987,6 +989,7 @@ def _frames_show(
             sensor=_load_sensor(sensor),
             unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
             quantity=quantity,  # type: ignore[arg-type]
+            valid_status=valid_status,
             untrusted=True,
         )
         _refuse_index(index, len(measured) * measured.n_frames)

@@ -157,7 +157,8 @@ def write_recording(
     arrays, unit, quantity = _arrays(recording)
     if suffix == ".npz":
         buffer = io.BytesIO()
-        np.savez(buffer, **arrays, unit=unit, quantity=quantity, simulated=told)
+        stated: dict[str, Any] = {"unit": unit, "quantity": quantity, "simulated": told}
+        np.savez(buffer, **{**arrays, **stated})
         return write_atomically(path, buffer.getvalue(), force=force)
     with replacing(path, force=force) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["simulated"] = told
