@@ -301,6 +301,15 @@ def test_a_simulated_recording_has_millimetres_status_codes_and_the_noise_of_the
     np.testing.assert_allclose(z_mm[:, returned].std(axis=0), np.sqrt(std**2 + 1 / 12), rtol=0.16)  # 4.5 of 1/√800
 
 
+def test_a_frame_of_a_recording_is_drawn(run, folder, tmp_path):
+    show = ["frames", "show", folder / "still.csv", "--sensor", "vl53l5cx-8x8", "--index", 3, "-o", tmp_path / "a.png"]
+    code, _, err = run(*show)
+    assert code == 2
+    assert "--valid-status" in err
+    assert run(*show, "--valid-status", 5)[0] == 0
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_another_seed_is_other_noise_and_the_same_seed_the_same(run, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         assert run("frames", "simulate", *SCENE, "--seed", seed, "-o", tmp_path / f"{name}.npz")[0] == 0
