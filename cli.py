@@ -17,7 +17,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,13 +35,18 @@ if TYPE_CHECKING:
     from phasemark.data import Bank, BankPlan, FramePlan, MeshPlan
     from phasemark.data.plan import ScenePlan
     from phasemark.landmarks import LandmarkSpec
-    from phasemark.matcher import Calibration, FilteredFrames, LandmarkMap, Match, Matches, RobotPose
+    from phasemark.matcher import Calibration, FilteredFrames, LandmarkMap, Match, RobotPose
     from phasemark.matcher.drive import DrivePlan
-    from phasemark.render import Background, Estimate, Sensor
+    from phasemark.render import Background, Estimate, Frames, Sensor
 
 __all__ = ["app", "main"]
 
 _ORIGIN_HELP = "What becomes the origin: file (its own), base (centre of its foot) or center (of its bounding box)."
+
+_DRAWN_ALL = 4
+"""Most positions that are drawn unless the user says which; a picture takes two seconds."""
+_NEAREST_AT_ONCE, _REFINED_AT_ONCE = 256, 64
+"""Positions matched before their answers are printed; refinement takes up to 50 ms each."""
 
 _COMPLETION = "_PHASEMARK_COMPLETE"
 """Set by the script that ``--install-completion`` gives to a shell."""
@@ -58,6 +63,7 @@ Then, by task:
   see what it sees       phasemark render --class cylinder --distance 1.0 --delta 30 --wall 4 -o frame.png
   build a bank           phasemark bank build -o bank.h5
   match your frames      phasemark match bank.h5 measured.csv --unit m --quantity range
+  try it without camera  phasemark frames simulate --class cylinder --distance 1.0 -o recording.csv
   know the mounting      phasemark calibrate cylinder frames.npz --poses poses.csv -o mounted.toml
   make labelled frames   phasemark plan example frames > frames.toml; phasemark frames build frames.toml -o frames.h5
   know the accuracy      phasemark sweep run paper -o out/paper
@@ -908,6 +914,89 @@ def _frames_import(
     typer.echo(write_measured(frames, out, force=force))
 
 
+@_frames_app.command("simulate")
+def _frames_simulate(
+    out: Annotated[Path, typer.Option("-o", "--out", help="The recording to write: .csv, .npz or .h5.")],
+    class_name: Annotated[
+        str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=_a_class)
+    ] = None,
+    mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
+    unit: _Unit = None,
+    up: _Up = "z",
+    origin: _Origin = "file",
+    sensor: _SensorOption = "pmd-16x16",
+    distance: Annotated[
+        float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis, in the first frame.")
+    ] = 1.0,
+    delta: Annotated[
+        float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen, in the first frame.")
+    ] = 0.0,
+    bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
+    height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the optical axis.")] = 0.0,
+    wall: _Wall = None,
+    floor: _Floor = None,
+    moving: Annotated[
+        bool, typer.Option("--moving/--still", help="Whether D and δ change evenly until the last frame.")
+    ] = False,
+    to_distance: Annotated[
+        float | None,
+        typer.Option("--to-distance", metavar="M", help="With --moving, D in the last frame; 0.8 of the first."),
+    ] = None,
+    to_delta: Annotated[
+        float | None, typer.Option("--to-delta", metavar="DEG", help="With --moving, δ in the last frame; 40 more.")
+    ] = None,
+    n_frames: Annotated[int, typer.Option("--frames", min=1, help="How many frames.")] = 20,
+    seed: _Seed = 0,
+    force: _Force = False,
+) -> None:
+    """Simulate a recording in the form that sensors write, with time stamps and the truth, to try match with.
+
+    The file says that it is simulated. A direct sensor writes z in millimetres and status codes (5: valid), another one
+    ranges in metres with amplitudes. The truth of each frame stands in columns truth_..., which other commands ignore.
+    """
+    import numpy as np
+
+    from phasemark.data import simulate_recording, write_recording
+    from phasemark.data.simulated import recording_format
+    from phasemark.render import Views
+
+    if (class_name is None) == (mesh_file is None):
+        raise UsageError("say what to record: either --class NAME or --mesh NAME=FILE")
+    if class_name is not None and unit is not None:
+        raise UsageError("--unit belongs to --mesh: the catalogue is in metres")
+    for option, value in (("--to-distance", to_distance), ("--to-delta", to_delta)):
+        if value is not None and not moving:
+            raise UsageError(f"{option} goes with --moving: a camera at rest keeps its view")
+    recording_format(out)
+    _refuse_unwritable([out], force)
+    if class_name is not None:
+        name, mesh = _load_landmark(class_name, None, "z", "file", from_catalog=True)
+    else:
+        assert mesh_file is not None
+        name, path = _name_and_file(mesh_file)
+        _, mesh = _load_landmark(path, unit, up, origin)
+    way = np.linspace(0.0, 1.0, n_frames) if moving else np.zeros(n_frames)
+    last_distance = 0.8 * distance if to_distance is None else to_distance
+    last_delta = delta + 40.0 if to_delta is None else to_delta
+    views = Views.broadcast(
+        distance + way * (last_distance - distance),
+        np.radians(delta + way * (last_delta - delta)),
+        math.radians(bearing),
+        height,
+    )
+    recording = simulate_recording(
+        mesh,
+        name,
+        _load_sensor(sensor),
+        views,
+        seed=seed,
+        albedo=mesh.metadata.get("albedo", 0.8),
+        background=_background(wall, floor),
+    )
+    description = f"landmark={name} sensor={Path(sensor).name} seed={seed} {'moving' if moving else 'still'}"
+    typer.echo(write_recording(recording, out, description=description, force=force))
+
+
 @_frames_app.command("show")
 def _frames_show(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, or measured frames.")],
@@ -916,6 +1005,7 @@ def _frames_show(
     sensor: _SensorOption = "pmd-16x16",
     unit: _FramesUnit = None,
     quantity: _Quantity = None,
+    valid_status: _ValidStatus = None,
     force: _Force = False,
 ) -> None:
     """Draw one frame."""
@@ -936,6 +1026,7 @@ def _frames_show(
             sensor=_load_sensor(sensor),
             unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
             quantity=quantity,  # type: ignore[arg-type]
+            valid_status=valid_status,
             untrusted=True,
         )
         _refuse_index(index, len(measured) * measured.n_frames)
@@ -1151,18 +1242,42 @@ def _match(
         Path | None,
         typer.Option("--map", metavar="MAP", help="Where the landmarks stand (.toml), instead of --landmark-xy."),
     ] = None,
+    moving: Annotated[
+        bool, typer.Option("--moving", help="The camera moves: match every frame by itself instead of their mean.")
+    ] = False,
+    estimates: Annotated[
+        Path | None,
+        typer.Option("--estimates", metavar="FILE", help="Write a line for each position into this .csv."),
+    ] = None,
     plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw measured, model and residual into this .png.")
+        Path | None,
+        typer.Option(
+            "--plot", help="Draw measured, model and residual into this .png; of several positions, number K into -K."
+        ),
+    ] = None,
+    plot_index: Annotated[
+        str | None,
+        typer.Option(
+            "--plot-index",
+            metavar="LIST",
+            help=f"Positions to draw, such as 0,17,200:210. By default all, or the first of more than {_DRAWN_ALL}.",
+        ),
     ] = None,
     as_json: _Json = False,
+    as_jsonl: Annotated[
+        bool, typer.Option("--jsonl", help="Print each match as a line of JSON as soon as it is known.")
+    ] = False,
     force: _Force = False,
 ) -> None:
     """Match measured frames against a bank, and place the robot.
 
     All frames of a file are averaged: the camera stands still. A file of shape (n, frames, rows, cols) has n positions.
+    With --moving every frame is a position of its own. A CSV file may have a header that names its columns: t_ms or
+    t_s, mm_0 ... (or range_0 ..., z_0 ...), status_0 ...; for a VL53L5CX or VL53L8CX give --valid-status 5.
     """
-    from phasemark.data import read_frames
+    from phasemark.data import read_frames, write_atomically
     from phasemark.matcher import Matcher, kalman_filter, load_map, phasor_mean
+    from phasemark.matcher.recording import EstimateTable, match_in_batches
 
     filters = {"kalman": kalman_filter, "phasor-mean": phasor_mean}
     if filter_name not in filters:
@@ -1180,6 +1295,12 @@ def _match(
         landmarks = load_map(map_file)
     if plot is not None and plot.suffix.lower() != ".png":
         raise UsageError(f"the picture must be a .png file, got '{plot}'")
+    if plot is None and plot_index is not None:
+        raise UsageError("--plot-index needs --plot, the file to draw into")
+    if estimates is not None and estimates.suffix.lower() != ".csv":
+        raise UsageError(f"the estimates must be a .csv file, got '{estimates}'")
+    if as_json and as_jsonl:
+        raise UsageError("--json and --jsonl are two forms of the same output: give one of them")
     background = _background(wall, floor)
     if auto_background and background is not None:
         raise UsageError("--auto-background estimates wall and floor: leave --wall and --floor out")
@@ -1209,10 +1330,10 @@ def _match(
             untrusted=True,
         )
         _note_too_far(opened.sensor, {"--wall": wall})
-        plots = [] if plot is None else _numbered(plot, len(measured.range_m))
-        _refuse_existing(plots, force)
-        filtered = filters[filter_name](measured)
-        matches = Matcher(
+        positions = measured.each_a_position() if moving else measured
+        plots = {} if plot is None else _plots_by_position(plot, plot_index, len(positions))
+        _refuse_unwritable([*plots.values(), *([] if estimates is None else [estimates])], force)
+        matcher = Matcher(
             opened,
             method,
             free=parameters,
@@ -1221,23 +1342,56 @@ def _match(
             on=on,  # type: ignore[arg-type]  # Matcher says what is right
             pixels=pixels,  # type: ignore[arg-type]
             robust=robust,
-        ).match(filtered)
-        _save_match_pictures(plots, filtered, matches, opened, background, force)
-        missed = next((k for k, match in enumerate(matches) if match.class_name is None), None)
+        )
+        if not moving:
+            _note_motion(measured, frames)
+        answers: list[dict[str, Any]] = []  # all of them only for --json, whose answers are one list
+        table, estimated = _Table(), EstimateTable(parameters)
+        drawn: dict[int, tuple[FilteredFrames, Match]] = {}
+        missed: FilteredFrames | None = None
+        at_once = _NEAREST_AT_ONCE if method == "nearest" else _REFINED_AT_ONCE
+        with _Progress("matching") if len(positions) > at_once else nullcontext() as progress:
+            for batch in match_in_batches(matcher, positions, filters[filter_name], at_once=at_once):
+                some = []
+                for k, match in enumerate(batch.matches):
+                    answer = match.as_dict()
+                    if batch.filtered.time_s is not None:
+                        answer["time_s"] = float(batch.filtered.time_s[k])
+                    if landmarks is not None:
+                        answer["poses"] = _poses(
+                            match, landmarks, map_file is None, math.radians(pan), prior, prior_std
+                        )
+                    some.append(answer)
+                    if batch.start + k in plots:
+                        drawn[batch.start + k] = batch.filtered[k : k + 1], match
+                    if missed is None and match.class_name is None:
+                        missed = batch.filtered[k : k + 1]
+                if estimates is not None:
+                    estimated.add(batch)
+                if as_json:
+                    answers += some
+                elif as_jsonl:
+                    for k, answer in enumerate(some):
+                        typer.echo(
+                            json.dumps({"index": batch.start + k, **answer}, ensure_ascii=False, allow_nan=False)
+                        )
+                else:
+                    table.echo(_match_rows(some, batch.start, moving))
+                sys.stdout.flush()
+                if progress is not None:
+                    progress(batch.start + len(some), len(positions))
+        if as_json:
+            _echo_json({"bank": str(bank), "frames": str(frames), "matches": answers})
         if missed is not None:
-            _note_why_nothing(filtered[missed : missed + 1], opened, auto_background or background is not None)
-    answers = []
-    for match in matches:
-        answer = match.as_dict()
-        if landmarks is not None:
-            answer["poses"] = _poses(match, landmarks, map_file is None, math.radians(pan), prior, prior_std)
-        answers.append(answer)
-    if as_json:
-        _echo_json({"bank": str(bank), "frames": str(frames), "matches": answers})
-        return
-    _echo_matches(answers)
-    for path in plots:
-        typer.echo(path)
+            _note_why_nothing(missed, opened, auto_background or background is not None)
+        if estimates is not None:
+            write_atomically(estimates, estimated.to_csv().encode(), force=force)
+        for k, path in plots.items():
+            _save_match_picture(path, *drawn[k], opened, background, force)
+    if not (as_json or as_jsonl):
+        for path in [*([] if estimates is None else [estimates]), *plots.values()]:
+            typer.echo(path)
+        _note_plots(plots, plot_index, len(positions))
 
 
 @app.command("calibrate")
@@ -1675,29 +1829,56 @@ def _drive(
         typer.echo(path)
 
 
-def _numbered(path: Path, n: int) -> list[Path]:
-    """Return the names of n pictures; more than one get a number before the suffix."""
-    return [path] if n == 1 else [path.with_stem(f"{path.stem}-{k}") for k in range(n)]
+def _plots_by_position(plot: Path, chosen: str | None, n: int) -> dict[int, Path]:
+    """Return which of n positions to draw, and into which files; those of several have a number before the suffix."""
+    from phasemark.data.grid import parse_indices
+
+    if chosen is not None:
+        indices = parse_indices(chosen, n, "--plot-index")
+    else:
+        indices = list(range(n if n <= _DRAWN_ALL else 1))
+    return {k: plot if n == 1 else plot.with_stem(f"{plot.stem}-{k}") for k in indices}
 
 
-def _save_match_pictures(
-    paths: Sequence[Path],
-    filtered: FilteredFrames,
-    matches: Matches,
-    bank: Bank,
-    background: Background | None,
-    force: bool,
+def _note_plots(plots: Mapping[int, Path], chosen: str | None, n: int) -> None:
+    """Say how to have more positions drawn than the first."""
+    if plots and chosen is None and len(plots) < n:
+        typer.echo(
+            f"note: drew the first of {n} positions; --plot-index 0,{n // 2}:{min(n // 2 + 9, n - 1)} draws others"
+            " (some seconds each)",
+            err=True,
+        )
+
+
+def _note_motion(measured: Frames, file: Path) -> None:
+    """Say that frames which are about to be averaged were not taken at rest."""
+    import numpy as np
+
+    from phasemark.matcher import motion_test
+
+    moved = np.flatnonzero(motion_test(measured).moved())
+    if moved.size:
+        n = len(measured)
+        where = "the file" if n == 1 else f"{len(moved)} of {n} positions, the first being {moved[0]}"
+        typer.echo(
+            f"note: {file}: the camera or the scene moved during {where}, so that the mean of the frames is no single"
+            " view; --moving matches every frame by itself",
+            err=True,
+        )
+
+
+def _save_match_picture(
+    path: Path, filtered: FilteredFrames, match: Match, bank: Bank, background: Background | None, force: bool
 ) -> None:
-    """Draw one picture a match; none if there are no paths."""
+    """Draw one position."""
     import io as bytes_io
 
     from phasemark.data import write_atomically
     from phasemark.matcher.picture import match_picture
 
-    for k, path in enumerate(paths):
-        buffer = bytes_io.BytesIO()
-        match_picture(filtered, matches[k], bank, background, k).savefig(buffer, format="png", dpi=120)
-        write_atomically(path, buffer.getvalue(), force=force)
+    buffer = bytes_io.BytesIO()
+    match_picture(filtered, match, bank, background).savefig(buffer, format="png", dpi=120)
+    write_atomically(path, buffer.getvalue(), force=force)
 
 
 _FAR_FROM_BANK = 3.0
@@ -1806,23 +1987,24 @@ def _plus_minus(answer: dict[str, Any], name: str, scale: float, digits: int) ->
     return f" ± {error_text(scale * math.sqrt(answer['covariance'][k][k]))}"
 
 
-def _echo_matches(answers: Sequence[dict[str, Any]]) -> None:
-    """Print one line a match, and one a pose."""
+def _match_rows(answers: Sequence[dict[str, Any]], start: int, moving: bool) -> list[dict[str, str]]:
+    """Return one row of the table a match, by column."""
     rows = []
-    for k, answer in enumerate(answers):
+    for k, answer in enumerate(answers, start):
         found = answer["class"] is not None
-        rows.append(
-            (
-                str(k),
-                answer["class"] or "no landmark",
-                f"{answer['distance_m']:.3f}{_plus_minus(answer, 'distance_m', 1.0, 4)}" if found else "",
-                f"{answer['delta_deg']:.2f}{_plus_minus(answer, 'delta_rad', 180 / math.pi, 3)}" if found else "",
-                "yes" if answer["accepted"] else "no",
-                "" if answer["p_value"] is None else f"{answer['p_value']:.3g}",
-                "  or  ".join(_pose_text(pose) for pose in answer.get("poses", ())),
-            )
-        )
-    _echo_table(("position", "class", "D (m)", "δ (°)", "accepted", "p", "robot"), rows)
+        row = {"frame" if moving else "position": str(k)}
+        if "time_s" in answer:
+            row["time (s)"] = f"{answer['time_s']:.3f}"
+        row |= {
+            "class": answer["class"] or "no landmark",
+            "D (m)": f"{answer['distance_m']:.3f}{_plus_minus(answer, 'distance_m', 1.0, 4)}" if found else "",
+            "δ (°)": f"{answer['delta_deg']:.2f}{_plus_minus(answer, 'delta_rad', 180 / math.pi, 3)}" if found else "",
+            "accepted": "yes" if answer["accepted"] else "no",
+            "p": "" if answer["p_value"] is None else f"{answer['p_value']:.3g}",
+            "robot": "  or  ".join(_pose_text(pose) for pose in answer.get("poses", ())),
+        }
+        rows.append(row)
+    return rows
 
 
 def _load_landmark(
@@ -1918,6 +2100,15 @@ _PROGRESS_SECONDS = 10.0
 """Time between two lines of progress where stderr is no terminal; work that takes less writes none."""
 
 
+def _refuse_unwritable(paths: Iterable[Path], force: bool) -> None:
+    """Refuse outputs that exist or cannot be written, before any work is done."""
+    from phasemark.data.store import refuse_unwritable
+
+    _refuse_existing(paths := list(paths), force)
+    for path in paths:
+        refuse_unwritable(path, force=force)
+
+
 class _Progress:
     """Progress on stderr, reported by a call with (done, total): a bar on a terminal, a line now and then elsewhere.
 
@@ -1941,7 +2132,9 @@ class _Progress:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+        # results printed meanwhile go above the bar, but not where standard output is no terminal
+        redirect = sys.stdout.isatty()
+        self._bar = Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=redirect)
         self._bar.start()
         task = self._bar.add_task(self._what, total=None)
         bar = self._bar
@@ -2056,6 +2249,25 @@ def _echo_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     for row in table:
         typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+class _Table:
+    """Aligned columns that are printed in pieces: the header with the first, and later ones as wide at least."""
+
+    def __init__(self) -> None:
+        self._widths: list[int] = []
+
+    def echo(self, rows: Sequence[Mapping[str, str]]) -> None:
+        """Print some rows."""
+        table = [list(row.values()) for row in rows]
+        if not self._widths:
+            table.insert(0, list(rows[0]))
+            self._widths = [0] * len(table[0])
+        self._widths = [
+            max(width, *map(len, column)) for width, column in zip(self._widths, zip(*table, strict=True), strict=True)
+        ]
+        for row in table:
+            typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, self._widths, strict=True)).rstrip())
 
 
 def _report_error(message: str) -> None:

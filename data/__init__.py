@@ -12,6 +12,7 @@ from phasemark.data.jobs import build_part, estimate, merge_parts, parse_part
 from phasemark.data.measured import read_frames, write_measured
 from phasemark.data.plan import BankPlan, MeshPlan, load_plan, read_plan
 from phasemark.data.provenance import mesh_sha256, versions
+from phasemark.data.simulated import SimulatedRecording, simulate_recording, write_recording
 from phasemark.data.size import planned_size
 from phasemark.data.store import read_checksum, verify_checksum, write_atomically, write_checksum
 from phasemark.data.verify import verify_bank, verify_frames
@@ -25,6 +26,7 @@ __all__ = [
     "FrameSet",
     "FrameSubset",
     "MeshPlan",
+    "SimulatedRecording",
     "build_bank",
     "build_frames",
     "build_part",
@@ -43,6 +45,7 @@ __all__ = [
     "read_checksum",
     "read_frames",
     "read_plan",
+    "simulate_recording",
     "summary_sentences",
     "verify_bank",
     "verify_checksum",
@@ -52,4 +55,5 @@ __all__ = [
     "write_characterisation",
     "write_checksum",
     "write_measured",
+    "write_recording",
 ]

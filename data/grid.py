@@ -84,6 +84,39 @@ def format_grid(values: NDArray[np.float64] | Sequence[float]) -> str:
     return ",".join(_decimal(value) for value in array)
 
 
+def parse_indices(text: str, n: int, name: str = "index") -> list[int]:
+    """Return the numbers that a list of numbers and ranges names, increasing, each once.
+
+    Parameters
+    ----------
+    text : str
+        ``"0,17,200:210"``; a range has both its ends, as in a grid.
+    n : int
+        The numbers are 0 … n − 1.
+    name : str
+        The option that holds the text, for error messages.
+
+    Raises
+    ------
+    UsageError
+        A part is neither a number nor a range, or a number is n or above.
+
+    Examples
+    --------
+    >>> parse_indices("17,0,4:6", 20)
+    [0, 4, 5, 6, 17]
+    """
+    found: set[int] = set()
+    for part in text.split(","):
+        ends = part.strip().split(":")
+        if len(ends) > 2 or not all(end.isascii() and end.isdigit() for end in ends) or int(ends[0]) > int(ends[-1]):
+            raise UsageError(f"{name} must be numbers and ranges such as 0,17,200:210, got {_shown(text)}")
+        if int(ends[-1]) >= n:
+            raise UsageError(f"{name} must be below {n}, the number of positions, got {part.strip()}")
+        found.update(range(int(ends[0]), int(ends[-1]) + 1))
+    return sorted(found)
+
+
 def drop_repeated_stop(delta_deg: NDArray[np.float64], period_deg: float) -> NDArray[np.float64]:
     """Return a grid of angles without its last value if that is a full number of periods above the first."""
     turns = (delta_deg[-1] - delta_deg[0]) / period_deg

@@ -6,7 +6,6 @@ import csv
 import io
 import math
 import os
-import re
 import tokenize
 import warnings
 import zipfile
@@ -23,6 +22,7 @@ from PIL import Image
 
 from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.data.bags import read_rosbag
+from phasemark.data.csv_frames import MILLISECONDS, SECONDS, SECONDS_PER_TIME_UNIT, note_disorder, parse_csv
 from phasemark.data.guard import EXPANSION, FREE_BYTES
 from phasemark.data.hdf5 import open_hdf5
 from phasemark.data.store import write_atomically
@@ -37,10 +37,8 @@ QUANTITIES = ("range", "z")
 
 _FIELDS = ("range", "amplitude", "intensity", "status", "valid")
 _NUMBERS = ("range", "amplitude", "intensity")
-_STATED = re.compile(r"\b(unit|quantity)=(\S+)")
 _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
-_NOT_A_NUMBER = ("", "nan")
 _BEYOND_MAX_RANGE = 1.25
 """How far beyond `max_range_m` a direct sensor may still report: real chips exceed their data sheet by a little."""
 _UNREADABLE = (
@@ -55,7 +53,9 @@ class _Raw:
 
     arrays: Mapping[str, NDArray[Any]]
     stated: Mapping[str, str] = field(default_factory=dict)  # "unit" and "quantity", where the file says so
+    time_s: NDArray[np.float64] | None = None
     flat: bool = False  # frames are rows of rows · cols values
+    named: bool = False  # names of columns state unit or quantity
 
 
 def read_frames(
@@ -77,9 +77,13 @@ def read_frames(
     *CSV*: one frame a line, row by row from the top left pixel. Values are separated by semicolons (then decimal
     commas are understood too), tabs, commas or blanks, the first of these that occurs. A first line without a number
     is a header; empty lines and those that start with ``#`` are skipped, but such a first line may state ``unit=…`` and
-    ``quantity=…``; an empty cell and ``nan`` are invalid pixels.
+    ``quantity=…``; an empty cell and ``nan`` are invalid pixels. A header may name the columns, which then stand in any
+    order: pixels ``mm_0`` … (this states the unit), ``range_0`` … or ``z_0`` … (this states the quantity); optionally
+    ``status_0`` …, ``amplitude_0`` …, ``intensity_0`` …; and the time stamp, ``t_ms`` or ``t_s``. Other columns are
+    ignored, and a warning names them unless they are ``truth_*``.
     *NPY*: the ranges. *NPZ*: ``range`` and optionally ``amplitude``, ``intensity`` (electrons per phase image),
-    ``status``, ``valid`` (0: invalid), ``unit`` and ``quantity``. *HDF5*: the same arrays as datasets, with the
+    ``status``, ``valid`` (0: invalid), ``t_ms`` or ``t_s`` (the shape of ``range`` without rows and columns), ``unit``
+    and ``quantity``. *HDF5*: the same arrays as datasets, with the
     attributes ``units`` and ``quantity`` on ``range``. *PNG*, one or a folder of them in the order of their names: 16
     bits, grey, 0 is invalid; codes are in the stated unit, or scaled by the text chunk ``metres_per_unit``. *ROS 2
     bag* (its folder): images of 32FC1, metres, or 16UC1, millimetres; 0 is invalid. Arrays are (frames, rows, cols),
@@ -103,7 +107,8 @@ def read_frames(
     invalid_means : {"missing", "no-return"}
         What an invalid pixel stands for (PHYSICS section 7).
     valid_status : collection of int, optional
-        Which values of ``status`` mark a valid pixel; needed if the file has it, since cameras differ.
+        Which values of ``status`` mark a valid pixel; needed if the file has it, since cameras differ. It is 5 for the
+        VL53L5CX and VL53L8CX. A status that is empty or NaN is not valid.
     flip_h, flip_v : bool
         Whether to mirror left and right, or top and bottom.
     rotate : {0, 90, 180, 270}
@@ -116,7 +121,7 @@ def read_frames(
     Returns
     -------
     Frames
-        (n, frames, rows, cols), ranges along the ray, metres.
+        (n, frames, rows, cols), ranges along the ray, metres; with `time_s` if the file has time stamps.
 
     Raises
     ------
@@ -129,7 +134,7 @@ def read_frames(
     Warns
     -----
     UserWarning
-        Some ranges cannot be right.
+        Some ranges cannot be right, time stamps repeat or run backwards, or columns are ignored.
     """
     path = Path(path)
     if rotate not in (0, 90, 180, 270):
@@ -158,7 +163,10 @@ def read_frames(
         valid &= arrays["valid"] != 0
     if "status" in arrays:
         if valid_status is None:
-            raise UsageError(f"{path}: has 'status': say with --valid-status which of its values mark a valid pixel")
+            raise UsageError(
+                f"{path}: has 'status': say with --valid-status which of its values mark a valid pixel (5 for VL53L5CX"
+                " and VL53L8CX)"
+            )
         valid &= np.isin(arrays["status"], list(valid_status))
     arrays = {name: _upright(values, flip_h, flip_v, rotate) for name, values in arrays.items()}
     with np.errstate(invalid="ignore", over="ignore"):  # what becomes NaN or infinite is invalid
@@ -176,9 +184,21 @@ def read_frames(
             valid,
             sensor=sensor,
             invalid_means=invalid_means,
+            time_s=_frame_times_s(raw, valid.shape[:2], path),
         )
     except UsageError as error:  # an amplitude or intensity that cannot be
         raise InputFileError(f"{path}: {error}") from None
+
+
+def _frame_times_s(raw: _Raw, shape: tuple[int, ...], path: Path) -> NDArray[np.float64] | None:
+    """Return the time stamps as (n, frames)."""
+    if raw.time_s is None:
+        return None
+    if raw.time_s.size != math.prod(shape) or raw.time_s.shape not in (shape, shape[1:], ()):
+        raise InputFileError(
+            f"{path}: the time stamps must have one number for each frame, shape {shape}, got {raw.time_s.shape}"
+        )
+    return raw.time_s.reshape(shape)
 
 
 def _upright(values: NDArray[Any], flip_h: bool, flip_v: bool, rotate: int) -> NDArray[Any]:
@@ -239,8 +259,9 @@ def _settled(name: str, given: str | None, raw: _Raw, known: tuple[str, ...], pa
         raise UsageError(f"--{name} is {given}, but {path} says {stated}")
     value = given or stated
     if value is None:
-        # a file that says one of the two was written by a program that says both: damaged, or somebody else's
-        asked = InputFileError if raw.stated else UsageError
+        # a file that says one of the two was written by a program that says both: damaged, or somebody else's;
+        # but names of columns say one of the two at most
+        asked = InputFileError if raw.stated and not raw.named else UsageError
         raise asked(f"{path}: does not say its {name}: give --{name} {'|'.join(known)}")
     return value
 
@@ -268,6 +289,8 @@ def _as_frames(values: NDArray[Any], name: str, shape: tuple[int, int], flat: bo
 def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write measured frames as an NPZ file: range along the ray in metres, which :func:`read_frames` reads untold.
 
+    Time stamps go into it as ``t_s``.
+
     Parameters
     ----------
     frames : Frames
@@ -289,6 +312,8 @@ def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool 
     for name, values in (("amplitude", frames.amplitude_e), ("intensity", frames.intensity_e)):
         if values is not None:
             arrays[name] = values
+    if frames.time_s is not None:
+        arrays[SECONDS] = frames.time_s
     buffer = io.BytesIO()
     np.savez(buffer, **arrays, unit="m", quantity="range")
     return write_atomically(path, buffer.getvalue(), force=force)
@@ -310,8 +335,8 @@ def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None
             return _read_pngs(path)
         if start.startswith(b"\x89HDF"):
             return _read_hdf5(path, untrusted)
-        values, stated = _parse_csv(path.read_bytes(), shape, path)
-        return _Raw({"range": values}, stated, flat=True)
+        found = parse_csv(path.read_bytes(), shape, path)
+        return _Raw(found.arrays, found.stated, found.time_s, flat=True, named=found.named)
     except PhasemarkError:
         raise
     except MemoryError:
@@ -357,7 +382,8 @@ def _read_npz(path: Path) -> _Raw:
             raise InputFileError(f"{path}: must have an array 'range', got {', '.join(archive) or 'nothing'}")
         arrays = {name: np.asarray(archive[name]) for name in _FIELDS if name in archive}
         stated = {name: str(archive[name]) for name in ("unit", "quantity") if name in archive}
-    return _Raw(arrays, stated)
+        times = {name: np.asarray(archive[name]) for name in SECONDS_PER_TIME_UNIT if name in archive}
+    return _Raw(arrays, stated, _times_s(times, path))
 
 
 def _read_hdf5(path: Path, untrusted: bool) -> _Raw:
@@ -379,63 +405,25 @@ def _read_hdf5(path: Path, untrusted: bool) -> _Raw:
             for name, key in attributes.items()
             if key in datasets["range"].attrs
         }
-        return _Raw({name: np.asarray(dataset[...]) for name, dataset in datasets.items()}, stated)
+        times = {
+            name: np.asarray(file[name]) for name in SECONDS_PER_TIME_UNIT if isinstance(file.get(name), h5py.Dataset)
+        }
+        arrays = {name: np.asarray(dataset[...]) for name, dataset in datasets.items()}
+        return _Raw(arrays, stated, _times_s(times, path))
 
 
-def _parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> tuple[NDArray[np.float64], dict[str, str]]:
-    """Return (frames, rows · cols) values of a text file, and what a comment in its first line says of them."""
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = "\0"
-    if "\0" in text:
-        raise InputFileError(f"{path}: is not CSV, NPY, NPZ, HDF5 or PNG")
-    expected = math.prod(shape)
-    lines = [
-        (number, line)
-        for number, line in enumerate(io.StringIO(text, newline=None), start=1)
-        if line.strip() and not line.startswith("#")
-    ]
-    first_frame = lines[:2][-1][1] if lines else ""  # a header's names may have separators of their own, or none
-    separator = next((mark for mark in ";\t," if mark in first_frame), None)
-    frames: list[list[float]] = []
-    for index, (number, line) in enumerate(lines):
-        cells = _cells(line, separator)
-        if index == 0 and _is_header(cells, separator):
-            continue
-        if len(cells) != expected:
-            raise InputFileError(
-                f"{path}: line {number} has {len(cells)} values, must have {expected} ({shape[0]} × {shape[1]} pixels)"
-            )
-        frame = []
-        for column, cell in enumerate(cells, start=1):
-            value = _to_float(cell, separator)
-            if value is None:
-                raise InputFileError(f"{path}: line {number}, column {column} must be a number, got {cell[:40]!r}")
-            frame.append(value)
-        frames.append(frame)
-    if not frames:
-        raise InputFileError(f"{path}: holds no frames")
-    first = text.partition("\n")[0]
-    return np.array(frames), dict(_STATED.findall(first)) if first.startswith("#") else {}
-
-
-def _cells(line: str, separator: str | None) -> list[str]:
-    cells = line.split() if separator is None else next(csv.reader([line], delimiter=separator))
-    return [cell.strip() for cell in cells]
-
-
-def _is_header(cells: list[str], separator: str | None) -> bool:
-    filled = [cell for cell in cells if cell.lower() not in _NOT_A_NUMBER]
-    return bool(filled) and all(_to_float(cell, separator) is None for cell in filled)
-
-
-def _to_float(cell: str, separator: str | None) -> float | None:
-    """Return a cell's number, NaN if it is empty, or None if it is neither."""
-    if cell.lower() in _NOT_A_NUMBER:
-        return math.nan
-    try:
-        number = float(cell.replace(",", ".", 1) if separator == ";" else cell)
-    except ValueError:
-        return None
-    return None if "_" in cell else number  # Python reads 1_000 as a number; nobody else does
+def _times_s(found: Mapping[str, NDArray[Any]], path: Path) -> NDArray[np.float64] | None:
+    """Return time stamps in seconds from the array of that name; None if there is none."""
+    if len(found) > 1:
+        raise InputFileError(f"{path}: has both '{MILLISECONDS}' and '{SECONDS}': leave one of them out")
+    for name, values in found.items():
+        if values.dtype.kind not in "fiu":
+            raise InputFileError(f"{path}: '{name}' must hold real numbers, got {values.dtype}")
+        times = values.astype(np.float64)
+        if not np.isfinite(times).all():
+            k = int(np.flatnonzero(~np.isfinite(times.ravel()))[0])
+            raise InputFileError(f"{path}: frame {k} has no time: '{name}' must be finite, got {times.ravel()[k]}")
+        for position in times.reshape(-1, times.shape[-1] if times.ndim else 1):
+            note_disorder(position, path, "frame {}".format)
+        return times * SECONDS_PER_TIME_UNIT[name]
+    return None

@@ -28,6 +28,7 @@ from phasemark.matcher.match import Candidate, Match, Matches
 from phasemark.matcher.matcher import Matcher, background_image
 from phasemark.matcher.population import GridLoss, SpacingLoss, grid_loss
 from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
+from phasemark.matcher.stillness import MotionTest, motion_test
 from phasemark.matcher.surroundings import Surroundings, estimate_surroundings
 from phasemark.matcher.sweep import read_sweep, run_sweep
 from phasemark.matcher.sweep_compare import Difference, compare_cells
@@ -56,6 +57,7 @@ __all__ = [
     "Matcher",
     "Matches",
     "Method",
+    "MotionTest",
     "Mounting",
     "PixelKalman",
     "PixelState",
@@ -85,6 +87,7 @@ __all__ = [
     "kalman_step",
     "load_map",
     "load_sweep",
+    "motion_test",
     "nees",
     "noise_free",
     "phasor_mean",

@@ -209,20 +209,6 @@ def _write_workshop(path: Path) -> None:
     np.savez(path, range=ranges, amplitude=amplitude, intensity=intensity, unit="m", quantity="range")
 
 
-def _write_recording(path: Path) -> None:
-    """Write 12 frames of the cylinder at 0.7 m from 30° by 8 × 8 zones, a wall behind: z in millimetres."""
-    import numpy as np
-
-    from phasemark.landmarks import build_mesh, catalog
-    from phasemark.render import Background, Renderer, capture, preset
-
-    sensor, wall = preset("vl53l5cx-8x8"), Background(wall_m=1.5)
-    renderer = Renderer(build_mesh(catalog()["cylinder"]), sensor, albedo=0.8)
-    image = renderer.render(distance_m=0.7, delta_rad=np.pi / 6, background=wall)
-    frames = capture(image, sensor, rng=np.random.default_rng(1), n_frames=12)
-    np.savetxt(path, np.nan_to_num(1e3 * frames.z_m).reshape(12, -1), delimiter=",", fmt="%.0f")
-
-
 def _copy_example(path: Path) -> None:
     """Copy a file of the examples of that name."""
     path.write_bytes((Path(__file__).parent.parent / "examples" / path.name).read_bytes())
@@ -237,6 +223,5 @@ GIVEN: dict[str, Callable[[Path], None]] = {
     "own_matcher.py": _copy_example,
     "own_matcher.toml": _copy_example,
     "poses.csv": _write_poses,
-    "recording.csv": _write_recording,
     "workshop.npz": _write_workshop,
 }

@@ -1,13 +1,14 @@
 """Measured frames from files that somebody else wrote."""
 
 import math
+import time
 
 import h5py
 import numpy as np
 import pytest
 
 from phasemark import InputFileError, UsageError
-from phasemark.data import read_frames
+from phasemark.data import read_frames, write_measured
 from phasemark.render import Flag, Sensor, preset
 
 PMD = preset("pmd-16x16")
@@ -289,6 +290,155 @@ def test_a_direct_sensor_measures_little_beyond_its_largest_range(tmp_path):
 def test_a_direct_sensor_without_a_largest_range_takes_far_ones(tmp_path):
     path = csv_file(tmp_path, "1,2,3,4,5,60\n")
     assert read_frames(path, sensor=DIRECT.with_(max_range_m=None), **STATED).valid.all()
+
+
+RECORDING = """t_ms,battery,mm_0,mm_1,mm_2,mm_3,mm_4,mm_5,status_0,status_1,status_2,status_3,status_4,status_5
+100,3.9,1000,2000,3000,4000,5000,6000,5,5,5,5,5,5
+166,3.9,1000,,3000,0,5000,6000,5,5,4,5,,nan
+"""
+IGNORED = "ignore:.*ignores the columns battery"
+
+
+@pytest.mark.filterwarnings(IGNORED)
+def test_a_recording_with_named_columns_has_times_and_its_invalid_pixels(tmp_path):
+    frames = read_frames(csv_file(tmp_path, RECORDING), sensor=SMALL, quantity="range", valid_status=[5])
+    assert frames.range_m.shape == (1, 2, 2, 3)
+    np.testing.assert_allclose(frames.range_m[0, 0], IMAGE, rtol=1e-15)  # mm_* states the unit
+    # an empty cell, a bad status, 0 mm, an empty status and a NaN status
+    assert frames.valid[0, 1].ravel().tolist() == [True, False, False, False, False, False]
+    np.testing.assert_allclose(frames.time_s, [[0.1, 0.166]], rtol=1e-15)
+
+
+def test_columns_that_are_not_read_are_named(tmp_path):
+    with pytest.warns(UserWarning, match="ignores the columns battery$"):
+        read_frames(csv_file(tmp_path, RECORDING), sensor=SMALL, quantity="range", valid_status=[5])
+
+
+def named(prefix, lines=("1,2,3,4,5,6",), before="", after=""):
+    header = before + ",".join(f"{prefix}_{k}" for k in range(6)) + after
+    return "\n".join([header, *lines, ""])
+
+
+@pytest.mark.parametrize(
+    ("text", "options"),
+    [
+        (named("range"), {"unit": "m"}),
+        (named("RANGE"), {"unit": "m"}),
+        (named("range").replace(",", ";").replace("2;3", "2,0;3"), {"unit": "m"}),
+        ("z_5,z_4,z_3,z_2,z_1,z_0\n6,5,4,3,2,1\n", {"unit": "m"}),
+        (named("mm", ["1000,2000,3000,4000,5000,6000"]), {"quantity": "z"}),
+        (named("mm", ["1000,2000,3000,4000,5000,6000"]).replace(",", " "), {"quantity": "z"}),
+        ("# unit=m\n" + named("z"), {}),
+        (named("z", ['1,2,3,4,5,6,"on; off"'], after=",truth_note"), {"unit": "m"}),
+    ],
+)
+def test_named_columns_state_unit_or_quantity_and_stand_in_any_order(tmp_path, text, options):
+    frames = read_frames(csv_file(tmp_path, text), sensor=SMALL, **options)
+    is_range = "range" in text.lower()
+    found = frames.range_m if is_range else frames.z_m
+    np.testing.assert_allclose(found[0, 0], IMAGE, rtol=1e-15)  # one rounding of a product
+    assert frames.time_s is None
+
+
+def test_amplitudes_have_columns_of_their_own(tmp_path):
+    groups = [",".join(f"{name}_{k}" for k in range(6)) for name in ("range", "amplitude", "intensity")]
+    text = ",".join(["t_s", *groups]) + "\n" + ",".join(["0.5", "1,2,3,4,5,6", "7,7,7,7,7,7", "8,8,8,8,8,8"]) + "\n"
+    frames = read_frames(csv_file(tmp_path, text), sensor=SMALL, unit="m")
+    assert (frames.amplitude_e == 7).all()
+    assert (frames.intensity_e == 8).all()
+    assert frames.time_s.tolist() == [[0.5]]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (named("mm").replace("mm_2,", "", 1), r"line 1: has 5 columns 'mm_\*', must have 6, .*; 'mm_2' is missing"),
+        (named("mm").replace("mm_5", "mm_6"), "'mm_5' is missing"),
+        (named("mm", after=",mm_6"), r"has 7 columns 'mm_\*', must have 6, from 'mm_0' to 'mm_5' \(2 × 3 pixels\)$"),
+        (named("mm", after=",status_0,status_1"), r"has 2 columns 'status_\*', must have 6"),
+        (named("mm", after=",mm_3"), "names the column 'mm_3' twice"),
+        (named("mm", after=",t_ms,t_ms"), "names the column 't_ms' twice"),
+        (named("mm", after="," + named("z").partition("\n")[0]), "has columns mm_0 … and z_0 …: leave one of them out"),
+        (named("mm", before="t_ms,t_s,"), "line 1: has both 't_ms' and 't_s'"),
+        (named("depth", before="t_ms,"), "line 1: names no columns of pixels, which must be mm_0 … mm_5, range_0"),
+        (
+            named("mm", ["1,1,2,3,4,5,6", "x,1,2,3,4,5,6"], "t_ms,"),
+            r"line 3, column 1 \(t_ms\) must be a number, got 'x'",
+        ),
+        (named("mm", ["1,1,2,3,4,5,6", ",1,2,3,4,5,6"], "t_s,"), "line 3: has no time: 't_s' must be a finite number"),
+        (named("mm", ["1,1,2,3,4,5,6", "inf,1,2,3,4,5,6"], "t_s,"), "line 3: has no time"),
+        (named("mm", ["1,2,3,4,5"]), "line 2 has 5 values, must have 6 \\(the columns that the header names\\)"),
+        (named("mm", ["1,2,3,?,5,6"]), r"line 2, column 4 \(mm_3\) must be a number, got '\?'"),
+        (named("mm", []), "holds no frames"),
+        ("# unit=m\n" + named("mm"), "line 2: has columns mm_0 …, but the first line says unit=m"),
+    ],
+)
+def test_a_bad_header_or_line_of_a_recording_is_named(tmp_path, text, reason):
+    path = csv_file(tmp_path, text)
+    with pytest.raises(InputFileError, match=reason) as caught:
+        read_frames(path, sensor=SMALL, quantity="range")
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_millimetres_do_not_say_whether_they_are_range_or_z(tmp_path):
+    with pytest.raises(UsageError, match=r"does not say its quantity: give --quantity range\|z"):
+        read_frames(csv_file(tmp_path, named("mm")), sensor=SMALL)
+
+
+def test_times_that_repeat_or_run_backwards_keep_their_order_with_one_warning(tmp_path):
+    lines = [f"{t},1,2,3,4,5,6" for t in (10, 20, 20, 15, 30, 30)]
+    with pytest.warns(
+        UserWarning, match="2 of 6 time stamps repeat and 1 of 6 time stamps run backwards, the first in line 4"
+    ) as caught:
+        frames = read_frames(csv_file(tmp_path, named("z", lines, "t_ms,")), sensor=SMALL, unit="m")
+    assert len(caught) == 1
+    np.testing.assert_allclose(frames.time_s, [[0.01, 0.02, 0.02, 0.015, 0.03, 0.03]], rtol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ["npz", "h5"])
+def test_arrays_have_times_too(tmp_path, kind):
+    def written(**arrays):
+        if kind == "npz":
+            np.savez(tmp_path / "a.npz", range=np.stack([IMAGE, IMAGE]), **arrays)
+            return tmp_path / "a.npz"
+        return hdf5_file(tmp_path, {"range": np.stack([IMAGE, IMAGE]), **arrays})
+
+    for name, scale in (("t_s", 1.0), ("t_ms", 1e-3)):
+        frames = read_frames(written(**{name: np.array([1, 2])}), sensor=SMALL, **STATED)
+        np.testing.assert_allclose(frames.time_s, [[scale, 2 * scale]], rtol=1e-15)
+    with pytest.raises(InputFileError, match="has both 't_ms' and 't_s'"):
+        read_frames(written(t_s=np.zeros(2), t_ms=np.zeros(2)), sensor=SMALL, **STATED)
+    with pytest.raises(InputFileError, match="frame 1 has no time: 't_s' must be finite, got nan"):
+        read_frames(written(t_s=np.array([0.0, np.nan])), sensor=SMALL, **STATED)
+    with pytest.raises(InputFileError, match=r"one number for each frame, shape \(1, 2\), got \(3,\)"):
+        read_frames(written(t_s=np.arange(3.0)), sensor=SMALL, **STATED)
+    with pytest.warns(UserWarning, match="1 of 2 time stamps repeat, the first in frame 1"):
+        read_frames(written(t_s=np.zeros(2)), sensor=SMALL, **STATED)
+
+
+def test_times_survive_an_import(tmp_path):
+    frames = read_frames(
+        csv_file(tmp_path, named("z", ["10,1,2,3,4,5,6", "20,1,2,3,4,5,6"], "t_ms,")), sensor=SMALL, unit="m"
+    )
+    again = read_frames(write_measured(frames, tmp_path / "a.npz"), sensor=SMALL)
+    assert again.time_s.tolist() == [[0.01, 0.02]]
+
+
+def test_a_long_recording_with_empty_cells_is_read_in_seconds(tmp_path):
+    # 100 000 lines of 64 zones take a few seconds; a fifth of that here, and ten times as long as it takes
+    sensor = preset("vl53l5cx-8x8")
+    n = 20_000
+    cells = ["700"] * 64
+    cells[7] = ""
+    line = ",".join(cells + ["5"] * 64)
+    header = ",".join(["t_ms"] + [f"mm_{k}" for k in range(64)] + [f"status_{k}" for k in range(64)])
+    path = csv_file(tmp_path, header + "\n" + "".join(f"{66 * k},{line}\n" for k in range(n)))
+    start = time.process_time()
+    frames = read_frames(path, sensor=sensor, quantity="z", valid_status=[5])
+    assert time.process_time() - start < 15
+    assert frames.valid.sum() == 63 * n
+    assert frames.time_s[0, -1] == pytest.approx(66e-3 * (n - 1))
 
 
 def saved(tmp_path, **arrays):

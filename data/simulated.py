@@ -1,0 +1,240 @@
+"""A small simulated recording in the form that real ones have, to try the program without a sensor."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from phasemark import UsageError, __version__
+from phasemark.data.seeds import stream
+from phasemark.data.store import replacing, write_atomically
+from phasemark.render import Background, Flag, Frames, Renderer, Sensor, Views, capture
+
+STATUS_VALID = 5
+STATUS_NO_TARGET = 255
+STATUS_NO_UPDATE = 0
+"""Status codes as the VL53L5CX has them: valid; nothing came back; the zone gave nothing."""
+
+MOST_FRAMES = 100_000
+_FORMATS = (".csv", ".npz", ".h5")
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedRecording:
+    """Frames of a simulated camera with the view at which each was taken.
+
+    Parameters
+    ----------
+    frames : Frames
+        One position, n frames, with time stamps.
+    views : Views
+        n views: the truth.
+    class_name : str
+        Name of the landmark.
+    """
+
+    frames: Frames
+    views: Views
+    class_name: str
+
+
+def simulate_recording(
+    mesh: trimesh.Trimesh,
+    class_name: str,
+    sensor: Sensor,
+    views: Views,
+    *,
+    seed: int,
+    albedo: float = 0.8,
+    background: Background | None = None,
+) -> SimulatedRecording:
+    """Simulate a recording of a landmark at the frame rate of the sensor.
+
+    Each frame is taken as if the camera stood still meanwhile. A wall keeps its distance behind the landmark of the
+    first view, and stands square to the line of sight of each.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        The landmark.
+    class_name : str
+    sensor : Sensor
+    views : Views
+        One view a frame; a camera at rest has the same each time.
+    seed : int
+        Root of the noise.
+    albedo : float
+    background : Background, optional
+        As seen from the first view.
+
+    Returns
+    -------
+    SimulatedRecording
+        Time stamps in steps of 1 / `frame_rate_hz`, rounded to milliseconds.
+
+    Raises
+    ------
+    UsageError
+        There is no view or too many, or a view cannot be rendered.
+    """
+    if not 1 <= len(views) <= MOST_FRAMES:
+        raise UsageError(f"a simulated recording must have 1 … {MOST_FRAMES} frames, got {len(views)}")
+    renderer = Renderer(mesh, sensor, albedo=albedo)
+    taken, image, rendered = [], None, None
+    for k in range(len(views)):
+        view = views[k : k + 1]
+        at = (float(view.distance_m[0]), float(view.delta_rad[0]), float(view.bearing_rad[0]), float(view.height_m[0]))
+        if image is None or at != rendered:
+            behind = background
+            if background is not None and background.wall_m is not None:
+                behind = replace(background, wall_m=background.wall_m + at[0] - float(views.distance_m[0]))
+            image, rendered = renderer.render_views(view, background=behind), at
+        taken.append(capture(image, sensor, rng=stream(seed, "simulated recording", 0), first_frame=k))
+
+    def joined(name: str) -> NDArray[Any] | None:
+        parts = [getattr(frame, name) for frame in taken]
+        return None if parts[0] is None else np.concatenate(parts, axis=1)
+
+    range_m, flags = joined("range_m"), joined("flags")
+    assert range_m is not None
+    frames = Frames(
+        range_m,
+        joined("amplitude_e"),
+        joined("intensity_e"),
+        flags=flags,
+        sensor=sensor,
+        time_s=np.round(np.arange(len(views)) / sensor.frame_rate_hz, 3)[None],
+    )
+    return SimulatedRecording(frames, views, class_name)
+
+
+def write_recording(
+    recording: SimulatedRecording, path: str | os.PathLike[str], *, description: str = "", force: bool = False
+) -> Path:
+    """Write a simulated recording in a form that :func:`~phasemark.data.read_frames` reads.
+
+    The recording of a direct sensor has z in whole millimetres, 0 where there is no reading, and status codes (5:
+    valid). That of another sensor has ranges in metres, amplitudes and intensities; a pixel without a valid range is
+    empty in CSV and has ``valid`` 0 in arrays. All have time stamps and the truth of each frame as ``truth_*``. All say
+    that they are simulated: the first line of CSV, the array ``simulated`` of NPZ, the attribute ``simulated`` of HDF5.
+
+    Parameters
+    ----------
+    recording : SimulatedRecording
+    path : path-like
+        Its suffix gives the form: .csv, .npz or .h5.
+    description : str
+        What is said of the recording beside that it is simulated; one line.
+    force : bool
+        Whether an existing file may be replaced.
+
+    Returns
+    -------
+    Path
+        `path`.
+
+    Raises
+    ------
+    UsageError
+        The suffix is none of these.
+    OutputExistsError, StorageError
+        As :func:`~phasemark.data.write_atomically`.
+    """
+    path = Path(path)
+    suffix = recording_format(path)
+    told = " ".join(f"simulated by phasemark {__version__} {description}".split())
+    if suffix == ".csv":
+        return write_atomically(path, _csv(recording, told).encode(), force=force)
+    arrays, unit, quantity = _arrays(recording)
+    if suffix == ".npz":
+        buffer = io.BytesIO()
+        stated: dict[str, Any] = {"unit": unit, "quantity": quantity, "simulated": told}
+        np.savez(buffer, **{**arrays, **stated})
+        return write_atomically(path, buffer.getvalue(), force=force)
+    with replacing(path, force=force) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["simulated"] = told
+        for name, values in arrays.items():
+            file[name] = str(values) if values.dtype.kind == "U" else values
+        file["range"].attrs.update({"units": unit, "quantity": quantity})
+    return path
+
+
+def recording_format(path: Path) -> str:
+    """Return the suffix of a recording.
+
+    Raises
+    ------
+    UsageError
+        It is not one that recordings are written with.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in _FORMATS:
+        raise UsageError(f"the recording must be a {', '.join(_FORMATS[:-1])} or {_FORMATS[-1]} file, got '{path}'")
+    return suffix
+
+
+def _truth(recording: SimulatedRecording) -> dict[str, NDArray[np.float64]]:
+    views = recording.views
+    return {
+        "truth_distance_m": views.distance_m,
+        "truth_delta_deg": np.degrees(views.delta_rad),
+        "truth_bearing_deg": np.degrees(views.bearing_rad),
+        "truth_height_m": views.height_m,
+    }
+
+
+def _zones(frames: Frames) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return z in millimetres, 0 where there is no reading, and status codes; (frames, rows, cols)."""
+    z_mm = np.round(1e3 * np.nan_to_num(frames.z_m[0])).astype(np.int64)
+    missing = (frames.flags[0] & int(Flag.MISSING)) > 0
+    status = np.where(frames.valid[0], STATUS_VALID, np.where(missing, STATUS_NO_UPDATE, STATUS_NO_TARGET))
+    return z_mm, status
+
+
+def _arrays(recording: SimulatedRecording) -> tuple[dict[str, NDArray[Any]], str, str]:
+    """Return what NPZ and HDF5 files hold, with unit and quantity."""
+    frames = recording.frames
+    assert frames.time_s is not None
+    arrays: dict[str, NDArray[Any]] = {"t_s": frames.time_s[0]}
+    direct = frames.sensor.kind == "direct"
+    if direct:
+        arrays["range"], arrays["status"] = _zones(frames)
+    else:
+        arrays["range"], arrays["valid"] = frames.range_m[0], frames.valid[0]
+        for name, values in (("amplitude", frames.amplitude_e), ("intensity", frames.intensity_e)):
+            if values is not None:
+                arrays[name] = values[0]
+    arrays |= {**_truth(recording), "truth_class": np.array(recording.class_name)}
+    return arrays, "mm" if direct else "m", "z" if direct else "range"
+
+
+def _csv(recording: SimulatedRecording, told: str) -> str:
+    arrays, unit, quantity = _arrays(recording)
+    n = len(recording.views)
+    columns: dict[str, list[str]] = {"t_ms": [f"{1e3 * time:.0f}" for time in arrays["t_s"]]}
+    if quantity == "z":
+        groups = {"mm": (arrays["range"], "d"), "status": (arrays["status"], "d")}
+    else:
+        groups = {"range": (np.where(arrays["valid"], arrays["range"], np.nan), ".5f")}
+        groups |= {name: (arrays[name], ".2f") for name in ("amplitude", "intensity") if name in arrays}
+    for prefix, (values, form) in groups.items():
+        for k, pixel in enumerate(values.reshape(n, -1).T):
+            columns[f"{prefix}_{k}"] = ["" if value != value else format(value, form) for value in pixel]
+    for name, values in _truth(recording).items():
+        columns[name] = [f"{value:.9g}" for value in values]
+    columns["truth_class"] = [recording.class_name] * n
+    text = io.StringIO()
+    text.write(f"# {told} unit={unit} quantity={quantity}\n")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return text.getvalue()

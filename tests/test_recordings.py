@@ -1,0 +1,343 @@
+"""Recordings on the command line: simulated, matched frame by frame or as one, their estimates and pictures."""
+
+import csv
+import io
+import json
+import math
+
+import h5py
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from phasemark.cli import main
+from phasemark.data import open_bank, read_frames
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.matcher import Matcher, kalman_filter
+from phasemark.matcher.recording import match_in_batches
+from phasemark.render import Background, Renderer, preset
+
+ZONES = preset("vl53l5cx-8x8")
+WALL = ["--wall", 1.5]
+SCENE = ["--class", "cylinder", "--sensor", "vl53l5cx-8x8", "--distance", 0.75, "--delta", 30, *WALL]
+READ = ["--quantity", "z", "--valid-status", 5]
+N = 9
+"""Frames of the flight."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder with a bank of the cylinder, a flight towards it, and a recording at rest."""
+    folder = tmp_path_factory.mktemp("recordings")
+
+    def made(*arguments):
+        assert main([str(argument) for argument in arguments]) == 0
+
+    grid = ["--distance", "0.54:0.82:0.02", "--delta", "0:180:5"]
+    made("bank", "build", "--class", "cylinder", "--sensor", "vl53l5cx-8x8", *grid, "-o", folder / "bank.h5")
+    made("frames", "simulate", *SCENE, "--moving", "--frames", N, "--to-distance", 0.6, "-o", folder / "flight.csv")
+    made("frames", "simulate", *SCENE, "--frames", 20, "-o", folder / "still.csv")
+    return folder
+
+
+@pytest.fixture
+def run(capsys):
+    """Run a command; return its exit code, standard output and standard error."""
+
+    def run(*arguments):
+        capsys.readouterr()
+        code = main([str(argument) for argument in arguments])
+        done = capsys.readouterr()
+        return code, done.out, done.err
+
+    return run
+
+
+@pytest.fixture
+def drawn(monkeypatch, capsys):
+    """Draw nothing, and collect what was printed before each picture."""
+    printed = []
+
+    def picture(*arguments, **options):
+        printed.append(capsys.readouterr().out)
+        return Figure(figsize=(1, 1))
+
+    monkeypatch.setattr("phasemark.matcher.picture.match_picture", picture)
+    return printed
+
+
+def rows_of(path):
+    return list(csv.DictReader(io.StringIO(path.read_text())))
+
+
+def test_every_frame_of_a_moving_camera_is_a_match_with_its_time(run, folder):
+    match = ["match", folder / "bank.h5", folder / "flight.csv", *READ, "--moving", "--method", "refine"]
+    match.append("--auto-background")  # the wall comes nearer with the landmark
+    code, out, err = run(*match, "--json")
+    assert (code, err) == (0, "")
+    matches = json.loads(out)["matches"]
+    # 15 frames a second, in whole milliseconds
+    assert [one["time_s"] for one in matches] == [round(k / 15, 3) for k in range(N)]
+    truth = np.linspace(0.75, 0.6, N)
+    # five standard deviations of 0.4 mm
+    np.testing.assert_allclose([one["distance_m"] for one in matches], truth, atol=0.002)
+    code, out, _ = run(*match)
+    header, *rows = out.splitlines()
+    assert header.split()[:3] == ["frame", "time", "(s)"]
+    assert [row.split()[:3] for row in rows] == [[str(k), f"{k / 15:.3f}", "cylinder"] for k in range(N)]
+
+
+def test_without_moving_one_note_says_that_something_moved(run, folder):
+    code, out, err = run("match", folder / "bank.h5", folder / "flight.csv", *READ)
+    assert code == 0
+    assert [line.split()[0] for line in out.splitlines()] == ["position", "0"]
+    assert len(err.splitlines()) == 1
+    assert err.startswith(f"note: {folder / 'flight.csv'}: the camera or the scene moved during the file")
+    assert "--moving matches every frame by itself" in err
+    code, _, err = run("match", folder / "bank.h5", folder / "still.csv", *READ, *WALL)
+    assert (code, err) == (0, "")
+
+
+def test_the_note_names_the_first_position_that_moved(run, folder, tmp_path):
+    rng = np.random.default_rng(1)
+    ranges = 0.7 + rng.normal(0, 0.004, (3, 12, 8, 8))
+    ranges[2] += np.linspace(0, 0.1, 12)[:, None, None]
+    np.savez(tmp_path / "a.npz", range=ranges)
+    _, _, err = run("match", folder / "bank.h5", tmp_path / "a.npz", "--unit", "m", "--quantity", "range")
+    assert "moved during 1 of 3 positions, the first being 2," in err
+
+
+def test_rows_are_printed_as_batches_finish(folder, capsys, monkeypatch):
+    monkeypatch.setattr("phasemark.cli._NEAREST_AT_ONCE", 4)
+    printed, match = [], Matcher.match
+
+    def watched(self, frames):
+        printed.append(capsys.readouterr().out)
+        return match(self, frames)
+
+    monkeypatch.setattr(Matcher, "match", watched)
+    command = ["match", str(folder / "bank.h5"), str(folder / "flight.csv"), *map(str, READ), "--moving"]
+    assert main(command) == 0
+    printed.append(capsys.readouterr().out)
+    # before each batch the rows of the one before, the header with the first
+    assert [[line.split()[0] for line in text.splitlines()] for text in printed] == [
+        [], ["frame", "0", "1", "2", "3"], ["4", "5", "6", "7"], ["8"],
+    ]  # fmt: skip
+    assert main([*command, "--jsonl"]) == 0
+    lines = [json.loads(line) for text in (*printed[4:], capsys.readouterr().out) for line in text.splitlines()]
+    assert [line["index"] for line in lines] == list(range(N))
+    assert lines[2]["time_s"] == 0.133
+
+
+def test_answers_do_not_depend_on_the_size_of_a_batch(folder):
+    with open_bank(folder / "bank.h5") as bank:
+        frames = read_frames(
+            folder / "flight.csv", sensor=bank.sensor, quantity="z", valid_status=[5]
+        ).each_a_position()
+        matcher = Matcher(bank, "refine", background=Background(wall_m=1.5))
+        found = [
+            [match.as_dict() for batch in match_in_batches(matcher, frames, kalman_filter, at_once=at_once)
+             for match in batch.matches]
+            for at_once in (2, 256)
+        ]  # fmt: skip
+    assert len(found[0]) == N
+    assert found[0] == found[1]
+
+
+def test_a_single_frame_of_a_direct_sensor_has_the_noise_that_the_sensor_states(folder):
+    with open_bank(folder / "bank.h5") as bank:
+        frames = read_frames(folder / "flight.csv", sensor=bank.sensor, quantity="z", valid_status=[5])
+        (batch,) = match_in_batches(Matcher(bank), frames.each_a_position(), kalman_filter)
+    returned = np.isfinite(batch.filtered.range_m)
+    assert returned.any()
+    assert (batch.filtered.std_m[returned] == ZONES.range_std_m).all()
+    assert not batch.filtered.std_from_scatter
+
+
+def test_the_fit_of_frames_at_rest_passes_its_test_as_often_as_stated(run, folder, tmp_path):
+    assert run("frames", "simulate", *SCENE, "--frames", 100, "--seed", 5, "-o", tmp_path / "long.csv")[0] == 0
+    match = ["match", folder / "bank.h5", tmp_path / "long.csv", *READ, *WALL, "--moving", "--method", "refine"]
+    assert run(*match, "--estimates", tmp_path / "e.csv")[0] == 0
+    rows = rows_of(tmp_path / "e.csv")
+    assert {row["class"] for row in rows} == {"cylinder"}
+    # 1 % of 100 may fail: more than 6 do so once in 10⁴ runs
+    assert sum(row["accepted"] == "false" for row in rows) <= 6
+    pulls = [(float(row["distance_m"]) - 0.75) / float(row["distance_std_m"]) for row in rows]
+    assert abs(np.mean(pulls)) < 0.5  # five standard deviations of a mean of 100
+    assert 0.7 < np.std(pulls) < 1.3  # four
+
+
+def test_estimates_are_a_table_of_what_was_free(run, folder, tmp_path):
+    file = tmp_path / "estimates.csv"
+    match = ["match", folder / "bank.h5", folder / "flight.csv", *READ, *WALL, "--moving", "--method", "refine"]
+    code, out, _ = run(*match, "--free", "bearing", "--estimates", file)
+    assert code == 0
+    assert out.splitlines()[-1] == str(file)
+    rows = rows_of(file)
+    assert list(rows[0]) == [
+        "index", "time_s", "class", "accepted", "distance_m", "distance_std_m", "delta_deg", "delta_std_deg",
+        "bearing_deg", "bearing_std_deg", "corr_distance_delta", "corr_distance_bearing", "corr_delta_bearing", "chi2",
+        "dof", "p_value", "reason",
+    ]  # fmt: skip
+    _, out, _ = run(*match, "--free", "bearing", "--json")
+    for k, (row, answer) in enumerate(zip(rows, json.loads(out)["matches"], strict=True)):
+        covariance = np.array(answer["covariance"])
+        std = np.sqrt(np.diag(covariance))
+        expected = {
+            "index": k,
+            "time_s": answer["time_s"],
+            "distance_m": answer["distance_m"],
+            "distance_std_m": std[0],
+            "delta_deg": answer["delta_deg"],
+            "delta_std_deg": math.degrees(std[1]),
+            "bearing_deg": answer["bearing_deg"],
+            "bearing_std_deg": math.degrees(std[2]),
+            "corr_distance_bearing": covariance[0, 2] / (std[0] * std[2]),
+            "corr_delta_bearing": covariance[1, 2] / (std[1] * std[2]),
+            "chi2": answer["chi2"],
+            "dof": answer["dof"],
+            "p_value": answer["p_value"],
+        }
+        for name, value in expected.items():
+            assert float(row[name]) == pytest.approx(value, rel=1e-8)  # nine digits are written
+        assert (row["class"], row["accepted"]) == (answer["class"], str(answer["accepted"]).lower())
+    code, out, err = run(*match, "--estimates", file)
+    assert (code, out) == (4, "")
+    assert "--force" in err
+    assert run(*match, "--estimates", file, "--force")[0] == 0
+    assert "bearing_deg" not in rows_of(file)[0]
+
+
+def test_where_nothing_is_found_the_estimates_are_empty(run, folder, tmp_path):
+    np.savez(tmp_path / "a.npz", range=np.full((1, 2, 8, 8), np.nan))
+    match = ["match", folder / "bank.h5", tmp_path / "a.npz", "--unit", "m", "--quantity", "range"]
+    assert run(*match, "--estimates", tmp_path / "e.csv")[0] == 0
+    (row,) = rows_of(tmp_path / "e.csv")
+    assert (row["index"], row["class"], row["accepted"], row["distance_m"]) == ("0", "", "false", "")
+
+
+def test_pictures_of_chosen_positions_come_after_the_table(run, folder, tmp_path, drawn):
+    match = ["match", folder / "bank.h5", folder / "flight.csv", *READ, "--moving", "--plot", tmp_path / "m.png"]
+    code, out, err = run(*match, "--plot-index", "1,3:4")
+    assert code == 0
+    assert "note: drew" not in err
+    assert {path.name for path in tmp_path.iterdir()} == {"m-1.png", "m-3.png", "m-4.png"}
+    assert len(drawn[0].splitlines()) == 1 + N
+    assert out.split() == [str(tmp_path / f"m-{k}.png") for k in (1, 3, 4)]
+
+
+def test_of_many_positions_the_first_is_drawn_unless_the_user_says_which(run, folder, tmp_path, drawn):
+    match = ["match", folder / "bank.h5", folder / "flight.csv", *READ, "--moving", "--plot", tmp_path / "m.png"]
+    _, _, err = run(*match)
+    assert [path.name for path in tmp_path.iterdir()] == ["m-0.png"]
+    assert f"note: drew the first of {N} positions; --plot-index 0,4:8 draws others" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "contains"),
+    [
+        (["--plot", "m.png", "--plot-index", "0,9"], "--plot-index must be below 9, the number of positions, got 9"),
+        (["--plot", "m.png", "--plot-index", "4:2"], "numbers and ranges such as 0,17,200:210, got '4:2'"),
+        (["--plot", "m.png", "--plot-index", "first"], "numbers and ranges"),
+        (["--plot-index", "1"], "--plot-index needs --plot"),
+        (["--estimates", "e.txt"], "must be a .csv file, got 'e.txt'"),
+        (["--estimates", "no/such/e.csv"], "the folder 'no/such' does not exist"),
+        (["--json", "--jsonl"], "give one of them"),
+    ],
+)
+def test_a_wrong_option_is_one_line_before_any_work(run, folder, tmp_path, monkeypatch, arguments, contains):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("match", folder / "bank.h5", folder / "flight.csv", *READ, "--moving", *arguments)
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert contains in err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("sensor", ["vl53l5cx-8x8", "pmd-16x16"])
+def test_a_simulated_recording_says_so_and_is_the_same_in_each_form(run, tmp_path, sensor):
+    scene = ["--class", "cone", "--sensor", sensor, "--distance", 0.9, "--moving", "--frames", 5]  # nothing behind
+    for suffix in ("csv", "npz", "h5"):
+        code, out, _ = run("frames", "simulate", *scene, "--seed", 3, "-o", tmp_path / f"a.{suffix}")
+        assert (code, out) == (0, f"{tmp_path / f'a.{suffix}'}\n")
+    camera = preset(sensor)
+    files = [read_frames(tmp_path / f"a.{suffix}", sensor=camera, valid_status=[5]) for suffix in ("csv", "npz", "h5")]
+    for one in files[1:]:
+        assert np.array_equal(one.valid, files[0].valid)
+        np.testing.assert_allclose(one.range_m, files[0].range_m, atol=6e-6)  # metres are written with 5 decimals
+        np.testing.assert_allclose(one.time_s, files[0].time_s, rtol=1e-12)
+    assert files[0].valid.any()
+    assert not files[0].valid.all()
+    assert (files[0].amplitude_e is None) == (sensor == "vl53l5cx-8x8")
+    np.testing.assert_allclose(np.diff(files[0].time_s), 1 / camera.frame_rate_hz, atol=1.1e-3)
+    first = (tmp_path / "a.csv").read_text().splitlines()[0]
+    assert first.startswith("# simulated by phasemark")
+    with np.load(tmp_path / "a.npz") as archive, h5py.File(tmp_path / "a.h5") as file:
+        assert str(archive["simulated"]).startswith("simulated by phasemark")
+        assert file.attrs["simulated"] == str(archive["simulated"])
+        np.testing.assert_allclose(archive["truth_distance_m"], np.linspace(0.9, 0.72, 5))
+        assert np.array_equal(file["truth_delta_deg"][...], archive["truth_delta_deg"])
+    rows = list(csv.DictReader((tmp_path / "a.csv").read_text().splitlines()[1:]))
+    assert [row["truth_class"] for row in rows] == ["cone"] * 5
+    np.testing.assert_allclose([float(row["truth_delta_deg"]) for row in rows], np.linspace(0, 40, 5))
+
+
+def test_a_simulated_recording_has_millimetres_status_codes_and_the_noise_of_the_sensor(run, tmp_path):
+    n = 400
+    scene = ["--class", "cylinder", "--sensor", "vl53l5cx-8x8", "--distance", 0.7, "--delta", 30]
+    assert run("frames", "simulate", *scene, "--frames", n, "-o", tmp_path / "a.csv")[0] == 0
+    rows = list(csv.DictReader((tmp_path / "a.csv").read_text().splitlines()[1:]))
+    z_mm = np.array([[int(row[f"mm_{k}"]) for k in range(64)] for row in rows])
+    status = np.array([[int(row[f"status_{k}"]) for k in range(64)] for row in rows])
+    assert np.array_equal(status == 5, z_mm > 0)
+    assert set(np.unique(status)) == {5, 255}  # nothing stands behind the landmark
+    image = Renderer(build_mesh(catalog()["cylinder"]), ZONES).render(0.7, math.radians(30))
+    returned = image.intensity[0].ravel() > 0
+    assert np.array_equal(status[0] == 5, returned)
+    exact = (1e3 * image.range_m[0] * ZONES.axis_cosine()).ravel()[returned]
+    std = 1e3 * (ZONES.range_std_m * ZONES.axis_cosine()).ravel()[returned]
+    pulls = (z_mm[:, returned].mean(axis=0) - exact) / (std / math.sqrt(n))
+    assert np.abs(pulls).max() < 4.5  # of at most 64: once in 2000 runs
+    np.testing.assert_allclose(z_mm[:, returned].std(axis=0), np.sqrt(std**2 + 1 / 12), rtol=0.16)  # 4.5 of 1/√800
+
+
+def test_a_frame_of_a_recording_is_drawn(run, folder, tmp_path):
+    show = ["frames", "show", folder / "still.csv", "--sensor", "vl53l5cx-8x8", "--index", 3, "-o", tmp_path / "a.png"]
+    code, _, err = run(*show)
+    assert code == 2
+    assert "--valid-status" in err
+    assert run(*show, "--valid-status", 5)[0] == 0
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_another_seed_is_other_noise_and_the_same_seed_the_same(run, tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert run("frames", "simulate", *SCENE, "--seed", seed, "-o", tmp_path / f"{name}.npz")[0] == 0
+    a, b, c = (np.load(tmp_path / f"{name}.npz")["range"] for name in "abc")
+    assert np.array_equal(a, b)
+    assert not np.array_equal(a, c)
+    assert not np.array_equal(a[0], a[1])
+
+
+@pytest.mark.parametrize(
+    ("code", "arguments", "contains"),
+    [
+        (2, ["-o", "a.csv"], "either --class NAME or --mesh NAME=FILE"),
+        (2, ["--class", "pyramid", "-o", "a.csv"], "pyramid"),
+        (2, ["--class", "cone", "-o", "a.xlsx"], "must be a .csv, .npz or .h5 file, got 'a.xlsx'"),
+        (2, ["--class", "cone", "--to-delta", 3, "-o", "a.csv"], "--to-delta goes with --moving"),
+        (2, ["--class", "cone", "--frames", 0, "-o", "a.csv"], "--frames"),
+        (2, ["--class", "cone", "--frames", 100_001, "-o", "a.csv"], "1 … 100000 frames, got 100001"),
+        (2, ["--class", "cone", "--distance", -1, "-o", "a.csv"], "'distance_m' must be positive"),
+        (2, ["--class", "cone", "--wall", 0.5, "-o", "a.csv"], "wall_m"),
+        (4, ["--class", "cone", "-o", "taken.csv"], "--force"),
+    ],
+)
+def test_a_recording_that_cannot_be_simulated_is_one_line(run, tmp_path, monkeypatch, code, arguments, contains):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken.csv").write_text("mine")
+    found, out, err = run("frames", "simulate", *arguments)
+    assert (found, out) == (code, "")
+    assert len(err.splitlines()) == 1
+    assert contains in err
+    assert [path.name for path in tmp_path.iterdir()] == ["taken.csv"]
