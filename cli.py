@@ -1197,8 +1197,22 @@ def _match(
         list[str] | None,
         typer.Option(
             "--free",
-            help="With refine, estimate this too: bearing or height; repeatable.",
+            help="With refine, estimate this with nothing known of it: bearing or height; repeatable.",
             autocompletion=_one_of("bearing", "height"),
+        ),
+    ] = None,
+    fix: Annotated[
+        str | None,
+        typer.Option(
+            "--fix", help="With refine, leave this at 0: bearing.", autocompletion=_one_of("bearing"), metavar="NAME"
+        ),
+    ] = None,
+    bearing_std: Annotated[
+        float | None,
+        typer.Option(
+            "--bearing-std",
+            metavar="DEG",
+            help="With refine, how well the camera points at the landmark (1.5 unless --free or --fix is given).",
         ),
     ] = None,
     on: Annotated[
@@ -1221,6 +1235,10 @@ def _match(
     ] = 0.01,
     auto_background: Annotated[
         bool, typer.Option("--auto-background", help="With refine, estimate wall and floor from each frame.")
+    ] = False,
+    unknown_background: Annotated[
+        bool,
+        typer.Option("--unknown-background", help="With refine: other things may stand before, beside and behind it."),
     ] = False,
     wall: _Wall = None,
     floor: _Floor = None,
@@ -1277,6 +1295,7 @@ def _match(
     """
     from phasemark.data import read_frames, write_atomically
     from phasemark.matcher import Matcher, kalman_filter, load_map, phasor_mean
+    from phasemark.matcher.estimator import BEARING_STD_RAD
     from phasemark.matcher.recording import EstimateTable, match_in_batches
 
     filters = {"kalman": kalman_filter, "phasor-mean": phasor_mean}
@@ -1304,14 +1323,28 @@ def _match(
     background = _background(wall, floor)
     if auto_background and background is not None:
         raise UsageError("--auto-background estimates wall and floor: leave --wall and --floor out")
+    if unknown_background and (auto_background or background is not None):
+        raise UsageError(
+            "--unknown-background takes nothing for known: leave --auto-background, --wall and --floor out"
+        )
+    if fix not in (None, "bearing"):
+        raise UsageError(f"--fix must be bearing, got '{fix}'")
+    if bearing_std is not None and (free or fix):
+        raise UsageError("--bearing-std says how well the bearing is known: leave --free and --fix out")
+    if fix and "bearing" in (free or ()):
+        raise UsageError("--free and --fix both name bearing: give one of them")
     parameters = ["distance_m", "delta_rad"]
     for name in free or ():
         if name not in _FREE:
             raise UsageError(f"--free must be {' or '.join(_FREE)}, got '{name}'")
         parameters.append(_FREE[name])
+    near_the_axis = method == "refine" and not free and not fix
+    if near_the_axis:
+        parameters.append(_FREE["bearing"])
     refined = (
         ("--free", bool(free)), ("--on", on != "ranges"), ("--pixels", pixels != "all"), ("--robust", robust),
-        ("--auto-background", auto_background),
+        ("--auto-background", auto_background), ("--unknown-background", unknown_background),
+        ("--fix", fix is not None), ("--bearing-std", bearing_std is not None),
     )  # fmt: skip
     for option, used in refined:
         if used and method == "nearest":
@@ -1336,8 +1369,9 @@ def _match(
         matcher = Matcher(
             opened,
             method,
-            free=parameters,
-            background="auto" if auto_background else background,
+            free=None if near_the_axis else parameters,
+            background="auto" if auto_background else "unknown" if unknown_background else background,
+            bearing_std_rad=BEARING_STD_RAD if bearing_std is None else math.radians(bearing_std),
             false_alarm=false_alarm,
             on=on,  # type: ignore[arg-type]  # Matcher says what is right
             pixels=pixels,  # type: ignore[arg-type]
@@ -1977,14 +2011,19 @@ def _pose_text(pose: Mapping[str, Any]) -> str:
 _FREE = {"bearing": "bearing_rad", "height": "height_m"}
 
 
-def _plus_minus(answer: dict[str, Any], name: str, scale: float, digits: int) -> str:
-    """Return the standard deviation of one parameter of a match as text; nothing if there is none."""
-    if answer["covariance"] is None:
-        return ""
-    from phasemark.render.rounding import error_text
+def _estimated(answer: dict[str, Any], value: float, name: str, scale: float, form: str) -> str:
+    """Return one parameter of a match as text: with its standard deviation if the match is accepted and has one."""
+    from phasemark.render.rounding import with_error
 
+    if not answer["accepted"] or answer["covariance"] is None:
+        return f"{value:{form}}"
     k = answer["free"].index(name)
-    return f" ± {error_text(scale * math.sqrt(answer['covariance'][k][k]))}"
+    return with_error(value, scale * math.sqrt(answer["covariance"][k][k]))
+
+
+def _refusal(answer: dict[str, Any]) -> str:
+    """Return the word for a refused match, and why it is refused."""
+    return "refused" + (f": {answer['reason']}" if answer["reason"] and answer["class"] is not None else "")
 
 
 def _match_rows(answers: Sequence[dict[str, Any]], start: int, moving: bool) -> list[dict[str, str]]:
@@ -1997,9 +2036,9 @@ def _match_rows(answers: Sequence[dict[str, Any]], start: int, moving: bool) -> 
             row["time (s)"] = f"{answer['time_s']:.3f}"
         row |= {
             "class": answer["class"] or "no landmark",
-            "D (m)": f"{answer['distance_m']:.3f}{_plus_minus(answer, 'distance_m', 1.0, 4)}" if found else "",
-            "δ (°)": f"{answer['delta_deg']:.2f}{_plus_minus(answer, 'delta_rad', 180 / math.pi, 3)}" if found else "",
-            "accepted": "yes" if answer["accepted"] else "no",
+            "D (m)": _estimated(answer, answer["distance_m"], "distance_m", 1.0, ".3f") if found else "",
+            "δ (°)": _estimated(answer, answer["delta_deg"], "delta_rad", 180 / math.pi, ".2f") if found else "",
+            "accepted": "yes" if answer["accepted"] else _refusal(answer),
             "p": "" if answer["p_value"] is None else f"{answer['p_value']:.3g}",
             "robot": "  or  ".join(_pose_text(pose) for pose in answer.get("poses", ())),
         }

@@ -299,10 +299,17 @@ class MaximumLikelihood:
         sides = () if background is None else (-_BESIDE_RAD, _BESIDE_RAD)
         fits = [self._fit(models, evidence, enough, starts, sides, behind)]
         poor = doubtful(fits[0])
-        if poor.size:
+        if poor.size and self._prior_std:
+            # a scout knows no bearing: turn its best views, heading kept, and look at shifted images
+            direct = _Models(models.final, None)
+            fits.append(self._turned(direct, evidence, poor, Fits.joined(fits), behind))
+            poor = doubtful(Fits.joined(fits))
+        if poor.size and self._prior_std:
+            starts = wide.starts(_some(seen, poor), n_modes, all_classes=all_classes)
+            fits.append(self._fit(direct, evidence, poor, starts, (-_BESIDE_RAD, _BESIDE_RAD), behind))
+        elif poor.size:
             starts = wide.starts(_some(seen, poor), _MODES_AGAIN, all_classes=all_classes)
-            thorough = _Models(models.final, None) if self._prior_std else models  # a scout knows no bearing
-            fits.append(self._fit(thorough, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True))
+            fits.append(self._fit(models, evidence, poor, starts, _BESIDE_AGAIN_RAD, behind, patient=True))
             poor = doubtful(fits[-1])
         if poor.size and models.scout is not None and not self._prior_std:
             # too little may be smooth for the scout to see the way
@@ -321,6 +328,26 @@ class MaximumLikelihood:
         if models.final is not None:
             fits.append(self._from_behind(models.final, evidence, Fits.joined(fits), behind))
         return Fits.joined(fits)
+
+    def _turned(
+        self, models: _Models, evidence: Evidence, which: NDArray[np.int64], fits: Fits, behind: PhasorImages | None
+    ) -> Fits:
+        """Fit some frames from their best views seen under several bearings, as far apart as their prior is wide.
+
+        A frame tells the heading δ − b before it tells δ and b: a view fitted without a bearing has the right heading.
+        """
+        best = _best_of_frame(fits)
+        best = best[np.isin(fits.frame[best], which)]
+        turns = np.array([-2.0, -1.0, 1.0, 2.0]) * min(self._widest / 2, self._search.column_rad / 2)
+        view = np.tile(fits.view[best], (len(turns), 1))
+        view[:, 1] += np.repeat(turns, len(best))
+        view[:, 2] += np.repeat(turns, len(best))
+        assert models.final is not None
+        order = np.argsort(np.tile(fits.frame[best], len(turns)), kind="stable")
+        frame, class_index = np.tile(fits.frame[best], len(turns)), np.tile(fits.class_index[best], len(turns))
+        settings = self._settings(behind)
+        found = self._modes(models.final, evidence, frame[order], class_index[order], view[order], settings, _MARGIN)
+        return Fits.joined([found, self._other_classes(models.final, evidence, found, settings)])
 
     def _from_behind(self, model: ImageModel, evidence: Evidence, fits: Fits, behind: PhasorImages | None) -> Fits:
         """Let the other side of the best landmark explain each frame, its middle seen at the same place.

@@ -115,20 +115,21 @@ class FilteredFrames:
         """Return the frames of a direct sensor with the noise of its law, scaled to the scatter of all pixels together.
 
         The scatter of a few frames in one pixel is a poor measure of its noise. The law (`range_std_m` and its
-        neighbours in :class:`~phasemark.render.Sensor`) says how the noise of the pixels compares; the median over
-        pixels and positions of scatter over law says how large it is. A single frame has the noise of the law.
+        neighbours in :class:`~phasemark.render.Sensor`) says how the noise of the pixels compares; the median over the
+        pixels of a position of scatter over law says how large it is. A single frame has the noise of the law.
         """
         if self.sensor.kind != "direct" or not self.std_from_scatter:
             return self
         law = assumed_std_m(np.nan_to_num(self.range_m, nan=1.0), self.sensor)
         n = self.n_effective
         ratio = np.divide(self.std_m**2 * n, law**2, out=np.full(n.shape, np.nan), where=(n > 1.5) & (law > 0))
-        scattered = np.isfinite(ratio)
-        scale = 1.0
-        if scattered.any():
-            freedom = float(np.median(n[scattered])) - 1
-            scale = float(np.median(ratio[scattered])) / float(special.chdtri(freedom, 0.5) / freedom)
-        std = np.sqrt(max(scale, _LEAST_POOLED)) * law / np.sqrt(np.maximum(n, 1.0))
+        scale = np.ones((len(self), 1, 1))
+        for k in np.flatnonzero(np.isfinite(ratio).any(axis=(1, 2))):
+            scattered = np.isfinite(ratio[k])
+            freedom = float(np.median(n[k][scattered])) - 1
+            usual = float(special.chdtri(freedom, 0.5)) / freedom
+            scale[k] = float(np.median(ratio[k][scattered])) / usual
+        std = np.sqrt(np.maximum(scale, _LEAST_POOLED)) * law / np.sqrt(np.maximum(n, 1.0))
         return replace(self, std_m=np.where(n > 0, std, np.nan), std_from_scatter=False)
 
     def _repr_png_(self) -> bytes | None:

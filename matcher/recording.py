@@ -6,15 +6,15 @@ import csv
 import io
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
-from phasemark.matcher.filters import FilteredFrames, PixelState
+from phasemark.matcher.filters import FilteredFrames
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
-from phasemark.render import Frames, predicted_range_std
+from phasemark.render import Frames
 
 POSITIONS_AT_ONCE = 256
 """Largest batch: as many answers as a reader of the output waits for."""
@@ -55,9 +55,6 @@ def match_in_batches(
 ) -> Iterator[MatchedBatch]:
     """Filter and match the positions of a recording in batches; the answers do not depend on the size of a batch.
 
-    A direct sensor gives no amplitudes, and a single frame no scatter. The noise of such frames is the figure that the
-    sensor states, `range_std_m`.
-
     Parameters
     ----------
     matcher : Matcher
@@ -73,17 +70,8 @@ def match_in_batches(
     MatchedBatch
     """
     for start in range(0, len(frames), at_once):
-        filtered = _with_stated_noise(filter_frames(frames[start : start + at_once]), frames)
+        filtered = filter_frames(frames[start : start + at_once])
         yield MatchedBatch(start, filtered, matcher.match(filtered))
-
-
-def _with_stated_noise(filtered: FilteredFrames, frames: Frames) -> FilteredFrames:
-    """Give single frames of a direct sensor the noise that the sensor states."""
-    stated_m = float(predicted_range_std(1.0, 1.0, frames.sensor)) if frames.sensor.kind == "direct" else 0.0
-    if frames.n_frames > 1 or frames.amplitude_e is not None or not stated_m > 0:
-        return filtered
-    std_m = np.where(filtered.state == PixelState.RETURN, stated_m, np.nan)
-    return replace(filtered, std_m=std_m, std_from_scatter=False)
 
 
 class EstimateTable:
