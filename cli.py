@@ -16,7 +16,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -32,7 +32,16 @@ if TYPE_CHECKING:
 
     from phasemark.data import Bank, BankPlan, FramePlan
     from phasemark.landmarks import LandmarkSpec
-    from phasemark.matcher import Calibration, FilteredFrames, LandmarkMap, Match, Matches, RobotPose
+    from phasemark.matcher import (
+        Calibration,
+        Change,
+        Diagnosis,
+        FilteredFrames,
+        LandmarkMap,
+        Match,
+        Matches,
+        RobotPose,
+    )
     from phasemark.render import Background, Estimate, Sensor
 
 __all__ = ["app", "main"]
@@ -1078,6 +1087,9 @@ def _match(
     plot: Annotated[
         Path | None, typer.Option("--plot", help="Draw measured, model and residual into this .png.")
     ] = None,
+    no_diagnosis: Annotated[
+        bool, typer.Option("--no-diagnosis", help="Do not look for the setting that makes a refused frame fit.")
+    ] = False,
     as_json: _Json = False,
     force: _Force = False,
 ) -> None:
@@ -1086,7 +1098,7 @@ def _match(
     All frames of a file are averaged: the camera stands still. A file of shape (n, frames, rows, cols) has n positions.
     """
     from phasemark.data import read_frames
-    from phasemark.matcher import Matcher, kalman_filter, load_map, phasor_mean
+    from phasemark.matcher import Matcher, diagnose, kalman_filter, load_map, phasor_mean
 
     filters = {"kalman": kalman_filter, "phasor-mean": phasor_mean}
     if filter_name not in filters:
@@ -1135,7 +1147,7 @@ def _match(
         plots = [] if plot is None else _numbered(plot, len(measured.range_m))
         _refuse_existing(plots, force)
         filtered = filters[filter_name](measured)
-        matches = Matcher(
+        matcher = Matcher(
             opened,
             method,
             free=parameters,
@@ -1144,17 +1156,26 @@ def _match(
             on=on,  # type: ignore[arg-type]  # Matcher says what is right
             pixels=pixels,  # type: ignore[arg-type]
             robust=robust,
-        ).match(filtered)
+        )
+        matches = matcher.match(filtered)
         _save_match_pictures(plots, filtered, matches, opened, background, force)
-        missed = next((k for k, match in enumerate(matches) if match.class_name is None), None)
-        if missed is not None:
-            _note_why_nothing(filtered[missed : missed + 1], opened, auto_background or background is not None)
+        refused = next((k for k, match in enumerate(matches) if not match.accepted), None)
+        diagnosis = None
+        if refused is not None and not no_diagnosis:
+            diagnosis = diagnose(matcher, filtered, refused, background=background)
+            given = _ReadOptions(unit, flip_h, flip_v, rotate, method == "nearest")
+            typer.echo(f"note: {_diagnosis_text(diagnosis, given)}", err=True)
     answers = []
     for match in matches:
         answer = match.as_dict()
         if landmarks is not None:
             answer["poses"] = _poses(match, landmarks, map_file is None, math.radians(pan), prior, prior_std)
         answers.append(answer)
+    if diagnosis is not None:
+        answers[diagnosis.index]["diagnosis"] = {
+            **diagnosis.as_dict(),
+            "message": _diagnosis_text(diagnosis, given),
+        }
     if as_json:
         _echo_json({"bank": str(bank), "frames": str(frames), "matches": answers})
         return
@@ -1616,35 +1637,62 @@ def _save_match_pictures(
         write_atomically(path, buffer.getvalue(), force=force)
 
 
-_FAR_FROM_BANK = 3.0
-"""A factor between ranges and a bank's distances that no landmark before its background makes."""
+@dataclass(frozen=True)
+class _ReadOptions:
+    """How a command was told to read frames and match them, as far as a diagnosis depends on it."""
+
+    unit: str | None
+    flip_h: bool
+    flip_v: bool
+    rotate: int
+    nearest: bool
 
 
-def _note_why_nothing(filtered: FilteredFrames, bank: Bank, has_background: bool) -> None:
-    """Say what is odd about a position where nothing was found: ranges nowhere near the bank's, or a wall behind."""
-    import numpy as np
+def _diagnosis_text(diagnosis: Diagnosis, given: _ReadOptions) -> str:
+    """Return a diagnosis in one line that names options."""
+    changes = (*diagnosis.changes, *diagnosis.alternatives)
+    return diagnosis.message({change.parameter: _flags(change, given) for change in changes})
 
-    from phasemark.matcher import estimate_surroundings
 
-    ranges = filtered.range_m[np.isfinite(filtered.range_m)]
-    if not ranges.size:
-        return
-    near, far = float(np.percentile(ranges, 5)), float(np.percentile(ranges, 95))
-    first, last = float(bank.distance_m[0]), float(bank.distance_m[-1])
-    if far < first / _FAR_FROM_BANK or near > last * _FAR_FROM_BANK:
-        typer.echo(
-            f"note: the frames' ranges are {near:.3g} … {far:.3g} m, the bank's distances {first:g} … {last:g} m: is"
-            " --unit right, and the bank the one for this place?",
-            err=True,
+def _flags(change: Change, given: _ReadOptions) -> str:
+    """Return the options that make one change."""
+    from phasemark.data.measured import METRES_PER_UNIT
+
+    value = change.value
+    refine = "--method refine " if given.nearest else ""
+    turned = given.rotate in (90, 270)  # mirrored before it is turned: left and right become top and bottom
+    if change.parameter == "method":
+        return refine.strip()
+    if change.parameter == "free":
+        return f"{refine}--free bearing"
+    if change.parameter == "background":
+        if value == "auto":
+            return f"{refine}--auto-background"
+        if value is None:
+            return f"{refine}without --wall and --floor".strip()
+        planes = ((f"--{name}", getattr(value, f"{name}_m")) for name in ("wall", "floor"))
+        return refine + " ".join(f"{option} {metres:.4f}" for option, metres in planes if metres is not None)
+    if change.parameter in ("flip_h", "flip_v"):
+        horizontal = (change.parameter == "flip_h") != turned
+        option = "--flip-h" if horizontal else "--flip-v"
+        return f"without {option}" if (given.flip_h if horizontal else given.flip_v) else option
+    if change.parameter == "rotate":
+        angle = (given.rotate + value) % 360
+        return f"--rotate {angle}" if angle else "without --rotate"
+    if change.parameter == "quantity":
+        return f"--quantity {value}"
+    if change.parameter == "unit_factor":
+        scale = None if given.unit is None else METRES_PER_UNIT[given.unit] * value
+        right = next((name for name, metres in METRES_PER_UNIT.items() if scale and math.isclose(metres, scale)), None)
+        return f"a unit {value:g} times as large as the file states" if right is None else f"--unit {right}"
+    if change.parameter == "half_angle_deg":
+        return (
+            "a bank of a sensor file with"
+            f" half_angle_h_deg = {value[0]:.4g}, half_angle_v_deg = {value[1]:.4g} (phasemark calibrate makes one)"
         )
-        return
-    behind = None if has_background else estimate_surroundings(filtered).background
-    if behind is not None:
-        typer.echo(
-            f"note: something returns behind what is nearest, from {behind.wall_m:.2f} m or so, and nothing was stated"
-            " to stand there: try --method refine --auto-background, or --wall and --floor",
-            err=True,
-        )
+    if change.parameter == "bearing_offset_deg":
+        return f"a bank of a sensor file with bearing_offset_deg = {value:.3g}, or the camera turned"
+    return f"phasemark bank build --distance with a grid that has {value:.2f} m"
 
 
 def _one_landmark(xy: tuple[float, float], yaw_deg: float) -> LandmarkMap:
