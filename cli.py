@@ -1650,8 +1650,7 @@ class _ReadOptions:
 
 def _diagnosis_text(diagnosis: Diagnosis, given: _ReadOptions) -> str:
     """Return a diagnosis in one line that names options."""
-    changes = (*diagnosis.changes, *diagnosis.alternatives)
-    return diagnosis.message({change.parameter: _flags(change, given) for change in changes})
+    return diagnosis.message(lambda change: _flags(change, given))
 
 
 def _flags(change: Change, given: _ReadOptions) -> str:

@@ -7,7 +7,7 @@ setting. A change is named only if its match is accepted and explains the frame 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -44,10 +44,10 @@ FEWEST_RETURNS = 3
 """Fewer returns give no view."""
 FEWEST_DOF = 3
 """A fit with fewer degrees of freedom says too little to recommend a change."""
-DECISIVE_RATIO = 4.0
+DECISIVE_RATIO = 1.5
 """A change must lower chi2 by this factor."""
-DECISIVE_DROP = 30.0
-"""And by this much: three parameters lower chi2 of a frame that fits by more than 30 once in a million."""
+DECISIVE_DROP = 40.0
+"""And by this much: three free parameters lower chi2 by chance by more than 40 once in a hundred million frames."""
 WORTH_A_MATCH = 8.0
 """Cost per pixel of a rough fit up to which it is matched."""
 CLEARLY_ASIDE_RAD = math.radians(0.5)
@@ -120,13 +120,13 @@ class Diagnosis:
         """Whether a single change makes the frame fit."""
         return len(self.changes) == 1
 
-    def message(self, remedies: Mapping[Parameter, str] | None = None) -> str:
+    def message(self, remedy: Callable[[Change], str] | None = None) -> str:
         """Return the diagnosis in one line.
 
         Parameters
         ----------
-        remedies : mapping of str to str, optional
-            What to do for each parameter, in place of the library's own names: the flags of a command line.
+        remedy : callable, optional
+            Returns what to do for a change, in place of the library's own names: the options of a command line.
         """
         head = f"frame {self.index} is refused ({self._why()})"
         if not self.changes:
@@ -137,13 +137,11 @@ class Diagnosis:
                 " makes it fit: it may show another landmark, or none"
             )
 
-        def remedy(change: Change) -> str:
-            return (remedies or {}).get(change.parameter) or _remedy(change)
-
+        told = remedy or _remedy
         words = " and ".join(change.words for change in self.changes)
-        text = f"{head}: it fits with {words}: {', '.join(remedy(change) for change in self.changes)}"
+        text = f"{head}: it fits with {words}: {', '.join(told(change) for change in self.changes)}"
         for other in self.alternatives:
-            text += f"; it fits as well with {other.words}: {remedy(other)}"
+            text += f"; it fits as well with {other.words}: {told(other)}"
         return text
 
     def __str__(self) -> str:
@@ -254,7 +252,7 @@ def diagnose(
     Notes
     -----
     A change counts if its match is accepted, has at least three degrees of freedom and a chi2 that is lower than
-    before by a factor of four and by 30.
+    before by a factor of 1.5 and by 40.
     """
     if not -len(frames) <= index < len(frames):
         raise UsageError(f"'index' must be in 0 … {len(frames) - 1}, got {index}")
@@ -323,10 +321,10 @@ class _Trials:
             return [((*before, _free_bearing(match, self.with_bearing)), match)]
         # the matcher's own search of bearings may miss what a camera stated to look there finds
         sensor = self._turned(rough)
-        match = self._match_window(rough, frame, sensor, self.with_bearing, background)
-        if match is None or not self._inside(match.distance_m):
+        turned = self._match_window(rough, frame, sensor, self.with_bearing, background)
+        if turned is None or not self._inside(turned.distance_m):
             return []
-        match = self._turned_back(match, sensor)
+        match = self._turned_back(turned, sensor)
         bearing_deg = math.degrees(match.bearing_rad)
         offset_deg = self.bank.sensor.bearing_offset_deg + bearing_deg
         words = f"a bearing of {bearing_deg:.2g}°"
@@ -389,8 +387,9 @@ class _Trials:
             return []
         for free in dict.fromkeys((self.setup.free, self.with_bearing)):
             sensor = self._turned(rough) if free == self.with_bearing else self.bank.sensor
-            match = self._match_window(rough, self.frame, sensor, free, self.setup.background)
-            if match is not None and not self._inside(match.distance_m):
+            found = self._match_window(rough, self.frame, sensor, free, self.setup.background)
+            if found is not None and not self._inside(found.distance_m):
+                match = found
                 first, last = float(self.bank.distance_m[0]), float(self.bank.distance_m[-1])
                 where = (
                     f"before its first, {first:.3g} m" if match.distance_m < first else f"beyond its last, {last:.3g} m"
@@ -516,22 +515,25 @@ def _transforms(frame: FilteredFrames, bank: Bank) -> Iterator[tuple[Change, Fil
             yield Change("unit_factor", factor, words), _scaled(frame, np.full(cosine.shape, factor))
 
 
-def _moved(frame: FilteredFrames, move: Any) -> FilteredFrames:
-    def moved(array: NDArray[Any] | None) -> NDArray[Any] | None:
-        return None if array is None else np.ascontiguousarray(move(array))
+_ARRAYS = ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
 
-    names = ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
-    return replace(frame, **{name: moved(getattr(frame, name)) for name in names})
+
+def _moved(frame: FilteredFrames, move: Any) -> FilteredFrames:
+    moved: dict[str, Any] = {
+        name: np.ascontiguousarray(move(array)) for name in _ARRAYS if (array := getattr(frame, name)) is not None
+    }
+    return replace(frame, **moved)
 
 
 def _joined(frames: Sequence[FilteredFrames]) -> FilteredFrames:
     """Return frames of one camera as a batch."""
     first = frames[0]
-    names = ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
-    given = [name for name in names if getattr(first, name) is not None]
-    return replace(
-        first, time_s=None, **{name: np.concatenate([getattr(frame, name) for frame in frames]) for name in given}
-    )
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(frame, name) for frame in frames])
+        for name in _ARRAYS
+        if getattr(first, name) is not None
+    }
+    return replace(first, time_s=None, **arrays)
 
 
 def _scaled(frame: FilteredFrames, factor: NDArray[np.float64]) -> FilteredFrames:

@@ -20,6 +20,7 @@ from phasemark.render import Background, Renderer, Sensor, Views, predicted_rang
 
 SIZES = (0.8, 0.85, 0.9, 0.95, 1.05, 1.1, 1.15, 1.2)
 """Fields of view that are tried, as ratios of the tangents of half angles."""
+_SIZE_LIMITS = (0.7, 1.4)
 MOST_COST = 25.0
 """Limit of a pixel's cost, and the cost of a pixel that returns here and not there."""
 _LEAST_STD_M = 3e-4
@@ -196,6 +197,8 @@ class Search:
         mismatch = np.ones((len(views), pixels), np.bool_)
         for size in np.unique(views[:, 3]):
             of = np.flatnonzero(views[:, 3] == size)
+            if not _SIZE_LIMITS[0] <= size <= _SIZE_LIMITS[1]:
+                continue
             sensor = wider(self._sensor, float(size))
             renderer = self._renderers[c].seen_by(sensor)
             arguments = Views.broadcast(views[of, 0], views[of, 1], views[of, 2], 0.0)
