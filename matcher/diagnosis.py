@@ -48,8 +48,8 @@ DECISIVE_RATIO = 1.5
 """A change must lower chi2 by this factor."""
 DECISIVE_DROP = 40.0
 """And by this much: three free parameters lower chi2 by chance by more than 40 once in a hundred million frames."""
-WORTH_A_MATCH = 8.0
-"""Cost per pixel of a rough fit up to which it is matched."""
+WORTH_A_MATCH = 60.0
+"""Cost above what noise explains up to which a rough fit is matched: two pixels that contradict it, and a little."""
 CLEARLY_ASIDE_RAD = math.radians(0.5)
 """Before a background a rough fit knows the bearing better than that."""
 _FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
@@ -227,7 +227,7 @@ def diagnose(
 
     Single changes are tried in the order of what they cost the user: a free bearing, another background, the image
     turned or mirrored, another quantity or unit, another field of view, a distance the bank does not reach. Then
-    pairs of a bearing with one of the others. It takes a second or two.
+    pairs of a bearing with one of the others. It takes 1 to 3 s of processor time, with a background up to 10 s.
 
     Parameters
     ----------
@@ -406,7 +406,7 @@ class _Trials:
     def _field_of_view(self) -> _Found:
         """Match before images of a camera with another field of view."""
         fit = self.search.best(self.frame, self.stated, sizes=SIZES, bearing=self.bearing_free)
-        if fit is None or fit.cost > WORTH_A_MATCH * fit.n_pixels:
+        if fit is None or not _is_promising(fit):
             return []
         sensor = wider(self.bank.sensor, fit.size)
         match = self._match_window(fit, self.frame, sensor, self.setup.free, self.setup.background)
@@ -420,7 +420,7 @@ class _Trials:
     def _rough(self, frame: FilteredFrames, scene: Background | None) -> Fit | None:
         """Return a rough fit with the bearing free; None if it promises nothing."""
         fit = self.search.best(frame, scene, bearing=True)
-        return None if fit is None or fit.cost > WORTH_A_MATCH * fit.n_pixels else fit
+        return None if fit is None or not _is_promising(fit) else fit
 
     def _match_window(
         self,
@@ -472,6 +472,12 @@ class _Trials:
 
     def _estimated(self) -> Background | None:
         return estimate_surroundings(self.frame, bearing_known=self.bearing_free).background
+
+
+def _is_promising(fit: Fit) -> bool:
+    """Return whether a rough fit is good enough to be matched."""
+    n = fit.n_pixels
+    return fit.cost <= n + 4 * math.sqrt(2 * n) + WORTH_A_MATCH
 
 
 _METHOD = Change("method", "refine", "views between the bank's images")
