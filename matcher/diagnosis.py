@@ -227,7 +227,7 @@ def diagnose(
 
     Single changes are tried in the order of what they cost the user: a free bearing, another background, the image
     turned or mirrored, another quantity or unit, another field of view, a distance the bank does not reach. Then
-    pairs of a bearing with one of the others. It takes 1 to 3 s of processor time, with a background up to 10 s.
+    pairs of a bearing with one of the others. It takes 1 to 3 s of processor time, on rare views 10 s.
 
     Parameters
     ----------
