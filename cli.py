@@ -18,7 +18,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,7 +35,15 @@ if TYPE_CHECKING:
     from phasemark.data import Bank, BankPlan, FramePlan, MeshPlan
     from phasemark.data.plan import ScenePlan
     from phasemark.landmarks import LandmarkSpec
-    from phasemark.matcher import Calibration, FilteredFrames, LandmarkMap, Match, RobotPose
+    from phasemark.matcher import (
+        Calibration,
+        Change,
+        Diagnosis,
+        FilteredFrames,
+        LandmarkMap,
+        Match,
+        RobotPose,
+    )
     from phasemark.matcher.drive import DrivePlan
     from phasemark.render import Background, Estimate, Frames, Sensor
 
@@ -1281,6 +1289,9 @@ def _match(
             help=f"Positions to draw, such as 0,17,200:210. By default all, or the first of more than {_DRAWN_ALL}.",
         ),
     ] = None,
+    no_diagnosis: Annotated[
+        bool, typer.Option("--no-diagnosis", help="Do not look for the setting that makes a refused frame fit.")
+    ] = False,
     as_json: _Json = False,
     as_jsonl: Annotated[
         bool, typer.Option("--jsonl", help="Print each match as a line of JSON as soon as it is known.")
@@ -1294,7 +1305,7 @@ def _match(
     t_s, mm_0 ... (or range_0 ..., z_0 ...), status_0 ...; for a VL53L5CX or VL53L8CX give --valid-status 5.
     """
     from phasemark.data import read_frames, write_atomically
-    from phasemark.matcher import Matcher, kalman_filter, load_map, phasor_mean
+    from phasemark.matcher import Matcher, diagnose, kalman_filter, load_map, phasor_mean
     from phasemark.matcher.estimator import BEARING_STD_RAD
     from phasemark.matcher.recording import EstimateTable, match_in_batches
 
@@ -1382,7 +1393,8 @@ def _match(
         answers: list[dict[str, Any]] = []  # all of them only for --json, whose answers are one list
         table, estimated = _Table(), EstimateTable(parameters)
         drawn: dict[int, tuple[FilteredFrames, Match]] = {}
-        missed: FilteredFrames | None = None
+        refused: tuple[int, FilteredFrames] | None = None
+        n_accepted = 0
         at_once = _NEAREST_AT_ONCE if method == "nearest" else _REFINED_AT_ONCE
         with _Progress("matching") if len(positions) > at_once else nullcontext() as progress:
             for batch in match_in_batches(matcher, positions, filters[filter_name], at_once=at_once):
@@ -1398,8 +1410,9 @@ def _match(
                     some.append(answer)
                     if batch.start + k in plots:
                         drawn[batch.start + k] = batch.filtered[k : k + 1], match
-                    if missed is None and match.class_name is None:
-                        missed = batch.filtered[k : k + 1]
+                    n_accepted += match.accepted
+                    if refused is None and not match.accepted:
+                        refused = batch.start + k, batch.filtered[k : k + 1]
                 if estimates is not None:
                     estimated.add(batch)
                 if as_json:
@@ -1414,10 +1427,15 @@ def _match(
                 sys.stdout.flush()
                 if progress is not None:
                     progress(batch.start + len(some), len(positions))
+        # among the frames of a moving camera some do not show the landmark: that needs no diagnosis
+        if refused is not None and not (no_diagnosis or unknown_background or (moving and n_accepted)):
+            diagnosis = replace(diagnose(matcher, refused[1], 0, background=background), index=refused[0])
+            message = _diagnosis_text(diagnosis, _ReadOptions(unit, flip_h, flip_v, rotate, method == "nearest"))
+            typer.echo(f"note: {message}", err=True)
+            if as_json:
+                answers[diagnosis.index]["diagnosis"] = {**diagnosis.as_dict(), "message": message}
         if as_json:
             _echo_json({"bank": str(bank), "frames": str(frames), "matches": answers})
-        if missed is not None:
-            _note_why_nothing(missed, opened, auto_background or background is not None)
         if estimates is not None:
             write_atomically(estimates, estimated.to_csv().encode(), force=force)
         for k, path in plots.items():
@@ -1915,35 +1933,61 @@ def _save_match_picture(
     write_atomically(path, buffer.getvalue(), force=force)
 
 
-_FAR_FROM_BANK = 3.0
-"""A factor between ranges and a bank's distances that no landmark before its background makes."""
+@dataclass(frozen=True)
+class _ReadOptions:
+    """How a command was told to read frames and match them, as far as a diagnosis depends on it."""
+
+    unit: str | None
+    flip_h: bool
+    flip_v: bool
+    rotate: int
+    nearest: bool
 
 
-def _note_why_nothing(filtered: FilteredFrames, bank: Bank, has_background: bool) -> None:
-    """Say what is odd about a position where nothing was found: ranges nowhere near the bank's, or a wall behind."""
-    import numpy as np
+def _diagnosis_text(diagnosis: Diagnosis, given: _ReadOptions) -> str:
+    """Return a diagnosis in one line that names options."""
+    return diagnosis.message(lambda change: _flags(change, given))
 
-    from phasemark.matcher import estimate_surroundings
 
-    ranges = filtered.range_m[np.isfinite(filtered.range_m)]
-    if not ranges.size:
-        return
-    near, far = float(np.percentile(ranges, 5)), float(np.percentile(ranges, 95))
-    first, last = float(bank.distance_m[0]), float(bank.distance_m[-1])
-    if far < first / _FAR_FROM_BANK or near > last * _FAR_FROM_BANK:
-        typer.echo(
-            f"note: the frames' ranges are {near:.3g} … {far:.3g} m, the bank's distances {first:g} … {last:g} m: is"
-            " --unit right, and the bank the one for this place?",
-            err=True,
+def _flags(change: Change, given: _ReadOptions) -> str:
+    """Return the options that make one change."""
+    from phasemark.data.measured import METRES_PER_UNIT
+
+    value = change.value
+    refine = "--method refine " if given.nearest else ""
+    turned = given.rotate in (90, 270)  # mirrored before it is turned: left and right become top and bottom
+    if change.parameter == "method":
+        return refine.strip()
+    if change.parameter == "free":
+        return f"{refine}--free bearing"
+    if change.parameter == "background":
+        if value == "auto":
+            return f"{refine}--auto-background"
+        if value is None:
+            return f"{refine}without --wall and --floor".strip()
+        planes = ((f"--{name}", getattr(value, f"{name}_m")) for name in ("wall", "floor"))
+        return refine + " ".join(f"{option} {metres:.4f}" for option, metres in planes if metres is not None)
+    if change.parameter in ("flip_h", "flip_v"):
+        horizontal = (change.parameter == "flip_h") != turned
+        option = "--flip-h" if horizontal else "--flip-v"
+        return f"without {option}" if (given.flip_h if horizontal else given.flip_v) else option
+    if change.parameter == "rotate":
+        angle = (given.rotate + value) % 360
+        return f"--rotate {angle}" if angle else "without --rotate"
+    if change.parameter == "quantity":
+        return f"--quantity {value}"
+    if change.parameter == "unit_factor":
+        scale = None if given.unit is None else METRES_PER_UNIT[given.unit] * value
+        right = next((name for name, metres in METRES_PER_UNIT.items() if scale and math.isclose(metres, scale)), None)
+        return f"a unit {value:g} times as large as the file states" if right is None else f"--unit {right}"
+    if change.parameter == "half_angle_deg":
+        return (
+            "a bank of a sensor file with"
+            f" half_angle_h_deg = {value[0]:.4g}, half_angle_v_deg = {value[1]:.4g} (phasemark calibrate makes one)"
         )
-        return
-    behind = None if has_background else estimate_surroundings(filtered).background
-    if behind is not None:
-        typer.echo(
-            f"note: something returns behind what is nearest, from {behind.wall_m:.2f} m or so, and nothing was stated"
-            " to stand there: try --method refine --auto-background, or --wall and --floor",
-            err=True,
-        )
+    if change.parameter == "bearing_offset_deg":
+        return f"a bank of a sensor file with bearing_offset_deg = {value:.3g}, or the camera turned"
+    return f"phasemark bank build --distance with a grid that has {value:.2f} m"
 
 
 def _one_landmark(xy: tuple[float, float], yaw_deg: float) -> LandmarkMap:

@@ -134,6 +134,58 @@ def _finished_identity(path: Path) -> dict[str, Any]:
         return bank.identity()
 
 
+def rebuild_bank(
+    bank: Bank,
+    *,
+    distance_m: Sequence[float],
+    delta_deg: Sequence[float],
+    classes: Sequence[str] | None = None,
+    sensor: Sensor | None = None,
+    workers: int | None = None,
+) -> Bank:
+    """Build a bank of the same landmarks on another grid, or for another camera, in a temporary file.
+
+    Parameters
+    ----------
+    bank : Bank
+        Its meshes are used; mesh files that its plan names are not read again.
+    distance_m, delta_deg : sequence of float
+        The new grid.
+    classes : sequence of str, optional
+        Which of its landmarks; None: all.
+    sensor : Sensor, optional
+        The new camera; None: the bank's own.
+    workers : int, optional
+        As for :func:`build_bank`.
+
+    Returns
+    -------
+    Bank
+        Open for reading; its file is gone once it is closed. Its layout is "full".
+
+    Raises
+    ------
+    UsageError
+        The grid or the camera cannot be rendered, with the reason.
+    """
+    old = bank.plan.model_dump(mode="json")
+    kept = set(bank.classes if classes is None else classes)
+    plan = BankPlan(
+        **{
+            **old,
+            **{key: [part for part in old[key] if part["name"] in kept] for key in ("landmarks", "meshes")},
+            "distance_m": tuple(distance_m),
+            "delta_deg": tuple(delta_deg),
+            "sensor_overrides": (sensor or bank.sensor).model_dump(mode="json"),
+            "layout": "full",
+        }
+    )
+    with TemporaryDirectory(prefix="phasemark-") as folder:
+        path = Path(folder) / "bank.h5"
+        produce(BankJob(plan, bank.mesh), path, finished=_finished_identity, workers=workers)
+        return open_bank(path)
+
+
 @dataclass(frozen=True)
 class _Slab:
     """Images that lie one behind the other in a group: those of one class, or of all."""

@@ -13,6 +13,7 @@ from phasemark.matcher.bounds import (
 from phasemark.matcher.calibrate import Calibration, calibrate, filter_poses
 from phasemark.matcher.calibrate_model import Mounting
 from phasemark.matcher.calibrate_poses import KnownPoses, PoseStd, frames_of_poses, read_poses
+from phasemark.matcher.diagnosis import Change, Diagnosis, diagnose
 from phasemark.matcher.filters import (
     FilteredFrames,
     PixelKalman,
@@ -44,8 +45,10 @@ __all__ = [
     "Calibration",
     "Candidate",
     "Cell",
+    "Change",
     "Condition",
     "Conditions",
+    "Diagnosis",
     "Difference",
     "Estimate",
     "FilteredFrames",
@@ -77,6 +80,7 @@ __all__ = [
     "confusion_probability",
     "covers",
     "cramer_rao",
+    "diagnose",
     "efficiency",
     "estimate_surroundings",
     "filter_poses",

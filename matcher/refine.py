@@ -627,8 +627,12 @@ class _Problem:
         view = np.ascontiguousarray(state.theta[which, :4])
         step = np.maximum(0.5 * std, _KINK * self.scale[: std.shape[1]])
         slope = self.model.wide_slopes(self.class_index, view, self.settings.free, step)
-        if slope is None or not self.with_albedo:
-            return slope
+        if slope is None:
+            return None
+        if not self.with_albedo:
+            # light that comes and goes within the step has no phase whose slope could tell anything
+            phasor = np.abs(state.images.phasor[which])[:, None]
+            return np.where(np.abs(slope) * step[:, :, None] > phasor, 0.0, slope)
         return np.concatenate([slope * state.theta[which, 4:, None], state.images.slope[which, -1:]], axis=1)
 
     def _scaled(self, images: ModelImages, theta: NDArray[np.float64]) -> ModelImages:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import math
+from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -130,7 +132,7 @@ class Renderer:
         self.sensor = sensor
         self.albedo = float(albedo)
         self.splits = int(splits)
-        self.topology = MeshTopology.empty() if mesh is None else MeshTopology.from_mesh(unite_shells(mesh))
+        self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
         self._orders = np.array([1, *harmonics], dtype=np.int64)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
         self._camera = _camera(sensor)
@@ -418,6 +420,28 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
             )
+
+
+_TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
+_MOST_TOPOLOGIES = 16
+
+
+def _topology(mesh: trimesh.Trimesh) -> MeshTopology:
+    """Analyse a mesh, or return the analysis of the same mesh from a few calls ago."""
+    arrays = (mesh.vertices, mesh.faces, mesh.face_attributes.get("part", ()))
+    digest = hashlib.blake2b()
+    for array in arrays:
+        values = np.ascontiguousarray(array)
+        digest.update(f"{values.dtype}{values.shape}".encode())
+        digest.update(values.tobytes())
+    key = digest.digest()
+    found = _TOPOLOGIES.get(key)
+    if found is None:
+        found = MeshTopology.from_mesh(unite_shells(mesh))
+        _TOPOLOGIES[key] = found
+        if len(_TOPOLOGIES) > _MOST_TOPOLOGIES:
+            _TOPOLOGIES.popitem(last=False)
+    return found
 
 
 def _camera(sensor: Sensor) -> NDArray[np.float64]:

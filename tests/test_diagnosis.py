@@ -1,0 +1,161 @@
+"""Diagnosis of a refused match: the change that undoes what was done to a frame, and none without a landmark."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from open_set import strangers
+
+from phasemark import UsageError
+from phasemark.cli import main
+from phasemark.data import BankPlan, build_bank
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.matcher import Matcher, diagnose, kalman_filter
+from phasemark.render import Background, Renderer, capture, preset
+
+PRESETS = ("vl53l5cx-8x8", "pmd-16x16")
+WALL = Background(wall_m=3.0)
+CONE_VIEW = (1.013, 0.7)
+ARRAYS = ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
+
+
+@pytest.fixture(scope="module")
+def banks(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("diagnosis")
+    plans = {name: BankPlan(sensor=name, classes=("cone",), distance_m="0.9:1.1:0.01") for name in PRESETS}
+    opened = {name: build_bank(plan, folder / f"{name}.h5") for name, plan in plans.items()}
+    yield opened
+    for bank in opened.values():
+        bank.close()
+
+
+def frames_of(name, *view, sensor=None, background=None, mesh=None):
+    """Return the filtered frame of 50 exposures of the cone, or of another landmark."""
+    renderer = Renderer(mesh or build_mesh(catalog()["cone"]), sensor or preset(name), albedo=0.8)
+    image = renderer.render(*view, background=background)
+    return kalman_filter(capture(image, renderer.sensor, rng=np.random.default_rng(1), n_frames=50))
+
+
+def moved(frames, move):
+    """Move the pixels of a frame."""
+    arrays = {name: getattr(frames, name) for name in ARRAYS}
+    return replace(frames, **{name: None if a is None else move(a).copy() for name, a in arrays.items()})
+
+
+def diagnosis_of(bank, frames, background=None):
+    return diagnose(Matcher(bank, "refine", free=("distance_m", "delta_rad"), background=background), frames)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("bearing_deg", [-3.1, 1.2])
+def test_a_landmark_off_to_a_side_is_diagnosed_with_its_bearing(banks, name, bearing_deg):
+    found = diagnosis_of(banks[name], frames_of(name, *CONE_VIEW, math.radians(bearing_deg)))
+    assert found.enough_alone
+    assert found.changes[0].parameter in ("free", "bearing_offset_deg")
+    assert found.match.accepted
+    assert math.degrees(found.match.bearing_rad) == pytest.approx(bearing_deg, abs=0.3)  # five standard deviations
+    assert f"bearing {'' if found.changes[0].parameter == 'free' else 'of '}" in str(found)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_wall_that_was_not_announced_is_found(banks, name):
+    found = diagnosis_of(banks[name], frames_of(name, *CONE_VIEW, background=WALL))
+    assert [change.parameter for change in found.changes] == ["background"]
+    assert found.match.background.wall_m == pytest.approx(3.0, abs=5e-3)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_wall_that_is_not_there_is_found(banks, name):
+    found = diagnosis_of(banks[name], frames_of(name, *CONE_VIEW), WALL)
+    assert [(change.parameter, change.value) for change in found.changes] == [("background", None)]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_an_image_upside_down_is_found_and_that_a_half_turn_would_do_as_well(banks, name):
+    # the landmark has a plane of symmetry: mirrored left to right it is the same seen from the other side
+    found = diagnosis_of(banks[name], moved(frames_of(name, *CONE_VIEW), lambda a: a[..., ::-1, :]))
+    assert [change.parameter for change in found.changes] == ["flip_v"]
+    assert [(change.parameter, change.value) for change in found.alternatives] == [("rotate", 180)]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_wrong_unit_and_a_wrong_quantity_are_found(banks, name):
+    frames = frames_of(name, *CONE_VIEW)
+    small = replace(frames, range_m=frames.range_m / 1000)
+    if frames.std_from_scatter:
+        small = replace(small, std_m=frames.std_m / 1000)
+    for changed, expected in (
+        (small, ("unit_factor", 1000.0)),
+        (replace(frames, range_m=frames.range_m * frames.sensor.axis_cosine()), ("quantity", "z")),
+        (replace(frames, range_m=frames.range_m / frames.sensor.axis_cosine()), ("quantity", "range")),
+    ):
+        found = diagnosis_of(banks[name], changed)
+        assert [(change.parameter, change.value) for change in found.changes] == [expected]
+
+
+def test_another_field_of_view_is_found_with_its_angle(banks):
+    sensor = preset("pmd-16x16")
+    wide = sensor.with_(
+        half_angle_h_deg=1.12 * sensor.half_angle_h_deg, half_angle_v_deg=1.12 * sensor.half_angle_v_deg
+    )
+    frames = replace(frames_of("pmd-16x16", *CONE_VIEW, sensor=wide), sensor=sensor)
+    found = diagnosis_of(banks["pmd-16x16"], frames)
+    assert [change.parameter for change in found.changes] == ["half_angle_deg"]
+    # a field of view 0.5 % wider does not show in chi2; 1.5 % allows for the noise
+    assert found.changes[0].value[0] == pytest.approx(wide.half_angle_h_deg, rel=0.015)
+
+
+@pytest.mark.parametrize("distance_m", [0.7, 1.4])
+def test_a_landmark_outside_the_bank_is_found_at_its_distance(banks, distance_m):
+    found = diagnosis_of(banks["pmd-16x16"], frames_of("pmd-16x16", distance_m, 0.7))
+    assert [change.parameter for change in found.changes] == ["distance_m"]
+    assert found.changes[0].value == pytest.approx(distance_m, abs=3e-3)  # five standard deviations
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("shape", ["cube", "slab"])
+def test_nothing_is_recommended_for_a_landmark_that_is_not_in_the_bank(banks, name, shape):
+    found = diagnosis_of(banks[name], frames_of(name, 1.0, 0.5, 0.02, mesh=strangers()[shape]))
+    assert found.changes == ()
+    assert found.match is None
+    assert "another landmark" in str(found)
+
+
+@pytest.mark.parametrize("background", [None, Background(wall_m=1.5)])
+def test_nothing_is_recommended_for_a_scene_without_a_landmark(banks, background):
+    sensor = preset("pmd-16x16")
+    image = Renderer(None, sensor).render(1.0, background=background)
+    frames = kalman_filter(capture(image, sensor, rng=np.random.default_rng(1), n_frames=50))
+    assert diagnosis_of(banks["pmd-16x16"], frames).changes == ()
+
+
+def test_an_accepted_frame_has_nothing_to_diagnose(banks):
+    with pytest.raises(UsageError, match="is accepted"):
+        diagnosis_of(banks["pmd-16x16"], frames_of("pmd-16x16", *CONE_VIEW))
+
+
+@pytest.mark.parametrize(
+    ("options", "flag"), [(["--method", "refine"], ": --free bearing"), ([], "--method refine --free")]
+)
+def test_the_command_names_the_option_that_makes_a_refused_frame_fit(banks, tmp_path, capsys, options, flag):
+    image = Renderer(build_mesh(catalog()["cone"]), preset("pmd-16x16"), albedo=0.8).render(
+        *CONE_VIEW, math.radians(2.1)
+    )
+    frames = capture(image, image.sensor, rng=np.random.default_rng(1), n_frames=50)
+    np.savez(tmp_path / "frames.npz", range=frames.range_m, unit="m", quantity="range",
+             amplitude=np.nan_to_num(frames.amplitude_e), intensity=frames.intensity_e, valid=frames.valid)  # fmt: skip
+    arguments = ["match", str(banks["pmd-16x16"].path), str(tmp_path / "frames.npz"), "--invalid-means", "no-return"]
+    assert main([*arguments, *options, "--json"]) == 0
+    done = capsys.readouterr()
+    (note,) = done.err.splitlines()
+    assert note.startswith("note: frame 0 is refused (")
+    assert "bearing 2" in note
+    assert flag in note
+    (answer,) = json.loads(done.out)["matches"]
+    assert answer["diagnosis"]["changes"][0]["parameter"] == "free"
+    assert main([*arguments, *options, "--json", "--no-diagnosis"]) == 0
+    done = capsys.readouterr()
+    assert done.err == ""
+    assert "diagnosis" not in json.loads(done.out)["matches"][0]
