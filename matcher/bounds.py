@@ -7,7 +7,7 @@ number which pixels count, whether ranges or phasors are measured, what is free,
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,14 @@ from phasemark import UsageError
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.likelihood import Quantity
 from phasemark.matcher.models import VIEW
+from phasemark.matcher.systematic import (
+    calibrated_covariance,
+    calibrated_fields,
+    calibrated_slopes,
+    carried_covariance,
+    check_systematic,
+    declared_covariance,
+)
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, predicted_range_std
 from phasemark.render.noise import phase_image_variance
 
@@ -38,24 +46,33 @@ class Bound:
         Fisher information in them, what the nuisances cost taken off.
     pixels : (n, rows, cols) bool
         Which pixels count.
+    systematic : (n, p, p) float64, optional
+        What the calibration of the sensor leaves, and what the sensor declares of a pose.
     """
 
     free: tuple[str, ...]
     information: NDArray[np.float64]
     pixels: NDArray[np.bool_]
+    systematic: NDArray[np.float64] | None = None
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """Cramér–Rao bound, (n, p, p); NaN where a direction is not observed."""
-        values, vectors = np.linalg.eigh(self.information)
-        seen = values[:, :1] > 1e-13 * np.abs(values[:, -1:])
-        inverse = np.divide(1.0, values, out=np.full(values.shape, np.nan), where=seen)
-        return np.asarray(np.einsum("nij,nj,nkj->nik", vectors, inverse, vectors))
+        """Cramér–Rao bound and what is systematic, (n, p, p); NaN where a direction is not observed."""
+        noise = _inverse(self.information)
+        return noise if self.systematic is None else noise + self.systematic
 
     def std(self, name: str) -> NDArray[np.float64]:
         """Return the bound on the standard deviation of one parameter, metres or radians, (n,)."""
         k = self.free.index(name)
         return np.sqrt(self.covariance[:, k, k])
+
+
+def _inverse(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the inverses of information matrices, (n, p, p); NaN where a direction is not observed."""
+    values, vectors = np.linalg.eigh(information)
+    seen = values[:, :1] > 1e-13 * np.abs(values[:, -1:])
+    inverse = np.divide(1.0, values, out=np.full(values.shape, np.nan), where=seen)
+    return np.asarray(np.einsum("nij,nj,nkj->nik", vectors, inverse, vectors))
 
 
 def cramer_rao(
@@ -69,6 +86,7 @@ def cramer_rao(
     background: Background | None = None,
     nuisances: Sequence[str] | None = None,
     image: PhasorImages | None = None,
+    systematic: Collection[str] = (),
     workers: int = 1,
 ) -> Bound:
     """Return the Cramér–Rao bound at some views (PHYSICS section 7).
@@ -92,6 +110,8 @@ def cramer_rao(
         Which of :data:`NUISANCES` are unknown too; None: the albedo on phasors, nothing on ranges.
     image : PhasorImages, optional
         What is seen at the views, where it has been rendered already: of the same landmark, optics and background.
+    systematic : collection of {"calibration", "declared"}
+        Which errors of the sensor that all frames share are added: what its calibration leaves, and what it declares.
     workers : int
         Threads.
 
@@ -152,7 +172,19 @@ def cramer_rao(
     frames = np.broadcast_to(np.asarray(n_frames, np.float64), image.phasor.shape)
     rows = _whitened(image.phasor, image.intensity, np.concatenate(columns, axis=1), use, frames, on, sensor)
     everything = rows @ rows.transpose(0, 2, 1)
-    return Bound(tuple(free), eliminated(everything, len(free)), use)
+    information = eliminated(everything, len(free))
+    common = None
+    if terms := check_systematic(systematic):
+        common = np.zeros(information.shape)
+        if "declared" in terms:
+            common += declared_covariance(sensor, free)
+        if "calibration" in terms and calibrated_fields(sensor):
+            by_fields = calibrated_slopes(renderer, sensor, views, image, background, workers)
+            calibrated = _whitened(image.phasor, image.intensity, by_fields, use, frames, on, sensor)
+            known = np.nan_to_num(_inverse(everything))  # nuisances included: they take up part of an error
+            p = len(free)
+            common += carried_covariance(known, rows, calibrated, calibrated_covariance(sensor))[:, :p, :p]
+    return Bound(tuple(free), information, use, common)
 
 
 def eliminated(information: NDArray[np.float64], p: int) -> NDArray[np.float64]:

@@ -23,7 +23,15 @@ from phasemark.matcher.match import Candidate, Match, Reason
 from phasemark.matcher.models import VIEW, BankModel, ImageModel, RenderedModel
 from phasemark.matcher.refine import SCALE, Fits, Settings, refine
 from phasemark.matcher.surroundings import NEAREST_WALL_M, estimate_surroundings, fit_background, without_background
-from phasemark.render import Background, PhasorImages, Renderer, phasor_to_range_m, wrap_difference_m
+from phasemark.matcher.systematic import (
+    Systematic,
+    calibrated_covariance,
+    calibrated_fields,
+    calibrated_slopes,
+    carried_covariance,
+    declared_covariance,
+)
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, phasor_to_range_m, wrap_difference_m
 
 Pixels = Literal["all", "lower"]
 MIN_RETURNS = 3
@@ -105,6 +113,7 @@ class MaximumLikelihood:
         pixels: Pixels = "all",
         robust: bool = False,
         bearing_std_rad: float = BEARING_STD_RAD,
+        systematic: Sequence[Systematic] = (),
         tolerance_m: float = TOLERANCE_M,
         tolerance_rad: float = TOLERANCE_RAD,
         workers: int | None = None,
@@ -122,6 +131,8 @@ class MaximumLikelihood:
         self._prior_std = (math.inf, math.inf, bearing_std_rad) if free is None else ()
         self.on: Quantity = on
         self.false_alarm = false_alarm
+        self._systematic = systematic
+        self._workers = workers or _usual_workers()
         self._tolerance = {name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW}
         self.auto = background == "auto"
         self.unknown = background == "unknown"
@@ -142,7 +153,7 @@ class MaximumLikelihood:
         self._scout = BankModel(bank, self._behind, smooth_only=True) if scouts else None
         self._rendered: RenderedModel | None = None
         if self.auto or not exact:
-            self._rendered = RenderedModel(bank, self.background, workers or _usual_workers())
+            self._rendered = RenderedModel(bank, self.background, self._workers)
         aside = "bearing_rad" in self.free
         fine = (1, 1) if self.background is not None and not aside else (2, 3)
         along, around = (
@@ -177,7 +188,7 @@ class MaximumLikelihood:
         fits = self._searched(models, evidence, evidence.seen, bare, self.background, self._behind)
         if self.unknown:
             fits = self._without_borders(models, evidence, fits)
-        return self._answers(frames, fits, bare, [self.background] * len(frames))
+        return self._answers(frames, evidence, fits, bare, self.background)
 
     def _match_auto(self, frames: FilteredFrames) -> list[Match]:
         """Match frames one by one, each before what stands behind it."""
@@ -209,7 +220,7 @@ class MaximumLikelihood:
                 fits = Fits.joined([fits, again])
                 if self._is_doubtful(fits):
                     background, fits = self._with_better_background(background, evidence, fits)
-            answers.extend(self._answers(one, fits, bare, [background]))
+            answers.extend(self._answers(one, evidence, fits, bare, background))
         return answers
 
     def _with_better_background(
@@ -553,9 +564,10 @@ class MaximumLikelihood:
     def _answers(
         self,
         frames: FilteredFrames,
+        evidence: Evidence,
         fits: Fits,
         bare: NDArray[np.float64],
-        backgrounds: list[Background | None],
+        background: Background | None,
     ) -> list[Match]:
         p_values = p_values_of(fits.tested, fits.dof, frames, fits.frame)
         order = np.lexsort((fits.cost, fits.frame))
@@ -565,8 +577,78 @@ class MaximumLikelihood:
         for k in range(len(frames)):
             own = order[first[k] : first[k + 1]]
             own = own[np.isfinite(fits.cost[own])]
-            answers.append(self._answer(fits, own, p_values, doubt, float(bare[k]), backgrounds[k]))
-        return answers
+            answers.append(self._answer(fits, own, p_values, doubt, float(bare[k]), background))
+        return self._with_systematic(frames.sensor, evidence, answers)
+
+    def _with_systematic(self, sensor: Sensor, evidence: Evidence, answers: list[Match]) -> list[Match]:
+        """Add to covariances what all frames of a camera share."""
+        parts: list[dict[str, NDArray[np.float64]]] = [{} for _ in answers]
+        known = [k for k, match in enumerate(answers) if match.covariance is not None and match.class_name is not None]
+        declared = declared_covariance(sensor, self.free)
+        if "declared" in self._systematic and declared.any():
+            for k in known:
+                parts[k]["declared"] = declared
+        if "calibration" in self._systematic and calibrated_fields(sensor):
+            for c, name in enumerate(self.bank.classes):
+                which = [k for k in known if answers[k].class_name == name]
+                if which:
+                    carried = self._carried(sensor, evidence, c, which, [answers[k] for k in which])
+                    for k, part in zip(which, carried, strict=True):
+                        parts[k]["calibration"] = part
+        return [self._with_parts(match, part) if part else match for match, part in zip(answers, parts, strict=True)]
+
+    def _with_parts(self, match: Match, parts: dict[str, NDArray[np.float64]]) -> Match:
+        """Return a match whose covariance holds further parts; refused if they leave it undetermined."""
+        assert match.covariance is not None
+        covariance = match.covariance + np.sum(list(parts.values()), axis=0)
+        reason = match.reason
+        if not reason and not self._is_determined(np.sqrt(np.diag(covariance))):
+            reason = "undetermined"
+        return replace(match, covariance=covariance, systematic=parts, reason=reason, accepted=not reason)
+
+    def _carried(
+        self, sensor: Sensor, evidence: Evidence, class_index: int, which: list[int], matches: list[Match]
+    ) -> NDArray[np.float64]:
+        """Return what a calibration leaves of the views of some frames with one class and background, (k, p, p)."""
+        background = matches[0].background
+        renderer = self._any_rendered().renderer(class_index)
+        views = Views(*(np.array([getattr(match, name) for match in matches]) for name in VIEW))
+        image = renderer.render_views(views, background=background, workers=self._workers)
+        slope = renderer.jacobian(
+            *(getattr(views, name) for name in VIEW),
+            background=background, parameters=self.free, workers=self._workers,
+        )  # fmt: skip
+        if self.on == "phasors":  # the albedo, which is fitted too, takes up part of an error
+            alone = image if background is None else renderer.render_views(views, workers=self._workers)
+            slope = np.concatenate([slope, alone.phasor[:, None]], axis=1)
+        by_fields = calibrated_slopes(renderer, sensor, views, image, background, self._workers)
+        use = counts(image.phasor, image.intensity, sensor).reshape(len(which), -1) & self._used
+        weight = np.where(use, evidence.weight[which], 0.0)
+        phasor = image.phasor.reshape(len(which), -1)
+        if self.unknown:
+            residual = sensor.metres_per_radian * np.angle(evidence.value[which] * phasor.conj())
+            weight = np.where(weight * residual**2 > _STRANGE_SIGMA**2, 0.0, weight)
+
+        def whitened(slopes: NDArray[np.complex128]) -> NDArray[np.float64]:
+            flat, root = slopes.reshape(*slopes.shape[:2], -1), np.sqrt(weight)[:, None]
+            if self.on == "phasors":
+                return np.concatenate([flat.real * root, flat.imag * root], axis=2)
+            turn = np.divide(1.0, phasor, out=np.zeros_like(phasor), where=phasor != 0)
+            return np.asarray(sensor.metres_per_radian * (flat * turn[:, None]).imag * root)
+
+        rows = whitened(slope)
+        information = rows @ rows.transpose(0, 2, 1)
+        p = len(self.free)
+        if self._prior_std:
+            information[:, :p, :p] += np.diag(np.array(self._prior_std) ** -2.0)
+        inverse = np.asarray(np.linalg.pinv(information, hermitian=True), np.float64)
+        return carried_covariance(inverse, rows, whitened(by_fields), calibrated_covariance(sensor))[:, :p, :p]
+
+    def _any_rendered(self) -> RenderedModel:
+        """Return a model that renders the landmarks of the bank, built when it is first needed."""
+        if self._rendered is None:
+            self._rendered = RenderedModel(self.bank, self.background, self._workers)
+        return self._rendered
 
     def _answer(
         self,

@@ -75,6 +75,9 @@ class Match:
         a covariance.
     background : Background or None
         What the match took to stand behind the landmark; estimated where the matcher was told to.
+    systematic : mapping of str to ndarray
+        What of `covariance` all frames of the camera share, by its cause: "calibration" and "declared". The rest is
+        noise.
     reason : {"", "no landmark", "poor fit", "undetermined", "ambiguous"}
         Why the answer is refused; empty if it is accepted. "poor fit": χ² fails its test. "undetermined": the frame
         leaves some free parameter open by more than the matcher tolerates. "ambiguous": another class or a view
@@ -99,6 +102,7 @@ class Match:
     weak_direction: Mapping[str, float] = field(default_factory=dict)
     background: Background | None = None
     reason: Reason = ""
+    systematic: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers and text, angles in degrees too; NaN as None, so that it is valid JSON."""
@@ -116,6 +120,7 @@ class Match:
             "height_m": plain(self.height_m),
             "free": list(self.free),
             "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "systematic": {name: part.tolist() for name, part in self.systematic.items()},
             "chi2": plain(self.chi2),
             "dof": self.dof,
             "p_value": plain(self.p_value),

@@ -7,7 +7,7 @@ upper pixels give the class, and the answer lies on the bank's grid. Maximum lik
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from typing import Literal
 
@@ -32,6 +32,7 @@ from phasemark.matcher.likelihood import Quantity
 from phasemark.matcher.match import Candidate, Match, Matches, Reason
 from phasemark.matcher.models import VIEW
 from phasemark.matcher.pruned import nearest_search
+from phasemark.matcher.systematic import SYSTEMATICS, check_systematic
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, wrap_difference_m
 
 METHODS = ("nearest", "refine")
@@ -82,6 +83,9 @@ class Matcher:
         Whether "refine" counts residuals beyond 3 σ linearly (Huber); the covariance is then the sandwich.
     bearing_std_rad : float
         How well the mount points at the landmark, where `free` is None: the standard deviation of a Gaussian prior.
+    systematic : collection of {"calibration", "declared"}
+        Which errors that all frames of the camera share are added to the covariance of "refine": what the calibration
+        of the frames' sensor leaves, and what the sensor declares of a pose. Both unless stated.
     tolerance_m, tolerance_rad : float
         How far off an accepted answer of "refine" may be. It is refused as "undetermined" where three standard
         deviations of a free length or angle exceed this, and as "ambiguous" where other classes keep a probability of
@@ -114,6 +118,7 @@ class Matcher:
         pixels: Pixels = "all",
         robust: bool = False,
         bearing_std_rad: float = BEARING_STD_RAD,
+        systematic: Collection[str] = SYSTEMATICS,
         tolerance_m: float = TOLERANCE_M,
         tolerance_rad: float = TOLERANCE_RAD,
         workers: int | None = None,
@@ -141,6 +146,7 @@ class Matcher:
                 pixels=pixels,
                 robust=robust,
                 bearing_std_rad=bearing_std_rad,
+                systematic=check_systematic(systematic),
                 tolerance_m=tolerance_m,
                 tolerance_rad=tolerance_rad,
                 workers=workers,

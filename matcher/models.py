@@ -253,6 +253,10 @@ class RenderedModel:
         self._limits = (near + 5e-3, far)
         """The lens outside the landmark, and the landmark before the wall."""
 
+    def renderer(self, class_index: int) -> Renderer:
+        """Return what renders one class of the bank."""
+        return self._renderers[class_index]
+
     def with_background(self, background: Background | None) -> RenderedModel:
         """Return the same model before another background."""
         other = object.__new__(RenderedModel)

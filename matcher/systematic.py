@@ -1,0 +1,137 @@
+"""Errors that all frames of a camera share, carried into the covariance of a view.
+
+A calibration leaves the fields κ of a sensor uncertain, with covariance C. With the Jacobian J of the residuals by the
+view, their weights W and the covariance P = (Jᵀ W J)⁻¹, an error δκ moves the estimate by −P Jᵀ W (∂f/∂κ) δκ to first
+order. So the covariance of the view grows by G C Gᵀ with G = P Jᵀ W ∂f/∂κ. Averaging frames does not reduce it. What a
+sensor declares beside that (`systematic_distance_m` and its neighbours) is added to the variances.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
+
+Systematic = Literal["calibration", "declared"]
+"""What a calibration leaves of the sensor's fields, and what the sensor declares of a pose."""
+SYSTEMATICS: tuple[Systematic, ...] = get_args(Systematic)
+
+_STEPS = {
+    "pitch_deg": 0.02,
+    "roll_deg": 0.02,
+    "half_angle_h_deg": 0.02,
+    "half_angle_v_deg": 0.02,
+    "bearing_offset_deg": 0.02,
+    "height_offset_m": 2e-4,
+}
+"""Fields that move an image, and the width of a difference in them."""
+_OFFSET = "range_offset_m"
+
+
+def check_systematic(names: Collection[str]) -> tuple[Systematic, ...]:
+    """Return names of systematic terms in their order.
+
+    Raises
+    ------
+    UsageError
+        A name is unknown.
+    """
+    for name in names:
+        if name not in SYSTEMATICS:
+            raise UsageError(f"'systematic' must be among {', '.join(SYSTEMATICS)}, got {name!r}")
+    return tuple(name for name in SYSTEMATICS if name in names)
+
+
+def declared_covariance(sensor: Sensor, free: Sequence[str]) -> NDArray[np.float64]:
+    """Return what a sensor declares of a pose, (p, p), metres and radians; zero where it declares nothing."""
+    std = {
+        "distance_m": sensor.systematic_distance_m,
+        "delta_rad": math.radians(sensor.systematic_delta_deg),
+        "bearing_rad": math.radians(sensor.systematic_bearing_deg),
+        "height_m": sensor.systematic_height_m,
+    }
+    return np.diag([std[name] ** 2 for name in free])
+
+
+def calibrated_fields(sensor: Sensor) -> tuple[str, ...]:
+    """Return which of a sensor's calibrated fields move what a frame shows."""
+    return tuple(name for name in sensor.calibration_fields if name in _STEPS or name == _OFFSET)
+
+
+def calibrated_covariance(sensor: Sensor) -> NDArray[np.float64]:
+    """Return the covariance of :func:`calibrated_fields`, (c, c), in the units of the fields."""
+    which = [sensor.calibration_fields.index(name) for name in calibrated_fields(sensor)]
+    return np.asarray(sensor.calibration_matrix[np.ix_(which, which)])
+
+
+def calibrated_slopes(
+    renderer: Renderer,
+    sensor: Sensor,
+    views: Views,
+    image: PhasorImages,
+    background: Background | None,
+    workers: int = 1,
+) -> NDArray[np.complex128]:
+    """Return ∂S/∂κ of the calibrated fields, (n, c, rows, cols), in units of |S| over the unit of the field.
+
+    The range offset is taken off measured frames, and a sensor that reports z has its ranges made with its half angles:
+    what that changes in the measured phase counts with the other sign.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        The landmark.
+    sensor : Sensor
+        The camera with its calibration; its optics are those of the renderer.
+    views : Views
+    image : PhasorImages
+        What is seen at the views.
+    background : Background, optional
+    workers : int
+        Threads.
+    """
+    names = calibrated_fields(sensor)
+    phasor = image.phasor
+    out = np.empty((len(phasor), len(names), *phasor.shape[1:]), np.complex128)
+    by_range = 1j * phasor / sensor.metres_per_radian
+    for k, name in enumerate(names):
+        if name == _OFFSET:
+            out[:, k] = by_range
+            continue
+        step = _STEPS[name]
+        moved = renderer.sensor.with_(**{name: getattr(renderer.sensor, name) + step})
+        there = renderer.seen_by(moved).render_views(views, background=background, workers=workers)
+        out[:, k] = (there.phasor - phasor) / step
+        if sensor.quantity == "z" and name.startswith("half_angle"):
+            stretch = sensor.axis_cosine() / moved.axis_cosine() - 1
+            out[:, k] -= by_range * np.nan_to_num(image.range_m) * stretch / step
+    return out
+
+
+def carried_covariance(
+    covariance: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    calibrated_rows: NDArray[np.float64],
+    calibrated: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return G C Gᵀ with G = P Jᵀ W K, (n, p, p).
+
+    Parameters
+    ----------
+    covariance : (n, p, p) float64
+        P, of noise alone.
+    rows : (n, p, residuals) float64
+        Whitened Jacobian √W J by the view, transposed.
+    calibrated_rows : (n, c, residuals) float64
+        Whitened Jacobian √W K by the calibrated fields, transposed.
+    calibrated : (c, c) float64
+        C.
+    """
+    gain = covariance @ (rows @ calibrated_rows.transpose(0, 2, 1))
+    return np.asarray(gain @ calibrated @ gain.transpose(0, 2, 1))

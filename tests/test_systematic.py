@@ -1,0 +1,133 @@
+"""Errors that all frames of a camera share are in the covariance of a view."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from phasemark import UsageError
+from phasemark.data import BankPlan, build_bank
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.matcher import Matcher, covers, cramer_rao, kalman_filter
+from phasemark.matcher.filters import noise_free
+from phasemark.matcher.systematic import calibrated_slopes
+from phasemark.render import Background, Frames, Renderer, Views, capture
+
+VIEW = ("distance_m", "delta_rad")
+FIELDS = ("pitch_deg", "half_angle_h_deg", "half_angle_v_deg", "bearing_offset_deg", "range_offset_m")
+STD = np.array([0.05, 0.03, 0.03, 0.1, 2e-3])
+N_CAMERAS = 60
+
+
+def calibrated(sensor, **more):
+    covariance = tuple(tuple(row) for row in np.diag(STD**2).tolist())
+    return sensor.with_(calibration_fields=FIELDS, calibration_covariance=covariance, **more)
+
+
+@pytest.fixture(scope="module", params=["pmd-16x16", "vl53l5cx-8x8"])
+def bank(request):
+    plan = BankPlan(
+        classes=("cone",), sensor=request.param, layout="full",
+        distance_m=tuple(np.round(np.arange(0.9, 1.11, 0.02), 3)), delta_deg=tuple(range(0, 180, 2)),
+    )  # fmt: skip
+    return build_bank(plan, workers=1)
+
+
+@pytest.mark.parametrize("wall_m", [None, 3.0])
+def test_slopes_by_calibrated_fields_are_those_of_frames_made_with_other_fields(bank, wall_m):
+    # the oracle measures twice: with the camera as it is, and read with a camera that is a little different
+    sensor, background = calibrated(bank.sensor), None if wall_m is None else Background(wall_m=wall_m)
+    renderer = Renderer(bank.mesh("cone"), sensor, albedo=0.8)
+    views = Views.broadcast(1.013, 0.7, 0.0, 0.0)
+    image = renderer.render_views(views, background=background)
+    slopes = calibrated_slopes(renderer, sensor, views, image, background)
+    inside = (image.coverage[0] > 0.999) | (image.coverage[0] < 1e-4)  # no edge, whose slope is another over each step
+    for k, (name, step) in enumerate(zip(FIELDS, (1e-3, 1e-3, 1e-3, 1e-3, 1e-5), strict=True)):
+        other = sensor.with_(**{name: getattr(sensor, name) + step})
+        there = Renderer(bank.mesh("cone"), other, albedo=0.8).render_views(views, background=background)
+        model = there.range_m[0] - image.range_m[0]
+        measured = np.zeros(model.shape)
+        if sensor.quantity == "z":
+            measured = image.range_m[0] * (sensor.axis_cosine() / other.axis_cosine() - 1)
+        expected = (model - measured) / step
+        lit = inside & (image.phasor[0] != 0)
+        found = sensor.metres_per_radian * (slopes[0, k][lit] / image.phasor[0][lit]).imag
+        if name == "range_offset_m":
+            np.testing.assert_allclose(found, 1.0, rtol=1e-9)  # m per m
+            continue
+        flat = np.abs(expected[lit]) < 0.05  # m per degree; not where an edge lies within the wider of the two steps
+        assert flat.sum() >= 2
+        np.testing.assert_allclose(found[flat], expected[lit][flat], atol=2e-3)
+
+
+def test_views_measured_by_many_cameras_scatter_as_the_covariance_says(bank):
+    # every camera differs from the calibrated one by a draw from the calibration's covariance; N = 60, 99.9 %
+    rng, sensor = np.random.default_rng(11), bank.sensor
+    matcher = Matcher(bank, "refine", free=VIEW)
+    renderer = Renderer(bank.mesh("cone"), sensor, albedo=0.8)
+    views = np.column_stack([rng.uniform(0.95, 1.05, N_CAMERAS), rng.uniform(0.2, 1.3, N_CAMERAS)])
+    taken = []
+    for view in views:
+        off = dict(zip(FIELDS, (STD * rng.standard_normal(len(FIELDS))).tolist(), strict=True))
+        true = sensor.with_(**{name: getattr(sensor, name) + value for name, value in off.items()})
+        frames = capture(renderer.seen_by(true).render(*view), true, rng=rng, n_frames=10)
+        if sensor.quantity == "z":  # a file holds z, and is read with the calibrated camera's angles
+            frames.range_m *= true.axis_cosine() / sensor.axis_cosine()
+        taken.append(frames)
+
+    def joined(name):
+        arrays = [getattr(frames, name) for frames in taken]
+        return None if arrays[0] is None else np.concatenate(arrays)
+
+    frames = Frames(
+        joined("range_m"), joined("amplitude_e"), joined("intensity_e"), flags=joined("flags"),
+        sensor=calibrated(sensor),
+    )  # fmt: skip
+    matches = list(matcher.match(kalman_filter(frames)))
+    known = [k for k, match in enumerate(matches) if set(match.systematic) == {"calibration"}]
+    assert len(known) > 0.9 * N_CAMERAS
+    error = [
+        [matches[k].distance_m - views[k, 0], math.remainder(matches[k].delta_rad - views[k, 1], math.pi)]
+        for k in known
+    ]
+    total = [matches[k].covariance for k in known]
+    noise = [matches[k].covariance - matches[k].systematic["calibration"] for k in known]
+    n = len(known)
+    assert stats.binom.ppf(5e-4, n, 0.95) <= covers(error, total).sum()
+    assert covers(error, noise).sum() < stats.binom.ppf(5e-4, n, 0.95)  # noise alone does not explain the errors
+
+
+def test_each_term_can_be_left_out_and_is_listed(bank):
+    sensor = calibrated(bank.sensor, systematic_delta_deg=0.5)
+    frames = noise_free(Renderer(bank.mesh("cone"), sensor, albedo=0.8).render(1.0, 0.7), 50)
+    by_terms = {
+        terms: Matcher(bank, "refine", free=VIEW, systematic=terms).match(frames)[0]
+        for terms in ((), ("calibration",), ("declared",), ("calibration", "declared"))
+    }
+    noise = by_terms[()].covariance
+    for terms, match in by_terms.items():
+        assert set(match.systematic) == set(terms)
+        total = noise + sum(match.systematic.values(), np.zeros((2, 2)))
+        np.testing.assert_allclose(match.covariance, total, rtol=1e-12)
+        assert set(match.as_dict()["systematic"]) == set(terms)
+    declared = by_terms["declared",].systematic["declared"]
+    np.testing.assert_allclose(declared, np.diag([0.0, math.radians(0.5) ** 2]), rtol=1e-12)
+
+
+def test_the_bound_carries_the_same_terms(bank):
+    sensor = calibrated(bank.sensor, systematic_distance_m=3e-3)
+    renderer = Renderer(build_mesh(catalog()["cone"]), sensor, albedo=0.8)
+    views = Views.broadcast(1.0, 0.7)
+    plain = cramer_rao(renderer, views)
+    declared = cramer_rao(renderer, views, systematic=("declared",))
+    np.testing.assert_allclose(declared.covariance - plain.covariance, [np.diag([9e-6, 0.0])], atol=1e-18)
+    both = cramer_rao(renderer, views, systematic=("calibration", "declared"))
+    assert (np.linalg.eigvalsh(both.covariance - declared.covariance) > -1e-12).all()
+    # a range offset moves the distance one for one: at least its variance is in the bound
+    assert both.covariance[0, 0, 0] > declared.covariance[0, 0, 0] + 0.5 * STD[-1] ** 2
+
+
+def test_unknown_terms_are_named(bank):
+    with pytest.raises(UsageError, match="'systematic' must be among calibration, declared, got 'noise'"):
+        Matcher(bank, "refine", systematic=("noise",))
