@@ -466,7 +466,7 @@ def _blocks(stamps: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the block of time of each frame."""
     span = float(stamps[-1] - stamps[0])
     length = min(_BLOCK_S, max(span / _BLOCKS, _SHORTEST_BLOCK_S))
-    return ((stamps - stamps[0]) / length).astype(np.int64)
+    return np.asarray(np.floor((stamps - stamps[0]) / length), np.int64)
 
 
 def _recording(

@@ -347,7 +347,8 @@ class Recording:
 
     def prior_of(self, theta: _Float, zone: _Float, sizes: Sizes) -> tuple[_Float, _Float]:
         """Return the prior's precision and how far its mean is from a place, (P,) each, in natural units."""
-        precision, away = self.prior**-2, (self.assumed - theta)[self.columns] / self.scale
+        precision = np.asarray(1 / self.prior**2, np.float64)
+        away: _Float = (self.assumed - theta)[self.columns] / self.scale
         if not self.zones:
             return precision, away
         zone_precision = np.full(self.pixels, (_ZONE_UNIT_M / sizes.zone_m) ** 2)
@@ -360,7 +361,7 @@ class Recording:
         """Return the Gauss–Newton step and the covariance, in natural units."""
         information, gradient, _, _ = linear.marginal(sizes, keep)
         precision, away = self.prior_of(theta, zone, sizes)
-        covariance = np.linalg.inv(information + np.diag(precision))
+        covariance: _Float = np.asarray(np.linalg.inv(information + np.diag(precision)), np.float64)
         return covariance @ (gradient + precision * away), covariance
 
     def moved(self, theta: _Float, zone: _Float, step: _Float) -> tuple[_Float, _Float]:
