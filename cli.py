@@ -1460,7 +1460,7 @@ def _calibrate(
     poses: Annotated[
         Path,
         typer.Option(
-            "--poses", metavar="CSV", help="Columns distance_m,delta_deg[,bearing_deg] or x_m,y_m,heading_deg."
+            "--poses", metavar="CSV", help="Columns distance_m,delta_deg[,bearing_deg] or x_m,y_m,heading_deg [,t_ms]."
         ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
@@ -1491,6 +1491,17 @@ def _calibrate(
         typer.Option("--bearing", metavar="DEG", help="Where the camera sees it if 0 is stated, likewise."),
     ] = None,
     albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmark, likewise.")] = None,
+    moving: Annotated[
+        bool, typer.Option("--moving", help="A moving camera: each frame has a pose of its own, by time stamps.")
+    ] = False,
+    delay_ms: Annotated[
+        float | None,
+        typer.Option("--delay-ms", metavar="MS", help="Fixed delay: added to the stamp of a frame to get its time."),
+    ] = None,
+    zones: Annotated[
+        bool | None,
+        typer.Option("--zones/--no-zones", help="Offsets of zones and noise law of a direct sensor; with --moving."),
+    ] = None,
     position_std: Annotated[
         float | None, typer.Option("--position-std", metavar="M", help="How well the places of the lens are known.")
     ] = None,
@@ -1531,14 +1542,15 @@ def _calibrate(
 ) -> None:
     """Find how a camera is mounted from frames of a landmark taken at known positions.
 
-    Pitch, roll, height, bearing, field of view, range offset and, from amplitudes, the landmark's albedo: --free and
-    --fix take pitch, roll, height, bearing, half_angle_h, half_angle_v (both: fov), range_offset and albedo.
+    Pitch, roll, height, bearing, field of view, range offset, from amplitudes the landmark's albedo, and with --moving
+    the delay of the stamps: --free and --fix take pitch, roll, height, bearing, half_angle_h, half_angle_v (both: fov),
+    range_offset, albedo and delay. A result that cannot be trusted is not written without --force (exit code 3).
     """
     import io as bytes_io
 
     from phasemark.data import read_frames, write_atomically
     from phasemark.data.executor import processors
-    from phasemark.matcher import PoseStd, calibrate, filter_poses, frames_of_poses, read_poses
+    from phasemark.matcher import PoseStd, calibrate, filter_poses, frames_of_poses, kalman_filter, read_poses
     from phasemark.matcher.calibrate_model import Mounting
     from phasemark.matcher.calibrate_report import calibration_dict, calibration_toml, residual_picture
 
@@ -1571,10 +1583,20 @@ def _calibrate(
         )
         for path in frames
     ]
-    filtered = filter_poses(
-        frames_of_poses(measured, known),
-        on,  # type: ignore[arg-type]  # calibrate says what is right
-    )
+    if moving:
+        if len(measured) != 1:
+            raise UsageError(f"--moving takes one recording, got {len(measured)} files")
+        filtered = kalman_filter(measured[0].each_a_position())
+    else:
+        filtered = filter_poses(
+            frames_of_poses(measured, known),
+            on,  # type: ignore[arg-type]  # calibrate says what is right
+        )
+    fixed = [] if fix is None else _names(fix)
+    if delay_ms is not None:
+        if not moving:
+            raise UsageError("--delay-ms takes --moving: still poses have no delay")
+        fixed.append("delay")
     bright = float(mesh.metadata.get("albedo", 0.8)) if albedo is None else albedo
     if not 0 < bright <= 1:
         raise UsageError(f"--albedo must be in (0, 1], got {bright:g}")
@@ -1583,20 +1605,29 @@ def _calibrate(
         start = replace(start, height_m=height)
     if bearing is not None:
         start = replace(start, bearing_rad=math.radians(bearing))
+    if delay_ms is not None:
+        start = replace(start, delay_s=delay_ms / 1e3)
     with _Progress("rendering poses") as progress:
         found = calibrate(
             mesh,
             filtered,
             known,
             free=None if free is None else _names(free),
-            fixed=() if fix is None else _names(fix),
+            fixed=fixed,
             start=start,
             on=on,  # type: ignore[arg-type]  # calibrate says what is right
             background=background,
             pose_std=stds,
             reports_z=quantity == "z" or None,
+            moving=moving,
+            zones=zones,
             workers=workers or min(processors(), 4),
             progress=progress,
+        )
+    if found.doubts and not force:
+        raise InputFileError(
+            f"nothing was written, for the calibration cannot be trusted: {'; '.join(found.doubts)}. Likely cause:"
+            f" {found.cause} (--force writes it all the same)"
         )
     buffer = bytes_io.BytesIO()
     residual_picture(found).savefig(buffer, format="png", dpi=100)
@@ -1648,11 +1679,11 @@ def _calibration_target(landmark: str, class_name: str | None, sensor: str | Non
 
 def _echo_calibration(found: Calibration) -> None:
     """Print every number with its standard deviation and use, their correlations, the test of the fit and notes."""
-    from phasemark.matcher.calibrate_model import NAMES, PARAMETERS
-    from phasemark.matcher.calibrate_report import USES, shown, shown_std
+    from phasemark.matcher.calibrate_model import PARAMETERS
+    from phasemark.matcher.calibrate_report import USES, shown, shown_names, shown_std
 
     rows = []
-    for name in NAMES:
+    for name in shown_names(found):
         parameter = PARAMETERS[name]
         use = USES.get(name) or f"{parameter.field} of the sensor"
         rows.append((name, shown(found, name), shown_std(found, name), parameter.unit, use))
@@ -1668,8 +1699,13 @@ def _echo_calibration(found: Calibration) -> None:
         )
     typer.echo(f"\nχ² = {found.chi2:.6g}, {found.dof} degrees of freedom, p = {found.p_value:.3g}")
     typer.echo(f"standard deviations from {found.covariance_from}")
+    before, after = found.held_out_m
+    if math.isfinite(after):
+        typer.echo(f"residuals of held-out frames, r.m.s.: {1e3 * before:.3g} mm before, {1e3 * after:.3g} mm after")
     for note in found.notes:
         typer.echo(f"note: {note}")
+    for doubt in found.doubts:
+        typer.echo(f"not to be trusted: {doubt}; likely cause: {found.cause}")
 
 
 @app.command("demo")

@@ -1,32 +1,36 @@
 """How a camera is really mounted: calibration from frames of a landmark taken at known positions.
 
-:func:`calibrate` finds the mounting (pitch, roll, height, bearing, field of view, range offset and, from amplitudes,
-the landmark's albedo) under which filtered frames are most likely, with its covariance, a test of the fit, and
-sentences on what these poses cannot tell.
+:func:`calibrate` finds the mounting (pitch, roll, height, bearing, field of view, range offset, from amplitudes the
+landmark's albedo, and from a moving camera the delay of its stamps) under which filtered frames are most likely, with
+its covariance, a test of the fit, and sentences on what these poses cannot tell.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy import stats
 
 from phasemark import UsageError
 from phasemark.data.progress import Progress, counter
 from phasemark.matcher.calibrate_fit import Fit, Knowledge, Place, inverse
-from phasemark.matcher.calibrate_model import NAMES, PARAMETERS, CalibrationModel, Mounting
+from phasemark.matcher.calibrate_judge import doubts_about, likely_cause
+from phasemark.matcher.calibrate_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel, Mounting
 from phasemark.matcher.calibrate_notes import advice, named, observability_notes, odd_pose_notes
 from phasemark.matcher.calibrate_pose_errors import estimate_pose_std
 from phasemark.matcher.calibrate_poses import KnownPoses, PoseStd
+from phasemark.matcher.calibrate_recording import Recorded, Recording, prior_std
+from phasemark.matcher.calibrate_track import LONGEST_GAP_S, PoseTrack
 from phasemark.matcher.estimator import MIN_RETURNS, p_values_of
 from phasemark.matcher.filters import FilteredFrames, PixelState, assumed_std_m, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood import Evidence, Quantity
-from phasemark.render import Background, Frames, Sensor, wrap_difference_m
+from phasemark.render import Background, Frames, Sensor, wrap_difference_m, wrap_range_m
 from phasemark.render.sensor_file import rounded
 
 FEWEST_POSES = 3
@@ -51,6 +55,20 @@ _POSES_FOR_SANDWICH = 3
 _FAR_RETURNS = 0.02
 """Share of pixels that may return where the model has nothing, before something is taken to stand there."""
 _OUT_OF_VIEW_RAD = math.radians(5.0)
+_DELAY_REACH_S = 0.3
+"""A free delay may be up to so long: frames nearer to a gap between poses are left out."""
+_BLOCK_S, _BLOCKS = 2.0, 20
+"""Length of a block of time, seconds; at most so many blocks are wanted of a short recording."""
+_SHORTEST_BLOCK_S = 0.5
+_MOST_FRAMES = 800
+"""Frames of a recording that enter; more are thinned evenly."""
+_FROM_PRIOR = 0.7
+"""Standard deviation over that of the prior, from which the data are said not to tell a number."""
+_DELAY_UNKNOWN_S = 0.05
+_DELAY_NOTED_S, _DELAY_GAIN = 0.015, 0.8
+"""A stated delay is doubted if one farther away lowers the mean square residual to that share."""
+_NEARBY_M, _FEWEST_NEARBY = 0.25, 0.1
+"""Residuals from which a fit can start, and the share of pixels that must have them."""
 _UNITS = {
     0.001: "1000 times",
     0.01: "100 times",
@@ -93,6 +111,15 @@ class Calibration:
         Standard deviation of the filtered range; NaN where a pixel does not count.
     notes : tuple of str
         Sentences on what is not observable, what does not fit, and what to do.
+    doubts : tuple of str
+        Why the result should not be used; empty for a calibration that can be trusted.
+    cause : str
+        What is likely wrong, if there are doubts.
+    held_out_m : (before, after)
+        Root mean square of the residuals of frames that were left out in turn: with the mounting assumed and with
+        that from the other frames. NaN where it is not known.
+    left_out : float
+        Share of the pixels that see the landmark by the model, but disagree with it and have no weight.
     """
 
     sensor: Sensor
@@ -114,6 +141,10 @@ class Calibration:
     residual_before_m: NDArray[np.float64]
     range_std_m: NDArray[np.float64]
     notes: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
+    cause: str = ""
+    held_out_m: tuple[float, float] = (math.nan, math.nan)
+    left_out: float = 0.0
 
     def value(self, name: str) -> float:
         """Return one number of the mounting, radians, metres or albedo."""
@@ -144,9 +175,9 @@ def check_names(names: Sequence[str], what: str) -> tuple[str, ...]:
     spelled: set[str] = set()
     for name in names:
         spelled |= {"half_angle_h", "half_angle_v"} if name == "fov" else {name}
-        if name != "fov" and name not in NAMES:
-            raise UsageError(f"{what} must be among {', '.join(NAMES)} and fov (both half angles), got {name!r}")
-    return tuple(name for name in NAMES if name in spelled)
+        if name != "fov" and name not in ALL_NAMES:
+            raise UsageError(f"{what} must be among {', '.join(ALL_NAMES)} and fov (both half angles), got {name!r}")
+    return tuple(name for name in ALL_NAMES if name in spelled)
 
 
 def filter_poses(frames: Sequence[Frames], on: Quantity | Literal["auto"] = "auto") -> FilteredFrames:
@@ -186,6 +217,7 @@ def filter_poses(frames: Sequence[Frames], on: Quantity | Literal["auto"] = "aut
         np.concatenate([part.n_effective for part in parts]),
         first.sensor,
         any(part.std_from_scatter for part in parts),
+        joined("time_s"),
     )
 
 
@@ -211,6 +243,8 @@ def calibrate(
     background: Background | None = None,
     pose_std: PoseStd | None = None,
     reports_z: bool | None = None,
+    moving: bool = False,
+    zones: bool | None = None,
     workers: int = 1,
     progress: Progress | None = None,
 ) -> Calibration:
@@ -250,6 +284,12 @@ def calibrate(
     reports_z : bool, optional
         Whether the camera measures z, from which its ranges were made with the half angles it is thought to have; None:
         what the sensor says of itself.
+    moving : bool
+        Whether the camera moved: every frame then has a pose of its own, interpolated from `poses.time_s` at its stamp
+        plus the delay, and the delay is among what can be free. On ranges.
+    zones : bool, optional
+        Whether to estimate the offsets of zones, the noise law and systematic errors of a direct sensor; None: with
+        `moving`.
     workers : int
         Threads that render.
     progress : callable (done, total), optional
@@ -269,17 +309,34 @@ def calibrate(
     has_light = frames.amplitude_e is not None and frames.intensity_e is not None and sensor.kind == "phase"
     if on not in ("auto", "ranges", "phasors"):
         raise UsageError(f"'on' must be auto, ranges or phasors, got {on!r}")
-    quantity: Quantity = ("phasors" if has_light else "ranges") if on == "auto" else on
-    names = NAMES if free is None else check_names(free, "'free'")
+    recorded = moving or bool(zones)
+    if recorded and on == "phasors":
+        raise UsageError("'on' must be auto or ranges for a moving camera or offsets of zones, got 'phasors'")
+    if zones and sensor.kind != "direct":
+        raise UsageError("offsets of zones belong to sensors of 'kind' = 'direct'")
+    quantity: Quantity = ("phasors" if has_light and not recorded else "ranges") if on == "auto" else on
+    names = (ALL_NAMES if moving else NAMES) if free is None else check_names(free, "'free'")
+    if "delay" in names and not moving:
+        raise UsageError("the delay takes a moving camera: give --moving, and time stamps of frames and poses")
+    if recorded:
+        if "albedo" in names and free is not None:
+            raise UsageError(
+                "the albedo cannot be free for a moving camera or with offsets of zones: give --fix albedo"
+            )
+        names = tuple(name for name in names if name != "albedo")
     lit = quantity == "phasors" or background is not None or poses.wall_m is not None
     if free is None and not lit:
         names = tuple(name for name in names if name != "albedo")
     kept = check_names(fixed, "'fixed'")
     names = tuple(name for name in names if name not in kept)
-    _check(frames, poses, names, lit)
-    evidence = Evidence.from_frames(frames, quantity)
     assumed = start or Mounting.of_sensor(sensor, albedo)
     z = sensor.quantity == "z" if reports_z is None else reports_z
+    if recorded:
+        whole = _Job(mesh, background, assumed, names, z, zones is not False and sensor.kind == "direct", workers)
+        return _from_recording(whole, frames, poses, moving, counter(progress, _USUAL_RENDERINGS))
+    frames = _without_zones(frames)
+    _check(frames, poses, names, lit)
+    evidence = Evidence.from_frames(frames, quantity)
     model = CalibrationModel(
         mesh,
         sensor,
@@ -312,7 +369,365 @@ def calibrate(
             place = fit.solve(place.theta, place.use, place.shift)
     knowledge = fit.knowledge(place)
     _check_observable(knowledge.information, fit, poses)
-    return _concluded(fit, place, knowledge, frames, assumed, edges, estimated)
+    found = _concluded(fit, place, knowledge, frames, assumed, edges, estimated)
+    held_out = _leave_one_out(fit, place, found)
+    doubts = doubts_about(place.theta, assumed.vector, names, held_out)
+    cause = ""
+    if doubts:
+        job = _Job(mesh, background, assumed, tuple(n for n in names if n != "albedo"), z, False, workers)
+        cause = _cause(job, frames, poses, edges)
+    return replace(found, doubts=tuple(doubts), cause=cause, held_out_m=held_out)
+
+
+def _leave_one_out(fit: Fit, place: Place, found: Calibration) -> tuple[float, float]:
+    """Return the r.m.s. residual of each pose with the mounting assumed, and with that of all other poses.
+
+    The second by the jackknife of the linearised problem: without pose k the mounting moves by −(H − H_k)⁻¹ g_k.
+    """
+    if len(fit.evidence.weight) <= FEWEST_POSES:
+        return math.nan, math.nan
+    linear = fit.linear(place)
+    by_pose, _ = linear.gradients(place.residual, place.u)
+    own = linear.pose_information()
+    slope, _ = fit.model.slopes(place.theta, place.shift, fit.free, "ranges")
+    slope_m = fit.evidence.sensor.metres_per_radian * slope.imag
+    after = found.residual_m.reshape(len(by_pose), -1).copy()
+    before = found.residual_before_m.reshape(after.shape)
+    for k, gradient in enumerate(by_pose):
+        step = inverse(linear.information - own[k], fit.scale) @ gradient
+        after[k] += np.einsum("pr,p->r", slope_m[k], np.clip(step, -10 * fit.scale, 10 * fit.scale))
+    both = np.isfinite(before) & np.isfinite(after)
+    if not both.any():
+        return math.nan, math.nan
+    return tuple(math.sqrt(float((one[both] ** 2).mean())) for one in (before, after))  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What a recording is calibrated with."""
+
+    mesh: trimesh.Trimesh
+    background: Background | None
+    assumed: Mounting
+    names: tuple[str, ...]
+    reports_z: bool
+    zones: bool
+    workers: int
+
+
+def _without_zones(frames: FilteredFrames) -> FilteredFrames:
+    """Take the stated offsets of zones off; the range offset stays, for it is estimated."""
+    if not frames.sensor.zone_offset_m:
+        return frames
+    return replace(frames, range_m=frames.range_m - frames.sensor.zone_offsets)
+
+
+def _track_of(frames: FilteredFrames, poses: KnownPoses, job: _Job) -> tuple[PoseTrack, NDArray[np.intp], list[str]]:
+    """Return the poses by time, the frames that have one in the order of time, and notes on what was left out."""
+    if frames.time_s is None:
+        raise UsageError("the frames have no time stamps: a moving camera takes a recording with a column t_ms or t_s")
+    track = PoseTrack.of(poses)
+    stamps = frames.time_s
+    repeated = np.isin(
+        stamps, [stamp for stamp, n in zip(*np.unique(stamps, return_counts=True), strict=True) if n > 1]
+    )
+    backwards = stamps < np.maximum.accumulate(stamps)
+    delay = job.assumed.delay_s
+    reach = max(_DELAY_REACH_S, abs(delay)) if "delay" in job.names else 0.0
+    known = track.known(stamps + delay - reach, stamps + delay + reach)
+    returned = (frames.state == PixelState.RETURN).reshape(len(frames), -1).sum(axis=1) >= MIN_RETURNS
+    index = np.flatnonzero(~repeated & ~backwards & known & returned)
+    index = index[np.argsort(stamps[index], kind="stable")]
+    if len(index) < max(FEWEST_POSES, len(job.names)):
+        raise UsageError(
+            f"{len(index)} of {len(frames)} frames have a pose at their time: frames are stamped from"
+            f" {stamps.min():.6g} to {stamps.max():.6g} s and poses from {track.pieces[0][0]:.6g} to"
+            f" {track.pieces[-1][1]:.6g} s; are both in one clock and in the unit of their column?"
+        )
+    notes = []
+    for n, what in (
+        (track.dropped, "poses were left out, for their stamps repeat or run backwards"),
+        (int((repeated | backwards).sum()), "frames were left out, for their stamps repeat or run backwards"),
+        (
+            int((~known & ~repeated & ~backwards).sum()),
+            f"frames were left out, for no poses within {LONGEST_GAP_S:g} s of each other surround them",
+        ),
+    ):
+        if n:
+            notes.append(f"{n} {what}.")
+    if len(index) > _MOST_FRAMES:
+        notes.append(f"Of {len(index)} frames {_MOST_FRAMES} entered, evenly spaced.")
+        index = index[np.linspace(0, len(index) - 1, _MOST_FRAMES).round().astype(int)]
+    return track, index, notes
+
+
+def _blocks(stamps: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the block of time of each frame."""
+    span = float(stamps[-1] - stamps[0])
+    length = min(_BLOCK_S, max(span / _BLOCKS, _SHORTEST_BLOCK_S))
+    return np.asarray(np.floor((stamps - stamps[0]) / length), np.int64)
+
+
+def _recording(
+    job: _Job,
+    frames: FilteredFrames,
+    poses: KnownPoses,
+    track: PoseTrack | None,
+    edges: bool | None,
+    rendered: Callable[[], None] = lambda: None,
+) -> Recording:
+    """Set up the calibration of frames, one for each pose or by time."""
+    stamps = frames.time_s
+    moving = track is not None and stamps is not None
+    model = CalibrationModel(
+        job.mesh,
+        frames.sensor,
+        poses,
+        albedo=job.assumed.albedo,
+        background=job.background,
+        reports_z=job.reports_z,
+        workers=job.workers,
+        rendered=rendered,
+        track=track,
+        stamp_s=stamps if moving else None,
+    )
+    evidence = Evidence.from_frames(frames, "ranges")
+    if edges is None:
+        direct = frames.sensor.kind == "direct"
+        edges = model.has_background or not (direct or _returns_beside(model, evidence, job.assumed))
+    block = _blocks(stamps) if moving and stamps is not None else np.arange(len(frames))
+    return Recording(model, evidence, job.names, job.assumed.vector, block, edges=edges, zones=job.zones)
+
+
+def _poses_at(track: PoseTrack, times: NDArray[np.float64]) -> KnownPoses:
+    """Return the poses at some times, named by them."""
+    distance, delta, bearing, height = np.ascontiguousarray(track.at(times)[0].T)
+    place = tuple(f"pose at {time:.3f} s" for time in times)
+    return KnownPoses(distance, delta, bearing, height, place=place, time_s=times)
+
+
+def _from_recording(
+    job: _Job, frames: FilteredFrames, poses: KnownPoses, moving: bool, rendered: Callable[[], None]
+) -> Calibration:
+    """Calibrate on many poses, by time or one for each frame."""
+    notes: list[str] = []
+    track = None
+    if not job.names:
+        raise UsageError("nothing is free: there is nothing to calibrate")
+    if moving:
+        if poses.wall_m is not None:
+            raise UsageError("'wall_m' belongs to still poses: leave it out for a moving camera")
+        track, index, notes = _track_of(frames, poses, job)
+        frames = frames[index]
+        assert frames.time_s is not None
+        poses = _poses_at(track, frames.time_s + job.assumed.delay_s)
+    else:
+        _check(frames, poses, job.names, True)
+    recording = _recording(job, frames, poses, track, None, rendered)
+    if not moving:
+        _check_view(recording.model, recording.evidence, job.assumed)
+    _check_ranges(recording, job.assumed)
+    theta, _ = recording.approach(job.assumed.vector)
+    found = recording.solve(theta)
+    left_out = 1 - float(found.use.sum()) / max(int(found.candidates.sum()), 1)
+    std = np.sqrt(np.diag(found.covariance))
+    if "delay" in job.names and std[job.names.index("delay")] > _DELAY_UNKNOWN_S:
+        raise UsageError(
+            f"the delay cannot be told from this recording (± {1e3 * std[job.names.index('delay')]:.0f} ms): turn and"
+            " approach faster, or state it with --delay-ms and give --fix delay"
+        )
+    untold = [
+        name for name, one in zip(job.names, std, strict=True)
+        if one > _FROM_PRIOR * prior_std(name, job.assumed.vector)
+    ]  # fmt: skip
+    if untold:
+        notes.append(
+            f"The {named(untold)} {'are' if len(untold) > 1 else 'is'} not told by these frames and as assumed, within"
+            " the standard deviations shown."
+        )
+    notes += _recording_notes(found, left_out)
+    doubts = doubts_about(found.theta, job.assumed.vector, job.names, found.held_out_m, left_out)
+    if moving and "delay" not in job.names:
+        doubts += _delay_doubts(job, frames, poses, recording, track)
+    cause = _cause(job, frames, poses, recording.edges, track) if doubts else ""
+    mounting = Mounting.of_vector(found.theta)
+    if moving and track is not None and frames.time_s is not None:
+        poses = _poses_at(track, frames.time_s + mounting.delay_s)
+    beside = found.residual_m - _of_pose_errors(recording, found)
+    chi2 = np.where(found.use, (beside / found.std_m) ** 2, 0.0).sum(axis=1)
+    dof = int(found.use.sum()) - len(job.names)
+    shape = found.residual_m.shape[0], frames.sensor.rows, frames.sensor.cols
+    sensor = _calibrated(frames.sensor, mounting, job.names, found.covariance)
+    if job.zones:
+        sensor = _with_zones(sensor, found, shape[1:])
+    return Calibration(
+        sensor=sensor,
+        base=frames.sensor,
+        mounting=mounting,
+        assumed=job.assumed,
+        free=job.names,
+        covariance=found.covariance,
+        covariance_from="noise, slow errors and weak priors (restricted maximum likelihood)",
+        chi2=found.chi2,
+        dof=dof,
+        p_value=float(stats.chi2.sf(found.chi2, max(dof, 1))),
+        on="ranges",
+        poses=poses,
+        pose_shift=found.pose_error[:, :3],
+        pose_chi2=chi2,
+        pose_residuals=found.use.sum(axis=1),
+        residual_m=np.where(found.use, found.residual_m, np.nan).reshape(shape),
+        residual_before_m=np.where(found.use, found.before_m, np.nan).reshape(shape),
+        range_std_m=np.where(found.use, found.std_m, np.nan).reshape(shape),
+        notes=tuple(notes),
+        doubts=tuple(doubts),
+        cause=cause,
+        held_out_m=found.held_out_m,
+        left_out=left_out,
+    )
+
+
+def _check_ranges(recording: Recording, assumed: Mounting) -> None:
+    """Refuse ranges that are nowhere near those that the model expects."""
+    images = recording.images(assumed.vector)
+    seen = recording.candidates(images)
+    if not seen.any():
+        raise UsageError(
+            "no pixel sees the landmark alone and returns something: do poses, landmark and frames belong together?"
+        )
+    sensor = recording.evidence.sensor
+    measured = recording.evidence.seen.range_m[seen]
+    expected = measured - recording.residual(images)[seen]
+    if (np.abs(measured - expected) < _NEARBY_M).mean() >= _FEWEST_NEARBY:
+        return
+    ratio = float(np.median(measured / np.maximum(wrap_range_m(expected, sensor), 1e-6)))
+    unit = next((text for factor, text in _UNITS.items() if 0.6 < ratio / factor < 1.6), None)
+    hint = f", about {unit} {'more' if ratio > 1 else 'less'}: are both in the units stated?" if unit else ""
+    raise UsageError(
+        f"the landmark should be {np.median(expected):.3g} m away, but the ranges are {np.median(measured):.3g} m"
+        f" (medians){hint or ': do poses, landmark and frames belong together?'}"
+    )
+
+
+def _delay_doubts(
+    job: _Job, frames: FilteredFrames, poses: KnownPoses, fixed: Recording, track: PoseTrack | None
+) -> list[str]:
+    """Say if another delay than the one stated fits much better."""
+    freed = _recording(replace(job, names=(*job.names, "delay")), frames, poses, track, fixed.edges)
+    start = job.assumed.vector
+    with_it, without = freed.approach(start)[0], fixed.approach(start)[0]
+    moved = float(with_it[ALL_NAMES.index("delay")]) - job.assumed.delay_s
+    if abs(moved) < _DELAY_NOTED_S or freed.misfit(with_it) > _DELAY_GAIN * fixed.misfit(without):
+        return []
+    return [f"frames fit much better {1e3 * moved:+.0f} ms from the delay stated, {1e3 * job.assumed.delay_s:.0f} ms"]
+
+
+def _of_pose_errors(recording: Recording, found: Recorded) -> NDArray[np.float64]:
+    """Return what the estimated errors of the poses add to ranges, (K, pixels)."""
+    _, pose = recording.slopes(found.theta)
+    return np.asarray(np.einsum("ks,ksr->kr", found.pose_error, pose))
+
+
+def _recording_notes(found: Recorded, left_out: float) -> list[str]:
+    """Say how many pixels disagreed, and what errors noise does not explain."""
+    frames = int((found.use.sum(axis=1) > 0).sum())
+    notes = [
+        f"{int(found.use.sum())} pixels of {frames} frames counted; {100 * left_out:.1f} % of those that should see the"
+        " landmark disagreed with it and were left out."
+    ]
+    distance, delta, bearing, height, time = found.systematic
+    parts = [
+        text
+        for size, text in (
+            (distance, f"{1e3 * distance:.2g} mm in distance"),
+            (delta, f"{math.degrees(delta):.2g}° in δ"),
+            (bearing, f"{math.degrees(bearing):.2g}° in bearing"),
+            (height, f"{1e3 * height:.2g} mm in height"),
+            (time, f"{1e3 * time:.2g} ms in time"),
+        )
+        if size > 0
+    ]
+    if parts:
+        notes.append(
+            f"Beyond noise, poses and ranges disagree by {', '.join(parts)} (standard deviations); all but the last are"
+            " systematic errors of the sensor file."
+        )
+    return notes
+
+
+def _with_zones(sensor: Sensor, found: Recorded, shape: tuple[int, int]) -> Sensor:
+    """Return the sensor with zone offsets, noise law and systematic errors."""
+    constant, shot, ambient = found.noise
+    distance, delta, bearing, height, _ = found.systematic
+    table = tuple(tuple(row) for row in found.zone_m.reshape(shape).tolist())
+    return sensor.with_(
+        zone_offset_m=rounded(table),
+        range_std_m=rounded(constant),
+        range_shot_std_m=rounded(shot),
+        range_ambient_std_m=rounded(ambient),
+        systematic_distance_m=rounded(float(distance)),
+        systematic_delta_deg=rounded(math.degrees(delta)),
+        systematic_bearing_deg=rounded(math.degrees(bearing)),
+        systematic_height_m=rounded(float(height)),
+    )
+
+
+def _cause(job: _Job, frames: FilteredFrames, poses: KnownPoses, edges: bool, track: PoseTrack | None = None) -> str:
+    """Say what is likely wrong, by what fits much better than what was stated."""
+
+    def misfit(job: _Job, frames: FilteredFrames, poses: KnownPoses, track: PoseTrack | None) -> tuple[float, float]:
+        recording = _recording(job, frames, poses, track, edges)
+        theta, _ = recording.approach(job.assumed.vector)
+        away = (theta - job.assumed.vector)[recording.columns] / recording.scale / recording.prior
+        held = theta.copy()  # no farther than what can be
+        held[recording.columns] = (
+            job.assumed.vector[recording.columns] + np.clip(away, -3, 3) * recording.prior * recording.scale
+        )
+        return recording.misfit(held), float(theta[ALL_NAMES.index("delay")])
+
+    def other_quantity() -> tuple[float, str]:
+        cosine = frames.sensor.axis_cosine()
+        changed = frames.range_m * cosine if job.reports_z else frames.range_m / cosine
+        right, wrong = ("range", "z") if job.reports_z else ("z", "range")
+        other = replace(job, reports_z=not job.reports_z)
+        return (
+            misfit(other, replace(frames, range_m=changed), poses, track)[0],
+            f"the numbers are likely {right}, not {wrong}: give --quantity {right}",
+        )
+
+    def free_delay() -> tuple[float, str]:
+        cost, delay = misfit(replace(job, names=(*job.names, "delay")), frames, poses, track)
+        return cost, f"frames likely show the pose {1e3 * delay:+.0f} ms from their stamp: leave the delay free"
+
+    def reordered(which: NDArray[np.intp], sentence: str) -> Callable[[], tuple[float, str]]:
+        return lambda: (misfit(job, frames, poses[which], None)[0], sentence)
+
+    def mirrored() -> tuple[float, str]:
+        turned = replace(poses, delta_rad=-poses.delta_rad, bearing_rad=-poses.bearing_rad)
+        other = None
+        if track is not None:
+            other = track.mirrored()
+        return misfit(job, frames, turned, other)[
+            0
+        ], "angles of the poses likely have the other sign: counter-clockwise"
+
+    def flipped() -> tuple[float, str]:
+        arrays = {name: getattr(frames, name)[:, :, ::-1] for name in ("range_m", "std_m", "state", "n_effective")}
+        return misfit(job, replace(frames, **arrays), poses, track)[0], "images are likely mirrored: give --flip-h"
+
+    alternatives: list[tuple[str, Callable[[], tuple[float, str]]]] = [
+        ("quantity", other_quantity), ("mirror", mirrored), ("flip", flipped),
+    ]  # fmt: skip
+    if track is not None and "delay" not in job.names:
+        alternatives.append(("delay", free_delay))
+    if track is None:
+        order = np.arange(len(poses))
+        alternatives += [
+            ("order", reordered(order[::-1], "the poses are likely in the reverse order of the frames")),
+            ("order", reordered(np.roll(order, 1), "each frame likely belongs to the pose before: check the order")),
+            ("order", reordered(np.roll(order, -1), "each frame likely belongs to the next pose: check the order")),
+        ]
+    return likely_cause(misfit(job, frames, poses, track)[0], alternatives)
 
 
 def _check(frames: FilteredFrames, poses: KnownPoses, names: tuple[str, ...], lit: bool) -> None:
@@ -338,7 +753,7 @@ def _check(frames: FilteredFrames, poses: KnownPoses, names: tuple[str, ...], li
 
 def _check_view(model: CalibrationModel, evidence: Evidence, assumed: Mounting) -> None:
     """Refuse poses from which the landmark cannot be seen, and units that cannot be right."""
-    poses, seen = model.poses, evidence.seen
+    poses = model.poses
     edge = max(assumed.half_angle_h_rad, assumed.half_angle_v_rad) * math.sqrt(2) + _OUT_OF_VIEW_RAD
     reach = np.arctan2(model.reach_m, poses.distance_m)
     bearing = poses.bearing_rad + assumed.bearing_rad
@@ -358,11 +773,19 @@ def _check_view(model: CalibrationModel, evidence: Evidence, assumed: Mounting) 
             f"{poses.where(k)}: the lens would be in the landmark, {poses.distance_m[k]:g} m from its axis: distances"
             " are in metres, from lens to axis"
         )
-    nearest = np.array([np.percentile(r[m], 10) for r, m in zip(seen.range_m, seen.returned, strict=True)])
+    _check_units(model, evidence)
+
+
+def _check_units(model: CalibrationModel, evidence: Evidence) -> None:
+    """Refuse ranges and poses whose distances differ by a unit."""
+    poses, seen = model.poses, evidence.seen
+    nearest = np.array(
+        [np.percentile(r[m], 10) if m.any() else np.nan for r, m in zip(seen.range_m, seen.returned, strict=True)]
+    )
     away = np.abs(wrap_difference_m(seen.range_m - poses.distance_m[:, None], evidence.sensor))
     hit = (seen.returned & (away < model.reach_m + 0.3)).any(axis=1)
     if hit.mean() < 0.5:
-        ratio = float(np.median(nearest / poses.distance_m))
+        ratio = float(np.nanmedian(nearest / poses.distance_m))
         unit = next((text for factor, text in _UNITS.items() if 0.6 < ratio / factor < 1.6), None)
         hint = f", about {unit} {'more' if ratio > 1 else 'less'}: are both in the units stated?" if unit else ""
         k = int(np.flatnonzero(~hit)[0])
@@ -483,7 +906,7 @@ def _concluded(
     after = evidence.sensor.metres_per_radian * np.angle(evidence.value * place.images.phasor.conj())
     thought = evidence.sensor.metres_per_radian * np.angle(evidence.value * before.phasor.conj())
     return Calibration(
-        sensor=_mounted(sensor, mounting, fit.free),
+        sensor=_calibrated(sensor, mounting, fit.free, covariance, estimated, poses),
         base=sensor,
         mounting=mounting,
         assumed=assumed,
@@ -502,6 +925,44 @@ def _concluded(
         residual_before_m=np.where(place.use & (before.phasor != 0), thought, np.nan).reshape(shape),
         range_std_m=np.where(place.use, np.maximum(evidence.seen.weight, 1e-300) ** -0.5, np.nan).reshape(shape),
         notes=tuple(notes),
+    )
+
+
+def _calibrated(
+    sensor: Sensor,
+    mounting: Mounting,
+    free: Sequence[str],
+    covariance: NDArray[np.float64],
+    pose_std: PoseStd | None = None,
+    poses: KnownPoses | None = None,
+) -> Sensor:
+    """Return a sensor with its mounting and what is common to all its frames: the covariance of what was estimated.
+
+    What an earlier calibration estimated and this one left stays, uncorrelated with the rest.
+    """
+    there = _mounted(sensor, mounting, free)
+    known = [name for name in free if PARAMETERS[name].field is not None]
+    fields = [str(PARAMETERS[name].field) for name in known]
+    unit = np.array([PARAMETERS[name].shown if PARAMETERS[name].unit == "°" else 1.0 for name in known])
+    index = [list(free).index(name) for name in known]
+    own = covariance[np.ix_(index, index)] * np.outer(unit, unit)
+    older = [k for k, name in enumerate(sensor.calibration_fields) if name not in fields]
+    n = len(fields)
+    whole = np.zeros((n + len(older), n + len(older)))
+    whole[:n, :n] = (own + own.T) / 2
+    whole[n:, n:] = sensor.calibration_matrix[np.ix_(older, older)]
+    changes: dict[str, object] = {}
+    if pose_std is not None and poses is not None and sensor.kind == "direct":
+        across = pose_std.position_m / float(np.median(poses.distance_m))
+        changes = {
+            "systematic_distance_m": rounded(pose_std.position_m),
+            "systematic_delta_deg": rounded(math.degrees(math.hypot(pose_std.delta_rad, across))),
+            "systematic_bearing_deg": rounded(math.degrees(math.hypot(pose_std.heading_rad, across))),
+        }
+    return there.with_(
+        calibration_fields=(*fields, *(sensor.calibration_fields[k] for k in older)),
+        calibration_covariance=rounded(tuple(tuple(row) for row in whole.tolist())),
+        **changes,
     )
 
 

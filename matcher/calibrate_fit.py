@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phasemark.matcher.agreement import DISAGREEMENT, one_frame_limit_m
-from phasemark.matcher.calibrate_model import LONGEST_STEP, NAMES, SCALE, STEP, CalibrationModel, Images, clipped
+from phasemark.matcher.calibrate_model import ALL_NAMES, LONGEST_STEP, SCALE, STEP, CalibrationModel, Images, clipped
 from phasemark.matcher.calibrate_register import OUTLINE, register
 from phasemark.matcher.likelihood import Evidence
 from phasemark.render import predicted_range_std
@@ -60,8 +60,8 @@ class Place:
 
     Parameters
     ----------
-    theta : (8,) float64
-        Mounting, in the order of :data:`~phasemark.matcher.calibrate_model.NAMES`.
+    theta : (9,) float64
+        Mounting, in the order of :data:`~phasemark.matcher.calibrate_model.ALL_NAMES`.
     u : (K, q) float64
         Errors of the poses, of unit variance each.
     shift : (K, 3) float64
@@ -138,6 +138,11 @@ class _Linear:
         eliminated = np.einsum("kpq,kq->kp", self.cross, self._solved(own))
         return np.einsum("kpr,kr->kp", self.rows, residual) - eliminated, own
 
+    def pose_information(self) -> NDArray[np.float64]:
+        """Return what each pose tells of the mounting, its own errors eliminated, (K, p, p)."""
+        eliminated = np.linalg.solve(self.own, self.cross.transpose(0, 2, 1))
+        return np.asarray(self.rows @ self.rows.transpose(0, 2, 1) - self.cross @ eliminated)
+
     def own_step(self, own_gradient: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return by how much each pose's errors move with a step of the mounting, (K, q)."""
         return self._solved(own_gradient - np.einsum("kpq,p->kq", self.cross, step))
@@ -178,7 +183,7 @@ class Fit:
         noise_measured: bool = True,
     ) -> None:
         self.model, self.evidence, self.free = model, evidence, tuple(free)
-        self.columns = np.array([NAMES.index(name) for name in free])
+        self.columns = np.array([ALL_NAMES.index(name) for name in free])
         self.scale = SCALE[self.columns]
         k = len(evidence.weight)
         self.factor = np.zeros((k, 3, 0)) if factor is None else factor
@@ -194,13 +199,13 @@ class Fit:
             turned = self.evidence.value[full] * images.phasor[full].conj()
             mean = np.angle((turned / np.abs(turned)).sum())  # so that no range wraps about the median
             late = mean + np.median(np.angle(turned * np.exp(-1j * mean)))
-            theta[NAMES.index("range_offset")] += self.evidence.sensor.metres_per_radian * late
+            theta[ALL_NAMES.index("range_offset")] += self.evidence.sensor.metres_per_radian * late
         if "albedo" in self.free and self.evidence.on == "phasors":
             use = self.pixels(theta, images, cautious=True)
             measured = np.abs(self.evidence.value[use]).sum()
             modelled = np.abs(images.phasor[use]).sum()
             if measured > 0 and modelled > 0:
-                theta[NAMES.index("albedo")] *= measured / modelled
+                theta[ALL_NAMES.index("albedo")] *= measured / modelled
         return theta
 
     def pixels(self, theta: NDArray[np.float64], images: Images, *, cautious: bool = False) -> NDArray[np.bool_]:
@@ -236,7 +241,7 @@ class Fit:
 
         Parameters
         ----------
-        theta : (8,) float64
+        theta : (9,) float64
         use : (K, pixels) bool
         shift : (K, 3) float64, optional
             Errors of the poses to start from; None: none.
@@ -271,6 +276,10 @@ class Fit:
     def information(self, theta: NDArray[np.float64], use: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return what the pixels given tell at a mounting, (p, p), at little cost."""
         return self._linearise(self._at(theta, np.zeros((len(use), self.factor.shape[2])), use)).information
+
+    def linear(self, place: Place) -> _Linear:
+        """Linearise about a place, with slopes over the standard deviations."""
+        return self._linearise_wide(place)
 
     def _with_its_pixels(self, place: Place) -> Place:
         """Decide anew which pixels count, and descend from the place if others do."""
@@ -346,9 +355,9 @@ class Fit:
     def _linearise_wide(self, place: Place, widths: Sequence[float] = (1.0,)) -> _Linear:
         """Take slopes over multiples of the standard deviations that slopes at the place give."""
         narrow = self._linearise(place)
-        std = np.zeros(len(NAMES))
+        std = np.zeros(len(ALL_NAMES))
         std[self.columns] = np.sqrt(np.diag(inverse(narrow.information, self.scale)))
-        std[NAMES.index("range_offset")] = 0.0  # its slope is exact
+        std[ALL_NAMES.index("range_offset")] = 0.0  # its slope is exact
         if (max(widths) * std <= STEP).all():
             return narrow
         return self._linearise(place, *(np.minimum(width * np.nan_to_num(std), 0.5 * SCALE) for width in widths))

@@ -1,8 +1,8 @@
 """What a camera would see from known positions, for any mounting: the model that a calibration moves.
 
-The mounting is eight numbers, :class:`Mounting`. Four of them turn or widen the camera itself (pitch, roll and both
-half angles), two move the landmark in its image (height and bearing), one delays the light (range offset) and one is
-the brightness of the landmark (albedo), the only one that is not the camera's.
+The mounting is nine numbers, :class:`Mounting`. Four of them turn or widen the camera itself (pitch, roll and both
+half angles), two move the landmark in its image (height and bearing), one delays the light (range offset), one the time
+stamps (delay, for a moving camera), and one is the brightness of the landmark (albedo), which is not the camera's.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark.matcher.calibrate_poses import KnownPoses
+from phasemark.matcher.calibrate_track import PoseTrack
 from phasemark.matcher.likelihood import Quantity
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 
@@ -61,19 +62,23 @@ PARAMETERS = {
         Parameter("half_angle_v", "half_angle_v_rad", _DEGREE, 1 / _DEGREE, "°", "half_angle_v_deg"),
         Parameter("range_offset", "range_offset_m", _CM, 1e3, "mm", "range_offset_m"),
         Parameter("albedo", "albedo", 0.1, 1.0, "", None),
+        Parameter("delay", "delay_s", 0.01, 1e3, "ms", "delay_s"),
     )
 }
 """What a calibration can estimate, by name."""
-NAMES = tuple(PARAMETERS)
+ALL_NAMES = tuple(PARAMETERS)
+"""The order of the parameter vector."""
+NAMES = ALL_NAMES[:-1]
+"""What frames from still poses can tell; the delay takes a moving camera."""
 SCALE = np.array([parameter.scale for parameter in PARAMETERS.values()])
-"""Natural units, in the order of :data:`NAMES`."""
+"""Natural units, in the order of :data:`ALL_NAMES`."""
 LONGEST_STEP = 1.0
 """No descent steps farther at once, in natural units: slopes jump where edges pass corners of pixels."""
 STEP = 2e-4
 """Half the width of a difference, radians or metres: 1/60 of a pixel, wide enough to average what jumps where an edge
 passes a corner of a pixel, narrow enough to be the slope."""
-_LEAST = np.array([-0.75, -0.75, -2.0, -1.2, 0.01, 0.01, -np.inf, 1e-3])
-_MOST = np.array([0.75, 0.75, 2.0, 1.2, 1.4, 1.4, np.inf, np.inf])
+_LEAST = np.array([-0.75, -0.75, -2.0, -1.2, 0.01, 0.01, -np.inf, 1e-3, -10.0])
+_MOST = np.array([0.75, 0.75, 2.0, 1.2, 1.4, 1.4, np.inf, np.inf, 10.0])
 POSE = ("distance_m", "delta_rad", "bearing_rad")
 """What of a pose may be uncertain."""
 
@@ -94,6 +99,8 @@ class Mounting:
     range_offset_m : float
     albedo : float
         Of the landmark.
+    delay_s : float
+        Added to the stamp of a frame to get the time at which the camera was where the frame shows it.
     """
 
     pitch_rad: float
@@ -104,6 +111,7 @@ class Mounting:
     half_angle_v_rad: float
     range_offset_m: float
     albedo: float
+    delay_s: float = 0.0
 
     @classmethod
     def of_sensor(cls, sensor: Sensor, albedo: float) -> Mounting:
@@ -117,16 +125,17 @@ class Mounting:
             math.radians(sensor.half_angle_v_deg),
             sensor.range_offset_m,
             albedo,
+            sensor.delay_s,
         )
 
     @classmethod
     def of_vector(cls, theta: NDArray[np.float64]) -> Mounting:
-        """Take numbers in the order of :data:`NAMES`."""
+        """Take numbers in the order of :data:`ALL_NAMES`."""
         return cls(*theta.tolist())
 
     @property
     def vector(self) -> NDArray[np.float64]:
-        """The numbers in the order of :data:`NAMES`, (8,)."""
+        """The numbers in the order of :data:`ALL_NAMES`, (9,)."""
         return np.array([getattr(self, parameter.attribute) for parameter in PARAMETERS.values()])
 
     def on(self, sensor: Sensor) -> Sensor:
@@ -139,6 +148,7 @@ class Mounting:
             half_angle_h_deg=math.degrees(self.half_angle_h_rad),
             half_angle_v_deg=math.degrees(self.half_angle_v_rad),
             range_offset_m=self.range_offset_m,
+            delay_s=self.delay_s,
         )
 
 
@@ -185,6 +195,10 @@ class CalibrationModel:
         Threads.
     rendered : callable
         Called with each rendering of all poses; threads may do so at the same time.
+    track : PoseTrack, optional
+        Poses by time, for a moving camera; the poses of the frames then follow from the delay of the mounting.
+    stamp_s : (K,) float64, optional
+        Time stamps of the frames, with `track`.
     """
 
     def __init__(
@@ -198,7 +212,10 @@ class CalibrationModel:
         reports_z: bool = False,
         workers: int = 1,
         rendered: Callable[[], None] = lambda: None,
+        track: PoseTrack | None = None,
+        stamp_s: NDArray[np.float64] | None = None,
     ) -> None:
+        self._track, self._stamp_s = track, stamp_s
         self.sensor, self.poses, self.workers, self._rendered = sensor, poses, workers, rendered
         self._axis_cosine = sensor.axis_cosine() if reports_z else None
         self._albedo = albedo
@@ -228,7 +245,7 @@ class CalibrationModel:
 
         Parameters
         ----------
-        theta : (8,) float64
+        theta : (9,) float64
             Where the mounting is thought to be.
         slack_m : float
 
@@ -236,7 +253,7 @@ class CalibrationModel:
         ------
         UsageError
         """
-        views = self._views(np.zeros((len(self.poses), 3))).in_camera(Mounting.of_vector(theta).on(self.sensor))
+        views = self._views(theta, np.zeros((len(self.poses), 3))).in_camera(Mounting.of_vector(theta).on(self.sensor))
         views = replace(views, distance_m=views.distance_m - slack_m, height_m=views.height_m + slack_m)
         for which, background in self._scenes:
             if background is not None:
@@ -254,19 +271,20 @@ class CalibrationModel:
 
         Parameters
         ----------
-        theta : (8,) float64
+        theta : (9,) float64
             The mounting.
-        shift : (K, 3) float64
-            What is added to the poses, :data:`POSE`.
+        shift : (K, 3) or (K, 4) float64
+            What is added to the poses, :data:`POSE` and the height.
         need_alone : bool
             Whether the landmark alone is wanted even where nothing else is made of it.
         """
         mounting = Mounting.of_vector(theta)
-        image = self._render(mounting, self._views(shift))
+        views = self._views(theta, shift)
+        image = self._render(mounting, views)
         alone = image
         brighter = mounting.albedo / self._albedo - 1
         if self.has_background and (brighter or need_alone):
-            alone = self._render(mounting, self._views(shift), alone=True)
+            alone = self._render(mounting, views, alone=True)
         turn = self._turn(mounting, image)
         k = len(self.poses)
         turn = turn.reshape(-1, *turn.shape[-2:])
@@ -301,7 +319,7 @@ class CalibrationModel:
         on : {"ranges", "phasors"}
         of_poses : bool
             Whether the poses are uncertain too.
-        width : (8,) float64, optional
+        width : (9,) float64, optional
             Half width of each difference; at least :data:`STEP`.
 
         Returns
@@ -312,7 +330,7 @@ class CalibrationModel:
         (K, 3, pixels) complex128
             By :data:`POSE`; (K, 0, pixels) without `of_poses`.
         """
-        half = np.full(len(NAMES), STEP) if width is None else np.maximum(width, STEP)
+        half = np.full(len(ALL_NAMES), STEP) if width is None else np.maximum(width, STEP)
 
         def moved(name: str | None, column: int, side: float) -> NDArray[np.complex128]:
             there, shifted = theta.copy(), shift.copy()
@@ -332,7 +350,7 @@ class CalibrationModel:
 
         rendered = [name for name in free if name != "range_offset" and (name != "albedo" or on == "ranges")]
         columns = [] if not of_poses else [0, 1] if "bearing" in rendered else [0, 1, 2]
-        jobs: list[tuple[str | None, int]] = [(name, NAMES.index(name)) for name in rendered]
+        jobs: list[tuple[str | None, int]] = [(name, ALL_NAMES.index(name)) for name in rendered]
         jobs += [(None, column) for column in columns]
         with ThreadPoolExecutor(self.workers) as pool:
             found = list(pool.map(difference, jobs))
@@ -344,7 +362,7 @@ class CalibrationModel:
             image = self.images(theta, shift, need_alone=on == "phasors" and "albedo" in free)
             later = 1.0 if on == "ranges" else image.phasor
             by_name["range_offset"] = np.broadcast_to(1j * later / self.sensor.metres_per_radian, image.phasor.shape)
-            by_name.setdefault("albedo", image.alone / theta[-1])
+            by_name.setdefault("albedo", image.alone / theta[ALL_NAMES.index("albedo")])
         k, pixels = len(self.poses), self.sensor.rows * self.sensor.cols
         empty = np.zeros((k, 0, pixels), np.complex128)
         return (
@@ -355,7 +373,7 @@ class CalibrationModel:
     def coverage(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the share of each pixel that sees the landmark, (K, pixels)."""
         mounting = Mounting.of_vector(theta)
-        views = self._views(np.zeros((len(self.poses), 3)))
+        views = self._views(theta, np.zeros((len(self.poses), 3)))
         return self._render(mounting, views, alone=True).coverage.reshape(len(views), -1)
 
     def _turn(self, mounting: Mounting, image: PhasorImages) -> NDArray[np.complex128]:
@@ -370,14 +388,20 @@ class CalibrationModel:
         longer = image.sensor.axis_cosine() / self._axis_cosine - 1
         return np.asarray(turn * np.exp(1j * np.nan_to_num(image.range_m) * longer / scale))
 
-    def _views(self, shift: NDArray[np.float64]) -> Views:
+    def pose_rates(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return rates of distance, δ, bearing and height at the frames' times, (K, 4) per second; 0 if still."""
+        if self._track is None or self._stamp_s is None:
+            return np.zeros((len(self.poses), 4))
+        return self._track.at(self._stamp_s + theta[ALL_NAMES.index("delay")])[1]
+
+    def _views(self, theta: NDArray[np.float64], shift: NDArray[np.float64]) -> Views:
         poses = self.poses
-        return Views(
-            poses.distance_m + shift[:, 0],
-            poses.delta_rad + shift[:, 1],
-            poses.bearing_rad + shift[:, 2],
-            poses.height_m,
-        )
+        seen = np.column_stack([poses.distance_m, poses.delta_rad, poses.bearing_rad, poses.height_m])
+        if self._track is not None and self._stamp_s is not None:
+            seen = self._track.at(self._stamp_s + theta[ALL_NAMES.index("delay")])[0]
+        seen = seen.copy()
+        seen[:, : shift.shape[1]] += shift
+        return Views(*np.ascontiguousarray(seen.T))
 
     def _render(self, mounting: Mounting, views: Views, *, alone: bool = False) -> PhasorImages:
         renderer = self._renderer.seen_by(mounting.on(self.sensor))

@@ -21,6 +21,7 @@ TITLES = {
     "half_angle_v": "vertical field of view",
     "range_offset": "range offset",
     "albedo": "albedo",
+    "delay": "delay",
 }
 _POORLY = 0.5
 """Natural units (1°, 1 cm, 0.1): a standard deviation from which a number is called poorly known."""

@@ -17,10 +17,12 @@ from phasemark.render import Frames
 
 POLAR = ("distance_m", "delta_deg")
 CARTESIAN = ("x_m", "y_m", "heading_deg")
-OPTIONAL = ("height_m", "wall_m", "frames")
+TIMES = {"t_s": 1.0, "t_ms": 1e-3}
+"""Columns of time stamps, with their unit in seconds."""
+OPTIONAL = ("height_m", "wall_m", "frames", *TIMES)
 COLUMNS = (
     "either distance_m,delta_deg (and bearing_deg if the camera does not point at the landmark's axis) or"
-    " x_m,y_m,heading_deg of the lens; optional height_m, wall_m, frames"
+    " x_m,y_m,heading_deg of the lens; optional height_m, wall_m, frames, t_s or t_ms"
 )
 """What a file of poses may have, in words."""
 POSE_UNITS = (("distance_mm", 1e3), ("delta_deg", math.degrees(1)), ("bearing_deg", math.degrees(1)))
@@ -42,6 +44,8 @@ class KnownPoses:
         How many frames were taken at each, where the file says so.
     place : tuple of str
         Where each stands in its file, for messages.
+    time_s : (K,) float64, optional
+        Time stamp of each pose, seconds, in the clock of the frames. Stamps may repeat or run backwards.
     """
 
     distance_m: NDArray[np.float64]
@@ -51,10 +55,11 @@ class KnownPoses:
     wall_m: NDArray[np.float64] | None = None
     frames: NDArray[np.int64] | None = None
     place: tuple[str, ...] = ()
+    time_s: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.distance_m)
-        for name in ("distance_m", "delta_rad", "bearing_rad", "height_m", "wall_m"):
+        for name in ("distance_m", "delta_rad", "bearing_rad", "height_m", "wall_m", "time_s"):
             values = getattr(self, name)
             if values is None:
                 continue
@@ -81,6 +86,7 @@ class KnownPoses:
             None if self.wall_m is None else self.wall_m[which],
             None if self.frames is None else self.frames[which],
             tuple(self.place[k] for k in which) if self.place else (),
+            None if self.time_s is None else self.time_s[which],
         )
 
     def where(self, k: int) -> str:
@@ -180,8 +186,9 @@ def read_poses(
     ----------
     path : path-like
         Columns ``distance_m`` and ``delta_deg``, optionally ``bearing_deg``; or ``x_m``, ``y_m`` and ``heading_deg`` of
-        the lens. In both cases optionally ``height_m`` (of the landmark above where it usually stands), ``wall_m`` and
-        ``frames``. Lines that start with ``#`` and empty ones are skipped.
+        the lens. In both cases optionally ``height_m`` (of the landmark above where it usually stands), ``wall_m``,
+        ``frames``, and ``t_s`` or ``t_ms``, the time stamp in the clock of the frames. Lines that start with ``#`` and
+        empty ones are skipped.
     landmark_xy_m, landmark_yaw_rad : optional
         Where the landmark stands, for the second form.
 
@@ -254,6 +261,7 @@ def read_poses(
         values.get("wall_m"),
         frames,
         place,
+        next((scale * values[name] for name, scale in TIMES.items() if name in values), None),
     )
 
 
@@ -268,6 +276,8 @@ def _check_header(path: Path, names: list[str]) -> bool:
         if name not in allowed or names.count(name) > 1:
             problem = "unknown" if name not in allowed else "repeated"
             raise InputFileError(f"{path}: {problem} column '{name}'; its columns must be {COLUMNS}")
+    if set(TIMES) <= set(names):
+        raise InputFileError(f"{path}: columns 't_s' and 't_ms' state the same stamps twice: keep one of them")
     return own is POLAR
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.calibrate_model import LONGEST_STEP, NAMES, SCALE, CalibrationModel, clipped
+from phasemark.matcher.calibrate_model import ALL_NAMES, LONGEST_STEP, SCALE, CalibrationModel, clipped
 from phasemark.matcher.likelihood import Evidence
 
 OUTLINE = ("pitch", "roll", "height", "bearing", "half_angle_h", "half_angle_v")
@@ -43,14 +43,14 @@ def register(
     ----------
     model : CalibrationModel
     evidence : Evidence
-    theta : (8,) float64
+    theta : (9,) float64
         Where the mounting is thought to be.
     free : sequence of str
         What may move.
 
     Returns
     -------
-    (8,) float64
+    (9,) float64
     """
     if not free:
         return theta
@@ -61,7 +61,7 @@ def register(
     if not (known & ~seen.returned).any() and (target[known] == 1).all():
         known = np.ones_like(known)  # nothing was told apart: what is missing returned nothing
     enough = _PREVAILS_FROM if (seen.returned & ~near).mean() > _BESIDE else _RETURNS_FROM
-    columns = np.array([NAMES.index(name) for name in free])
+    columns = np.array([ALL_NAMES.index(name) for name in free])
     scale = SCALE[columns]
     prior = np.array([_OUTLINE_STD[OUTLINE.index(name)] for name in free])
 
@@ -76,13 +76,13 @@ def register(
     tried = [theta]
     for name in ("pitch", "bearing"):
         if name in free:
-            steps = np.eye(len(NAMES))[NAMES.index(name)] * SCALE[NAMES.index(name)]
+            steps = np.eye(len(ALL_NAMES))[ALL_NAMES.index(name)] * SCALE[ALL_NAMES.index(name)]
             tried = [clipped(one + side * steps) for one in tried for side in _TRIED]
     best = min(tried, key=cost)
     for _ in range(_OUTLINE_STEPS):
         rows = []
         for column in columns:
-            move = np.eye(len(NAMES))[column] * SCALE[column] * _OUTLINE_WIDTH
+            move = np.eye(len(ALL_NAMES))[column] * SCALE[column] * _OUTLINE_WIDTH
             rows.append((difference(best - move) - difference(best + move)).ravel() / (2 * _OUTLINE_WIDTH))
         design = np.array(rows)
         away = (best - theta)[columns] / scale

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from phasemark.matcher.calibrate import Calibration
-from phasemark.matcher.calibrate_model import NAMES, PARAMETERS
+from phasemark.matcher.calibrate_model import ALL_NAMES, NAMES, PARAMETERS
 from phasemark.matcher.calibrate_poses import POSE_UNITS
 from phasemark.render.plot import draw_difference
 from phasemark.render.rounding import error_text, value_and_error
@@ -20,6 +20,19 @@ from phasemark.render.sensor_file import sensor_toml
 USES = {"albedo": "of the landmark: phasemark bank build --albedo, or 'albedo' in a plan"}
 """Where the numbers go that a sensor file has no place for."""
 _SIGMAS, _BINS = 5.0, 50
+_COMMON = {
+    "range_std_m": "calibrated: noise law of the residuals",
+    "range_shot_std_m": "calibrated: noise law of the residuals",
+    "range_ambient_std_m": "calibrated: noise law of the residuals",
+    "zone_offset_m": "calibrated",
+    "calibration_fields": "what was estimated",
+    "calibration_covariance": "its covariance, in the units of the fields",
+    "systematic_distance_m": "calibrated: what noise does not explain",
+    "systematic_delta_deg": "calibrated: what noise does not explain",
+    "systematic_bearing_deg": "calibrated: what noise does not explain",
+    "systematic_height_m": "calibrated: what noise does not explain",
+}
+"""What stands behind the fields that no parameter of the mounting has."""
 
 
 def calibration_toml(found: Calibration, *, base_name: str) -> str:
@@ -36,6 +49,9 @@ def calibration_toml(found: Calibration, *, base_name: str) -> str:
         parameter = PARAMETERS[name]
         if parameter.field is not None:
             comments[parameter.field] = f"calibrated, ± {error_text(_file_std(found, name))} (standard deviation)"
+    for field, what in _COMMON.items():
+        if field not in comments and getattr(found.sensor, field) != getattr(found.base, field):
+            comments[field] = what
     header = [
         f"Calibrated by phasemark calibrate from {len(found.poses)} known poses, on {found.on}; covariance from"
         f" {found.covariance_from}.",
@@ -45,8 +61,17 @@ def calibration_toml(found: Calibration, *, base_name: str) -> str:
         if name in found.free:
             unit = f" {PARAMETERS[name].unit}" if PARAMETERS[name].unit else ""
             header.append(f"{name} = {shown(found, name)} ± {shown_std(found, name)}{unit}: {use}")
+    before, after = found.held_out_m
+    if math.isfinite(after):
+        header.append(f"Held-out residuals, r.m.s.: {1e3 * before:.3g} mm before, {1e3 * after:.3g} mm after.")
+    header += [f"Not to be trusted: {doubt}." for doubt in found.doubts]
     header += found.notes
     return sensor_toml(found.sensor, comments, header=header, otherwise=f"assumed: as in {base_name}")
+
+
+def shown_names(found: Calibration) -> tuple[str, ...]:
+    """Return the names of the numbers to show: the delay only where it was estimated or is stated."""
+    return ALL_NAMES if "delay" in found.free or found.mounting.delay_s else NAMES
 
 
 def shown(found: Calibration, name: str) -> str:
@@ -77,7 +102,7 @@ def calibration_dict(found: Calibration) -> dict[str, Any]:
                 "assumed": PARAMETERS[name].shown * float(getattr(found.assumed, PARAMETERS[name].attribute)),
                 "sensor_field": PARAMETERS[name].field,
             }
-            for name in NAMES
+            for name in shown_names(found)
         },
         "free": list(found.free),
         "covariance": (found.covariance * np.outer(unit, unit)).tolist(),
@@ -87,6 +112,10 @@ def calibration_dict(found: Calibration) -> dict[str, Any]:
         "dof": found.dof,
         "p_value": found.p_value,
         "on": found.on,
+        "held_out_rms_mm": dict(zip(("before", "after"), map(_mm, found.held_out_m), strict=True)),
+        "left_out": found.left_out,
+        "doubts": list(found.doubts),
+        "likely_cause": found.cause or None,
         "residual_rms_mm": {"before": _rms_mm(found.residual_before_m), "after": _rms_mm(found.residual_m)},
         "poses": [
             {
@@ -187,6 +216,10 @@ def _mean_of_pixels(residual_m: NDArray[np.float64], std_m: NDArray[np.float64])
     weight = np.where(there, 1 / np.where(there, std_m, 1.0) ** 2, 0.0)
     total = (weight * np.where(there, residual_m, 0.0)).sum(axis=0)
     return np.where(there.any(axis=0), total / np.maximum(weight.sum(axis=0), 1e-300), np.nan)
+
+
+def _mm(value_m: float) -> float | None:
+    return 1e3 * value_m if math.isfinite(value_m) else None
 
 
 def _rms_mm(residual_m: NDArray[np.float64]) -> float | None:
