@@ -57,6 +57,8 @@ BEARING_STD_RAD = math.radians(1.5)
 _PRIOR_SIGMA = 3.0
 """Bearings up to so many standard deviations of the prior are searched."""
 _TOLERATED_SIGMA = 3.0
+_LARGEST_SCALE = 2.0
+"""Where unknown things stand in view, residuals may be so many times their noise."""
 _STRANGE_SIGMA = 5.0
 """A return farther from the model than this sees something else."""
 _FEWEST_EXPLAINED = 6
@@ -390,7 +392,8 @@ class MaximumLikelihood:
     def _without_borders(self, models: _Models, evidence: Evidence, fits: Fits) -> Fits:
         """Fit the best views again without the pixels beside one that sees something else.
 
-        They may see a little of it too, at the sides of the landmark, where a wrong range turns the view most.
+        They may see a little of it too, at the sides of the landmark, where a wrong range turns the view most. How
+        pixels scatter among unknown things is known less well than otherwise: covariances grow with the χ² found.
         """
         model = models.final
         assert model is not None
@@ -403,17 +406,20 @@ class MaximumLikelihood:
         )
         returned = evidence.seen.returned[frame]
         other = returned & ((phasor == 0) | (size > _STRANGE_SIGMA))
-        beside = _beside(other.reshape(-1, evidence.sensor.rows, evidence.sensor.cols)).reshape(other.shape)
-        kept = ~beside | other
-        enough = (kept & returned & ~other).sum(axis=1) >= _FEWEST_EXPLAINED * len(self.free)
+        shape = (-1, evidence.sensor.rows, evidence.sensor.cols)
+        kept = np.ones(other.shape, np.bool_)
+        needed = _FEWEST_EXPLAINED * len(self.free)
+        for strange in (other, other | ~returned):  # beside pixels without a return too, where enough are left
+            inside = ~_beside(strange.reshape(shape)).reshape(other.shape) | other
+            enough = (inside & returned & ~other).sum(axis=1) >= needed
+            kept[enough] = inside[enough]
         weight = evidence.weight.copy()
-        weight[frame[enough]] *= kept[enough]
-        inside = replace(evidence, weight=weight)
-        some = fits[best[enough]]
-        settings = self._settings(None)
-        again = refine(model, inside, some.frame, some.class_index, some.view, settings)
-        rest = np.setdiff1d(np.arange(len(fits)), best[enough])
-        return Fits.joined([again, fits[rest]])
+        weight[frame] *= kept
+        some = fits[best]
+        again = refine(
+            model, replace(evidence, weight=weight), some.frame, some.class_index, some.view, self._settings(None)
+        )
+        return Fits.joined([again, fits[np.setdiff1d(np.arange(len(fits)), best)]]).with_scale(_LARGEST_SCALE)
 
     def _trimmed(
         self, model: ImageModel, evidence: Evidence, fits: Fits, which: NDArray[np.int64], seen: Observation
@@ -569,7 +575,8 @@ class MaximumLikelihood:
         bare: NDArray[np.float64],
         background: Background | None,
     ) -> list[Match]:
-        p_values = p_values_of(fits.tested, fits.dof, frames, fits.frame)
+        tolerated = _LARGEST_SCALE**2 if self.unknown else 1.0
+        p_values = p_values_of(fits.tested / tolerated, fits.dof, frames, fits.frame)
         order = np.lexsort((fits.cost, fits.frame))
         first = np.searchsorted(fits.frame[order], np.arange(len(frames) + 1))
         doubt = np.asarray(special.chdtri(np.maximum(fits.dof, 1), self.false_alarm), np.float64)
