@@ -1,0 +1,149 @@
+"""Nothing that a frame shows is free: an accepted answer is right, on every preset and with every setting."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from thin_landmarks import PRESETS, SETTINGS, bank_of, count, meshes
+
+from phasemark.matcher import Matcher, kalman_filter
+from phasemark.matcher.agreement import DISAGREEMENT, counts, disagrees
+from phasemark.matcher.likelihood import Evidence, gauss_newton_sums
+from phasemark.render import Background, Frames, Renderer, Views, capture, preset
+
+DIRECT = preset("vl53l5cx-8x8")
+
+
+@pytest.fixture(scope="module")
+def panel(tmp_path_factory):
+    return bank_of("panel", "vl53l5cx-8x8", tmp_path_factory.mktemp("panel"))
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_no_pixel_of_an_empty_image_counts(name):
+    sensor = preset(name)
+    nothing = np.zeros((sensor.rows, sensor.cols))
+    assert not counts(nothing.astype(complex), nothing, sensor).any()
+
+
+def test_a_direct_sensor_measures_nothing_beyond_its_range_or_below_its_intensity():
+    image = Renderer(None, DIRECT).render(1.0, background=Background(wall_m=1.5))
+    assert counts(image.phasor, image.intensity, DIRECT).all()
+    assert not counts(image.phasor, image.intensity, DIRECT.with_(min_intensity=0.3)).any()  # 0.5 / 1.5² = 0.22
+    far = Renderer(None, DIRECT).render(1.0, background=Background(wall_m=4.5))
+    assert not counts(far.phasor, far.intensity, DIRECT).any()
+
+
+def test_the_table_of_frame_against_model():
+    yes, no = np.array([True]), np.array([False])
+    assert disagrees(yes, no, no, no).all()  # a return where nothing can
+    assert disagrees(no, yes, yes, yes).all()  # none where something must
+    for returned, absent, may, must in ((yes, no, yes, yes), (yes, no, yes, no), (no, yes, yes, no), (no, yes, no, no)):
+        assert not disagrees(returned, absent, may, must).any()
+    for may, must in ((no, no), (yes, no), (yes, yes)):
+        assert not disagrees(no, no, may, must).any()  # a missing pixel says nothing
+
+
+def test_a_return_costs_a_disagreement_where_the_model_has_no_light():
+    frames = kalman_filter(Frames(np.full((1, 1, 8, 8), 0.7), sensor=DIRECT)).with_pooled_noise()
+    evidence = Evidence.from_frames(frames, "ranges")
+    dark = np.zeros((1, 64), complex)
+    sums = gauss_newton_sums(
+        dark, dark[:, None], evidence, np.zeros(1, np.int64), np.ones((1, 64), bool), None
+    )  # fmt: skip
+    assert sums.cost[0] == sums.capped[0] == 64 * DISAGREEMENT
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_an_accepted_answer_on_a_thin_panel_is_right(panel, setting):
+    found = count(panel, setting, 25, 1, np.random.default_rng(5))
+    assert found.wrong_accepted == 0
+    if setting in ("fixed", "wall", "robust"):
+        assert found.right_accepted >= 23  # 25 at a false alarm of 0.01: 3 refused have a probability of 0.002
+
+
+def test_a_bearing_that_nothing_tells_is_undetermined(tmp_path):
+    # the panel fills the 16 × 16 camera's view: its heading is known, but not where along it the camera looks
+    found = count(bank_of("panel", "pmd-16x16", tmp_path), "bearing", 8, 10, np.random.default_rng(6))
+    assert found.wrong_accepted == 0
+    assert sum(match.reason == "undetermined" for match in found.answers) >= 5  # a few views show an edge
+
+
+def test_two_sides_that_look_alike_are_ambiguous(tmp_path):
+    # front and back of a thin frame with a window off its middle by 3 cm differ by less than a zone
+    found = count(bank_of("frame", "vl53l5cx-8x8", tmp_path), "bearing", 25, 1, np.random.default_rng(7))
+    assert found.wrong_accepted == 0
+    assert "ambiguous" in {match.reason for match in found.answers}
+
+
+def test_a_background_that_no_pixel_sees_alone_is_found_behind_the_panel(panel):
+    sensor = panel.sensor
+    views = Views.broadcast(0.647, np.radians(-16.3), 0.0, 0.0)
+    image = Renderer(panel.mesh("panel"), sensor, albedo=0.8).render_views(views, background=Background(wall_m=2.5))
+    assert (image.coverage > 0).all()
+    frames = capture(image, sensor, rng=np.random.default_rng(1), n_frames=1)
+    (match,) = Matcher(panel, "refine", free=("distance_m", "delta_rad"), background="auto").match(
+        kalman_filter(frames)
+    )
+    assert match.accepted
+    assert match.distance_m == pytest.approx(0.647, abs=4e-3)
+    assert match.background.wall_m == pytest.approx(2.5, rel=0.1)
+
+
+def test_what_stands_around_is_left_out_with_an_unknown_background(panel):
+    # a post before the panel and a shelf at its side: two columns and a row of other returns
+    sensor = panel.sensor
+    image = Renderer(panel.mesh("panel"), sensor, albedo=0.8).render(0.6, 0.1)
+    ranges = np.array(capture(image, sensor, rng=np.random.default_rng(2), n_frames=1).range_m)
+    ranges[..., 0] = 0.3
+    ranges[..., 7, :] = 0.45
+    frames = kalman_filter(Frames(ranges, sensor=sensor))
+    options = {"free": ("distance_m", "delta_rad")}
+    assert not Matcher(panel, "refine", **options).match(frames)[0].accepted
+    (match,) = Matcher(panel, "refine", background="unknown", **options).match(frames)
+    assert match.accepted
+    assert (match.distance_m, match.delta_rad) == pytest.approx((0.6, 0.1), abs=0.01)
+
+
+def test_few_returns_among_unknown_things_determine_nothing(panel):
+    ranges = np.full((1, 1, 8, 8), np.nan)
+    ranges[..., 7, 1:7] = 1.0  # a row of something
+    frames = kalman_filter(Frames(ranges, sensor=panel.sensor))
+    (match,) = Matcher(panel, "refine", background="unknown", free=("distance_m", "delta_rad")).match(frames)
+    assert not match.accepted
+
+
+def test_a_landmark_beside_the_middle_is_matched_by_default_and_refused_where_the_bearing_is_fixed(tmp_path):
+    bank = bank_of("bracket", "pmd-16x16", tmp_path)
+    image = Renderer(bank.mesh("bracket"), bank.sensor, albedo=0.8).render(1.1, 0.3, np.radians(2.5))
+    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(3), n_frames=20))
+    assert Matcher(bank, "refine", free=("distance_m", "delta_rad")).match(frames)[0].reason == "poor fit"
+    (match,) = Matcher(bank, "refine").match(frames)
+    assert match.free == ("distance_m", "delta_rad", "bearing_rad")
+    assert abs(match.bearing_rad - np.radians(2.5)) < 4 * np.sqrt(match.covariance[2, 2])
+    assert abs(match.distance_m - 1.1) < 0.005
+
+
+def test_refused_answers_say_why_and_claim_no_precision(panel):
+    ranges = np.full((1, 1, 8, 8), 0.5)
+    ranges[..., ::2] = 0.9
+    matches = Matcher(panel, "refine").match(kalman_filter(Frames(ranges, sensor=panel.sensor)))
+    assert not matches.accepted.any()
+    assert matches.reason[0] in ("no landmark", "poor fit")
+    assert matches[0].as_dict()["reason"] == matches.reason[0]
+    shown = matches._repr_html_()
+    assert "refused" in shown
+    assert "±" not in shown
+    accepted = dataclasses.replace(matches[0], accepted=True, reason="")
+    assert "refused" not in accepted._repr_html_()
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("n_frames", [1, 10])
+@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize("sensor", PRESETS)
+@pytest.mark.parametrize("name", meshes())
+def test_no_accepted_answer_on_thin_landmarks_is_grossly_wrong(tmp_path, name, sensor, setting, n_frames):
+    found = count(bank_of(name, sensor, tmp_path), setting, 100, n_frames, np.random.default_rng([len(name), n_frames]))
+    print(f"{name} {sensor} {setting} {n_frames}: {found.right_accepted} of {found.right} right answers accepted")
+    assert found.wrong_accepted == 0
