@@ -269,7 +269,7 @@ class MaximumLikelihood:
             some.view[0] = view
             again = refine(model, evidence, some.frame, some.class_index, some.view, settings)
             others = self._other_classes(model, evidence, again, settings)
-            again = Fits.joined([again, others, self._from_behind(model, evidence, again, behind)])
+            again = Fits.joined([again, others, self._look_alikes(model, evidence, again, behind)])
             if not again.cost.min() < fits.cost[best[0]]:
                 break
             settled = again.cost.min() > fits.cost[best[0]] - 1
@@ -339,7 +339,7 @@ class MaximumLikelihood:
                 starts = search.starts(kept, n_modes, all_classes=all_classes)
                 fits.append(self._fit(models, evidence, poor, starts, sides, behind))
         if models.final is not None:
-            fits.append(self._from_behind(models.final, evidence, Fits.joined(fits), behind))
+            fits.append(self._look_alikes(models.final, evidence, Fits.joined(fits), behind))
         return Fits.joined(fits)
 
     def _turned(
@@ -362,14 +362,15 @@ class MaximumLikelihood:
         found = self._modes(models.final, evidence, frame[order], class_index[order], view[order], settings, _MARGIN)
         return Fits.joined([found, self._other_classes(models.final, evidence, found, settings)])
 
-    def _from_behind(self, model: ImageModel, evidence: Evidence, fits: Fits, behind: PhasorImages | None) -> Fits:
-        """Let the other side of the best landmark explain each frame, its middle seen at the same place.
+    def _look_alikes(self, model: ImageModel, evidence: Evidence, fits: Fits, behind: PhasorImages | None) -> Fits:
+        """Let views that look like the best one explain each frame: what no slope leads to from there.
 
-        A thin landmark looks nearly the same from the front and from the back; no slope leads from one to the other.
+        A thin landmark looks nearly the same from the front and from the back, its middle seen at the same place.
+        A flat one looks nearly the same under every bearing, its heading kept.
         """
         best = _best_of_frame(fits)
         odd = np.array([self._symmetry[c] % 2 for c in fits.class_index[best]], np.bool_)
-        best = best[odd & np.isfinite(fits.cost[best])]
+        best = best[(odd | ("bearing_rad" in self.free)) & np.isfinite(fits.cost[best])]
         view = fits.view[best].copy()
         view[:, 1] += math.pi
         middle = self._middle[fits.class_index[best]]
@@ -380,13 +381,23 @@ class MaximumLikelihood:
             view[:, 2] -= np.arctan2(there[:, 1], view[:, 0] + there[:, 0])
         settings = self._settings(behind)
         limit = fits.cost[best] + LIKELY
-        half = self._search.column_rad / 2
-        sides = np.array([0.0, -half, half]) if "bearing_rad" in self.free else np.zeros(1)
-        views = np.tile(view, (len(sides), 1))
-        views[:, 2] += np.repeat(sides, len(view))
-        best, limit = np.tile(best, len(sides)), np.tile(limit, len(sides))
+        candidates = [view]
+        if "bearing_rad" in self.free:
+            # a flat landmark tells the heading δ − b, and little of its two parts
+            half = self._search.column_rad / 2
+            turned = (-half, half) if self._prior_std else (-2 * half, -half, half, 2 * half)
+            candidates += [view + np.array([0.0, 0.0, side, 0.0]) for side in (-half, half)]
+            candidates += [fits.view[best] + np.array([0.0, side, side, 0.0]) for side in turned]
+        best, limit = np.tile(best, len(candidates)), np.tile(limit, len(candidates))
         return refine(
-            model, evidence, fits.frame[best], fits.class_index[best], views, settings, limit, at_first_sight=True
+            model,
+            evidence,
+            fits.frame[best],
+            fits.class_index[best],
+            np.concatenate(candidates),
+            settings,
+            limit,
+            at_first_sight="bearing_rad" not in self.free or bool(self._prior_std),
         )
 
     def _without_borders(self, models: _Models, evidence: Evidence, fits: Fits) -> Fits:
@@ -705,6 +716,8 @@ class MaximumLikelihood:
         if not is_landmark:
             reason = "no landmark"
         elif p_values[best] < self.false_alarm:
+            reason = "poor fit"
+        elif self.unknown and fits.agreeing[best] < fits.elsewhere[best]:
             reason = "poor fit"
         elif self.unknown and fits.explained[best] < _FEWEST_EXPLAINED * len(self.free):
             reason = "undetermined"

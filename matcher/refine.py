@@ -104,6 +104,9 @@ class Fits:
         Returns that are left to unknown things in view; in `cost` each is a disagreement, in `dof` it is none.
     explained : int64
         Returns that are compared and not left to unknown things.
+    agreeing, elsewhere : int64
+        Returns where the landmark stands in the model: those that agree with it, compared or not, and those that see
+        something else.
     prior : float64
         What the prior adds to the cost; no test of the fit counts it.
     covariance : (m, p, p) float64
@@ -124,6 +127,8 @@ class Fits:
     dof: NDArray[np.int64]
     unexplained: NDArray[np.int64]
     explained: NDArray[np.int64]
+    agreeing: NDArray[np.int64]
+    elsewhere: NDArray[np.int64]
     prior: NDArray[np.float64]
     covariance: NDArray[np.float64]
     information: NDArray[np.float64]
@@ -535,10 +540,11 @@ class _Problem:
         # pixels is not better for it
         n_open = (returned & ~fitted & ~wrong).sum(axis=1)
         n_residuals = fitted.sum(axis=1) * evidence.per_pixel + n_wrong + n_open
-        unexplained = np.zeros(len(state.theta), np.int64)
+        unexplained, agreeing, elsewhere = (np.zeros(len(state.theta), np.int64) for _ in range(3))
         if settings.unknown_around:
-            outlying = fitted & self._outlying(state)
-            unexplained = outlying.sum(axis=1) + (wrong & returned).sum(axis=1)
+            outlying, here = self._outlying(state), state.use & returned
+            agreeing, elsewhere = (here & ~outlying).sum(axis=1), (here & outlying).sum(axis=1)
+            unexplained = (fitted & outlying).sum(axis=1) + (wrong & returned).sum(axis=1)
             fitted = fitted & ~outlying
         return Fits(
             frame=self.frame,
@@ -550,6 +556,8 @@ class _Problem:
             dof=np.maximum(n_residuals - unexplained - int((self.prior_weight == 0).sum()), 0),
             unexplained=unexplained,
             explained=fitted.sum(axis=1),
+            agreeing=agreeing,
+            elsewhere=elsewhere,
             prior=self.prior_cost(state.theta),
             covariance=covariance,
             information=information,
@@ -561,7 +569,7 @@ class _Problem:
         sensor, huber = self.evidence.sensor, self.settings.huber or math.inf
         phasor = state.images.phasor
         residual = sensor.metres_per_radian * np.angle(self.evidence.value[self.frame] * phasor.conj())
-        size = np.abs(residual) * np.sqrt(self.evidence.weight[self.frame])
+        size = np.abs(residual) * np.sqrt(self.evidence.seen.weight[self.frame])
         return np.asarray((phasor == 0) | (huber * (2 * size - huber) >= DISAGREEMENT))
 
     def _std_without_one(
