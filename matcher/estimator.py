@@ -426,11 +426,37 @@ class MaximumLikelihood:
             kept[enough] = inside[enough]
         weight = evidence.weight.copy()
         weight[frame] *= kept
-        some = fits[best]
-        again = refine(
-            model, replace(evidence, weight=weight), some.frame, some.class_index, some.view, self._settings(None)
-        )
-        return Fits.joined([again, fits[np.setdiff1d(np.arange(len(fits)), best)]]).with_scale(_LARGEST_SCALE)
+        inside, some = replace(evidence, weight=weight), fits[best]
+        again = refine(model, inside, some.frame, some.class_index, some.view, self._settings(None))
+        again = again.with_scale(self._scatter_of_columns(model, inside, again))
+        return Fits.joined([again, fits[np.setdiff1d(np.arange(len(fits)), best)]])
+
+    def _scatter_of_columns(self, model: ImageModel, evidence: Evidence, fits: Fits) -> NDArray[np.float64]:
+        """Return by how much covariances of views are too small, (m,): from χ², and from leaving out columns of pixels.
+
+        Errors at the sides of a landmark are common to a column of pixels. The view changes by δθ_c without column c;
+        the jackknife's covariance (C − 1) / C · Σ δθ_c δθ_cᵀ over C columns is compared with that of independent noise.
+        """
+        rows, cols = evidence.sensor.rows, evidence.sensor.cols
+        m, p = len(fits), len(self.free)
+        image = model.images(fits.class_index, np.ascontiguousarray(fits.view), self.free)
+        turn = np.divide(1.0, image.phasor, out=np.zeros_like(image.phasor), where=image.phasor != 0)
+        slope = evidence.sensor.metres_per_radian * (image.slope * turn[:, None]).imag
+        residual = evidence.sensor.metres_per_radian * np.angle(evidence.value[fits.frame] * image.phasor.conj())
+        weight = np.where(image.phasor != 0, evidence.weight[fits.frame], 0.0)
+        weight = np.where(weight * residual**2 > _STRANGE_SIGMA**2, 0.0, weight)
+        by_column = (m, p, rows, cols)
+        weighted = (slope * weight[:, None]).reshape(by_column)
+        gradient = np.einsum("mprc,mrc->mcp", weighted, residual.reshape(m, rows, cols))
+        information = np.einsum("mprc,mqrc->mcpq", weighted, slope.reshape(by_column))
+        whole = information.sum(axis=1)
+        used = (weight.reshape(m, rows, cols) > 0).any(axis=1)
+        shift = np.einsum("mcpq,mcq->mcp", np.linalg.pinv(whole[:, None] - information, hermitian=True), gradient)
+        n = np.maximum(used.sum(axis=1), 2)
+        jackknife = np.einsum("mcp,mcq,mc->mpq", shift, shift, used) * ((n - 1) / n)[:, None, None]
+        by_columns = np.einsum("mpq,mqp->m", whole, jackknife) / p
+        by_chi2 = fits.tested / np.maximum(fits.dof, 1)
+        return np.asarray(np.maximum(1.0, np.maximum(by_columns, by_chi2)))
 
     def _trimmed(
         self, model: ImageModel, evidence: Evidence, fits: Fits, which: NDArray[np.int64], seen: Observation

@@ -145,14 +145,13 @@ class Fits:
     def __getitem__(self, index: NDArray[Any]) -> Fits:
         return Fits(**{name: values[index] for name, values in vars(self).items()})
 
-    def with_scale(self, largest: float) -> Fits:
-        """Return the fits with covariances scaled by χ² per degree of freedom, by 1 at least and at most `largest`²."""
-        scale = np.clip(self.tested / np.maximum(self.dof, 1), 1.0, largest**2)[:, None]
+    def with_scale(self, scale: NDArray[np.float64]) -> Fits:
+        """Return the fits with covariances scaled, each by a number (m,)."""
         return replace(
             self,
-            covariance=self.covariance * scale[:, :, None],
-            information=self.information / scale[:, :, None],
-            std_without_one=self.std_without_one * np.sqrt(scale),
+            covariance=self.covariance * scale[:, None, None],
+            information=self.information / scale[:, None, None],
+            std_without_one=self.std_without_one * np.sqrt(scale)[:, None],
         )
 
     def with_free(self, p: int) -> Fits:
