@@ -1430,7 +1430,8 @@ def _match(
         # among the frames of a moving camera some do not show the landmark: that needs no diagnosis
         if refused is not None and not (no_diagnosis or unknown_background or (moving and n_accepted)):
             diagnosis = replace(diagnose(matcher, refused[1], 0, background=background), index=refused[0])
-            message = _diagnosis_text(diagnosis, _ReadOptions(unit, flip_h, flip_v, rotate, method == "nearest"))
+            given = _ReadOptions(unit, flip_h, flip_v, rotate, method == "nearest", fix == "bearing")
+            message = _diagnosis_text(diagnosis, given)
             typer.echo(f"note: {message}", err=True)
             if as_json:
                 answers[diagnosis.index]["diagnosis"] = {**diagnosis.as_dict(), "message": message}
@@ -1978,6 +1979,7 @@ class _ReadOptions:
     flip_v: bool
     rotate: int
     nearest: bool
+    bearing_fixed: bool
 
 
 def _diagnosis_text(diagnosis: Diagnosis, given: _ReadOptions) -> str:
@@ -1995,7 +1997,7 @@ def _flags(change: Change, given: _ReadOptions) -> str:
     if change.parameter == "method":
         return refine.strip()
     if change.parameter == "free":
-        return f"{refine}--free bearing"
+        return f"{refine}--free bearing" + (" instead of --fix bearing" if given.bearing_fixed else "")
     if change.parameter == "background":
         if value == "auto":
             return f"{refine}--auto-background"

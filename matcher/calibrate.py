@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from phasemark import UsageError
 from phasemark.data.progress import Progress, counter
@@ -570,7 +570,7 @@ def _from_recording(
         covariance_from="noise, slow errors and weak priors (restricted maximum likelihood)",
         chi2=found.chi2,
         dof=dof,
-        p_value=float(stats.chi2.sf(found.chi2, max(dof, 1))),
+        p_value=float(special.chdtrc(max(dof, 1), found.chi2)),
         on="ranges",
         poses=poses,
         pose_shift=found.pose_error[:, :3],

@@ -273,6 +273,7 @@ class _Seen:
 
     @classmethod
     def of(cls, frame: FilteredFrames) -> _Seen:
+        frame = frame.with_pooled_noise()
         returned = (frame.state[0] == PixelState.RETURN).ravel()
         std = np.where(returned, frame.std_m[0].ravel(), np.inf)
         returned &= np.isfinite(std)
@@ -306,6 +307,7 @@ def fitted_wall(frame: FilteredFrames, background: Background, bearing_rad: floa
     bearing_rad : float
         Of the landmark: the wall is perpendicular to the line of sight.
     """
+    frame = frame.with_pooled_noise()
     empty = Renderer(None, frame.sensor)
     returned = frame.state[0] == PixelState.RETURN
     for _ in range(3):

@@ -646,7 +646,7 @@ class MaximumLikelihood:
         assert match.covariance is not None
         covariance = match.covariance + np.sum(list(parts.values()), axis=0)
         reason = match.reason
-        if not reason and not self._is_determined(np.sqrt(np.diag(covariance))):
+        if not reason and not self._is_determined(np.sqrt(np.diag(covariance)), match.symmetry):
             reason = "undetermined"
         return replace(match, covariance=covariance, systematic=parts, reason=reason, accepted=not reason)
 
@@ -747,7 +747,7 @@ class MaximumLikelihood:
             reason = "poor fit"
         elif self.unknown and fits.explained[best] < _FEWEST_EXPLAINED * len(self.free):
             reason = "undetermined"
-        elif not self._is_determined(fits.std_without_one[best]):
+        elif not self._is_determined(fits.std_without_one[best], self._symmetry[c]):
             reason = "undetermined"
         elif self._is_ambiguous(fits, kept, weight[:-1]):
             reason = "ambiguous"
@@ -772,10 +772,16 @@ class MaximumLikelihood:
             reason=reason,
         )
 
-    def _is_determined(self, std: NDArray[np.float64]) -> bool:
-        """Return whether a frame tells every free parameter to within the tolerance, three standard deviations."""
+    def _is_determined(self, std: NDArray[np.float64], symmetry: int) -> bool:
+        """Return whether a frame tells every free parameter to within the tolerance, three standard deviations.
+
+        The error of δ is at most half a period of the landmark, which no tolerance is below for a body of revolution.
+        """
         tolerance = np.array([self._tolerance[name] for name in self.free])
-        return bool((_TOLERATED_SIGMA * std <= tolerance).all())
+        error = _TOLERATED_SIGMA * std
+        turn = self.free.index("delta_rad")
+        error[turn] = min(error[turn], math.pi / symmetry)
+        return bool((error <= tolerance).all())
 
     def _is_ambiguous(self, fits: Fits, kept: list[int], weight: NDArray[np.float64]) -> bool:
         """Return whether other classes, or views beyond the tolerance, are too probable; `kept` is best first."""

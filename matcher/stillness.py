@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
+from scipy import special
 
 from phasemark.render import Frames, measured_range_std, predicted_range_std, wrap_difference_m
 
@@ -128,6 +128,8 @@ def _order(ranges: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
 
 def _correlations(series: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return C and its variance for each pixel of (frames, pixels); NaN where too few frames are valid or all alike."""
+    from scipy import stats  # slow to import
+
     valid = np.isfinite(series)
     n = valid.sum(axis=0)
     in_time = np.argsort(~valid, axis=0, kind="stable")  # the valid ones first, in their order

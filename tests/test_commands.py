@@ -225,20 +225,21 @@ def test_a_hard_render_has_no_mixed_pixel(run, tmp_path):
         assert set(np.unique(data["coverage"])) == {0.0, 1.0}
 
 
-def test_refinement_tells_standard_deviations_and_frees_the_bearing(run, folder):
-    code, out, _ = run("match", folder / "bank.h5", folder / "frames.csv", *MATCH, "--method", "refine", "--json")
+def test_refinement_tells_standard_deviations_and_fixes_or_frees_the_bearing(run, folder):
+    refine = ["match", folder / "bank.h5", folder / "frames.csv", *MATCH, "--method", "refine", "--json"]
+    code, out, _ = run(*refine, "--fix", "bearing")
     assert code == 0
     (match,) = json.loads(out)["matches"]
     assert match["class"] == "cone"
     assert match["distance_m"] == pytest.approx(1.0, abs=1e-3)  # ten standard deviations before a wall
     assert match["delta_deg"] == pytest.approx(40.0, abs=0.5)
     assert np.array(match["covariance"]).shape == (2, 2)
-    code, out, _ = run(
-        "match", folder / "bank.h5", folder / "frames.csv", *MATCH, "--method", "refine", "--free", "bearing", "--json"
-    )
-    (match,) = json.loads(out)["matches"]
-    assert match["free"] == ["distance_m", "delta_rad", "bearing_rad"]
-    assert match["bearing_deg"] == pytest.approx(0.0, abs=0.3)
+    for bearing in ([], ["--free", "bearing"]):
+        code, out, _ = run(*refine, *bearing)
+        (match,) = json.loads(out)["matches"]
+        assert match["free"] == ["distance_m", "delta_rad", "bearing_rad"]
+        assert np.array(match["covariance"]).shape == (3, 3)
+        assert match["bearing_deg"] == pytest.approx(0.0, abs=0.3)
     auto = ["--unit", "m", "--quantity", "range", "--auto-background", "--method", "refine"]
     code, out, _ = run("match", folder / "bank.h5", folder / "frames.csv", *auto)
     assert code == 0

@@ -88,7 +88,7 @@ def test_every_frame_of_a_moving_camera_is_a_match_with_its_time(run, folder):
 
 
 def test_without_moving_one_note_says_that_something_moved(run, folder):
-    code, out, err = run("match", folder / "bank.h5", folder / "flight.csv", *READ)
+    code, out, err = run("match", folder / "bank.h5", folder / "flight.csv", *READ, "--no-diagnosis")
     assert code == 0
     assert [line.split()[0] for line in out.splitlines()] == ["position", "0"]
     assert len(err.splitlines()) == 1
@@ -117,6 +117,7 @@ def test_rows_are_printed_as_batches_finish(folder, capsys, monkeypatch):
 
     monkeypatch.setattr(Matcher, "match", watched)
     command = ["match", str(folder / "bank.h5"), str(folder / "flight.csv"), *map(str, READ), "--moving"]
+    command.append("--no-diagnosis")  # which matches too
     assert main(command) == 0
     printed.append(capsys.readouterr().out)
     # before each batch the rows of the one before, the header with the first
@@ -150,8 +151,9 @@ def test_a_single_frame_of_a_direct_sensor_has_the_noise_that_the_sensor_states(
         (batch,) = match_in_batches(Matcher(bank), frames.each_a_position(), kalman_filter)
     returned = np.isfinite(batch.filtered.range_m)
     assert returned.any()
-    assert (batch.filtered.std_m[returned] == ZONES.range_std_m).all()
-    assert not batch.filtered.std_from_scatter
+    frames = batch.filtered.with_pooled_noise()
+    assert (frames.std_m[returned] == ZONES.range_std_m).all()
+    assert not frames.std_from_scatter
 
 
 def test_the_fit_of_frames_at_rest_passes_its_test_as_often_as_stated(run, folder, tmp_path):
@@ -204,7 +206,7 @@ def test_estimates_are_a_table_of_what_was_free(run, folder, tmp_path):
     code, out, err = run(*match, "--estimates", file)
     assert (code, out) == (4, "")
     assert "--force" in err
-    assert run(*match, "--estimates", file, "--force")[0] == 0
+    assert run(*match, "--fix", "bearing", "--estimates", file, "--force")[0] == 0
     assert "bearing_deg" not in rows_of(file)[0]
 
 

@@ -97,7 +97,7 @@ def test_views_in_the_last_cells_of_the_grid_are_found(bank, renderers, distance
 def test_the_error_of_distance_and_angle_is_the_bound_and_the_covariance_says_so(bank, renderers):
     # N = 500 over the four classes; 99.9 % intervals over 7 figures
     rng = np.random.default_rng(20)
-    match = Matcher(bank, "refine").match
+    match = Matcher(bank, "refine", free=VIEW[:2]).match
     errors = [run_trials(match, renderers[name], name, Conditions(), 125, rng) for name in NAMES]
     for trials in errors:
         assert (trials.found == trials.class_name).all()
@@ -122,7 +122,7 @@ def test_the_error_of_distance_and_angle_is_the_bound_and_the_covariance_says_so
 def test_before_a_wall_mixed_pixels_inform_and_the_error_is_that_bound(bank, renderers):
     # N = 40: a matcher that stops at a side peak, or at ranges of the landmark alone, is off by tens of bounds
     conditions = Conditions(background=WALL)
-    matcher = Matcher(bank, "refine", background=WALL)
+    matcher = Matcher(bank, "refine", free=VIEW[:2], background=WALL)
     trials = run_trials(matcher.match, renderers["cone"], "cone", conditions, 40, np.random.default_rng(2))
     inner = trials.scaled[~trials.outlier]
     assert len(inner) >= 38
@@ -135,9 +135,8 @@ def test_on_phasors_the_albedo_does_not_matter(bank):
     # 30 % darker than the bank has it; N = 30
     dark = Renderer(build_mesh(catalog()["cylinder"]), SENSOR, albedo=0.56)
     conditions = Conditions(on="phasors", distance_m=(0.8, 1.2))
-    trials = run_trials(
-        Matcher(bank, "refine", on="phasors").match, dark, "cylinder", conditions, 30, np.random.default_rng(3)
-    )
+    matcher = Matcher(bank, "refine", free=VIEW[:2], on="phasors")
+    trials = run_trials(matcher.match, dark, "cylinder", conditions, 30, np.random.default_rng(3))
     inner = trials.scaled[~trials.outlier]
     assert len(inner) >= 29
     assert np.sqrt((inner**2).mean()) < 1.05 + 3.3 / math.sqrt(4 * len(inner))
