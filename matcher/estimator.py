@@ -54,6 +54,8 @@ TOLERANCE_M, TOLERANCE_RAD = 0.03, math.radians(6.0)
 """An accepted answer is right to within these at three standard deviations."""
 BEARING_STD_RAD = math.radians(1.5)
 """How well a mount is thought to point at the landmark, unless the matcher is told."""
+_SURE_BEARING = 0.05
+"""Share of half a column to which a bearing must be known for other bearings to be out of the question."""
 _PRIOR_SIGMA = 3.0
 """Bearings up to so many standard deviations of the prior are searched."""
 _TOLERATED_SIGMA = 3.0
@@ -369,36 +371,41 @@ class MaximumLikelihood:
         A flat one looks nearly the same under every bearing, its heading kept.
         """
         best = _best_of_frame(fits)
-        odd = np.array([self._symmetry[c] % 2 for c in fits.class_index[best]], np.bool_)
-        best = best[(odd | ("bearing_rad" in self.free)) & np.isfinite(fits.cost[best])]
-        view = fits.view[best].copy()
-        view[:, 1] += math.pi
-        middle = self._middle[fits.class_index[best]]
-        here, there = (_rotated(middle, delta) for delta in (fits.view[best, 1], view[:, 1]))
-        view[:, 0] += here[:, 0] - there[:, 0]
-        if "bearing_rad" in self.free:
-            view[:, 2] += np.arctan2(here[:, 1], fits.view[best, 0] + here[:, 0])
-            view[:, 2] -= np.arctan2(there[:, 1], view[:, 0] + there[:, 0])
-        settings = self._settings(behind)
-        limit = fits.cost[best] + LIKELY
-        candidates = [view]
+        best = best[np.isfinite(fits.cost[best])]
+        half = self._search.column_rad / 2
+        candidates = []
+        odd = best[np.array([self._symmetry[c] % 2 for c in fits.class_index[best]], np.bool_)]
+        bearings = (0.0, -half, half) if "bearing_rad" in self.free else (0.0,)
+        candidates += [(odd, self._from_behind(fits, odd) + np.array([0.0, 0.0, side, 0.0])) for side in bearings]
         if "bearing_rad" in self.free:
             # a flat landmark tells the heading δ − b, and little of its two parts
-            half = self._search.column_rad / 2
-            turned = (-half, half) if self._prior_std else (-2 * half, -half, half, 2 * half)
-            candidates += [view + np.array([0.0, 0.0, side, 0.0]) for side in (-half, half)]
-            candidates += [fits.view[best] + np.array([0.0, side, side, 0.0]) for side in turned]
-        best, limit = np.tile(best, len(candidates)), np.tile(limit, len(candidates))
+            flat = best[fits.std_without_one[best, self.free.index("bearing_rad")] > _SURE_BEARING * half]
+            turned = np.array([-half, half] if self._prior_std else [-2 * half, -half, half, 2 * half])
+            candidates += [(flat, fits.view[flat] + np.array([0.0, side, side, 0.0])) for side in turned]
+        source = np.concatenate([which for which, _ in candidates])
         return refine(
             model,
             evidence,
-            fits.frame[best],
-            fits.class_index[best],
-            np.concatenate(candidates),
-            settings,
-            limit,
-            at_first_sight="bearing_rad" not in self.free or bool(self._prior_std),
+            fits.frame[source],
+            fits.class_index[source],
+            np.concatenate([views for _, views in candidates]),
+            self._settings(behind),
+            fits.cost[source] + LIKELY,
+            # zones of a direct sensor do not mix light: the cost of a view says little of that of its neighbours
+            at_first_sight=len(self.free) == 2 or bool(self._prior_std) or evidence.sensor.kind == "phase",
         )
+
+    def _from_behind(self, fits: Fits, which: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return views of some fits from the other side, the landmark's middle at the same place; (k, 4)."""
+        view = fits.view[which].copy()
+        view[:, 1] += math.pi
+        middle = self._middle[fits.class_index[which]]
+        here, there = (_rotated(middle, delta) for delta in (fits.view[which, 1], view[:, 1]))
+        view[:, 0] += here[:, 0] - there[:, 0]
+        if "bearing_rad" in self.free:
+            view[:, 2] += np.arctan2(here[:, 1], fits.view[which, 0] + here[:, 0])
+            view[:, 2] -= np.arctan2(there[:, 1], view[:, 0] + there[:, 0])
+        return view
 
     def _without_borders(self, models: _Models, evidence: Evidence, fits: Fits) -> Fits:
         """Fit the best views again without the pixels beside one that sees something else.
