@@ -137,10 +137,11 @@ def test_an_accepted_frame_has_nothing_to_diagnose(banks):
 
 
 @pytest.mark.parametrize(
-    ("options", "flag"), [
+    ("options", "flag"),
+    [
         (["--method", "refine", "--fix", "bearing"], ": --free bearing instead of --fix bearing"),
         ([], "--method refine --free"),
-    ]
+    ],
 )
 def test_the_command_names_the_option_that_makes_a_refused_frame_fit(banks, tmp_path, capsys, options, flag):
     image = Renderer(build_mesh(catalog()["cone"]), preset("pmd-16x16"), albedo=0.8).render(
