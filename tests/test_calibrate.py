@@ -416,7 +416,8 @@ def matched(folder, capsys, sensor, albedo, truth):
             "--distance", "0.85:1.15:0.01", "--delta", "15:75:1", "--out", str(folder / "bank.h5")]  # fmt: skip
     assert main(bank) == 0
     match = ["match", str(folder / "bank.h5"), str(folder / "frames.npz"), "--method", "refine", "--fix", "bearing",
-             "--json", "--landmark-xy", "0", "0", "--prior", "-0.7", "-0.7", "45", "--prior-std", "1", "45"]  # fmt: skip
+             "--json", "--landmark-xy", "0", "0", "--prior", "-0.7", "-0.7", "45",
+             "--prior-std", "1", "45"]  # fmt: skip
     capsys.readouterr()
     assert main(match) == 0
     answers = json.loads(capsys.readouterr().out)["matches"]
