@@ -152,6 +152,11 @@ def test_a_free_bearing_is_found_with_the_rest(bank, renderers):
     assert np.sqrt((trials.scaled**2).mean()) < 1.05 + 3.3 / math.sqrt(6 * 12)
 
 
+def test_trials_of_a_matcher_that_estimates_something_else_are_refused(bank, renderers):
+    with pytest.raises(UsageError, match="estimates distance_m, delta_rad, bearing_rad, and 'free'"):
+        run_trials(Matcher(bank, "refine").match, renderers["cone"], "cone", Conditions(), 1, np.random.default_rng(1))
+
+
 def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, renderers):
     view = Views.broadcast([0.9, 1.2], [0.5, 2.0])
     wall = Background(wall_m=3.3, wall_albedo=0.4)
