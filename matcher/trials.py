@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from phasemark import UsageError
 from phasemark.matcher.bounds import Estimate, covers, cramer_rao, efficiency, mean_of, nees, share
 from phasemark.matcher.filters import FilteredFrames, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood import Quantity
@@ -282,6 +283,11 @@ def run_trials(
     Returns
     -------
     Trials
+
+    Raises
+    ------
+    UsageError
+        The matcher estimates other parameters than the conditions say.
     """
     period = 2 * math.pi / symmetry
     sensor = renderer.sensor
@@ -322,6 +328,8 @@ def _judged(
     k = free.index("delta_rad")
     error[:, k] -= period * np.round(error[:, k] / period)
     covariance = matches.covariance
+    if covariance is not None and matches.free != free:
+        raise UsageError(f"the matcher estimates {', '.join(matches.free)}, and 'free' of the conditions is {free!r}")
     return Trials(
         class_name=class_name,
         views=views,

@@ -1,7 +1,10 @@
 """Calibration of a mounting: truth recovered from simulated recordings and what is said when not."""
 
+import io
 import json
 import math
+import shutil
+from contextlib import redirect_stdout
 from dataclasses import replace
 
 import numpy as np
@@ -366,10 +369,20 @@ def command(folder, tmp_path, *more, frames="frames.npz", poses="poses.csv", lan
     )  # fmt: skip
 
 
-def test_the_command_writes_a_sensor_that_every_other_command_takes(folder, tmp_path, capsys):
+@pytest.fixture(scope="module")
+def written(folder, tmp_path_factory):
+    """Return a folder with what the command writes, and what it prints."""
+    there, printed = tmp_path_factory.mktemp("written"), io.StringIO()
+    with redirect_stdout(printed):
+        assert command(folder[0], there, "--json") == 0
+    return there, json.loads(printed.getvalue())
+
+
+def test_the_command_writes_a_sensor_that_every_other_command_takes(folder, written, tmp_path, capsys):
     path, truth = folder
-    assert command(path, tmp_path, "--json") == 0
-    answer = json.loads(capsys.readouterr().out)
+    there, answer = written
+    for name in ("cam.toml", "cam.png"):
+        shutil.copy(there / name, tmp_path)
     sensor = Sensor.from_toml(tmp_path / "cam.toml")
     assert sensor == Sensor(**answer["sensor"])
     for name in NAMES:
@@ -388,7 +401,9 @@ def test_the_command_writes_a_sensor_that_every_other_command_takes(folder, tmp_
     assert main(bank) == 0
     assert command(path, tmp_path) == 4  # it exists
     capsys.readouterr()
-    assert command(path, tmp_path, "--force", "--fix", "fov,albedo", landmark=str(tmp_path / "bank.h5")) == 0
+    assert (
+        command(path, tmp_path, "--force", "--fix", "roll,height,fov,albedo", landmark=str(tmp_path / "bank.h5")) == 0
+    )
     printed = capsys.readouterr().out
     assert "half_angle_h" in printed
     assert "fixed" in printed
@@ -400,8 +415,8 @@ def matched(folder, capsys, sensor, albedo, truth):
     bank = ["bank", "build", "--class", "cylinder", "--sensor", sensor, "--albedo", albedo, "--force",
             "--distance", "0.85:1.15:0.01", "--delta", "15:75:1", "--out", str(folder / "bank.h5")]  # fmt: skip
     assert main(bank) == 0
-    match = ["match", str(folder / "bank.h5"), str(folder / "frames.npz"), "--method", "refine", "--json",
-             "--fix", "bearing", "--landmark-xy", "0", "0", "--prior", "-0.7", "-0.7", "45",
+    match = ["match", str(folder / "bank.h5"), str(folder / "frames.npz"), "--method", "refine", "--fix", "bearing",
+             "--json", "--landmark-xy", "0", "0", "--prior", "-0.7", "-0.7", "45",
              "--prior-std", "1", "45"]  # fmt: skip
     capsys.readouterr()
     assert main(match) == 0
@@ -419,20 +434,20 @@ def matched(folder, capsys, sensor, albedo, truth):
     )
 
 
-def test_with_the_calibrated_sensor_distance_side_and_heading_are_at_the_bound(folder, tmp_path, capsys):
+def test_with_the_calibrated_sensor_distance_side_and_heading_are_at_the_bound(folder, written, tmp_path, capsys):
     """The whole mounting goes into the file: nothing is left to carry by hand but the landmark's albedo."""
-    path, truth = folder
-    assert command(path, tmp_path, "--json") == 0
-    albedo = json.loads(capsys.readouterr().out)["parameters"]["albedo"]["value"]
+    _, truth = folder
+    there, answer = written
+    albedo = answer["parameters"]["albedo"]["value"]
     rng, n = np.random.default_rng(71), 24
     poses = KnownPoses.polar(rng.uniform(0.9, 1.1, n), rng.uniform(20, 70, n) * DEGREE)  # the mount points at it
     save(tmp_path / "frames.npz", take(truth, poses, rng))
     # pointed at it, the robot heads along the line of sight (PHYSICS section 8, b = β = ψ = 0)
-    there = (poses.distance_m, poses.delta_rad, poses.delta_rad)
-    right = matched(tmp_path, capsys, str(tmp_path / "cam.toml"), str(albedo), there)
+    expected = (poses.distance_m, poses.delta_rad, poses.delta_rad)
+    right = matched(tmp_path, capsys, str(there / "cam.toml"), str(albedo), expected)
     # χ²(24) / 24 at 99.9 % over 3 numbers, and a common error of the calibration, some 0.3 σ of a single match
     assert (np.mean(right**2, axis=0) < stats.chi2.ppf(1 - 1e-3 / 3, n) / n + 0.3**2 * 4).all()
-    wrong = matched(tmp_path, capsys, "pmd-16x16", str(albedo), there)
+    wrong = matched(tmp_path, capsys, "pmd-16x16", str(albedo), expected)
     assert abs(wrong.mean(axis=0)).min() > 3 * abs(right.mean(axis=0)).max()
 
 
@@ -713,8 +728,16 @@ def test_the_command_says_what_a_delay_takes(folder, tmp_path, capsys, more, par
     assert part in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_the_command_refuses_to_write_what_cannot_be_trusted(folder, tmp_path, capsys):
+def test_the_command_refuses_to_write_what_cannot_be_trusted(folder, tmp_path, capsys, monkeypatch):
     """A cylinder calibrated as a cone: fields of view and range offset run away."""
+    found = []
+
+    def calibrated(*given, **options):
+        if not found:
+            found.append(calibrate(*given, **options))
+        return found[0]
+
+    monkeypatch.setattr("phasemark.matcher.calibrate", calibrated)  # both commands calibrate alike
     free = ("--free", "pitch,half_angle_h,range_offset", "--on", "ranges")
     assert command(folder[0], tmp_path, *free, landmark="cone") == 3
     error = capsys.readouterr().err.splitlines()[-1]

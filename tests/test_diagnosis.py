@@ -13,6 +13,7 @@ from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, diagnose, kalman_filter
+from phasemark.matcher.diagnosis_search import _Seen
 from phasemark.render import Background, Renderer, capture, preset
 
 PRESETS = ("vl53l5cx-8x8", "pmd-16x16")
@@ -57,6 +58,14 @@ def test_a_landmark_off_to_a_side_is_diagnosed_with_its_bearing(banks, name, bea
     assert found.match.accepted
     assert math.degrees(found.match.bearing_rad) == pytest.approx(bearing_deg, abs=0.3)  # five standard deviations
     assert f"bearing {'' if found.changes[0].parameter == 'free' else 'of '}" in str(found)
+
+
+def test_a_single_frame_of_a_direct_sensor_is_searched_with_the_noise_of_its_law():
+    sensor = preset("vl53l5cx-8x8")
+    image = Renderer(build_mesh(catalog()["cone"]), sensor, albedo=0.8).render(*CONE_VIEW)
+    seen = _Seen.of(kalman_filter(capture(image, sensor, rng=np.random.default_rng(1), n_frames=1)))
+    assert seen.returned.any()
+    assert seen.usual_std_m == pytest.approx(sensor.range_std_m)
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -152,6 +152,11 @@ def test_a_free_bearing_is_found_with_the_rest(bank, renderers):
     assert np.sqrt((trials.scaled**2).mean()) < 1.05 + 3.3 / math.sqrt(6 * 12)
 
 
+def test_trials_of_a_matcher_that_estimates_something_else_are_refused(bank, renderers):
+    with pytest.raises(UsageError, match="estimates distance_m, delta_rad, bearing_rad, and 'free'"):
+        run_trials(Matcher(bank, "refine").match, renderers["cone"], "cone", Conditions(), 1, np.random.default_rng(1))
+
+
 def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, renderers):
     view = Views.broadcast([0.9, 1.2], [0.5, 2.0])
     wall = Background(wall_m=3.3, wall_albedo=0.4)
@@ -167,13 +172,13 @@ def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, ren
         assert match.delta_rad == pytest.approx(delta, abs=math.radians(0.3))
 
 
+@pytest.mark.parametrize(("free", "n"), [(VIEW[:2], 40), (None, 3)])
 @pytest.mark.parametrize("name", ["cube", "slab", "table", "pyramid"])
-def test_a_stranger_on_the_same_box_is_refused(bank, name):
+def test_a_stranger_on_the_same_box_is_refused(bank, name, free, n):
     rng = np.random.default_rng(8)
-    n = 40
     renderer = Renderer(strangers()[name], SENSOR, albedo=0.8)
     views = Views.broadcast(rng.uniform(0.8, 1.2, n), rng.uniform(0, np.pi, n))
-    matcher = Matcher(bank, "refine")
+    matcher = Matcher(bank, "refine", free=free)
     images = renderer.render_views(views)
     noncentrality = matcher.match(noise_free(images, 50)).chi2  # after refitting the view, of the nearest class
     far = noncentrality >= 150
@@ -216,8 +221,8 @@ def test_a_hidden_column_is_refused_and_robust_residuals_place_the_rest(bank, re
     image.phasor[:, :, 6] = 0.8 / near**2 * np.exp(1j * near / SENSOR.metres_per_radian)
     image.intensity[:, :, 6] = 0.8 / near**2
     frames = kalman_filter(capture(image, SENSOR, rng=rng, n_frames=50))
-    assert not Matcher(bank, "refine").match(frames).accepted.any()
-    matches = Matcher(bank, "refine", robust=True).match(frames)
+    assert not Matcher(bank, "refine", free=VIEW[:2]).match(frames).accepted.any()
+    matches = Matcher(bank, "refine", free=VIEW[:2], robust=True).match(frames)
     assert (matches.class_name == "cone").mean() >= 0.9
     assert not matches.accepted.any()
     # a fifteenth of the pixels is lost: the errors are those of the whole frame, 0.3 mm at 1 m
@@ -229,7 +234,7 @@ def test_a_camera_with_unknown_offsets_still_gets_class_and_view_but_is_not_acce
     views = Views.broadcast(rng.uniform(0.8, 1.2, n), rng.uniform(0, np.pi, n))
     frames = kalman_filter(capture(renderers["cone"].render_views(views), SENSOR, rng=rng, n_frames=50))
     off = frames.range_m + rng.normal(0, 0.02, (16, 16))  # seven times what noise leaves in a pixel
-    matches = Matcher(bank, "refine").match(replace(frames, range_m=off))
+    matches = Matcher(bank, "refine", free=VIEW[:2]).match(replace(frames, range_m=off))
     assert (matches.class_name == "cone").mean() >= 0.9
     assert not matches.accepted.any()
     assert np.median(np.abs(matches.distance_m - views.distance_m)) < 10e-3
@@ -320,7 +325,7 @@ def test_phasors_of_frames_without_amplitude_are_refused(bank):
 
 @pytest.fixture(scope="module")
 def matchers(bank):
-    return Matcher(bank, "refine"), Matcher(bank, "refine", background="auto")
+    return tuple(Matcher(bank, "refine", free=VIEW[:2], background=background) for background in (None, "auto"))
 
 
 @given(**DAMAGE)

@@ -16,8 +16,9 @@ from phasemark.render import Background, Frames, Renderer, Views, capture
 
 VIEW = ("distance_m", "delta_rad")
 FIELDS = ("pitch_deg", "half_angle_h_deg", "half_angle_v_deg", "bearing_offset_deg", "range_offset_m")
-STD = np.array([0.05, 0.03, 0.03, 0.1, 2e-3])
-N_CAMERAS = 60
+STD = np.array([0.02, 0.01, 0.01, 0.05, 2e-3])
+"""Small enough that a frame read with another camera fits: poor fits are searched again, which takes long."""
+N_CAMERAS = 24
 
 
 def calibrated(sensor, **more):
@@ -29,7 +30,7 @@ def calibrated(sensor, **more):
 def bank(request):
     plan = BankPlan(
         classes=("cone",), sensor=request.param, layout="full",
-        distance_m=tuple(np.round(np.arange(0.9, 1.11, 0.02), 3)), delta_deg=tuple(range(0, 180, 2)),
+        distance_m="0.93:1.07:0.01", delta_deg="0:90:1",
     )  # fmt: skip
     return build_bank(plan, workers=1)
 
@@ -62,7 +63,7 @@ def test_slopes_by_calibrated_fields_are_those_of_frames_made_with_other_fields(
 
 
 def test_views_measured_by_many_cameras_scatter_as_the_covariance_says(bank):
-    # every camera differs from the calibrated one by a draw from the calibration's covariance; N = 60, 99.9 %
+    # every camera differs from the calibrated one by a draw from the calibration's covariance; N = 24, 99.9 %
     rng, sensor = np.random.default_rng(11), bank.sensor
     matcher = Matcher(bank, "refine", free=VIEW)
     renderer = Renderer(bank.mesh("cone"), sensor, albedo=0.8)
