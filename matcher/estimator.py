@@ -156,6 +156,14 @@ class MaximumLikelihood:
         self._rendered: RenderedModel | None = None
         if self.auto or not exact:
             self._rendered = RenderedModel(bank, self.background, self._workers)
+            nearest = self._rendered.limits()[0]
+            if bank.distance_m[-1] < nearest:
+                raise UsageError(
+                    f"the bank ends at {bank.distance_m[-1]:g} m, and views nearer than {nearest:.3g} m, half the"
+                    " landmark's width, are not rendered: build it in steps of at most"
+                    f" {_FINE[0]:g} m and {math.degrees(_FINE[1]):.2g}°, and free"
+                    " distance_m and delta_rad alone without a background"
+                )
         aside = "bearing_rad" in self.free
         fine = (1, 1) if self.background is not None and not aside else (2, 3)
         along, around = (
