@@ -1,14 +1,15 @@
-"""Match a recording of a small time-of-flight sensor that turns before a flat panel, and compare with the truth.
+"""Match a recording of a small time-of-flight sensor before a flat panel, frame by frame, and compare with the truth.
 
-``python examples/real_recording.py panel.csv --out out/recording``
+``python examples/real_recording.py panel.csv --sensor out/calibration/sensor.toml --second-half --out out/recording``
 
-The CSV has one frame a line, with a header: ``mm_0 … mm_63`` (z distances of 8 × 8 zones, row by row from the top),
-``status_0 … status_63`` (5: valid), and of a motion-capture system ``panel_x_m`` (how far the panel's plane is from the
-sensor along its normal) and ``yaw_deg`` (heading, 0: facing the panel, counter-clockwise). An empty cell is a missing
-value. ETH Zürich's data set Matrix_ToF_Drones has recordings of this kind.
+The CSV file is read as `phasemark match` reads it: ``t_ms``, ``mm_0 … mm_63`` (z of 8 × 8 zones, row by row from the
+top) and ``status_0 … status_63`` (5: valid). If it also has ``panel_x_m`` (distance of the panel's plane from the lens,
+along its normal) and ``yaw_deg`` (heading, counter-clockwise, 0: facing the panel), the estimates are compared with
+them. ETH Zürich's data set Matrix_ToF_Drones has recordings of this kind.
 
-Each frame by itself gives the panel's distance D along the optical axis and the side δ it is seen from. Zones that see
-the floor or miss the panel are told apart by a plane: seen by a pinhole, a plane's 1/z is linear over the image.
+Each frame alone gives the distance and the heading, with their covariance. A flat panel does not tell where along it
+the camera looks, so the model is a slab wider than the view and the bearing is fixed. The floor, and whatever is seen
+past the panel, are unknown things: ``background="unknown"``.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ import csv
 import math
 import sys
 import tempfile
+import time
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,278 +28,232 @@ import numpy as np
 import trimesh
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from phasemark import PhasemarkError
-from phasemark.data import read_frames
-from phasemark.render import Frames, Renderer, Sensor, preset
+from phasemark.data import BankPlan, MeshPlan, build_bank, read_frames
+from phasemark.matcher import Matcher, Matches, kalman_filter
+from phasemark.render import Frames, Sensor, preset
 
-VALID_STATUS = 5
-FEWEST_ZONES = 16
-"""A quarter of the zones has to lie on the panel."""
-FEWEST_INSIDE = 8
-"""Where fewer would be left without the zones at the sides, those are kept."""
-NEAREST_M = 0.2
-"""Nearer returns are the floor or the sensor's own cover."""
-TOLERANCE_M = 0.015
-"""A zone lies on the plane if it is nearer to it than this: four times the noise of a zone."""
-STEEPEST_RAD = np.radians(50.0)
 THICKNESS_M = 0.01
 """Of the panel; its landmark axis lies in the middle."""
-STEPS = 6
-"""Gauss–Newton steps; the model is all but linear."""
-DIFFERENCE = np.array([1e-3, 1e-3])
-"""Steps of the differences in D (m) and δ (rad)."""
+WIDE_M = 4.0
+"""Width and height of the slab, more than the view covers."""
+AT_ONCE = 64
+"""Frames in a batch."""
+FACING_RAD, GROSS_M, GROSS_RAD = np.radians(45.0), 0.03, np.radians(6.0)
+INSIDE_95 = 5.991
+"""95 % quantile of χ² with two degrees of freedom."""
+BLOCKS = 8
+"""Blocks of time that are left out in turn for the standard deviation of a delay."""
+Floats = NDArray[np.float64]
 
 
 @dataclass
 class Recording:
-    """A recording and its truth; n frames."""
+    """Frames of a moving camera, one a position, and the columns of their table that are no pixels.
 
-    z_m: NDArray[np.float64]
+    `columns` are those of the frames, `whole` those of the whole file.
+    """
+
     frames: Frames
-    distance_m: NDArray[np.float64]
-    yaw_rad: NDArray[np.float64]
+    columns: dict[str, Floats]
+    whole: dict[str, Floats]
+
+    def truth(self, name: str, at_s: Floats) -> Floats:
+        """Interpolate a column of the file at times (s); rows without a number and repeated stamps are left out."""
+        time_s, values = self.whole["t_ms"] / 1e3, self.whole[name]
+        known = np.isfinite(time_s) & np.isfinite(values)
+        stamps, first = np.unique(time_s[known], return_index=True)
+        smooth = np.unwrap(values[known], period=360.0) if name.endswith("_deg") else values[known]
+        return np.interp(at_s, stamps, smooth[first], left=np.nan, right=np.nan)
 
 
-def read_recording(path: Path, sensor: Sensor) -> Recording:
-    """Read a CSV as described above.
+def uncalibrated() -> Sensor:
+    """Return the preset with the noise that covers zone offsets too, for a sensor that was not calibrated."""
+    return preset("vl53l5cx-8x8").with_(range_std_m=0.006)
+
+
+def read_recording(path: Path, sensor: Sensor, needed: tuple[str, ...], half: str | None = None) -> Recording:
+    """Read a CSV file as described above.
 
     Raises
     ------
     ValueError
-        With one line that says which column or value is wrong.
+        A column is missing, or a value in it is not a number.
     """
-    zones = sensor.rows * sensor.cols
-    names = {
-        "mm": [f"mm_{i}" for i in range(zones)],
-        "status": [f"status_{i}" for i in range(zones)],
-        "truth": ["panel_x_m", "yaw_deg"],
-    }
-    table: dict[str, list[list[float]]] = {group: [] for group in names}
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always")
+        frames = read_frames(path, sensor=sensor, unit="mm", quantity="z", valid_status=[5]).each_a_position()
+    for note in notes:
+        print(f"note: {note.message}", file=sys.stderr)
     with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        try:
-            missing = [name for group in names.values() for name in group if name not in (reader.fieldnames or ())]
-            if missing:
-                raise ValueError(
-                    f"{path}: no column {missing[0]!r}; needed are {', '.join(g[0] for g in names.values())} …"
-                )
-            for line in reader:
-                for group, columns in names.items():
-                    table[group].append([_number(path, reader.line_num, name, line[name]) for name in columns])
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise ValueError(f"{path}, after line {reader.line_num}: not a text table ({error})") from None
-    if not table["mm"]:
-        raise ValueError(f"{path}: no frames")
-    shape = (-1, sensor.rows, sensor.cols)
-    millimetres = np.array(table["mm"]).reshape(shape)
-    status = np.nan_to_num(np.array(table["status"])).astype(int).reshape(shape)
-    truth = np.array(table["truth"])
-    with tempfile.TemporaryDirectory() as folder:
-        arrays = Path(folder) / "recording.npz"
-        np.savez(arrays, range=np.where(millimetres > 0, millimetres, np.nan), status=status)
-        frames = read_frames(arrays, sensor=sensor, unit="mm", quantity="z", valid_status=[VALID_STATUS])
-    z_m = np.where(status == VALID_STATUS, millimetres / 1e3, np.nan)
-    return Recording(z_m, frames, truth[:, 0], np.radians(truth[:, 1]))
-
-
-def _number(path: Path, line: int, name: str, text: str | None) -> float:
-    """Read one value of the table; NaN where there is none."""
+        rows = list(csv.DictReader(line for line in file if line.strip() and not line.startswith("#")))
+    missing = [name for name in needed if name not in rows[0]]
+    if missing:
+        raise ValueError(f"{path}: no column {missing[0]!r}; needed are {', '.join(needed)}")
+    names = [name for name in rows[0] if name and not name.startswith(("mm_", "status_"))]
     try:
-        value = float(text or "nan")
-    except ValueError:
-        raise ValueError(f"{path}, line {line}: {name} must be a number, got {text!r}") from None
-    return value if math.isfinite(value) else math.nan
+        columns = {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: a value is not a number: {error}") from None
+    middle = len(rows) // 2
+    part = {"first": slice(middle), "second": slice(middle, None), None: slice(None)}[half]
+    return Recording(frames[part], {name: values[part] for name, values in columns.items()}, columns)
 
 
-def zone_rays(sensor: Sensor) -> NDArray[np.float64]:
-    """Return (1, y, z) of the ray through the centre of each zone, (zones, 3)."""
-    tan_h, tan_v = sensor.tan_half_angles
-    centre_u, centre_v = sensor.centre_px
-    v, u = np.mgrid[: sensor.rows, : sensor.cols] + 0.5
-    y, z = (centre_u - u) * 2 * tan_h / sensor.cols, (centre_v - v) * 2 * tan_v / sensor.rows
-    return np.column_stack([np.ones(u.size), y.ravel(), z.ravel()])
+def panel_matcher(sensor: Sensor, distance: str) -> Matcher:
+    """Return a matcher for the panel, with a bank over a grid of distances (m) and headings up to 60°."""
+    with tempfile.TemporaryDirectory() as folder:
+        mesh = Path(folder) / "panel.stl"
+        trimesh.creation.box((THICKNESS_M, WIDE_M, WIDE_M)).export(mesh)
+        panel = MeshPlan(name="panel", path=str(mesh), unit="m", symmetry=2)
+        fields = sensor.model_dump(exclude_none=True)
+        plan = BankPlan(
+            meshes=(panel,), sensor="vl53l5cx-8x8", sensor_overrides=fields, distance_m=distance, delta_deg="-60:60:1",
+            layout="full",
+        )  # fmt: skip
+        bank = build_bank(plan)
+    return Matcher(bank, "refine", free=("distance_m", "delta_rad"), background="unknown")
 
 
-def find_plane(
-    z_m: NDArray[np.float64], rays: NDArray[np.float64], rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]] | None:
-    """Find the plane that most zones of a frame lie on, an upright panel before the sensor.
-
-    Returns
-    -------
-    plane : (3,)
-        Its points p satisfy plane · p = 1.
-    on_it : (zones,) bool
-        Or None: too few zones lie on any plane.
-    """
-    seen = np.flatnonzero(np.nan_to_num(z_m) > NEAREST_M)
-    if len(seen) < FEWEST_ZONES:
-        return None
-    a, inverse = rays[seen], 1 / z_m[seen]
-
-    def agrees(plane: NDArray[np.float64]) -> NDArray[np.bool_]:
-        value = a @ plane
-        return (value > 0) & (np.abs(1 / np.where(value > 0, value, 1.0) - z_m[seen]) < TOLERANCE_M)
-
-    best = np.zeros(len(seen), bool)
-    for _ in range(100):
-        chosen = rng.choice(len(seen), 3, replace=False)
-        if abs(np.linalg.det(a[chosen])) < 1e-4:
-            continue
-        on_it = agrees(np.linalg.solve(a[chosen], inverse[chosen]))
-        if on_it.sum() > best.sum():
-            best = on_it
-    plane = np.zeros(3)
-    for _ in range(3):
-        if best.sum() < FEWEST_ZONES:
-            return None
-        weight = z_m[seen][best] ** 2  # the noise of z is the same for all zones, that of 1/z is not
-        plane = np.linalg.lstsq(a[best] * weight[:, None], inverse[best] * weight, rcond=None)[0]
-        best = agrees(plane)
-    upright = abs(plane[2]) < 0.3 * plane[0]
-    if best.sum() < FEWEST_ZONES or not upright or abs(np.arctan2(plane[1], plane[0])) > STEEPEST_RAD:
-        return None
-    on_panel = np.zeros(len(z_m), bool)
-    on_panel[seen[best]] = True
-    return plane, on_panel
+def match(matcher: Matcher, frames: Frames) -> Matches:
+    """Match every frame by itself, in batches."""
+    parts = range(0, len(frames), AT_ONCE)
+    return Matches([one for k in parts for one in matcher.match(kalman_filter(frames[k : k + AT_ONCE]))])
 
 
-def inside(on_panel: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.bool_]:
-    """Leave out zones of a frame that may see past a side of the panel: those with a neighbour that is not on it.
-
-    A zone that sees both is a little too far or too near, and at the side, where it tilts the plane most.
-    """
-    grid = on_panel.reshape(sensor.rows, sensor.cols)
-    beside = np.pad(grid, ((0, 0), (1, 1)), constant_values=True)
-    kept = grid & beside[:, :-2] & beside[:, 2:]
-    return (kept if kept.sum() >= FEWEST_INSIDE else grid).ravel()
-
-
-def panel_width(planes: NDArray[np.float64], on_panel: NDArray[np.bool_], rays: NDArray[np.float64]) -> float:
-    """Return how wide the panel is at least: what zones on it span, to both sides of the axis it is hit at (m)."""
-    points = rays / (planes @ rays.T)[..., None]
-    along = np.stack([-planes[:, 1], planes[:, 0]], axis=1) / np.hypot(planes[:, 0], planes[:, 1])[:, None]
-    across = np.abs(np.einsum("nzk,nk->nz", points[..., :2] - [[[1.0, 0.0]]] / planes[:, None, :1], along))
-    return 2.2 * float(across[on_panel].max())
+def panel_pose(matches: Matches) -> tuple[Floats, Floats]:
+    """Return distance from the panel's front (m) and heading (rad) of n frames, (n, 2), and covariance, (n, 2, 2)."""
+    distance, delta = matches.distance_m, np.angle(np.exp(2j * matches.delta_rad)) / 2  # a slab repeats after 180°
+    covariance = np.full((len(delta), 2, 2), np.nan) if matches.covariance is None else matches.covariance
+    jacobian = np.zeros((len(delta), 2, 2))
+    jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 1] = np.cos(delta), -distance * np.sin(delta), 1.0
+    pose = np.column_stack([distance * np.cos(delta) - THICKNESS_M / 2, delta])
+    return pose, jacobian @ covariance @ jacobian.transpose(0, 2, 1)
 
 
-def match(
-    recording: Recording, sensor: Sensor, rng: np.random.Generator
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
-    """Estimate (D, δ) of every frame that shows enough of the panel.
-
-    Returns
-    -------
-    index : (m,)
-        The frames.
-    view : (m, 2)
-        D and δ.
-    covariance : (m, 2, 2)
-    chi2_per_dof : (m,)
-    width_m : float
-        Of the panel.
-    """
-    rays = zone_rays(sensor)
-    found = [(k, find_plane(z.ravel(), rays, rng)) for k, z in enumerate(recording.z_m)]
-    kept = [(k, *plane) for k, plane in found if plane is not None]
-    if not kept:
-        raise ValueError("no frame shows a panel")
-    index = np.array([k for k, _, _ in kept])
-    planes, on_panel = np.array([p for _, p, _ in kept]), np.array([z for _, _, z in kept])
-    width = panel_width(planes, on_panel, rays)
-    renderer = Renderer(trimesh.creation.box((THICKNESS_M, width, width)), sensor)
-    measured = recording.frames.range_m[0].reshape(len(recording.z_m), -1)[index]
-    used = np.array([inside(frame, sensor) for frame in on_panel])
-    weight = np.where(used & np.isfinite(measured), 1.0, 0.0)
-    view = np.column_stack([1 / planes[:, 0] + THICKNESS_M / 2, np.arctan2(planes[:, 1], planes[:, 0])])
-    view[:, 1] *= -1
-
-    def ranges(at: NDArray[np.float64]) -> NDArray[np.float64]:
-        return renderer.render(at[:, 0], at[:, 1]).range_m.reshape(len(at), -1)
-
-    for _ in range(STEPS):
-        model = ranges(view)
-        slope = np.stack(
-            [(ranges(view + step) - ranges(view - step)) / (2 * step.sum()) for step in np.diag(DIFFERENCE)], axis=2
-        )
-        use = weight * np.isfinite(model) * np.isfinite(slope).all(axis=2)
-        residual = np.where(use > 0, measured - model, 0.0)
-        slope = np.where(use[..., None] > 0, slope, 0.0)
-        information = np.einsum("nza,nzb->nab", slope, slope)
-        view = view + np.linalg.solve(information, np.einsum("nza,nz->na", slope, residual)[..., None])[..., 0]
-    variance = sensor.range_std_m**2
-    chi2_per_dof = (residual**2).sum(axis=1) / variance / np.maximum(use.sum(axis=1) - 2, 1)
-    covariance = variance * np.maximum(chi2_per_dof, 1.0)[:, None, None] * np.linalg.inv(information)
-    return index, view, covariance, chi2_per_dof, width
+def pose_error(recording: Recording, pose: Floats, delay_s: Floats | float) -> tuple[Floats, Floats]:
+    """Return errors of distance (m) and heading (rad), (n, 2), if frames show the pose `delay_s` after their stamp."""
+    at_s = recording.columns["t_ms"] / 1e3 + delay_s
+    yaw = np.radians(recording.truth("yaw_deg", at_s))
+    turn = np.angle(np.exp(1j * (pose[:, 1] - yaw)))
+    return np.column_stack([pose[:, 0] - recording.truth("panel_x_m", at_s), turn]), np.angle(np.exp(1j * yaw))
 
 
-def draw(
-    recording: Recording,
-    index: NDArray[np.intp],
-    distance: NDArray[np.float64],
-    std: NDArray[np.float64],
-    delta: NDArray[np.float64],
-    delta_std: NDArray[np.float64],
-) -> Figure:
-    """Draw the estimates over the truth."""
+def delay_of_run(recording: Recording, pose: Floats, used: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Fit the delay (s) in the middle of the run and its drift (s per s) robustly; return both and jackknife errors."""
+    time_s = recording.columns["t_ms"] / 1e3
+    since = time_s - np.median(time_s)
+    index = np.flatnonzero(used)
+
+    def fit(kept: NDArray[np.intp]) -> Floats:
+        def residual(x: Floats) -> Floats:
+            error, _ = pose_error(recording, pose, x[0] + x[1] * since)
+            return np.nan_to_num((error[kept] - x[2:]) / (0.004, np.radians(0.8))).ravel()
+
+        start = np.append([-0.05, 0.0], np.nanmedian(pose_error(recording, pose, -0.05)[0][kept], axis=0))
+        scale = (0.01, 0.001, 0.001, 0.01)
+        return np.asarray(least_squares(residual, start, loss="soft_l1", x_scale=scale, diff_step=0.05).x[:2])
+
+    left_out = np.array([fit(np.setdiff1d(index, block)) for block in np.array_split(index, BLOCKS)])
+    return fit(index), np.sqrt((BLOCKS - 1) * left_out.var(axis=0))
+
+
+def describe(
+    recording: Recording, pose: Floats, covariance: Floats, accepted: NDArray[np.bool_], delay_s: float
+) -> str:
+    """Say how the estimates agree with the truth, for one delay."""
+    error, yaw = pose_error(recording, pose, delay_s)
+    facing = np.abs(yaw) < FACING_RAD
+    good = accepted & facing & np.isfinite(error).all(axis=1)
+    if not good.any():
+        return "no accepted frame has a truth to compare with"
+    middle = np.median(error[good], axis=0)
+    mad = np.median(np.abs(error[good] - middle), axis=0)
+    rms = math.sqrt(np.mean((error[good, 1] - middle[1]) ** 2))
+    squared = np.einsum("ni,nij,nj->n", error[good], np.linalg.inv(covariance[good]), error[good])
+    gross = accepted & ((np.abs(error[:, 0]) > GROSS_M) | (np.abs(error[:, 1]) > GROSS_RAD))
+    return "\n".join(
+        [
+            f"compared at a delay of {1e3 * delay_s:.0f} ms:",
+            f"  answered: {good.sum()} of {facing.sum()} frames within 45° of the panel's normal"
+            f" ({100 * good.sum() / facing.sum():.0f} %)",
+            f"  distance: median error {1e3 * middle[0]:.1f} mm, MAD {1e3 * mad[0]:.1f} mm",
+            f"  heading: median error {np.degrees(middle[1]):.2f}°, r.m.s. about it {np.degrees(rms):.2f}°,"
+            f" MAD {np.degrees(mad[1]):.2f}°",
+            f"  truth in the 95 % ellipse: {100 * np.mean(squared < INSIDE_95):.0f} %",
+            f"  accepted beyond 30 mm or 6°: {gross.sum()}",
+        ]
+    )
+
+
+def draw(recording: Recording, pose: Floats, covariance: Floats, accepted: NDArray[np.bool_], delay_s: float) -> Figure:
+    """Draw the accepted estimates, with two standard deviations, over the truth."""
     figure = Figure(figsize=(10, 6), layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True)
-    for axes, estimate, spread, truth, label in (
-        (above, distance, std, recording.distance_m[index], "distance to the panel (m)"),
-        (below, np.degrees(delta), np.degrees(delta_std), np.degrees(recording.yaw_rad[index]), "side δ (°)"),
+    time_s = recording.columns["t_ms"] / 1e3
+    for k, (axes, name, label) in enumerate(
+        zip(figure.subplots(2, 1, sharex=True), ("panel_x_m", "yaw_deg"), ("distance (m)", "heading (°)"), strict=True)
     ):
-        axes.plot(index, truth, "k.", ms=3, label="motion capture")
-        axes.errorbar(index, estimate, 2 * spread, fmt=".", ms=4, lw=0.7, label="estimate ± 2σ")
+        unit = np.degrees(1.0) if k else 1.0
+        if name in recording.columns:
+            truth = recording.truth(name, time_s + delay_s)
+            axes.plot(time_s, (truth + 180) % 360 - 180 if k else truth, "k.", ms=3, label="motion capture")
+        spread = 2 * unit * np.sqrt(covariance[accepted, k, k])
+        axes.errorbar(time_s[accepted], unit * pose[accepted, k], spread, fmt=".", ms=4, lw=0.7, label="estimate ± 2σ")
         axes.set_ylabel(label)
         axes.grid(alpha=0.3)
-    above.legend(frameon=False)
-    below.set_xlabel("frame")
+    axes.set_xlabel("time (s)")
+    axes.legend(frameon=False)
     return figure
 
 
-def main() -> int:
-    """Match a recording and write estimates and picture."""
+def write_estimates(path: Path, matches: Matches, pose: Floats, covariance: Floats, time_s: Floats) -> None:
+    """Write a line for each frame."""
+    std = np.sqrt(np.einsum("nii->ni", covariance))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        names = "time_s,distance_m,distance_std_m,heading_deg,heading_std_deg,corr_distance_heading,accepted,reason"
+        writer.writerow(names.split(","))
+        for k, one in enumerate(matches):
+            numbers = (pose[k, 0], std[k, 0], np.degrees(pose[k, 1]), np.degrees(std[k, 1]))
+            values = (time_s[k], *numbers, covariance[k, 0, 1] / (std[k, 0] * std[k, 1]))
+            writer.writerow([*(f"{v:.6g}" for v in values), "true" if one.accepted else "false", one.reason])
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Match a recording, write estimates and picture, and compare."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("csv", type=Path, help="the recording")
+    parser.add_argument("--sensor", type=Path, help="sensor file of calibrate_recording.py; the preset without it")
+    parser.add_argument("--distance", default="0.4:1.2:0.01", help="distances of the bank: from:to:step, metres")
+    parser.add_argument("--second-half", action="store_const", const="second", help="match the second half alone")
     parser.add_argument("--out", type=Path, default=Path("out/recording"), help="folder of the results")
-    arguments = parser.parse_args()
-    sensor = preset("vl53l5cx-8x8")
+    arguments = parser.parse_args(argv)
     try:
-        recording = read_recording(arguments.csv, sensor)
-        index, view, covariance, chi2, width = match(recording, sensor, np.random.default_rng(2005))
+        sensor = uncalibrated() if arguments.sensor is None else Sensor.from_toml(arguments.sensor)
+        recording = read_recording(arguments.csv, sensor, ("t_ms",), arguments.second_half)
+        matcher = panel_matcher(sensor, arguments.distance)
+        started = time.perf_counter()
+        matches = match(matcher, recording.frames)
+        seconds = time.perf_counter() - started
     except (ValueError, OSError, PhasemarkError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 3
-    # the lens is D cos δ before the panel's middle plane, half its thickness nearer to its front
-    distance = view[:, 0] * np.cos(view[:, 1]) - THICKNESS_M / 2
-    slope = np.stack([np.cos(view[:, 1]), -view[:, 0] * np.sin(view[:, 1])], axis=1)
-    std = np.sqrt(np.einsum("na,nab,nb->n", slope, covariance, slope))
-    delta_std = np.sqrt(covariance[:, 1, 1])
+    pose, covariance = panel_pose(matches)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    columns = (index, distance, std, np.degrees(view[:, 1]), np.degrees(delta_std), chi2)
-    np.savetxt(
-        arguments.out / "estimates.csv",
-        np.column_stack(columns),
-        delimiter=",",
-        comments="",
-        fmt=("%d", "%.5f", "%.5f", "%.3f", "%.3f", "%.3f"),
-        header="frame,distance_m,distance_std_m,delta_deg,delta_std_deg,chi2_per_dof",
-    )
-    draw(recording, index, distance, std, view[:, 1], delta_std).savefig(arguments.out / "estimates.png", dpi=90)
-    error_m = distance - recording.distance_m[index]
-    turn = view[:, 1] - recording.yaw_rad[index]
-    error_deg = np.degrees(np.angle(np.exp(1j * turn)))
-    known = np.isfinite(error_m) & np.isfinite(error_deg)
-    print(f"{len(index)} of {len(recording.z_m)} frames show the panel, {width:.2f} m wide or more")
-    print(arguments.out / "estimates.png")
-    if not known.any():
-        print("no frame of these has a truth to compare with")
-        return 0
-    error_m, error_deg = error_m[known], error_deg[known]
-    offset = np.median(error_m)
-    print(f"distance: median error {1e3 * offset:.1f} mm, MAD {1e3 * np.median(np.abs(error_m - offset)):.1f} mm")
-    print(f"side: median error {np.median(error_deg):.2f}°, r.m.s. {np.sqrt(np.mean(error_deg**2)):.2f}°")
+    estimates, picture = arguments.out / "estimates.csv", arguments.out / "estimates.png"
+    write_estimates(estimates, matches, pose, covariance, recording.columns["t_ms"] / 1e3)
+    draw(recording, pose, covariance, matches.accepted, sensor.delay_s).savefig(picture, dpi=90)
+    print(f"{matches.accepted.sum()} of {len(matches)} frames accepted, {len(matches) / seconds:.0f} frames/s")
+    if {"panel_x_m", "yaw_deg"} <= set(recording.columns):
+        print(describe(recording, pose, covariance, matches.accepted, sensor.delay_s))
+        if matches.accepted.sum() > 4 * BLOCKS:
+            (delay, drift), std = delay_of_run(recording, pose, matches.accepted)
+            print(f"this run's own delay: {1e3 * delay:.0f} ± {1e3 * std[0]:.0f} ms in its middle,", end=" ")
+            print(f"drifting by {1e3 * drift:.1f} ± {1e3 * std[1]:.1f} ms per second")
+            print(describe(recording, pose, covariance, matches.accepted, delay))
+    print(estimates, picture, sep="\n")
     return 0
 
 

@@ -158,6 +158,14 @@ class MaximumLikelihood:
         self._rendered: RenderedModel | None = None
         if self.auto or not exact:
             self._rendered = RenderedModel(bank, self.background, self._workers)
+            nearest = self._rendered.limits()[0]
+            if bank.distance_m[-1] < nearest:
+                raise UsageError(
+                    f"the bank ends at {bank.distance_m[-1]:g} m, and views nearer than {nearest:.3g} m, half the"
+                    " landmark's width, are not rendered: build it in steps of at most"
+                    f" {_FINE[0]:g} m and {math.degrees(_FINE[1]):.2g}°, and free"
+                    " distance_m and delta_rad alone without a background"
+                )
         aside = "bearing_rad" in self.free
         fine = (1, 1) if self.background is not None and not aside else (2, 3)
         along, around = (
@@ -436,7 +444,11 @@ class MaximumLikelihood:
         inside, some = replace(evidence, weight=weight), fits[best]
         again = refine(model, inside, some.frame, some.class_index, some.view, self._settings(None))
         again = again.with_scale(self._scatter_of_columns(model, inside, again))
-        return Fits.joined([again, fits[np.setdiff1d(np.arange(len(fits)), best)]])
+        others = fits[np.setdiff1d(np.arange(len(fits)), best)]
+        less = np.zeros(len(evidence.weight))  # what the pixels left out cost the best no longer
+        less[some.frame] = again.cost - some.cost
+        others.cost[:] += less[others.frame]
+        return Fits.joined([again, others])
 
     def _scatter_of_columns(self, model: ImageModel, evidence: Evidence, fits: Fits) -> NDArray[np.float64]:
         """Return by how much covariances of views are too small, (m,): from χ², and from leaving out columns of pixels.
