@@ -75,6 +75,8 @@ edge costs half as much."""
 _MOST_REFINED = 3
 _WALLS_BEYOND_M = (0.5, 1.0, 2.0, 4.0)
 """How far behind the landmark a wall is tried that no pixel sees alone."""
+_OTHER_ANGLES = 12
+"""Angles that a frame before an estimated background is tried from, where nothing else fits."""
 _LONG_STEP = 1.0
 """The same where a scout did not know the bearing."""
 _BACKGROUND_ROUNDS = 4
@@ -232,6 +234,9 @@ class MaximumLikelihood:
                 fits = Fits.joined([fits, again])
                 if self._is_doubtful(fits):
                     background, fits = self._with_better_background(background, evidence, fits)
+            if background is not None and self._is_doubtful(fits):
+                fits = Fits.joined([fits, self._other_angles(background, evidence, fits)])
+                background, fits = self._with_better_background(background, evidence, fits)
             answers.extend(self._answers(one, evidence, fits, bare, background))
         return answers
 
@@ -253,6 +258,20 @@ class MaximumLikelihood:
             if not self._is_doubtful(found[1]):
                 break
         return found
+
+    def _other_angles(self, background: Background, evidence: Evidence, fits: Fits) -> Fits:
+        """Fit one frame from its best view turned to other angles; distance and bearing are found more easily."""
+        assert self._rendered is not None
+        if not np.isfinite(fits.cost).any():
+            return fits[:0]
+        best = int(fits.cost.argmin())
+        period = 2 * math.pi / self._symmetry[fits.class_index[best]]
+        angles = np.arange(1, _OTHER_ANGLES) * period / _OTHER_ANGLES
+        view = np.tile(fits.view[best], (len(angles), 1))
+        view[:, 1] += angles
+        frame, class_index = (np.full(len(angles), values[best]) for values in (fits.frame, fits.class_index))
+        settings = self._settings(_behind(self.bank, background))
+        return refine(self._rendered.with_background(background), evidence, frame, class_index, view, settings)
 
     def _background_and_views(self, background: Background, evidence: Evidence, fits: Fits) -> tuple[Background, Fits]:
         """Fit a background behind the best view of one frame, then the views before it, in turn while that helps."""

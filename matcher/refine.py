@@ -142,7 +142,7 @@ class Fits:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def __getitem__(self, index: NDArray[Any]) -> Fits:
+    def __getitem__(self, index: NDArray[Any] | slice) -> Fits:
         return Fits(**{name: values[index] for name, values in vars(self).items()})
 
     def with_scale(self, scale: NDArray[np.float64]) -> Fits:

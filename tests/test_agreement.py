@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from thin_landmarks import PRESETS, SETTINGS, bank_of, count, meshes
 
+from phasemark.data import BankPlan, build_bank
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.agreement import DISAGREEMENT, counts, disagrees
 from phasemark.matcher.likelihood import Evidence, gauss_newton_sums
 from phasemark.render import Background, Frames, Renderer, Views, capture, preset
 
 DIRECT = preset("vl53l5cx-8x8")
+NEAR = tuple(np.round(np.arange(0.6, 0.901, 0.01), 3).tolist())
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +138,20 @@ def test_refused_answers_say_why_and_claim_no_precision(panel):
     assert "±" not in shown
     accepted = dataclasses.replace(matches[0], accepted=True, reason="")
     assert "refused" not in accepted._repr_html_()
+
+
+@pytest.mark.parametrize("free", [None, ("distance_m", "delta_rad", "bearing_rad")])
+def test_a_wall_is_estimated_behind_a_landmark_beside_the_middle(free):
+    bank = build_bank(BankPlan(classes=("cylinder",), sensor="vl53l5cx-8x8", distance_m=NEAR), workers=1)
+    image = Renderer(bank.mesh("cylinder"), bank.sensor, albedo=0.8).render(
+        0.713, np.radians(33.3), np.radians(3.0), background=Background(wall_m=1.5)
+    )
+    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(4), n_frames=12))
+    (match,) = Matcher(bank, "refine", free=free, background="auto").match(frames)
+    assert match.accepted
+    assert match.distance_m == pytest.approx(0.713, abs=2e-3)
+    assert np.degrees(match.delta_rad) == pytest.approx(33.3, abs=1.0)
+    assert np.degrees(match.bearing_rad) == pytest.approx(3.0, abs=0.3)
 
 
 @pytest.mark.soak
