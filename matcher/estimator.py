@@ -14,6 +14,7 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.data import Bank
+from phasemark.landmarks.symmetry import mesh_symmetry
 from phasemark.matcher.agreement import DISAGREEMENT, counts
 from phasemark.matcher.candidates import Search, Starts
 from phasemark.matcher.coarse import Observation
@@ -75,6 +76,8 @@ edge costs half as much."""
 _MOST_REFINED = 3
 _WALLS_BEYOND_M = (0.5, 1.0, 2.0, 4.0)
 """How far behind the landmark a wall is tried that no pixel sees alone."""
+_MOST_EQUALS = 12
+"""Sides of one landmark that look the same and are all told."""
 _OTHER_ANGLES = 12
 """Angles that a frame before an estimated background is tried from, where nothing else fits."""
 _LONG_STEP = 1.0
@@ -180,6 +183,10 @@ class MaximumLikelihood:
         self._wide_search = self._new_search(self._behind, self._widest) if near else self._search
         meshes = [bank.mesh(name) for name in bank.classes]
         self._symmetry = [int(mesh.metadata["symmetry"]) for mesh in meshes]
+        # a mesh that is said to have no symmetry may look the same from several sides all the same
+        self._own_symmetry = [
+            mesh_symmetry(mesh) if n == 1 else n for mesh, n in zip(meshes, self._symmetry, strict=True)
+        ]
         self._middle = np.array([mesh.centroid for mesh in meshes])
 
     def _new_search(self, behind: PhasorImages | None, widest_rad: float) -> Search:
@@ -401,6 +408,12 @@ class MaximumLikelihood:
         best = best[np.isfinite(fits.cost[best])]
         half = self._search.column_rad / 2
         candidates = []
+        for k in range(1, min(_MOST_EQUALS, max(self._own_symmetry))):
+            n = np.array([self._own_symmetry[c] // self._symmetry[c] for c in fits.class_index[best]])
+            equal = best[k < n]
+            turned = fits.view[equal].copy()
+            turned[:, 1] += 2 * math.pi * k / n[k < n]
+            candidates.append((equal, turned))
         odd = best[np.array([self._symmetry[c] % 2 for c in fits.class_index[best]], np.bool_)]
         bearings = (0.0, -half, half) if "bearing_rad" in self.free else (0.0,)
         candidates += [(odd, self._from_behind(fits, odd) + np.array([0.0, 0.0, side, 0.0])) for side in bearings]
