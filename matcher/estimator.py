@@ -401,7 +401,8 @@ class MaximumLikelihood:
     def _look_alikes(self, model: ImageModel, evidence: Evidence, fits: Fits, behind: PhasorImages | None) -> Fits:
         """Let views that look like the best one explain each frame: what no slope leads to from there.
 
-        A thin landmark looks nearly the same from the front and from the back, its middle seen at the same place.
+        A mesh with a symmetry that its bank does not have looks the same from several sides. A thin landmark looks
+        nearly the same from the front and from the back, its middle seen at the same place.
         A flat one looks nearly the same under every bearing, its heading kept.
         """
         best = _best_of_frame(fits)
@@ -411,9 +412,9 @@ class MaximumLikelihood:
         for k in range(1, min(_MOST_EQUALS, max(self._own_symmetry))):
             n = np.array([self._own_symmetry[c] // self._symmetry[c] for c in fits.class_index[best]])
             equal = best[k < n]
-            turned = fits.view[equal].copy()
-            turned[:, 1] += 2 * math.pi * k / n[k < n]
-            candidates.append((equal, turned))
+            views = fits.view[equal].copy()
+            views[:, 1] += 2 * math.pi * k / n[k < n]
+            candidates.append((equal, views))
         odd = best[np.array([self._symmetry[c] % 2 for c in fits.class_index[best]], np.bool_)]
         bearings = (0.0, -half, half) if "bearing_rad" in self.free else (0.0,)
         candidates += [(odd, self._from_behind(fits, odd) + np.array([0.0, 0.0, side, 0.0])) for side in bearings]

@@ -4,9 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from thin_landmarks import PRESETS, SETTINGS, bank_of, count, meshes
+import trimesh
+from thin_landmarks import PRESETS, SETTINGS, bank_of, box, count, meshes
 
-from phasemark.data import BankPlan, build_bank
+from phasemark.cli import main
+from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.agreement import DISAGREEMENT, counts, disagrees
 from phasemark.matcher.likelihood import Evidence, gauss_newton_sums
@@ -138,6 +140,24 @@ def test_refused_answers_say_why_and_claim_no_precision(panel):
     assert "±" not in shown
     accepted = dataclasses.replace(matches[0], accepted=True, reason="")
     assert "refused" not in accepted._repr_html_()
+
+
+def test_sides_that_are_the_same_have_the_same_weight(tmp_path):
+    # a table with four equal legs whose bank was told of no symmetry
+    parts = [((0.3, 0.3, 0.02), (0, 0, 0.1))]
+    parts += [((0.03, 0.03, 0.22), (x, y, 0)) for x in (-0.12, 0.12) for y in (-0.12, 0.12)]
+    trimesh.boolean.union([box(*part) for part in parts]).export(tmp_path / "table.stl")
+    arguments = ["bank", "build", "--mesh", f"table={tmp_path}/table.stl", "--unit", "m", "--origin", "center"]
+    grid = ["--distance", "0.75:0.85:0.01", "--delta", "0:360:3", "--symmetry", "1", "--sensor", "vl53l5cx-8x8"]
+    assert main([*arguments, *grid, "--out", str(tmp_path / "table.h5")]) == 0
+    bank = open_bank(tmp_path / "table.h5")
+    image = Renderer(bank.mesh("table"), bank.sensor, albedo=0.8).render(0.8, 0.3)
+    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(4), n_frames=20))
+    (match,) = Matcher(bank, "refine", free=("distance_m", "delta_rad")).match(frames)
+    assert match.reason == "ambiguous"
+    angles = sorted([match.delta_rad, *(other.delta_rad for other in match.alternatives[:3])])
+    np.testing.assert_allclose(np.diff(angles), np.pi / 2, atol=0.01)
+    np.testing.assert_allclose([other.weight for other in match.alternatives[:3]], 0.25, atol=0.01)
 
 
 @pytest.mark.parametrize("free", [None, ("distance_m", "delta_rad", "bearing_rad")])

@@ -27,7 +27,8 @@ SETTINGS = {
 GROSS_M, GROSS_RAD = 0.03, math.radians(6.0)
 
 
-def _box(size, at=(0.0, 0.0, 0.0)):
+def box(size, at=(0.0, 0.0, 0.0)):
+    """Return a box somewhere."""
     mesh = trimesh.creation.box(size)
     mesh.apply_translation(at)
     return mesh
@@ -35,16 +36,16 @@ def _box(size, at=(0.0, 0.0, 0.0)):
 
 def meshes():
     """Return landmarks by name, each with its rotational symmetry."""
-    plate = _box((0.01, 0.4, 0.3))
+    plate = box((0.01, 0.4, 0.3))
     return {
-        "panel": (_box((0.01, 0.61, 0.49)), 2),
-        "bracket": (trimesh.boolean.union([plate, _box((0.2, 0.01, 0.3), (0.1, 0.1, 0.0))]), 1),
+        "panel": (box((0.01, 0.61, 0.49)), 2),
+        "bracket": (trimesh.boolean.union([plate, box((0.2, 0.01, 0.3), (0.1, 0.1, 0.0))]), 1),
         "sign": (
-            trimesh.boolean.union([_box((0.01, 0.3, 0.2), (0, 0.05, 0.1)), _box((0.03, 0.03, 0.4), (0, 0, -0.1))]),
+            trimesh.boolean.union([box((0.01, 0.3, 0.2), (0, 0.05, 0.1)), box((0.03, 0.03, 0.4), (0, 0, -0.1))]),
             1,
         ),
         "frame": (
-            trimesh.boolean.difference([_box((0.02, 0.5, 0.4)), _box((0.1, 0.3, 0.2), (0, 0.03, 0.02))]),
+            trimesh.boolean.difference([box((0.02, 0.5, 0.4)), box((0.1, 0.3, 0.2), (0, 0.03, 0.02))]),
             1,
         ),
     }
