@@ -31,9 +31,9 @@ _GRID_STD_M = 0.01
 """What half a step of the thinned grid changes in a range."""
 _MOST_OTHER_SIDES = 2
 _OTHER_SIDE_RAD = math.radians(30.0)
-"""Sides that differ by more than this are tried too, at most so many of them."""
+"""Number of further sides that are tried, and the least angle between them."""
 _OTHER_SIDE_COST, _OTHER_SIDE_SHARE = 100.0, 4.0
-"""Their cost on the grid may be this much, and so many times that of the best."""
+"""Largest cost of a further side on the grid: a constant, plus a multiple of the lowest cost."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,10 +58,10 @@ BEARING_STD_RAD = math.radians(1.5)
 _SURE_BEARING = 0.05
 """Share of half a column to which a bearing must be known for other bearings to be out of the question."""
 _PRIOR_SIGMA = 3.0
-"""Bearings up to so many standard deviations of the prior are searched."""
+"""Widest bearing that is searched, in standard deviations of the prior."""
 _TOLERATED_SIGMA = 3.0
 _LARGEST_SCALE = 2.0
-"""Where unknown things stand in view, residuals may be so many times their noise."""
+"""Largest ratio of residuals to their stated noise among unknown things."""
 _STRANGE_SIGMA = 5.0
 """A return farther from the model than this sees something else."""
 _FEWEST_EXPLAINED = 6
