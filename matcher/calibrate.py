@@ -56,9 +56,9 @@ _FAR_RETURNS = 0.02
 """Share of pixels that may return where the model has nothing, before something is taken to stand there."""
 _OUT_OF_VIEW_RAD = math.radians(5.0)
 _DELAY_REACH_S = 0.3
-"""A free delay may be up to so long: frames nearer to a gap between poses are left out."""
+"""Longest delay that is estimated, seconds: frames nearer to a gap between poses are left out."""
 _BLOCK_S, _BLOCKS = 2.0, 20
-"""Length of a block of time, seconds; at most so many blocks are wanted of a short recording."""
+"""Length of a block of time, seconds, and the number of blocks that a short recording is cut into."""
 _SHORTEST_BLOCK_S = 0.5
 _MOST_FRAMES = 800
 """Frames of a recording that enter; more are thinned evenly."""

@@ -175,7 +175,7 @@ def _draw_poses(axes: Any, found: Calibration) -> None:
     points = axes.scatter(
         x,
         size[told][order],
-        c=np.degrees(found.poses.bearing_rad[told][order]),
+        c=np.degrees(np.angle(np.exp(1j * found.poses.bearing_rad[told][order]))),
         cmap="coolwarm",
         edgecolor="0.3",
         zorder=3,
