@@ -36,7 +36,7 @@ _REFINED = (4, 2, 1)
 _KEPT = 16
 _ITERATIONS = 6
 _SLACKS_M = (0.012, 0.003)
-"""Added to the noise in the search, so that views an offset away are told apart, then in the refinement."""
+"""Added to the noise, metres: in the search, which has to separate views, and in the refinement."""
 _STEPS = (1e-4, 1e-4, 1e-4, 1e-4)
 _COVERAGE_SEEN, _COVERAGE_MUST = 1e-4, 0.4
 _MOST_CLASSES = 6

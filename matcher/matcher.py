@@ -65,7 +65,7 @@ class Matcher:
         bank all pixels choose all three. "refine" is maximum likelihood over a continuous view, with its covariance.
     free : sequence of str, optional
         What "refine" estimates: distance_m and delta_rad, and on request bearing_rad and height_m; what is not free
-        is 0. None: distance, delta and the bearing, which is thought to be 0 with the standard deviation
+        is 0. None: distance, delta and the bearing, whose Gaussian prior has mean 0 and the standard deviation
         `bearing_std_rad` before the frame is seen. ``("distance_m", "delta_rad")`` fixes the bearing at 0.
     background : Background, "auto", "unknown" or None
         What stands behind the landmark. None: nothing is expected to return beside it. "auto", with "refine": wall and

@@ -128,7 +128,7 @@ def fit_background(
     free: Sequence[str],
     background: Background,
 ) -> tuple[Background, NDArray[np.float64]]:
-    """Fit wall and floor together with the view of the landmark before them, from where both are thought to be.
+    """Fit wall and floor together with the view of the landmark before them, starting from guesses of both.
 
     Levenberg–Marquardt on the residuals of matching; slopes by the background are differences of rendered images.
 

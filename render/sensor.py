@@ -762,7 +762,7 @@ class Sensor(BaseModel):
 
 
 def _check_table(name: str, table: tuple[_Row, ...], rows: int, cols: int, what: str) -> None:
-    """Refuse a table that does not have so many rows and columns."""
+    """Raise ValueError if a table does not have the stated numbers of rows and columns."""
     lengths = {len(row) for row in table}
     if len(table) != rows or lengths - {cols}:
         got = f"{len(table)} rows of {' or '.join(map(str, sorted(lengths))) or 'no'} numbers"
