@@ -33,6 +33,7 @@ from scipy.optimize import least_squares
 from phasemark import PhasemarkError
 from phasemark.data import BankPlan, MeshPlan, build_bank, read_frames
 from phasemark.matcher import Matcher, Matches, kalman_filter
+from phasemark.matcher.calibrate_track import spread_stamps
 from phasemark.render import Frames, Sensor, preset
 
 THICKNESS_M = 0.01
@@ -53,7 +54,8 @@ Floats = NDArray[np.float64]
 class Recording:
     """Frames of a moving camera, one a position, and the columns of their table that are no pixels.
 
-    `columns` are those of the frames, `whole` those of the whole file.
+    `columns` are those of the frames, `whole` those of the whole file; ``shown_s`` is added to both, the stamps (s)
+    with those that repeat moved into the gaps beside them.
     """
 
     frames: Frames
@@ -97,6 +99,8 @@ def read_recording(path: Path, sensor: Sensor, needed: tuple[str, ...], half: st
         columns = {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: a value is not a number: {error}") from None
+    if "t_ms" in columns:
+        columns["shown_s"] = spread_stamps(columns["t_ms"] / 1e3)
     middle = len(rows) // 2
     part = {"first": slice(middle), "second": slice(middle, None), None: slice(None)}[half]
     return Recording(frames[part], {name: values[part] for name, values in columns.items()}, columns)
@@ -135,7 +139,7 @@ def panel_pose(matches: Matches) -> tuple[Floats, Floats]:
 
 def pose_error(recording: Recording, pose: Floats, delay_s: Floats | float) -> tuple[Floats, Floats]:
     """Return errors of distance (m) and heading (rad), (n, 2), if frames show the pose `delay_s` after their stamp."""
-    at_s = recording.columns["t_ms"] / 1e3 + delay_s
+    at_s = recording.columns["shown_s"] + delay_s
     yaw = np.radians(recording.truth("yaw_deg", at_s))
     turn = np.angle(np.exp(1j * (pose[:, 1] - yaw)))
     return np.column_stack([pose[:, 0] - recording.truth("panel_x_m", at_s), turn]), np.angle(np.exp(1j * yaw))

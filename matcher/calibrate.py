@@ -26,7 +26,7 @@ from phasemark.matcher.calibrate_notes import advice, named, observability_notes
 from phasemark.matcher.calibrate_pose_errors import estimate_pose_std
 from phasemark.matcher.calibrate_poses import KnownPoses, PoseStd
 from phasemark.matcher.calibrate_recording import Recorded, Recording, prior_std
-from phasemark.matcher.calibrate_track import LONGEST_GAP_S, PoseTrack
+from phasemark.matcher.calibrate_track import LONGEST_GAP_S, PoseTrack, spread_stamps
 from phasemark.matcher.estimator import MIN_RETURNS, p_values_of
 from phasemark.matcher.filters import FilteredFrames, PixelState, assumed_std_m, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood import Evidence, Quantity
@@ -422,12 +422,12 @@ def _without_zones(frames: FilteredFrames) -> FilteredFrames:
     return replace(frames, range_m=frames.range_m - frames.sensor.zone_offsets)
 
 
-def _track_of(frames: FilteredFrames, poses: KnownPoses, job: _Job) -> tuple[PoseTrack, NDArray[np.intp], list[str]]:
+def _track_of(frames: FilteredFrames, poses: KnownPoses, job: _Job) -> tuple[PoseTrack, FilteredFrames, list[str]]:
     """Return the poses by time, the frames that have one in the order of time, and notes on what was left out."""
     if frames.time_s is None:
         raise UsageError("the frames have no time stamps: a moving camera takes a recording with a column t_ms or t_s")
     track = PoseTrack.of(poses)
-    stamps = frames.time_s
+    stamps = spread_stamps(frames.time_s)
     repeated = np.isin(
         stamps, [stamp for stamp, n in zip(*np.unique(stamps, return_counts=True), strict=True) if n > 1]
     )
@@ -446,6 +446,10 @@ def _track_of(frames: FilteredFrames, poses: KnownPoses, job: _Job) -> tuple[Pos
         )
     notes = []
     for n, what in (
+        (
+            int((stamps != frames.time_s).sum()),
+            "frames got a time of their own in a gap beside their repeated stamps",
+        ),
         (track.dropped, "poses were left out, for their stamps repeat or run backwards"),
         (int((repeated | backwards).sum()), "frames were left out, for their stamps repeat or run backwards"),
         (
@@ -458,7 +462,7 @@ def _track_of(frames: FilteredFrames, poses: KnownPoses, job: _Job) -> tuple[Pos
     if len(index) > _MOST_FRAMES:
         notes.append(f"Of {len(index)} frames {_MOST_FRAMES} entered, evenly spaced.")
         index = index[np.linspace(0, len(index) - 1, _MOST_FRAMES).round().astype(int)]
-    return track, index, notes
+    return track, replace(frames, time_s=stamps)[index], notes
 
 
 def _blocks(stamps: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -517,8 +521,7 @@ def _from_recording(
     if moving:
         if poses.wall_m is not None:
             raise UsageError("'wall_m' belongs to still poses: leave it out for a moving camera")
-        track, index, notes = _track_of(frames, poses, job)
-        frames = frames[index]
+        track, frames, notes = _track_of(frames, poses, job)
         assert frames.time_s is not None
         poses = _poses_at(track, frames.time_s + job.assumed.delay_s)
     else:

@@ -57,6 +57,11 @@ BEARING_STD_RAD = math.radians(1.5)
 """How well a mount is thought to point at the landmark, unless the matcher is told."""
 _SURE_BEARING = 0.05
 """Share of half a column to which a bearing must be known for other bearings to be out of the question."""
+_SLIDES = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
+_SLIDES_PRIOR = (-1.0, 1.0)
+"""Bearings, in half columns, under which a flat landmark is tried again; the second where a prior holds the bearing."""
+_REGISTRATIONS = 2
+"""How often a first view is moved to the distance that the frame shows."""
 _PRIOR_SIGMA = 3.0
 """Widest bearing that is searched, in standard deviations of the prior."""
 _TOLERATED_SIGMA = 3.0
@@ -66,6 +71,8 @@ _STRANGE_SIGMA = 5.0
 """A return farther from the model than this sees something else."""
 _FEWEST_EXPLAINED = 6
 """Returns that each free parameter takes where unknown things stand in view."""
+_PIXELS_AMONG_UNKNOWN = 4
+"""Unexplained pixels that must stand against a far view where unknown things stand in view."""
 _AMBIGUITY = 1e-3
 """Largest probability that an accepted answer leaves to other classes."""
 LIKELY = 100.0
@@ -415,21 +422,26 @@ class MaximumLikelihood:
             views = fits.view[equal].copy()
             views[:, 1] += 2 * math.pi * k / n[k < n]
             candidates.append((equal, views))
+        aside = "bearing_rad" in self.free
+        slides = _SLIDES_PRIOR if self._prior_std else _SLIDES
         odd = best[np.array([self._symmetry[c] % 2 for c in fits.class_index[best]], np.bool_)]
-        bearings = (0.0, -half, half) if "bearing_rad" in self.free else (0.0,)
-        candidates += [(odd, self._from_behind(fits, odd) + np.array([0.0, 0.0, side, 0.0])) for side in bearings]
-        if "bearing_rad" in self.free:
+        flipped = self._from_behind(fits, odd)
+        for side in (0.0, *slides) if aside else (0.0,):
+            candidates.append((odd, flipped + np.array([0.0, side * half, side * half, 0.0])))
+        if aside:
             # a flat landmark tells the heading δ − b, and little of its two parts
             flat = best[fits.std_without_one[best, self.free.index("bearing_rad")] > _SURE_BEARING * half]
-            turned = np.array([-half, half] if self._prior_std else [-2 * half, -half, half, 2 * half])
-            candidates += [(flat, fits.view[flat] + np.array([0.0, side, side, 0.0])) for side in turned]
+            for side in slides:
+                candidates.append((flat, fits.view[flat] + np.array([0.0, side * half, side * half, 0.0])))
         source = np.concatenate([which for which, _ in candidates])
+        frame, class_index = fits.frame[source], fits.class_index[source]
+        view = np.concatenate([views for _, views in candidates])
         return refine(
             model,
             evidence,
-            fits.frame[source],
-            fits.class_index[source],
-            np.concatenate([views for _, views in candidates]),
+            frame,
+            class_index,
+            _at_measured_distance(model, evidence, frame, class_index, view),
             self._settings(behind),
             fits.cost[source] + LIKELY,
             # zones of a direct sensor do not mix light: the cost of a view says little of that of its neighbours
@@ -451,15 +463,34 @@ class MaximumLikelihood:
     def _without_borders(self, models: _Models, evidence: Evidence, fits: Fits) -> Fits:
         """Fit the best views again without the pixels beside one that sees something else.
 
-        They may see a little of it too, at the sides of the landmark, where a wrong range turns the view most. How
-        pixels scatter among unknown things is known less well than otherwise: covariances grow with the χ² found.
+        They may see a little of it too, at the sides of the landmark, where a wrong range turns the view most. Views
+        of one frame are compared on the same pixels: those that are beside something else in none of them. How pixels
+        scatter among unknown things is known less well than otherwise: covariances grow with the χ² found.
         """
         model = models.final
         assert model is not None
-        best = _best_of_frame(fits)
-        best = best[np.isfinite(fits.cost[best]) & (fits.explained[best] >= _FEWEST_EXPLAINED * len(self.free))]
-        frame, view = fits.frame[best], np.ascontiguousarray(fits.view[best])
-        phasor = model.images(fits.class_index[best], view, ()).phasor
+        least = _least_of_frame(fits, len(evidence.weight))
+        needed = _FEWEST_EXPLAINED * len(self.free)
+        close = np.isfinite(fits.cost) & (fits.cost < least[fits.frame] + _MARGIN) & (fits.explained >= needed)
+        modes = self._distinct_of_frames(fits, np.flatnonzero(close))
+        some = fits[modes]
+        kept = np.ones_like(evidence.seen.returned)
+        inside = self._inside(model, evidence, some, needed)
+        np.logical_and.at(kept, some.frame, inside)
+        inside_evidence = replace(evidence, weight=evidence.weight * kept)
+        again = refine(model, inside_evidence, some.frame, some.class_index, some.view, self._settings(None))
+        again = again.with_scale(self._scatter_of_columns(model, inside_evidence, again))
+        others = fits[np.setdiff1d(np.arange(len(fits)), modes)]
+        less = np.zeros(len(evidence.weight))  # what the pixels left out cost the best no longer
+        refitted = np.unique(some.frame)
+        less[refitted] = (_least_of_frame(again, len(less)) - least)[refitted]
+        others.cost[:] += less[others.frame]
+        return Fits.joined([again, others])
+
+    def _inside(self, model: ImageModel, evidence: Evidence, fits: Fits, needed: int) -> NDArray[np.bool_]:
+        """Return which pixels are not beside one that sees something else than some views, (m, pixels)."""
+        frame = fits.frame
+        phasor = model.images(fits.class_index, np.ascontiguousarray(fits.view), ()).phasor
         size = np.sqrt(evidence.weight[frame]) * np.abs(
             evidence.sensor.metres_per_radian * np.angle(evidence.value[frame] * phasor.conj())
         )
@@ -467,21 +498,11 @@ class MaximumLikelihood:
         other = returned & ((phasor == 0) | (size > _STRANGE_SIGMA))
         shape = (-1, evidence.sensor.rows, evidence.sensor.cols)
         kept = np.ones(other.shape, np.bool_)
-        needed = _FEWEST_EXPLAINED * len(self.free)
         for strange in (other, other | ~returned):  # beside pixels without a return too, where enough are left
             inside = ~_beside(strange.reshape(shape)).reshape(other.shape) | other
             enough = (inside & returned & ~other).sum(axis=1) >= needed
             kept[enough] = inside[enough]
-        weight = evidence.weight.copy()
-        weight[frame] *= kept
-        inside, some = replace(evidence, weight=weight), fits[best]
-        again = refine(model, inside, some.frame, some.class_index, some.view, self._settings(None))
-        again = again.with_scale(self._scatter_of_columns(model, inside, again))
-        others = fits[np.setdiff1d(np.arange(len(fits)), best)]
-        less = np.zeros(len(evidence.weight))  # what the pixels left out cost the best no longer
-        less[some.frame] = again.cost - some.cost
-        others.cost[:] += less[others.frame]
-        return Fits.joined([again, others])
+        return kept
 
     def _scatter_of_columns(self, model: ImageModel, evidence: Evidence, fits: Fits) -> NDArray[np.float64]:
         """Return by how much covariances of views are too small, (m,): from χ², and from leaving out columns of pixels.
@@ -844,7 +865,8 @@ class MaximumLikelihood:
         far = (apart > [self._tolerance[name] for name in VIEW]).any(axis=1)
         other = fits.class_index[kept] != fits.class_index[best]
         # where a landmark looks alike from two sides, a single pixel at an edge must not decide between them
-        alike = far & ~other & (fits.cost[kept] < fits.cost[best] + DISAGREEMENT)
+        enough = DISAGREEMENT * (_PIXELS_AMONG_UNKNOWN if self.unknown else 1)
+        alike = far & ~other & (fits.cost[kept] < fits.cost[best] + enough)
         return bool(weight[other].sum() > _AMBIGUITY * weight.sum() or alike.any())
 
     def _distinct_of_frames(self, fits: Fits, which: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -962,6 +984,26 @@ def _usual_workers() -> int:
 
 def _behind(bank: Bank, background: Background) -> PhasorImages:
     return Renderer(None, bank.sensor).render(distance_m=1.0, background=background)
+
+
+def _at_measured_distance(
+    model: ImageModel,
+    evidence: Evidence,
+    frame: NDArray[np.int64],
+    class_index: NDArray[np.int64],
+    view: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return views moved along their distance by the median residual of the ranges they explain, (m, 4)."""
+    view = view.copy()
+    for _ in range(_REGISTRATIONS):
+        view[:, 0] = np.clip(view[:, 0], *model.limits())
+        phasor = model.images(class_index, np.ascontiguousarray(view), ()).phasor
+        residual = evidence.sensor.metres_per_radian * np.angle(evidence.value[frame] * phasor.conj())
+        compared = (phasor != 0) & (evidence.weight[frame] > 0)
+        residual[~compared] = np.nan
+        some = compared.any(axis=1)
+        view[some, 0] += np.nanmedian(residual[some], axis=1)
+    return view
 
 
 def _some(seen: Observation, index: NDArray[np.int64]) -> Observation:

@@ -154,6 +154,27 @@ def gauss_newton_sums(
     return Sums(cost, capped, gradient, information, scatter)
 
 
+def robust_weight(
+    residual: NDArray[np.float64], weight: NDArray[np.float64], huber: float | None
+) -> NDArray[np.float64]:
+    """Return the weights that the information is summed with: less beyond Huber's limit, 0 for an outlier.
+
+    Parameters
+    ----------
+    residual : float64
+    weight : float64
+        Inverse variances, of a shape that broadcasts with `residual`.
+    huber : float, optional
+        As in :func:`gauss_newton_sums`.
+    """
+    weight = np.broadcast_to(weight, residual.shape)
+    if huber is None:
+        return np.asarray(weight)
+    size = np.abs(residual) * np.sqrt(weight)
+    share = np.where(size > huber, huber / np.maximum(size, huber), 1.0)
+    return np.asarray(np.where(huber * (2 * size - huber) >= DISAGREEMENT, 0.0, weight * share))
+
+
 @njit(cache=True, nogil=True)
 def _add(residual, row, weight, huber, k, cost, capped, gradient, information, scatter):  # type: ignore[no-untyped-def]
     """Add one residual with its row of the Jacobian to the sums of model k."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts, disagrees
-from phasemark.matcher.likelihood import Evidence, Sums, gauss_newton_sums
+from phasemark.matcher.likelihood import Evidence, Sums, gauss_newton_sums, robust_weight
 from phasemark.matcher.models import VIEW, ImageModel, ModelImages
 
 ALBEDO = "albedo"
@@ -515,14 +515,18 @@ class _Problem:
         if near.size:
             there = self.some(near)
             slope = there.slopes_around(state, near, self._std(covariance[near]))
+            sums = there._summed(
+                state.theta[near],
+                state.use[near],
+                ModelImages(
+                    **{name: values[near] for name, values in vars(state.images).items() if name != "slope"},
+                    slope=state.images.slope[near] if slope is None else slope,
+                ),
+            ).sums
             if slope is not None:
-                sums = gauss_newton_sums(
-                    state.images.phasor[near], slope, evidence, self.frame[near],
-                    state.use[near] & settings.pixels, settings.huber,
-                )  # fmt: skip
-                covariance[near] = self._covariance(self._with_prior(sums, state.theta[near]))
+                covariance[near] = self._covariance(sums)
             rows = state.images.slope[near] if slope is None else slope
-            without_one[near] = there._std_without_one(state, near, rows, covariance[near])
+            without_one[near] = there._std_without_one(state, near, rows, sums.information, covariance[near])
         information = _inverse(covariance / np.outer(self.scale[:p], self.scale[:p]), 1 / self.scale[:p])
         all_pixels = np.ones_like(settings.pixels)
         sums = state.sums
@@ -576,23 +580,32 @@ class _Problem:
         state: _State,
         which: NDArray[np.integer],
         slope: NDArray[np.complex128],
+        information: NDArray[np.float64],
         covariance: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return the largest standard deviations without any one pixel, (k, p), by the Sherman–Morrison formula."""
+        """Return the largest standard deviations without any one pixel, (k, p), by the Sherman–Morrison formula.
+
+        The formula holds for the inverse information. A sandwich covariance grows by the same ratio.
+        """
         p = covariance.shape[1]
         phasor, weight = state.images.phasor[which], self.evidence.weight[self.frame]
         use = state.use[which] & self.settings.pixels & (weight > 0) & (phasor != 0)
+        turn = np.divide(1.0, phasor, out=np.zeros_like(phasor), where=use)
+        value = self.evidence.value[self.frame]
         if self.evidence.on == "ranges":
-            turn = np.divide(1.0, phasor, out=np.zeros_like(phasor), where=use)
             rows = self.evidence.sensor.metres_per_radian * (slope * turn[:, None]).imag[..., None]
+            residual = self.evidence.sensor.metres_per_radian * np.angle(value * phasor.conj())[..., None]
         else:
             rows = np.stack([slope.real, slope.imag], axis=-1)
-        rows = rows[:, :p] * np.sqrt(weight * use)[:, None, :, None]  # (k, p, pixels, 1 or 2)
-        moved = np.einsum("kab,kbqr->kaqr", covariance, rows)
+            residual = np.stack([(value - phasor).real, (value - phasor).imag], axis=-1)
+        root = np.sqrt(robust_weight(residual, (weight * use)[..., None], self.settings.huber))
+        rows = rows * root[:, None]  # (k, p, pixels, 1 or 2)
+        inverse = _inverse(information * np.outer(self.scale, self.scale), self.scale)
+        moved = np.einsum("kab,kbqr->kaqr", inverse, rows)
         leverage = np.einsum("kaqr,kaqr->kqr", rows, moved)
-        more = moved**2 / np.maximum(1 - leverage, 1e-12)[:, None]
-        variance = np.einsum("kaa->ka", covariance) + more.sum(axis=3).max(axis=2)
-        return np.asarray(np.sqrt(variance))
+        more = (moved[:, :p] ** 2 / np.maximum(1 - leverage, 1e-12)[:, None]).sum(axis=3).max(axis=2)
+        own = np.einsum("kaa->ka", inverse)[:, :p]
+        return np.asarray(np.sqrt(np.einsum("kaa->ka", covariance) * (own + more) / own))
 
     def _wrong(
         self, state: _State, near: NDArray[np.intp], covariance: NDArray[np.float64], among: NDArray[np.bool_]
