@@ -48,6 +48,7 @@ _YOUNGER_FIELDS = {
     "systematic_delta_deg",
     "systematic_bearing_deg",
     "systematic_height_m",
+    "systematic_time_s",
 }
 """Of a sensor: what resolved plans in older files lack, and mean 0 or none by."""
 

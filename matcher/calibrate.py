@@ -26,10 +26,11 @@ from phasemark.matcher.calibrate_notes import advice, named, observability_notes
 from phasemark.matcher.calibrate_pose_errors import estimate_pose_std
 from phasemark.matcher.calibrate_poses import KnownPoses, PoseStd
 from phasemark.matcher.calibrate_recording import Recorded, Recording, prior_std
-from phasemark.matcher.calibrate_track import LONGEST_GAP_S, PoseTrack, spread_stamps
+from phasemark.matcher.calibrate_track import LONGEST_GAP_S, PoseTrack
 from phasemark.matcher.estimator import MIN_RETURNS, p_values_of
 from phasemark.matcher.filters import FilteredFrames, PixelState, assumed_std_m, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood import Evidence, Quantity
+from phasemark.matcher.stamps import spread_stamps
 from phasemark.render import Background, Frames, Sensor, wrap_difference_m, wrap_range_m
 from phasemark.render.sensor_file import rounded
 
@@ -652,8 +653,8 @@ def _recording_notes(found: Recorded, left_out: float) -> list[str]:
     ]
     if parts:
         notes.append(
-            f"Beyond noise, poses and ranges disagree by {', '.join(parts)} (standard deviations); all but the last are"
-            " systematic errors of the sensor file."
+            f"Beyond noise, poses and ranges disagree by {', '.join(parts)} (standard deviations): systematic errors"
+            " of the sensor file."
         )
     return notes
 
@@ -661,7 +662,7 @@ def _recording_notes(found: Recorded, left_out: float) -> list[str]:
 def _with_zones(sensor: Sensor, found: Recorded, shape: tuple[int, int]) -> Sensor:
     """Return the sensor with zone offsets, noise law and systematic errors."""
     constant, shot, ambient = found.noise
-    distance, delta, bearing, height, _ = found.systematic
+    distance, delta, bearing, height, time = found.systematic
     table = tuple(tuple(row) for row in found.zone_m.reshape(shape).tolist())
     return sensor.with_(
         zone_offset_m=rounded(table),
@@ -672,6 +673,7 @@ def _with_zones(sensor: Sensor, found: Recorded, shape: tuple[int, int]) -> Sens
         systematic_delta_deg=rounded(math.degrees(delta)),
         systematic_bearing_deg=rounded(math.degrees(bearing)),
         systematic_height_m=rounded(float(height)),
+        systematic_time_s=rounded(float(time)),
     )
 
 

@@ -31,6 +31,7 @@ _COMMON = {
     "systematic_delta_deg": "calibrated: what noise does not explain",
     "systematic_bearing_deg": "calibrated: what noise does not explain",
     "systematic_height_m": "calibrated: what noise does not explain",
+    "systematic_time_s": "calibrated: jitter of the stamps",
 }
 """What stands behind the fields that no parameter of the mounting has."""
 

@@ -23,8 +23,6 @@ _WIDTH_STEPS, _LEAST_WIDTH_S = 1.5, 0.03
 """Standard deviation of the weights: in median steps of the stamps, and at least in seconds."""
 _REACH = 4.0
 """Standard deviations beyond which a pose has no weight."""
-_SAME_GAP = 0.25
-"""Share of a period by which a gap may differ from a whole number of them."""
 _FEWEST = 4
 """Poses between two gaps that make a piece of track."""
 
@@ -116,40 +114,6 @@ class PoseTrack:
                 value[own] = spline(inside)
                 rate[own] = np.where((inside == time_s[own])[:, None], spline(inside, 1), 0.0)
         return value, rate
-
-
-def spread_stamps(stamps_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Move repeated stamps into the gap beside them where the gap has the length of the frames that share a stamp.
-
-    A recorder that is busy stamps a frame late, together with the next one. The stamps are then apart by k periods, 0
-    and so on, and the frames were in fact taken one period apart. Stamps beside a gap of another length stay.
-
-    Parameters
-    ----------
-    stamps_s : (n,) float64
-        In the order of the frames, seconds.
-
-    Returns
-    -------
-    (n,) float64
-    """
-    steps = np.diff(stamps_s)
-    if not (steps > 0).any():
-        return stamps_s
-    period = float(np.median(steps[steps > 0]))
-    out = stamps_s.copy()
-    starts = np.flatnonzero(np.append(True, steps != 0))
-    for start, end in zip(starts, np.append(starts[1:], len(stamps_s)), strict=True):
-        k = end - start
-        if k == 1:
-            continue
-        before = stamps_s[start] - stamps_s[start - 1] if start else np.inf
-        after = stamps_s[end] - stamps_s[start] if end < len(stamps_s) else np.inf
-        if abs(before - k * period) < _SAME_GAP * period:
-            out[start:end] = stamps_s[start] - before + before / k * np.arange(1, k + 1)
-        elif abs(after - k * period) < _SAME_GAP * period:
-            out[start:end] = stamps_s[start] + after / k * np.arange(k)
-    return out
 
 
 def _smooth(

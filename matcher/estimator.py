@@ -23,6 +23,7 @@ from phasemark.matcher.likelihood import Evidence, Quantity
 from phasemark.matcher.match import Candidate, Match, Reason
 from phasemark.matcher.models import VIEW, BankModel, ImageModel, RenderedModel
 from phasemark.matcher.refine import SCALE, Fits, Settings, refine
+from phasemark.matcher.stamps import spread_stamps
 from phasemark.matcher.surroundings import NEAREST_WALL_M, estimate_surroundings, fit_background, without_background
 from phasemark.matcher.systematic import (
     Systematic,
@@ -31,6 +32,7 @@ from phasemark.matcher.systematic import (
     calibrated_slopes,
     carried_covariance,
     declared_covariance,
+    rates_of_views,
 )
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, phasor_to_range_m, wrap_difference_m
 
@@ -207,7 +209,7 @@ class MaximumLikelihood:
         for start in range(0, len(frames), _FRAMES_AT_ONCE):
             some = frames[start : start + _FRAMES_AT_ONCE]
             answers.extend(self._match_auto(some) if self.auto else self._match_some(some))
-        return answers
+        return self._with_motion(frames, answers)
 
     def _match_some(self, frames: FilteredFrames) -> list[Match]:
         evidence = Evidence.from_frames(frames, self.on)
@@ -714,6 +716,26 @@ class MaximumLikelihood:
                         parts[k]["calibration"] = part
         return [self._with_parts(match, part) if part else match for match, part in zip(answers, parts, strict=True)]
 
+    def _with_motion(self, frames: FilteredFrames, answers: list[Match]) -> list[Match]:
+        """Add to covariances what the jitter of the stamps makes of the motion of the camera."""
+        jitter_s = frames.sensor.systematic_time_s
+        if "motion" not in self._systematic or jitter_s == 0 or frames.time_s is None:
+            return answers
+        nothing = np.full(len(self.free), np.nan)
+        view, std = (
+            np.array([nothing if m.covariance is None or m.class_name is None else value(m) for m in answers]).reshape(
+                -1, len(self.free)
+            )
+            for value in (
+                lambda m: np.array([getattr(m, name) for name in self.free]),
+                lambda m: np.sqrt(np.diag(m.covariance)),
+            )
+        )
+        period = np.array([2 * math.pi / match.symmetry for match in answers])
+        rate = rates_of_views(spread_stamps(frames.time_s), view, std, period, self.free.index("delta_rad"))
+        parts = [{"motion": np.outer(one, one) * jitter_s**2} if one.any() else {} for one in rate]
+        return [self._with_parts(match, part) if part else match for match, part in zip(answers, parts, strict=True)]
+
     def _with_parts(self, match: Match, parts: dict[str, NDArray[np.float64]]) -> Match:
         """Return a match whose covariance holds further parts; refused if they leave it undetermined."""
         assert match.covariance is not None
@@ -721,7 +743,8 @@ class MaximumLikelihood:
         reason = match.reason
         if not reason and not self._is_determined(np.sqrt(np.diag(covariance)), match.symmetry):
             reason = "undetermined"
-        return replace(match, covariance=covariance, systematic=parts, reason=reason, accepted=not reason)
+        whole = {**match.systematic, **parts}
+        return replace(match, covariance=covariance, systematic=whole, reason=reason, accepted=not reason)
 
     def _carried(
         self, sensor: Sensor, evidence: Evidence, class_index: int, which: list[int], matches: list[Match]

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 
-Systematic = Literal["calibration", "declared"]
-"""What a calibration leaves of the sensor's fields, and what the sensor declares of a pose."""
+Systematic = Literal["calibration", "declared", "motion"]
+"""What a calibration leaves of the sensor's fields, what the sensor declares of a pose, and the jitter of stamps."""
 SYSTEMATICS: tuple[Systematic, ...] = get_args(Systematic)
 
 _STEPS = {
@@ -32,6 +32,10 @@ _STEPS = {
 }
 """Fields that move an image, and the width of a difference in them."""
 _OFFSET = "range_offset_m"
+_REACH_S = 0.25
+"""Estimates farther away in time do not tell how fast a view changes."""
+_RATE_NEEDS = 3
+"""Estimates that a rate takes, the view's own among them."""
 
 
 def check_systematic(names: Collection[str]) -> tuple[Systematic, ...]:
@@ -57,6 +61,47 @@ def declared_covariance(sensor: Sensor, free: Sequence[str]) -> NDArray[np.float
         "height_m": sensor.systematic_height_m,
     }
     return np.diag([std[name] ** 2 for name in free])
+
+
+def rates_of_views(
+    time_s: NDArray[np.float64],
+    view: NDArray[np.float64],
+    std: NDArray[np.float64],
+    period_rad: NDArray[np.float64],
+    turn: int,
+) -> NDArray[np.float64]:
+    """Return how fast estimated views change, by a weighted line through the estimates nearby in time.
+
+    Parameters
+    ----------
+    time_s : (n,) float64
+    view, std : (n, p) float64
+        Free parameters and their standard deviations; NaN where a frame has no answer.
+    period_rad : (n,) float64
+        After which δ repeats.
+    turn : int
+        Column of δ.
+
+    Returns
+    -------
+    (n, p) float64
+        Per second; 0 where too few estimates are near.
+    """
+    known = np.isfinite(view).all(axis=1) & np.isfinite(std).all(axis=1)
+    rate = np.zeros_like(view)
+    for k in np.flatnonzero(known):
+        near = np.flatnonzero(known & (np.abs(time_s - time_s[k]) <= _REACH_S))
+        since = time_s[near] - time_s[k]
+        if len(near) < _RATE_NEEDS or np.ptp(since) == 0:
+            continue
+        away = view[near] - view[k]
+        away[:, turn] = (away[:, turn] + period_rad[k] / 2) % period_rad[k] - period_rad[k] / 2
+        weight = 1 / np.maximum(std[near], np.median(std[near], axis=0)) ** 2
+        total = weight.sum(axis=0)
+        middle = (weight * since[:, None]).sum(axis=0) / total
+        spread = since[:, None] - middle
+        rate[k] = (weight * spread * away).sum(axis=0) / (weight * spread**2).sum(axis=0)
+    return rate
 
 
 def calibrated_fields(sensor: Sensor) -> tuple[str, ...]:

@@ -115,6 +115,7 @@ _CALIBRATION = (
     "systematic_delta_deg",
     "systematic_bearing_deg",
     "systematic_height_m",
+    "systematic_time_s",
 )
 
 _DIRECT_NOISE = ("range_std_m", "range_shot_std_m", "range_ambient_std_m", "zone_offset_m")
@@ -240,6 +241,9 @@ class Sensor(BaseModel):
     systematic_distance_m, systematic_delta_deg, systematic_bearing_deg, systematic_height_m : float
         Standard deviation of what noise and calibration do not explain of a pose: an error that averaging frames does
         not reduce.
+    systematic_time_s : float
+        Standard deviation of the jitter of the stamps, seconds. While the camera moves, a stamp that is off by that
+        much moves the pose by that time's motion.
 
     Raises
     ------
@@ -320,6 +324,7 @@ class Sensor(BaseModel):
     systematic_delta_deg: _NonNegative = 0.0
     systematic_bearing_deg: _NonNegative = 0.0
     systematic_height_m: _NonNegative = 0.0
+    systematic_time_s: _NonNegative = 0.0
 
     def __init__(self, **data: Any) -> None:
         try:
