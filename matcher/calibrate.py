@@ -30,7 +30,7 @@ from phasemark.matcher.calibrate_track import LONGEST_GAP_S, PoseTrack
 from phasemark.matcher.estimator import MIN_RETURNS, p_values_of
 from phasemark.matcher.filters import FilteredFrames, PixelState, assumed_std_m, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood import Evidence, Quantity
-from phasemark.matcher.stamps import spread_stamps
+from phasemark.matcher.stamps import spread_stamps, stamp_jitter
 from phasemark.render import Background, Frames, Sensor, wrap_difference_m, wrap_range_m
 from phasemark.render.sensor_file import rounded
 
@@ -463,6 +463,7 @@ def _track_of(frames: FilteredFrames, poses: KnownPoses, job: _Job) -> tuple[Pos
     if len(index) > _MOST_FRAMES:
         notes.append(f"Of {len(index)} frames {_MOST_FRAMES} entered, evenly spaced.")
         index = index[np.linspace(0, len(index) - 1, _MOST_FRAMES).round().astype(int)]
+    track = replace(track, jitter_s=max(track.jitter_s, stamp_jitter(frames.time_s)))
     return track, replace(frames, time_s=stamps)[index], notes
 
 
@@ -501,7 +502,10 @@ def _recording(
         direct = frames.sensor.kind == "direct"
         edges = model.has_background or not (direct or _returns_beside(model, evidence, job.assumed))
     block = _blocks(stamps) if moving and stamps is not None else np.arange(len(frames))
-    return Recording(model, evidence, job.names, job.assumed.vector, block, edges=edges, zones=job.zones)
+    jitter_s = track.jitter_s if track is not None else 0.0
+    return Recording(
+        model, evidence, job.names, job.assumed.vector, block, edges=edges, zones=job.zones, jitter_s=jitter_s
+    )
 
 
 def _poses_at(track: PoseTrack, times: NDArray[np.float64]) -> KnownPoses:

@@ -236,6 +236,8 @@ class Recording:
         Whether pixels that see the landmark in part count.
     zones : bool
         Whether the offsets of zones and the noise law of a direct sensor are estimated.
+    jitter_s : float
+        Smallest standard deviation of the error of a stamp.
     """
 
     def __init__(
@@ -248,7 +250,9 @@ class Recording:
         *,
         edges: bool,
         zones: bool,
+        jitter_s: float = 0.0,
     ) -> None:
+        self.least = np.array([0.0, 0.0, 0.0, 0.0, jitter_s])
         self.model, self.evidence, self.free, self.assumed = model, evidence, tuple(free), assumed
         self.columns = np.array([ALL_NAMES.index(name) for name in free])
         self.scale = SCALE[self.columns]
@@ -388,7 +392,7 @@ class Recording:
             values = np.where(active, np.exp(log[:own]), 0.0)
             block = np.zeros(_EFFECTS) if self.single else values[_EFFECTS:] * _SIZE_UNIT
             zone_m = float(np.exp(log[own])) * _ZONE_UNIT_M if self.zones else start.zone_m
-            return Sizes(values[:_EFFECTS] * _SIZE_UNIT, block, zone_m)
+            return Sizes(np.maximum(values[:_EFFECTS] * _SIZE_UNIT, self.least), block, zone_m)
 
         def fitted(log: _Float, active: _Bool) -> tuple[_Float, float]:
             index = np.flatnonzero(np.append(active, [True] * self.zones))

@@ -16,6 +16,7 @@ from scipy import interpolate
 
 from phasemark import UsageError
 from phasemark.matcher.calibrate_poses import KnownPoses
+from phasemark.matcher.stamps import stamp_jitter
 
 LONGEST_GAP_S = 0.25
 """Longest time between two poses that is bridged."""
@@ -37,10 +38,13 @@ class PoseTrack:
         Stretches of time without gaps; each spline gives (..., 4) metres and radians.
     dropped : int
         Number of poses left out because their stamp repeats or runs backwards.
+    jitter_s : float
+        How far stamps are at least uncertain, standard deviation: 0 where none repeats.
     """
 
     pieces: tuple[tuple[float, float, interpolate.CubicHermiteSpline], ...]
     dropped: int
+    jitter_s: float = 0.0
 
     @classmethod
     def of(cls, poses: KnownPoses) -> PoseTrack:
@@ -73,7 +77,7 @@ class PoseTrack:
                 f"no {_FEWEST} poses follow one another within {LONGEST_GAP_S:g} s each: are their stamps in the unit"
                 " of their column, t_ms or t_s?"
             )
-        return cls(tuple(pieces), int((~first).sum()))
+        return cls(tuple(pieces), int((~first).sum()), stamp_jitter(poses.time_s))
 
     def mirrored(self) -> PoseTrack:
         """Return the track with the other sign of δ and bearing."""
@@ -82,7 +86,9 @@ class PoseTrack:
         def turned(spline: interpolate.CubicHermiteSpline) -> interpolate.CubicHermiteSpline:
             return interpolate.CubicHermiteSpline(spline.x, spline(spline.x) * sign, spline(spline.x, 1) * sign)
 
-        return PoseTrack(tuple((start, end, turned(spline)) for start, end, spline in self.pieces), self.dropped)
+        return PoseTrack(
+            tuple((start, end, turned(spline)) for start, end, spline in self.pieces), self.dropped, self.jitter_s
+        )
 
     def known(self, start_s: NDArray[np.float64], end_s: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return True where a stretch of time lies between two gaps, (n,)."""

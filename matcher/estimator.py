@@ -485,7 +485,7 @@ class MaximumLikelihood:
         others = fits[np.setdiff1d(np.arange(len(fits)), modes)]
         less = np.zeros(len(evidence.weight))  # what the pixels left out cost the best no longer
         refitted = np.unique(some.frame)
-        less[refitted] = (_least_of_frame(again, len(less)) - least)[refitted]
+        less[refitted] = _least_of_frame(again, len(less))[refitted] - least[refitted]
         others.cost[:] += less[others.frame]
         return Fits.joined([again, others])
 
@@ -717,7 +717,10 @@ class MaximumLikelihood:
         return [self._with_parts(match, part) if part else match for match, part in zip(answers, parts, strict=True)]
 
     def _with_motion(self, frames: FilteredFrames, answers: list[Match]) -> list[Match]:
-        """Add to covariances what the jitter of the stamps makes of the motion of the camera."""
+        """Add to covariances what the jitter of the stamps makes of the motion of the camera.
+
+        What a frame shows is as certain as before, so that no further answer is refused.
+        """
         jitter_s = frames.sensor.systematic_time_s
         if "motion" not in self._systematic or jitter_s == 0 or frames.time_s is None:
             return answers
@@ -733,18 +736,20 @@ class MaximumLikelihood:
         )
         period = np.array([2 * math.pi / match.symmetry for match in answers])
         rate = rates_of_views(spread_stamps(frames.time_s), view, std, period, self.free.index("delta_rad"))
-        parts = [{"motion": np.outer(one, one) * jitter_s**2} if one.any() else {} for one in rate]
-        return [self._with_parts(match, part) if part else match for match, part in zip(answers, parts, strict=True)]
+        return [
+            match if match.covariance is None or not one.any() else _with_part(match, "motion", part)
+            for match, one, part in zip(answers, rate, jitter_s**2 * rate[:, :, None] * rate[:, None], strict=True)
+        ]
 
     def _with_parts(self, match: Match, parts: dict[str, NDArray[np.float64]]) -> Match:
         """Return a match whose covariance holds further parts; refused if they leave it undetermined."""
+        for name, part in parts.items():
+            match = _with_part(match, name, part)
         assert match.covariance is not None
-        covariance = match.covariance + np.sum(list(parts.values()), axis=0)
         reason = match.reason
-        if not reason and not self._is_determined(np.sqrt(np.diag(covariance)), match.symmetry):
+        if not reason and not self._is_determined(np.sqrt(np.diag(match.covariance)), match.symmetry):
             reason = "undetermined"
-        whole = {**match.systematic, **parts}
-        return replace(match, covariance=covariance, systematic=whole, reason=reason, accepted=not reason)
+        return replace(match, reason=reason, accepted=not reason)
 
     def _carried(
         self, sensor: Sensor, evidence: Evidence, class_index: int, which: list[int], matches: list[Match]
@@ -922,6 +927,12 @@ class _Models:
 
     final: ImageModel | None
     scout: ImageModel | None
+
+
+def _with_part(match: Match, name: str, part: NDArray[np.float64]) -> Match:
+    """Return a match whose covariance holds a further part."""
+    assert match.covariance is not None
+    return replace(match, covariance=match.covariance + part, systematic={**match.systematic, name: part})
 
 
 def weak_direction(information: NDArray[np.float64], free: Sequence[str]) -> tuple[float, dict[str, float]]:

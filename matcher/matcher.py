@@ -83,9 +83,10 @@ class Matcher:
         Whether "refine" counts residuals beyond 3 σ linearly (Huber); the covariance is then the sandwich.
     bearing_std_rad : float
         How well the mount points at the landmark, where `free` is None: the standard deviation of a Gaussian prior.
-    systematic : collection of {"calibration", "declared"}
+    systematic : collection of {"calibration", "declared", "motion"}
         Which errors that all frames of the camera share are added to the covariance of "refine": what the calibration
-        of the frames' sensor leaves, and what the sensor declares of a pose. Both unless stated.
+        of the frames' sensor leaves, what the sensor declares of a pose, and what the jitter of its stamps makes of
+        the camera's motion. All unless stated.
     tolerance_m, tolerance_rad : float
         How far off an accepted answer of "refine" may be. It is refused as "undetermined" where three standard
         deviations of a free length or angle exceed this, and as "ambiguous" where other classes keep a probability of

@@ -583,7 +583,7 @@ class _Problem:
         information: NDArray[np.float64],
         covariance: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return the largest standard deviations without any one pixel, (k, p), by the Sherman–Morrison formula.
+        """Return the largest standard deviations without any one pixel, (k, p), by the Woodbury formula.
 
         The formula holds for the inverse information. A sandwich covariance grows by the same ratio.
         """
@@ -602,8 +602,9 @@ class _Problem:
         rows = rows * root[:, None]  # (k, p, pixels, 1 or 2)
         inverse = _inverse(information * np.outer(self.scale, self.scale), self.scale)
         moved = np.einsum("kab,kbqr->kaqr", inverse, rows)
-        leverage = np.einsum("kaqr,kaqr->kqr", rows, moved)
-        more = (moved[:, :p] ** 2 / np.maximum(1 - leverage, 1e-12)[:, None]).sum(axis=3).max(axis=2)
+        kept = (1 + 1e-12) * np.eye(rows.shape[3]) - np.einsum("kaqr,kaqs->kqrs", rows, moved)
+        moved = moved[:, :p]
+        more = np.einsum("kaqr,kqrs,kaqs->kaq", moved, np.linalg.inv(kept), moved).max(axis=2)
         own = np.einsum("kaa->ka", inverse)[:, :p]
         return np.asarray(np.sqrt(np.einsum("kaa->ka", covariance) * (own + more) / own))
 

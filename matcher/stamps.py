@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 _SAME_GAP = 0.25
 """Share of a period by which a gap may differ from a whole number of them."""
+
+
+def stamp_jitter(stamps_s: NDArray[np.float64]) -> float:
+    """Return how far stamps are at least uncertain, standard deviation in seconds.
+
+    Stamps that repeat are known to one period: they are uniform over it. 0 where none repeats.
+    """
+    steps = np.diff(np.unique(stamps_s))
+    if len(steps) == 0 or len(steps) + 1 == len(stamps_s):
+        return 0.0
+    return float(np.median(steps)) / math.sqrt(12.0)
 
 
 def spread_stamps(stamps_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -25,12 +38,14 @@ def spread_stamps(stamps_s: NDArray[np.float64]) -> NDArray[np.float64]:
     (n,) float64
     """
     steps = np.diff(stamps_s)
-    if not (steps > 0).any():
-        return stamps_s
-    period = float(np.median(steps[steps > 0]))
-    out = stamps_s.copy()
     starts = np.flatnonzero(np.append(True, steps != 0))
-    for start, end in zip(starts, np.append(starts[1:], len(stamps_s)), strict=True):
+    ends = np.append(starts[1:], len(stamps_s))
+    per_frame = steps[starts[1:] - 1] / (ends - starts)[1:]
+    if not (per_frame > 0).any():
+        return stamps_s
+    period = float(np.median(per_frame[per_frame > 0]))
+    out = stamps_s.copy()
+    for start, end in zip(starts, ends, strict=True):
         k = end - start
         if k == 1:
             continue

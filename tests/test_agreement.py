@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from thin_landmarks import PRESETS, SETTINGS, bank_of, box, count, meshes
+from thin_landmarks import PRESETS, SETTINGS, WALL, bank_of, box, count, meshes
 
 from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank, open_bank
@@ -64,6 +64,20 @@ def test_an_accepted_answer_on_a_thin_panel_is_right(panel, setting):
     assert found.wrong_accepted == 0
     if setting in ("fixed", "wall", "robust"):
         assert found.right_accepted >= 23  # 25 at a false alarm of 0.01: 3 refused have a probability of 0.002
+
+
+@pytest.mark.parametrize("setting", ["fixed", "wall", "unknown", "bearing"])
+def test_a_plate_that_fills_the_view_may_be_its_front_or_its_back(tmp_path, setting):
+    # at 0.6 m the 16 × 16 camera sees nothing of the bracket but its plate, from behind as from the front
+    bank = bank_of("bracket", "pmd-16x16", tmp_path)
+    views = Views.broadcast(np.array([0.608, 0.625, 0.569, 0.605]), np.radians([8.4, 1.4, 24.5, 14.2]))
+    image = Renderer(bank.mesh("bracket"), bank.sensor, albedo=0.8).render_views(
+        views, background=None if setting == "bearing" else WALL
+    )
+    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(9), n_frames=1))
+    matches = Matcher(bank, "refine", **SETTINGS[setting]).match(frames)
+    assert not matches.accepted.any()
+    assert set(matches.reason) <= {"ambiguous", "undetermined"}
 
 
 def test_a_bearing_that_nothing_tells_is_undetermined(tmp_path):

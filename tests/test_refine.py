@@ -13,7 +13,7 @@ from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, noise_free
-from phasemark.matcher.likelihood import Evidence
+from phasemark.matcher.likelihood import Evidence, gauss_newton_sums
 from phasemark.matcher.models import VIEW, BankModel, RenderedModel
 from phasemark.matcher.refine import Settings, _Problem
 from phasemark.matcher.trials import Conditions, noisy_frames, run_trials
@@ -155,6 +155,42 @@ def test_a_free_bearing_is_found_with_the_rest(bank, renderers):
 def test_trials_of_a_matcher_that_estimates_something_else_are_refused(bank, renderers):
     with pytest.raises(UsageError, match="estimates distance_m, delta_rad, bearing_rad, and 'free'"):
         run_trials(Matcher(bank, "refine").match, renderers["cone"], "cone", Conditions(), 1, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("huber", [None, 2.0])
+@pytest.mark.parametrize("on", ["ranges", "phasors"])
+def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, renderers, on, huber):
+    # the oracle sums again without each pixel; a robust covariance grows by the ratio of the inverse informations
+    free = VIEW[:2]
+    image = renderers["cone"].render(1.02, 0.5)
+    evidence = Evidence.from_frames(
+        kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(2), n_frames=10)), on
+    )
+    used = np.ones(evidence.value.shape[1], bool)
+    problem = _Problem(
+        RenderedModel(bank), evidence, np.zeros(1, np.int64), np.array([bank.classes.index("cone")]),
+        Settings(free, used, huber), np.full(1, np.inf),
+    )  # fmt: skip
+    state = problem.start(np.array([[1.02, 0.5, 0.0, 0.0]]), False)
+    p = len(problem.columns)
+    covariance = problem._covariance(state.sums)
+    found = problem._std_without_one(state, np.array([0]), state.images.slope, state.sums.information, covariance)
+
+    def variance(use):
+        sums = gauss_newton_sums(
+            state.images.phasor, state.images.slope, evidence, np.zeros(1, np.int64), use[None], huber
+        )
+        return np.diag(np.linalg.inv(sums.information[0]))[:2]
+
+    assert state.sums.information.shape == (1, p, p)
+    whole = variance(state.use[0])
+    without = []
+    for pixel in np.flatnonzero(state.use[0]):
+        use = state.use[0].copy()
+        use[pixel] = False
+        without.append(variance(use))
+    expected = np.sqrt(np.diag(covariance[0]) * np.max(without, axis=0) / whole)
+    np.testing.assert_allclose(found[0], expected, rtol=1e-6)
 
 
 def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, renderers):

@@ -1,6 +1,7 @@
 """Errors that all frames of a camera share are in the covariance of a view."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, covers, cramer_rao, kalman_filter
 from phasemark.matcher.filters import noise_free
-from phasemark.matcher.systematic import calibrated_slopes
+from phasemark.matcher.systematic import calibrated_slopes, rates_of_views
 from phasemark.render import Background, Frames, Renderer, Views, capture
 
 VIEW = ("distance_m", "delta_rad")
@@ -116,6 +117,36 @@ def test_each_term_can_be_left_out_and_is_listed(bank):
     np.testing.assert_allclose(declared, np.diag([0.0, math.radians(0.5) ** 2]), rtol=1e-12)
 
 
+def test_a_stamp_that_jitters_adds_the_motion_of_its_time(bank):
+    # a camera that turns by 40°/s and approaches by 0.3 m/s: the covariance grows by the square of 20 ms of that
+    rate, jitter_s = np.array([-0.3, math.radians(40.0)]), 0.02
+    sensor = bank.sensor.with_(systematic_time_s=jitter_s)
+    time_s = np.arange(6) * 0.06
+    view = np.array([1.05, 0.4]) + rate * time_s[:, None]
+    images = Renderer(bank.mesh("cone"), sensor, albedo=0.8).render_views(Views.broadcast(*view.T, 0.0, 0.0))
+    frames = replace(noise_free(images, 50), time_s=time_s)
+    matches = Matcher(bank, "refine", free=VIEW).match(frames)
+    for match in matches:
+        np.testing.assert_allclose(match.systematic["motion"], np.outer(rate, rate) * jitter_s**2, rtol=0.05)
+    still = Matcher(bank, "refine", free=VIEW, systematic=("declared",)).match(frames)
+    np.testing.assert_allclose(
+        matches.covariance - still.covariance, [match.systematic["motion"] for match in matches], atol=1e-15
+    )
+    assert not Matcher(bank, "refine", free=VIEW).match(replace(frames, time_s=None))[0].systematic
+    assert not Matcher(bank, "refine", free=VIEW).match(frames[:1])[0].systematic  # one frame tells no rate
+
+
+def test_rates_take_the_short_way_round_and_only_estimates_nearby():
+    time_s = np.array([0.0, 0.1, 0.2, 5.0, 5.1])
+    angle = np.radians([178.0, 179.5, 1.0, 90.0, 91.0])  # repeats after 180°
+    view, std = np.column_stack([np.ones(5), angle]), np.full((5, 2), 0.01)
+    rate = rates_of_views(time_s, view, std, np.full(5, math.pi), 1)
+    np.testing.assert_allclose(rate[:3], [[0.0, math.radians(15.0)]] * 3, atol=1e-12)
+    assert not rate[3:].any()
+    view[1] = np.nan
+    assert not rates_of_views(time_s, view, std, np.full(5, math.pi), 1).any()  # two estimates are too few
+
+
 def test_the_bound_carries_the_same_terms(bank):
     sensor = calibrated(bank.sensor, systematic_distance_m=3e-3)
     renderer = Renderer(build_mesh(catalog()["cone"]), sensor, albedo=0.8)
@@ -130,5 +161,5 @@ def test_the_bound_carries_the_same_terms(bank):
 
 
 def test_unknown_terms_are_named(bank):
-    with pytest.raises(UsageError, match="'systematic' must be among calibration, declared, got 'noise'"):
+    with pytest.raises(UsageError, match="'systematic' must be among calibration, declared, motion, got 'noise'"):
         Matcher(bank, "refine", systematic=("noise",))
