@@ -30,6 +30,7 @@ from phasemark.matcher.calibrate_model import ALL_NAMES, NAMES, PARAMETERS, Cali
 from phasemark.matcher.calibrate_report import calibration_toml
 from phasemark.matcher.calibrate_track import PoseTrack
 from phasemark.matcher.likelihood import Evidence
+from phasemark.matcher.stamps import stamp_jitter
 from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, preset
 
 PMD = preset("pmd-16x16")
@@ -613,20 +614,23 @@ def test_a_delay_is_found_far_from_where_it_was_assumed(delay_s):
     assert abs(found.value("delay") - delay_s) < 4 * found.std("delay")
 
 
-def test_stamps_that_repeat_or_run_backwards_are_left_out_and_told():
+def test_stamps_that_repeat_are_moved_into_a_gap_and_those_that_run_backwards_left_out():
     frames, poses, _ = record(np.random.default_rng(9), TURNING, 44)
     stamps, known = frames.time_s.copy(), poses.time_s.copy()
-    stamps[[7, 20]] = stamps[[6, 19]]  # which of the two is right is not known
+    stamps[[7, 20]] = stamps[[6, 19]]  # a gap of two periods follows
+    stamps[40] = stamps[39] = stamps[39] + 0.3 * (stamps[40] - stamps[39])  # which of the two is right is not known
     stamps[30] = stamps[28] + 0.01
     known[10], known[15] = known[9], known[12]
     found = calibrate(
         BOARD, replace(frames, time_s=stamps), replace(poses, time_s=known), free=FREE, moving=True
     )  # fmt: skip
     assert abs(found.value("delay") + 0.075) < 4 * found.std("delay")
-    assert len(found.poses) == 44 - 5
+    assert len(found.poses) == 44 - 3
+    assert found.sensor.systematic_time_s >= stamp_jitter(stamps)
     notes = " ".join(found.notes)
     assert "2 poses were left out, for their stamps repeat or run backwards" in notes
-    assert "5 frames were left out, for their stamps repeat or run backwards" in notes
+    assert "2 frames got a time of their own in a gap beside their repeated stamps" in notes
+    assert "3 frames were left out, for their stamps repeat or run backwards" in notes
 
 
 def test_gaps_between_poses_are_not_bridged():
