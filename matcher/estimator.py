@@ -724,16 +724,11 @@ class MaximumLikelihood:
         jitter_s = frames.sensor.systematic_time_s
         if "motion" not in self._systematic or jitter_s == 0 or frames.time_s is None:
             return answers
-        nothing = np.full(len(self.free), np.nan)
-        view, std = (
-            np.array([nothing if m.covariance is None or m.class_name is None else value(m) for m in answers]).reshape(
-                -1, len(self.free)
-            )
-            for value in (
-                lambda m: np.array([getattr(m, name) for name in self.free]),
-                lambda m: np.sqrt(np.diag(m.covariance)),
-            )
-        )
+        view, std = (np.full((len(answers), len(self.free)), np.nan) for _ in range(2))
+        for k, match in enumerate(answers):
+            if match.covariance is not None and match.class_name is not None:
+                view[k] = [getattr(match, name) for name in self.free]
+                std[k] = np.sqrt(np.diag(match.covariance))
         period = np.array([2 * math.pi / match.symmetry for match in answers])
         rate = rates_of_views(spread_stamps(frames.time_s), view, std, period, self.free.index("delta_rad"))
         return [
@@ -890,6 +885,9 @@ class MaximumLikelihood:
         period = 2 * math.pi / self._symmetry[fits.class_index[best]]
         apart = np.abs(fits.view[kept] - fits.view[best])
         apart[:, 1] = np.abs((apart[:, 1] + period / 2) % period - period / 2)
+        own = [VIEW.index(name) for name in self.free]
+        std = np.sqrt(np.nan_to_num(np.einsum("kpp->kp", fits.covariance[kept]), posinf=0.0))
+        apart[1:, own] += _TOLERATED_SIGMA * std[1:]  # the truth may be on the far side of the other view
         far = (apart > [self._tolerance[name] for name in VIEW]).any(axis=1)
         other = fits.class_index[kept] != fits.class_index[best]
         # where a landmark looks alike from two sides, a single pixel at an edge must not decide between them

@@ -538,16 +538,18 @@ class _Problem:
         fitted = state.use & (evidence.weight[self.frame] > 0)
         wrong = self._wrong(state, near, covariance, ~fitted)
         returned = evidence.seen.returned[self.frame]
-        n_wrong = wrong.sum(axis=1)
         # a return that is neither compared nor wrong costs what a pixel costs on average: a model that counts fewer
         # pixels is not better for it
-        n_open = (returned & ~fitted & ~wrong).sum(axis=1)
-        n_residuals = fitted.sum(axis=1) * evidence.per_pixel + n_wrong + n_open
+        open_ = returned & ~fitted & ~wrong
         unexplained, agreeing, elsewhere = (np.zeros(len(state.theta), np.int64) for _ in range(3))
         if settings.unknown_around:
             outlying, here = self._outlying(state), state.use & returned
+            wrong, open_ = wrong | (open_ & outlying), open_ & ~outlying
             agreeing, elsewhere = (here & ~outlying).sum(axis=1), (here & outlying).sum(axis=1)
             unexplained = (fitted & outlying).sum(axis=1) + (wrong & returned).sum(axis=1)
+        n_wrong, n_open = wrong.sum(axis=1), open_.sum(axis=1)
+        n_residuals = fitted.sum(axis=1) * evidence.per_pixel + n_wrong + n_open
+        if settings.unknown_around:
             fitted = fitted & ~outlying
         return Fits(
             frame=self.frame,
