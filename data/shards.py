@@ -10,7 +10,6 @@ One run writes an output at a time: the run holds a lock on ``FILE.partial``, wh
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -27,8 +26,17 @@ from numpy.typing import NDArray
 from phasemark import OutputExistsError, UsageError
 from phasemark.data.executor import Maker, processors, run_tasks
 from phasemark.data.layout import Layout, place
+from phasemark.data.lock_file import lock_file
 from phasemark.data.progress import Progress
-from phasemark.data.store import checksum_path, finish_publishing, publish, refuse_unwritable, sha256_of, storage_errors
+from phasemark.data.store import (
+    checksum_path,
+    finish_publishing,
+    followed,
+    publish,
+    refuse_unwritable,
+    sha256_of,
+    storage_errors,
+)
 
 SHARD_BYTES = 1 << 22
 """About how much of the file a shard holds; what a killed run loses is a few of these."""
@@ -139,7 +147,8 @@ def build(
     ----------
     job : Job
     path : path-like
-        The file; its checksum, and until it is finished ``FILE.partial`` and ``FILE.manifest``, lie beside it.
+        The file; its checksum, and until it is finished ``FILE.partial`` and ``FILE.manifest``, lie beside it. A link
+        is followed: all of them lie beside the file that it leads to.
     force : bool
         Whether a finished file may be replaced, and an unfinished one thrown away.
     resume : bool
@@ -171,16 +180,17 @@ def build(
     for name, value in (("workers", workers), ("shard_items", shard_items)):
         if value is not None and value < 1:
             raise UsageError(f"'{name}' must be at least 1, got {value}")
-    path = Path(path)
+    given = Path(path)
+    path = followed(given)
     if resume and _publish_again(job, path):
-        return path
-    for target in (path, checksum_path(path)):
+        return given
+    for target in (given, checksum_path(path)):
         refuse_unwritable(target, force=force)
     with storage_errors(path), _Run.locked(path, force=force) as run:
         run.begin(job, resume=resume, force=force, shard_items=shard_items)
         run.render(job, workers, maker, progress)
         run.publish(force=force)
-    return path
+    return given
 
 
 def _publish_again(job: Job, path: Path) -> bool:
@@ -250,7 +260,7 @@ class _Run:
     @contextmanager
     def locked(cls, path: Path, *, force: bool) -> Iterator[_Run]:
         """Hold the lock while the block runs; an unfinished run stays if something of it can be used again."""
-        descriptor, fresh = _lock(path)
+        descriptor, fresh = lock_file(partial_path(path), path)
         run = cls(path, descriptor)
         run._worth_keeping = not fresh
         try:
@@ -384,33 +394,6 @@ class _Run:
         publish(self.partial, self.path, digest, force=force)
         self.manifest.unlink(missing_ok=True)
         self._worth_keeping = True
-
-
-def _lock(path: Path) -> tuple[int, bool]:
-    """Open and lock ``FILE.partial``; return the descriptor and whether the file was made by this call."""
-    partial = partial_path(path)
-    while True:
-        try:
-            descriptor, fresh = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666), True
-        except FileExistsError:
-            try:
-                descriptor, fresh = os.open(partial, os.O_RDWR | os.O_NOFOLLOW), False
-            except FileNotFoundError:
-                continue  # its run has just ended
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(descriptor)
-            raise OutputExistsError(f"{path}: another run is writing it: wait for that one, or end it") from None
-        except BaseException:
-            os.close(descriptor)
-            raise
-        try:
-            if os.path.samestat(os.fstat(descriptor), os.stat(partial)):
-                return descriptor, fresh
-        except FileNotFoundError:
-            pass
-        os.close(descriptor)  # its run finished in between: what we hold is no longer the partial file
 
 
 def _flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
