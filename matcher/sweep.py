@@ -83,7 +83,7 @@ def run_sweep(
         if ":" in method.method:
             check_matcher(method.method)
     folder = Path(folder)
-    refuse_inputs(map(folder.joinpath, (_PLAN, *_TABLES)), named_files(plan.model_dump()))
+    refuse_inputs(sweep_outputs(folder), named_files(plan.model_dump()))
     with sweep_folder(folder) as ours:
         return _run(plan, ours, workers, scheduler, resume=resume, force=force, progress=progress)
 
@@ -115,6 +115,11 @@ def _run(
     write_atomically(folder / "trials.csv", trials_csv(trials), force=True)
     write_cells(plan, trials, folder)
     return trials
+
+
+def sweep_outputs(folder: Path) -> tuple[Path, ...]:
+    """Return what a sweep writes into its folder, but for later rounds and figures."""
+    return (*map(folder.joinpath, (_PLAN, *_TABLES)), *outputs_of(_round_path(folder, 0)))
 
 
 def read_plan_of(folder: str | os.PathLike[str]) -> SweepPlan:
@@ -223,8 +228,7 @@ def _begin(plan: SweepPlan, ours: OwnedFiles, *, resume: bool, force: bool) -> N
             raise OutputExistsError(
                 f"{folder}: was begun with another plan ({'; '.join(changes[:4])}): --force starts over"
             )
-    first = outputs_of(_round_path(folder, 0))
-    ours.claim(_PLAN, *_TABLES, *(path.name for path in first))
+    ours.claim(*(path.name for path in sweep_outputs(folder)))
     if old is None:
         write_atomically(folder / _PLAN, plan.model_dump_json(indent=1).encode(), force=True)
 

@@ -307,7 +307,7 @@ def test_an_existing_folder_needs_force_and_is_replaced_whole(frames, tmp_path):
     assert not set(before) & {entry.name for entry in folder.glob("*.ply")}
     export_frames(frames, folder, "ply", force=True)
     assert sorted(entry.name for entry in folder.iterdir()) == before
-    assert len(list(folder.iterdir())) == 24
+    assert len(list(folder.glob("*.ply"))) == 24
     assert [entry.name for entry in tmp_path.iterdir()] == ["out-ply"]
 
 
