@@ -4,12 +4,15 @@ import errno
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data import read_checksum, renames, verify_checksum, write_atomically, write_checksum
+
+HERE = Path(__file__).parent
 
 
 def names(folder: Path) -> list[str]:
@@ -271,3 +274,13 @@ def test_a_rename_that_replaces_nothing_refuses_an_existing_name(tmp_path, monke
     assert {name: (tmp_path / name).read_bytes() for name in names(tmp_path)} == {"b": b"b", "c": b"a"}
     if in_one_step and renames.exchange(tmp_path / "b", tmp_path / "c"):
         assert (tmp_path / "b").read_bytes() == b"a"
+
+
+@pytest.mark.parametrize("action", ["kill", "ENOSPC", "EIO", "other"])
+def test_a_file_ended_at_any_call_to_the_system_is_the_old_or_the_new_one(tmp_path, action):
+    done = subprocess.run(
+        [sys.executable, HERE / "file_crash_points.py", tmp_path, action],
+        env={**os.environ, "PYTHONPATH": str(HERE)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 15
