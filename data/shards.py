@@ -264,6 +264,13 @@ class _Run:
         run = cls(path, descriptor)
         run._worth_keeping = not fresh
         try:
+            run._refuse_foreign(fresh)
+        except BaseException:
+            if fresh:
+                run.partial.unlink(missing_ok=True)
+            os.close(descriptor)
+            raise
+        try:
             for target in (path, checksum_path(path)):  # another run may have finished before the lock was ours
                 refuse_unwritable(target, force=force)
             yield run
@@ -271,10 +278,23 @@ class _Run:
             if run._log >= 0:
                 os.close(run._log)
             if not run._worth_keeping:
-                for leftover in (run.manifest, run.partial):
+                for leftover in (run.partial, run.manifest):  # a partial file without a manifest is empty
                     with suppress(OSError):
                         leftover.unlink(missing_ok=True)
             os.close(descriptor)  # and with it the lock
+
+    def _refuse_foreign(self, fresh: bool) -> None:
+        """Refuse files of somebody else that have the names of an unfinished run."""
+        known = _Manifest.read(self.manifest) is not None
+        for theirs, exists in (
+            (self.manifest, os.path.lexists(self.manifest) and not known),
+            (self.partial, not fresh and not known and os.fstat(self._file).st_size > 0),
+        ):
+            if exists:
+                raise OutputExistsError(
+                    f"{theirs}: exists and is not of an unfinished run that this version can continue: move it away, or"
+                    f" give '{self.path.name}' another name"
+                )
 
     def begin(self, job: Job, *, resume: bool, force: bool, shard_items: int | None) -> None:
         """Lay the file out, or find what is left of an earlier run."""
@@ -299,15 +319,18 @@ class _Run:
             old = None
         if old is None:
             self._worth_keeping = False
-            self.manifest.unlink(missing_ok=True)
             os.ftruncate(self._file, 0)
+            self.manifest.unlink(missing_ok=True)
         self.state = old or fresh
+        if old is None:
+            self._start_manifest()  # before the first byte: what has no manifest is not ours
         layout.write_to(self._file)
-        kept = dict(filter(self._is_intact, self.state.shards.items())) if old else {}
+        kept = dict(filter(self._is_intact, self.state.shards.items())) if old is not None else {}
         self.state.shards = kept
         self._worth_keeping = bool(kept)
         os.fsync(self._file)
-        self._start_manifest()
+        if old is not None:
+            self._start_manifest()
 
     def _start_manifest(self) -> None:
         temporary = self.manifest.with_name(f".{self.manifest.name}.new")

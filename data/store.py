@@ -13,6 +13,7 @@ from pathlib import Path
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data import renames
+from phasemark.data.lock_file import exclusive
 
 _BLOCK_BYTES = 1 << 20
 _CHECKSUM_LINE = re.compile(r"\\?(?P<digest>[0-9a-fA-F]{64}) [ *](?P<name>[^\n]+)\n?")
@@ -135,7 +136,7 @@ def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
 def finish_publishing(path: Path) -> None:
     """Write the checksum of a file that :func:`publish` had just given its name when the process was killed."""
     write_checksum(path, force=True)
-    for leftover in _publishing_names(path):
+    for leftover in (*_publishing_names(path), _lock_path(path)):
         leftover.unlink(missing_ok=True)
 
 
@@ -147,6 +148,18 @@ def _publishing_names(path: Path) -> tuple[Path, Path]:
 
 def _move_into_place(parts: list[Path], targets: list[Path], *, force: bool) -> None:
     """Replace a file, and then its checksum; the old checksum steps aside first and returns if the file cannot go."""
+    if len(targets) == 1:
+        _replace(parts, targets, force=force)
+        return
+    with storage_errors(targets[0]), exclusive(_lock_path(targets[0]), targets[0]):  # both are of the same run
+        _replace(parts, targets, force=force)
+
+
+def _lock_path(path: Path) -> Path:
+    return path.with_name(f".{path.name}.lock")
+
+
+def _replace(parts: list[Path], targets: list[Path], *, force: bool) -> None:
     for target in targets:  # somebody else may have been faster
         refuse_unwritable(target, force=force)
     _, aside = _publishing_names(targets[0])
