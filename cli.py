@@ -313,9 +313,7 @@ def _sensor_characterise(
     from phasemark.render import characterise
 
     sensor = _load_sensor(name_or_file)
-    _refuse_existing([out / name for name in NAMES], force)
-    _make_folder(out)
-    with _Progress("measuring"):
+    with _output_folder(out, "sensor characterise", NAMES, force), _Progress("measuring"):
         found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
         report = write_characterisation(found, name_or_file, out, seed=seed, force=force)[0]
     if as_json:
@@ -520,16 +518,15 @@ def _landmark_design(
     plan = default_design() if plan_file is None else load_design_plan(plan_file)
     if seed is not None:
         plan = plan.model_copy(update={"seed": seed})
-    _refuse_existing([out / name for name in output_names(plan)], force, plan)
-    _make_folder(out)
-    with _Progress("searching") as progress:
-        design = run_design(plan, workers=workers, progress=progress)
-    confirmed = None
-    if confirm_frames:
-        with _Progress("matching simulated frames") as progress:
-            confirmed = confirm_design(design, confirm_frames, workers=workers, progress=progress)
-    with _Progress("writing the design"):
-        files = write_design(design, confirmed, out, force=force)
+    with _output_folder(out, "landmark design", output_names(plan), force, plan):
+        with _Progress("searching") as progress:
+            design = run_design(plan, workers=workers, progress=progress)
+        confirmed = None
+        if confirm_frames:
+            with _Progress("matching simulated frames") as progress:
+                confirmed = confirm_design(design, confirm_frames, workers=workers, progress=progress)
+        with _Progress("writing the design"):
+            files = write_design(design, confirmed, out, force=force)
     facts = summary(design, confirmed)
     if as_json:
         _echo_json({"files": [str(path) for path in files], **facts})
@@ -1755,16 +1752,18 @@ def _demo(
     force: _Force = False,
 ) -> None:
     """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°."""
+    from phasemark.data.production import outputs_of
     from phasemark.matcher.demo import cell_rows, run_demo, write_demo
     from phasemark.matcher.report import summary_rows
 
-    outputs = [out / name for name in ("bank.h5", "report.html", "cells.csv", "trials.csv")]
-    _refuse_existing(outputs, force)
-    _make_folder(out)
-    with _Progress("matching") as progress:
-        result = run_demo(outputs[0], seed=seed, workers=workers, force=force, progress=progress)
-    with _Progress("writing the report"):
-        report = write_demo(result, out, force=force)
+    bank = out / "bank.h5"
+    _refuse_existing([bank], force)
+    names = ("report.html", "cells.csv", "trials.csv")
+    with _output_folder(out, "demo", names, force, also=[path.name for path in outputs_of(bank)]):
+        with _Progress("matching") as progress:
+            result = run_demo(bank, seed=seed, workers=workers, force=force, progress=progress)
+        with _Progress("writing the report"):
+            report = write_demo(result, out, force=force)
     if as_json:
         cells = [{key: _plain(value) for key, value in row.items()} for row in cell_rows(result.cells)]
         _echo_json({"report": str(report), "seconds": result.seconds, "cells": cells})
@@ -1929,12 +1928,11 @@ def _drive(
         return
     plan = default_drive() if plan_file is None else load_drive_plan(plan_file)
     _note_plan_too_far(plan)
-    _refuse_existing([out / name for name in OUTPUTS], force, plan)
-    _make_folder(out)
-    with _Progress("driving, cm") as progress:
-        drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
-    with _Progress("drawing"):
-        files = write_drive(drive, out, force=force)
+    with _output_folder(out, "drive", OUTPUTS, force, plan):
+        with _Progress("driving, cm") as progress:
+            drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
+        with _Progress("drawing"):
+            files = write_drive(drive, out, force=force)
     facts = summary(drive)
     if as_json:
         _echo_json({"files": [str(path) for path in files], **facts})
@@ -2253,6 +2251,28 @@ def _refuse_inputs(outputs: Iterable[Path], plan: BaseModel | None = None) -> No
 
     of_plan = () if plan is None else named_files(plan.model_dump())
     refuse_inputs(outputs, [*_inputs.get(), *of_plan])
+
+
+@contextmanager
+def _output_folder(
+    folder: Path,
+    command: str,
+    names: Sequence[str],
+    force: bool,
+    plan: BaseModel | None = None,
+    *,
+    also: Sequence[str] = (),
+) -> Iterator[None]:
+    """Hold a folder while a command writes files into it; a file that another program wrote is not replaced.
+
+    `names` must not exist unless they are ours and `force` is set; `also` are ours too, and looked at by their writer.
+    """
+    from phasemark.data.folder_marker import adding_to_folder
+
+    _refuse_existing([folder / name for name in names], force, plan)
+    with adding_to_folder(folder, command) as ours:
+        ours.claim(*names, *also)
+        yield
 
 
 def _refuse_existing(paths: Sequence[Path], force: bool, plan: BaseModel | None = None) -> None:

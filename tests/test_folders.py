@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from phasemark import OutputExistsError, StorageError, UsageError
+from phasemark.cli import main
 from phasemark.data import renames
 from phasemark.data.folder_marker import LOCK, MARKER, adding_to_folder, read_marker
 from phasemark.data.replaced_folder import replacing_folder
@@ -193,3 +194,31 @@ def test_a_folder_ended_at_any_call_to_the_system_is_the_old_or_the_new_one(acti
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) > 30
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        (["demo"], "report.html"), (["demo"], "bank.h5"), (["drive"], "path.csv"),
+        (["landmark", "design"], "pareto.csv"),
+        (["sensor", "characterise", "pmd-16x16"], "points.csv"), (["sweep", "run", "paper"], "cells.csv"),
+    ],
+)  # fmt: skip
+def test_commands_that_write_several_files_leave_those_of_somebody_else(tmp_path, capsys, command, name):
+    (tmp_path / name).write_text("mine")
+    assert main([*command, "--out", str(tmp_path), "--force"]) == 4
+    assert f"{name}: exists and was not written by 'phasemark {command[0]}" in capsys.readouterr().err
+    assert names(tmp_path) == [name]
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_such_a_command_replaces_its_own_files_and_waits_for_no_other_run(tmp_path, capsys):
+    out = ["sensor", "characterise", "vl53l5cx-8x8", "--frames", "50", "--out", str(tmp_path / "out")]
+    assert main(out) == 0
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    assert main(out) == 4
+    assert main([*out, "--force"]) == 0
+    assert (tmp_path / "out" / "notes.txt").read_text() == "mine"
+    with adding_to_folder(tmp_path / "out", "test"):
+        assert main([*out, "--force"]) == 4
+    assert "another run is writing it" in capsys.readouterr().err
