@@ -32,8 +32,6 @@ def refuse_unwritable_output(path: Path, *, force: bool, resume: bool, inputs: I
     OutputExistsError, UsageError
         As :func:`phasemark.data.shards.build`.
     """
-    if not path.name:
-        raise UsageError(f"'{path}' is not a file name")
     real = followed(path)
     refuse_inputs(outputs_of(path), inputs)
     for target in (path, checksum_path(real)):
@@ -43,7 +41,15 @@ def refuse_unwritable_output(path: Path, *, force: bool, resume: bool, inputs: I
 
 
 def outputs_of(path: Path) -> tuple[Path, ...]:
-    """Return all that building a file writes: the file, its checksum, and what lies there until it is finished."""
+    """Return all that building a file writes: the file, its checksum, and what lies there until it is finished.
+
+    Raises
+    ------
+    UsageError
+        The path has no name.
+    """
+    if not path.name:
+        raise UsageError(f"'{path}' is not a file name")
     return (path, *(name(followed(path)) for name in (checksum_path, partial_path, manifest_path)))
 
 
