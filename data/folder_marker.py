@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from phasemark import OutputExistsError, UsageError
+from phasemark import OutputExistsError, StorageError, UsageError
 from phasemark.data.lock_file import exclusive
 from phasemark.data.store import storage_errors, sync, write_atomically
 
@@ -179,6 +179,8 @@ def adding_to_folder(folder: Path, content: str, adopted: Iterable[str] = ()) ->
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise UsageError(f"{folder}: is not a folder, or lies in a file") from None
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot be made ({error.strerror or error})") from error
     with storage_errors(folder), exclusive(folder / LOCK, folder):
         for name in filter(is_marker_part, os.listdir(folder)):  # of a run that was killed
             (folder / name).unlink(missing_ok=True)
