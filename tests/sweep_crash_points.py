@@ -32,7 +32,7 @@ def fail_at(folder, at, action, options):
         run_sweep(PLAN, folder, workers=1, **options)
     except PhasemarkError as error:  # what cannot be read is a damaged input, or not known to be ours
         return error.exit_code
-    except OSError:  # the program's own tables, such as a preset, cannot be read
+    except OSError:  # a table of the program itself, like a preset, cannot be read
         return StorageError.exit_code
     return 0 if trap.count < at else 6
 

@@ -212,7 +212,7 @@ def test_commands_that_write_several_files_leave_those_of_somebody_else(tmp_path
     assert (tmp_path / name).read_text() == "mine"
 
 
-def test_such_a_command_replaces_its_own_files_and_waits_for_no_other_run(tmp_path, capsys):
+def test_a_command_that_writes_several_files_replaces_its_own_one_run_at_a_time(tmp_path, capsys):
     out = ["sensor", "characterise", "vl53l5cx-8x8", "--frames", "50", "--out", str(tmp_path / "out")]
     assert main(out) == 0
     (tmp_path / "out" / "notes.txt").write_text("mine")
