@@ -18,17 +18,20 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
+from typer.core import TyperCommand
 
 from phasemark import InputFileError, OutputExistsError, PhasemarkError, StorageError, UsageError, __version__
 
 if TYPE_CHECKING:
     from types import FrameType
 
+    from pydantic import BaseModel
     from rich.progress import Progress
     from trimesh import Trimesh
 
@@ -100,20 +103,47 @@ def _a_preset(incomplete: str) -> list[str]:
 
 _a_plan_kind = _one_of("bank", "frames", "sweep", "drive", "design")
 
-app = typer.Typer(
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+_OUTPUTS = ("out", "plot", "estimates")
+"""Parameters of commands that name what is written; all other files that a command is given are read."""
+
+_inputs: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
+"""The files that the running command was given to read."""
+
+
+class _Command(TyperCommand):
+    """A command that notes which files it was given to read, so that none of them becomes its output."""
+
+    def invoke(self, ctx: Any) -> Any:
+        from phasemark.data.same_file import named_files
+
+        given = {name: value for name, value in ctx.params.items() if name not in _OUTPUTS}
+        _inputs.set(tuple(named_files(given)))
+        return super().invoke(ctx)
+
+
+class _Commands(typer.Typer):
+    """Commands that note which files they read."""
+
+    def command(self, name: str | None = None, **options: Any) -> Callable[[_Function], _Function]:
+        return super().command(name, cls=_Command, **options)
+
+
+app = _Commands(
     name="phasemark",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_landmark_app = typer.Typer(help="The landmarks: the catalogue and mesh files.")
-_sensor_app = typer.Typer(help="The cameras: shipped presets and sensor files.")
-_bank_app = typer.Typer(help="Banks of model images.")
-_frames_app = typer.Typer(help="Sets of noisy frames with their truth.")
-_plan_app = typer.Typer(help="Plans: what banks and frame sets are built from, and sweeps and drives run from.")
+_landmark_app = _Commands(help="The landmarks: the catalogue and mesh files.")
+_sensor_app = _Commands(help="The cameras: shipped presets and sensor files.")
+_bank_app = _Commands(help="Banks of model images.")
+_frames_app = _Commands(help="Sets of noisy frames with their truth.")
+_plan_app = _Commands(help="Plans: what banks and frame sets are built from, and sweeps and drives run from.")
 app.add_typer(_landmark_app, name="landmark")
 app.add_typer(_sensor_app, name="sensor")
 app.add_typer(_bank_app, name="bank")
-_sweep_app = typer.Typer(help="Accuracy sweeps: how accurate, where, and says who.")
+_sweep_app = _Commands(help="Accuracy sweeps: how accurate, where, and says who.")
 app.add_typer(_sweep_app, name="sweep")
 app.add_typer(_frames_app, name="frames")
 app.add_typer(_plan_app, name="plan")
@@ -283,9 +313,7 @@ def _sensor_characterise(
     from phasemark.render import characterise
 
     sensor = _load_sensor(name_or_file)
-    _refuse_existing([out / name for name in NAMES], force)
-    _make_folder(out)
-    with _Progress("measuring"):
+    with _output_folder(out, "sensor characterise", NAMES, force), _Progress("measuring"):
         found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
         report = write_characterisation(found, name_or_file, out, seed=seed, force=force)[0]
     if as_json:
@@ -446,6 +474,7 @@ def _landmark_export(
     from phasemark.data import write_atomically
     from phasemark.landmarks import export_mesh
 
+    _refuse_inputs([out])
     _, mesh = _load_landmark(name, None, "z", "file", from_catalog=True)
     typer.echo(write_atomically(out, export_mesh(mesh, out.suffix.removeprefix(".")), force=force))
 
@@ -489,16 +518,15 @@ def _landmark_design(
     plan = default_design() if plan_file is None else load_design_plan(plan_file)
     if seed is not None:
         plan = plan.model_copy(update={"seed": seed})
-    _refuse_existing([out / name for name in output_names(plan)], force)
-    _make_folder(out)
-    with _Progress("searching") as progress:
-        design = run_design(plan, workers=workers, progress=progress)
-    confirmed = None
-    if confirm_frames:
-        with _Progress("matching simulated frames") as progress:
-            confirmed = confirm_design(design, confirm_frames, workers=workers, progress=progress)
-    with _Progress("writing the design"):
-        files = write_design(design, confirmed, out, force=force)
+    with _output_folder(out, "landmark design", output_names(plan), force, plan):
+        with _Progress("searching") as progress:
+            design = run_design(plan, workers=workers, progress=progress)
+        confirmed = None
+        if confirm_frames:
+            with _Progress("matching simulated frames") as progress:
+                confirmed = confirm_design(design, confirm_frames, workers=workers, progress=progress)
+        with _Progress("writing the design"):
+            files = write_design(design, confirmed, out, force=force)
     facts = summary(design, confirmed)
     if as_json:
         _echo_json({"files": [str(path) for path in files], **facts})
@@ -881,6 +909,7 @@ def _frames_export(
     """Write a frame set for other programs."""
     from phasemark.data import export_frames, open_frames
 
+    _refuse_inputs([out])
     with open_frames(frames, untrusted=True) as opened:
         typer.echo(export_frames(opened, out, to, quantity=quantity, force=force))  # type: ignore[arg-type]
 
@@ -1072,7 +1101,7 @@ def _build(
     """Build a bank or frame set, whole or in part; or say what that would take."""
     from phasemark.data import build_part, estimate, parse_part, planned_size
     from phasemark.data.executor import processors
-    from phasemark.data.production import refuse_unwritable_output
+    from phasemark.data.production import outputs_of, refuse_unwritable_output
     from phasemark.data.size import format_size, parse_size
 
     limit = parse_size(max_size, "--max-size")
@@ -1091,6 +1120,7 @@ def _build(
         else:
             _echo_facts({**facts, "seconds": about})
         return
+    _refuse_inputs(outputs_of(out), plan)
     described = f"{out}: {', '.join(f'{n} {name}' for name, n in counts.items())}, {format_size(size)}"
     if size > limit:
         smaller = (
@@ -1122,7 +1152,9 @@ def _build(
 
 def _merge(shards: Sequence[Path], out: Path, resume: bool, force: bool) -> None:
     from phasemark.data import merge_parts
+    from phasemark.data.production import outputs_of
 
+    _refuse_inputs(outputs_of(out))
     with _Progress("merging") as progress:
         merge_parts(shards, out, resume=resume, force=force, progress=progress)
     typer.echo(out)
@@ -1720,16 +1752,18 @@ def _demo(
     force: _Force = False,
 ) -> None:
     """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°."""
+    from phasemark.data.production import outputs_of
     from phasemark.matcher.demo import cell_rows, run_demo, write_demo
     from phasemark.matcher.report import summary_rows
 
-    outputs = [out / name for name in ("bank.h5", "report.html", "cells.csv", "trials.csv")]
-    _refuse_existing(outputs, force)
-    _make_folder(out)
-    with _Progress("matching") as progress:
-        result = run_demo(outputs[0], seed=seed, workers=workers, force=force, progress=progress)
-    with _Progress("writing the report"):
-        report = write_demo(result, out, force=force)
+    bank = out / "bank.h5"
+    _refuse_existing([bank], force)
+    names = ("report.html", "cells.csv", "trials.csv")
+    with _output_folder(out, "demo", names, force, also=[path.name for path in outputs_of(bank)]):
+        with _Progress("matching") as progress:
+            result = run_demo(bank, seed=seed, workers=workers, force=force, progress=progress)
+        with _Progress("writing the report"):
+            report = write_demo(result, out, force=force)
     if as_json:
         cells = [{key: _plain(value) for key, value in row.items()} for row in cell_rows(result.cells)]
         _echo_json({"report": str(report), "seconds": result.seconds, "cells": cells})
@@ -1769,7 +1803,7 @@ def _sweep_run(
     force: Annotated[bool, typer.Option("--force", help="Start over where the folder holds a sweep.")] = False,
 ) -> None:
     """Run a sweep and write its tables and report."""
-    from phasemark.matcher.sweep import run_sweep
+    from phasemark.matcher.sweep import run_sweep, sweep_outputs
     from phasemark.matcher.sweep_plan import Method, SweepPlan, load_sweep
     from phasemark.matcher.sweep_report import write_report
 
@@ -1780,6 +1814,7 @@ def _sweep_run(
         changes["methods"] = (*loaded.methods, Method(name=matcher, method=matcher))
     changed = SweepPlan(**{**loaded.model_dump(), **changes})
     _note_plan_too_far(changed)
+    _refuse_inputs(sweep_outputs(out), changed)
     with _Progress("trials") as progress:
         run_sweep(changed, out, workers=workers, scheduler=scheduler, resume=resume, force=force, progress=progress)
     with _Progress("writing the report"):
@@ -1819,8 +1854,11 @@ def _sweep_frames(
 ) -> None:
     """Take the frames of one trial of a sweep again, bit for bit."""
     from phasemark.data import write_measured
+    from phasemark.data.folder_marker import read_marker
+    from phasemark.data.same_file import refuse_inputs
     from phasemark.matcher.sweep_examples import sweep_frames
 
+    refuse_inputs([out], map(folder.joinpath, read_marker(folder)[1] or ()))
     _refuse_existing([out], force)
     typer.echo(write_measured(sweep_frames(folder, condition, trial), out, force=force))
 
@@ -1890,12 +1928,11 @@ def _drive(
         return
     plan = default_drive() if plan_file is None else load_drive_plan(plan_file)
     _note_plan_too_far(plan)
-    _refuse_existing([out / name for name in OUTPUTS], force)
-    _make_folder(out)
-    with _Progress("driving, cm") as progress:
-        drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
-    with _Progress("drawing"):
-        files = write_drive(drive, out, force=force)
+    with _output_folder(out, "drive", OUTPUTS, force, plan):
+        with _Progress("driving, cm") as progress:
+            drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
+        with _Progress("drawing"):
+            files = write_drive(drive, out, force=force)
     facts = summary(drive)
     if as_json:
         _echo_json({"files": [str(path) for path in files], **facts})
@@ -2208,8 +2245,39 @@ def _make_folder(path: Path) -> None:
         raise UsageError(f"{path}: is no folder, or lies in something that is none") from None
 
 
-def _refuse_existing(paths: Iterable[Path], force: bool) -> None:
-    """Refuse outputs that exist before any work is done."""
+def _refuse_inputs(outputs: Iterable[Path], plan: BaseModel | None = None) -> None:
+    """Refuse outputs that are the same file as an argument of the running command, or as one that a plan names."""
+    from phasemark.data.same_file import named_files, refuse_inputs
+
+    of_plan = () if plan is None else named_files(plan.model_dump())
+    refuse_inputs(outputs, [*_inputs.get(), *of_plan])
+
+
+@contextmanager
+def _output_folder(
+    folder: Path,
+    command: str,
+    names: Sequence[str],
+    force: bool,
+    plan: BaseModel | None = None,
+    *,
+    also: Sequence[str] = (),
+) -> Iterator[None]:
+    """Hold a folder while a command writes files into it; a file that another program wrote is not replaced.
+
+    `names` must not exist unless they are ours and `force` is set; `also` are ours too, and looked at by their writer.
+    """
+    from phasemark.data.folder_marker import adding_to_folder
+
+    _refuse_existing([folder / name for name in names], force, plan)
+    with adding_to_folder(folder, command) as ours:
+        ours.claim(*names, *also)
+        yield
+
+
+def _refuse_existing(paths: Sequence[Path], force: bool, plan: BaseModel | None = None) -> None:
+    """Refuse outputs that are inputs, or exist, before any work is done."""
+    _refuse_inputs(paths, plan)
     for path in paths:
         if path.is_dir():
             raise UsageError(f"{path}: is a folder, give the name of a file")

@@ -34,6 +34,7 @@ from phasemark.data.plan import BankPlan, MeshPlan, factored_refusal
 from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.progress import Progress
 from phasemark.data.provenance import mesh_sha256, versions
+from phasemark.data.same_file import named_files
 from phasemark.data.shards import Place
 from phasemark.landmarks import (
     LandmarkSpec,
@@ -120,7 +121,8 @@ def build_bank(
         with TemporaryDirectory(prefix="phasemark-") as folder:
             # The open file outlives its name.
             return build_bank(plan, Path(folder) / "bank.h5", workers=workers, progress=progress)
-    refuse_unwritable_output(Path(path), force=force, resume=resume)
+    inputs = named_files(plan.model_dump())
+    refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=inputs)
     job = BankJob(plan)
     produce(
         job, path, finished=_finished_identity, force=force, resume=resume, workers=workers, shard_items=shard_items,

@@ -28,6 +28,7 @@ from phasemark.data.layout import Layout
 from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.progress import Progress
 from phasemark.data.provenance import mesh_sha256, versions
+from phasemark.data.same_file import named_files
 from phasemark.data.seeds import stream
 from phasemark.data.shards import Place
 from phasemark.data.size import frame_set_fields
@@ -84,7 +85,8 @@ def build_frames(
     """
     if workers is not None and workers < 1:
         raise UsageError(f"'workers' must be at least 1, got {workers}")
-    refuse_unwritable_output(Path(path), force=force, resume=resume)
+    inputs = named_files(plan.model_dump())
+    refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=inputs)
     job = FrameJob(plan)
     job.check_views()
     produce(

@@ -22,6 +22,7 @@ from phasemark.data.layout import Layout
 from phasemark.data.plan import BankPlan
 from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.progress import Progress
+from phasemark.data.same_file import named_files
 from phasemark.data.shards import Job, Place, difference, make_shard, pieces
 from phasemark.data.store import verify_checksum
 
@@ -160,7 +161,8 @@ def build_part(
     Path
         `path`.
     """
-    refuse_unwritable_output(Path(path), force=force, resume=resume)
+    inputs = named_files(plan.model_dump())
+    refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=inputs)
     return produce(
         PartJob(job_for(plan), *part), path, finished=_finished_identity, force=force, resume=resume, workers=workers,
         shard_items=shard_items, scheduler=scheduler, progress=progress,
@@ -211,7 +213,7 @@ def merge_parts(
     OutputExistsError, StorageError
         As for :func:`phasemark.data.build_bank`.
     """
-    refuse_unwritable_output(Path(path), force=force, resume=resume)
+    refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=map(Path, parts))
     if not parts:
         raise UsageError("give the shards to merge")
     opened = [_Part(Path(part)) for part in parts]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -11,24 +11,46 @@ from typing import Any
 from phasemark import UsageError
 from phasemark.data.progress import Progress
 from phasemark.data.remote import open_maker
-from phasemark.data.shards import Job, build, manifest_path, refuse_difference, refuse_unfinished
-from phasemark.data.store import checksum_path, refuse_unwritable
+from phasemark.data.same_file import refuse_inputs
+from phasemark.data.shards import Job, build, manifest_path, partial_path, refuse_difference, refuse_unfinished
+from phasemark.data.store import checksum_path, followed, refuse_unwritable
 
 
-def refuse_unwritable_output(path: Path, *, force: bool, resume: bool) -> None:
-    """Refuse an output before any work is done for it: it exists, or an unfinished run of it does.
+def refuse_unwritable_output(path: Path, *, force: bool, resume: bool, inputs: Iterable[Path] = ()) -> None:
+    """Refuse an output before any work is done for it: it is an input, it exists, or an unfinished run of it does.
+
+    Parameters
+    ----------
+    path : Path
+    force, resume : bool
+        As for :func:`phasemark.data.shards.build`.
+    inputs : iterable of Path
+        The files that it is made from.
 
     Raises
     ------
     OutputExistsError, UsageError
         As :func:`phasemark.data.shards.build`.
     """
+    real = followed(path)
+    refuse_inputs(outputs_of(path), inputs)
+    for target in (path, checksum_path(real)):
+        refuse_unwritable(target, force=force or resume)
+    if manifest_path(real).exists() and not (force or resume):
+        refuse_unfinished(path)
+
+
+def outputs_of(path: Path) -> tuple[Path, ...]:
+    """Return all that building a file writes: the file, its checksum, and what lies there until it is finished.
+
+    Raises
+    ------
+    UsageError
+        The path has no name.
+    """
     if not path.name:
         raise UsageError(f"'{path}' is not a file name")
-    for target in (path, checksum_path(path)):
-        refuse_unwritable(target, force=force or resume)
-    if manifest_path(path).exists() and not (force or resume):
-        refuse_unfinished(path)
+    return (path, *(name(followed(path)) for name in (checksum_path, partial_path, manifest_path)))
 
 
 def produce(
@@ -57,7 +79,7 @@ def produce(
         As for :func:`phasemark.data.shards.build`, which says what is raised.
     """
     path = Path(path)
-    begun = manifest_path(path).exists()
+    begun = manifest_path(followed(path)).exists()
     if resume and not begun and path.is_file():
         refuse_difference(path, finished(path), job.identity())
         return path

@@ -10,7 +10,6 @@ One run writes an output at a time: the run holds a lock on ``FILE.partial``, wh
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -27,8 +26,17 @@ from numpy.typing import NDArray
 from phasemark import OutputExistsError, UsageError
 from phasemark.data.executor import Maker, processors, run_tasks
 from phasemark.data.layout import Layout, place
+from phasemark.data.lock_file import lock_file
 from phasemark.data.progress import Progress
-from phasemark.data.store import checksum_path, finish_publishing, publish, refuse_unwritable, sha256_of, storage_errors
+from phasemark.data.store import (
+    checksum_path,
+    finish_publishing,
+    followed,
+    publish,
+    refuse_unwritable,
+    sha256_of,
+    storage_errors,
+)
 
 SHARD_BYTES = 1 << 22
 """About how much of the file a shard holds; what a killed run loses is a few of these."""
@@ -139,7 +147,8 @@ def build(
     ----------
     job : Job
     path : path-like
-        The file; its checksum, and until it is finished ``FILE.partial`` and ``FILE.manifest``, lie beside it.
+        The file; its checksum, and until it is finished ``FILE.partial`` and ``FILE.manifest``, lie beside it. A link
+        is followed: all of them lie beside the file that it leads to.
     force : bool
         Whether a finished file may be replaced, and an unfinished one thrown away.
     resume : bool
@@ -171,16 +180,17 @@ def build(
     for name, value in (("workers", workers), ("shard_items", shard_items)):
         if value is not None and value < 1:
             raise UsageError(f"'{name}' must be at least 1, got {value}")
-    path = Path(path)
+    given = Path(path)
+    path = followed(given)
     if resume and _publish_again(job, path):
-        return path
-    for target in (path, checksum_path(path)):
+        return given
+    for target in (given, checksum_path(path)):
         refuse_unwritable(target, force=force)
     with storage_errors(path), _Run.locked(path, force=force) as run:
         run.begin(job, resume=resume, force=force, shard_items=shard_items)
         run.render(job, workers, maker, progress)
         run.publish(force=force)
-    return path
+    return given
 
 
 def _publish_again(job: Job, path: Path) -> bool:
@@ -250,9 +260,16 @@ class _Run:
     @contextmanager
     def locked(cls, path: Path, *, force: bool) -> Iterator[_Run]:
         """Hold the lock while the block runs; an unfinished run stays if something of it can be used again."""
-        descriptor, fresh = _lock(path)
+        descriptor, fresh = lock_file(partial_path(path), path)
         run = cls(path, descriptor)
         run._worth_keeping = not fresh
+        try:
+            run._refuse_foreign(fresh)
+        except BaseException:
+            if fresh:
+                run.partial.unlink(missing_ok=True)
+            os.close(descriptor)
+            raise
         try:
             for target in (path, checksum_path(path)):  # another run may have finished before the lock was ours
                 refuse_unwritable(target, force=force)
@@ -261,10 +278,23 @@ class _Run:
             if run._log >= 0:
                 os.close(run._log)
             if not run._worth_keeping:
-                for leftover in (run.manifest, run.partial):
+                for leftover in (run.partial, run.manifest):  # a partial file without a manifest is empty
                     with suppress(OSError):
                         leftover.unlink(missing_ok=True)
             os.close(descriptor)  # and with it the lock
+
+    def _refuse_foreign(self, fresh: bool) -> None:
+        """Refuse files of somebody else that have the names of an unfinished run."""
+        known = _Manifest.read(self.manifest) is not None
+        for theirs, exists in (
+            (self.manifest, os.path.lexists(self.manifest) and not known),
+            (self.partial, not fresh and not known and os.fstat(self._file).st_size > 0),
+        ):
+            if exists:
+                raise OutputExistsError(
+                    f"{theirs}: exists and is not of an unfinished run that this version can continue: move it away, or"
+                    f" give '{self.path.name}' another name"
+                )
 
     def begin(self, job: Job, *, resume: bool, force: bool, shard_items: int | None) -> None:
         """Lay the file out, or find what is left of an earlier run."""
@@ -289,15 +319,18 @@ class _Run:
             old = None
         if old is None:
             self._worth_keeping = False
-            self.manifest.unlink(missing_ok=True)
             os.ftruncate(self._file, 0)
+            self.manifest.unlink(missing_ok=True)
         self.state = old or fresh
+        if old is None:
+            self._start_manifest()  # before the first byte: what has no manifest is not ours
         layout.write_to(self._file)
-        kept = dict(filter(self._is_intact, self.state.shards.items())) if old else {}
+        kept = dict(filter(self._is_intact, self.state.shards.items())) if old is not None else {}
         self.state.shards = kept
         self._worth_keeping = bool(kept)
         os.fsync(self._file)
-        self._start_manifest()
+        if old is not None:
+            self._start_manifest()
 
     def _start_manifest(self) -> None:
         temporary = self.manifest.with_name(f".{self.manifest.name}.new")
@@ -384,33 +417,6 @@ class _Run:
         publish(self.partial, self.path, digest, force=force)
         self.manifest.unlink(missing_ok=True)
         self._worth_keeping = True
-
-
-def _lock(path: Path) -> tuple[int, bool]:
-    """Open and lock ``FILE.partial``; return the descriptor and whether the file was made by this call."""
-    partial = partial_path(path)
-    while True:
-        try:
-            descriptor, fresh = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666), True
-        except FileExistsError:
-            try:
-                descriptor, fresh = os.open(partial, os.O_RDWR | os.O_NOFOLLOW), False
-            except FileNotFoundError:
-                continue  # its run has just ended
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(descriptor)
-            raise OutputExistsError(f"{path}: another run is writing it: wait for that one, or end it") from None
-        except BaseException:
-            os.close(descriptor)
-            raise
-        try:
-            if os.path.samestat(os.fstat(descriptor), os.stat(partial)):
-                return descriptor, fresh
-        except FileNotFoundError:
-            pass
-        os.close(descriptor)  # its run finished in between: what we hold is no longer the partial file
 
 
 def _flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:

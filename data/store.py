@@ -6,13 +6,14 @@ import hashlib
 import os
 import re
 import secrets
-import shutil
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
+from phasemark.data import renames
+from phasemark.data.lock_file import exclusive
 
 _BLOCK_BYTES = 1 << 20
 _CHECKSUM_LINE = re.compile(r"\\?(?P<digest>[0-9a-fA-F]{64}) [ *](?P<name>[^\n]+)\n?")
@@ -63,7 +64,8 @@ def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bo
 
     Whatever ends the block early, an interrupt included, removes the temporary file and leaves `path` as it was. With
     `checksum` the old ``FILE.sha256`` goes before the file is replaced and the new one comes after, so a crash in
-    between leaves a file without a checksum, never one with another file's checksum.
+    between leaves a file without a checksum, never one with another file's checksum. A file that is replaced keeps its
+    permissions, and gets a new checksum if it had one. A link is followed: what it leads to is replaced.
 
     Parameters and errors are those of :func:`write_atomically`; an OSError raised in the block is a StorageError.
 
@@ -75,59 +77,27 @@ def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bo
     path = Path(path)
     if not path.name:
         raise UsageError(f"'{path}' is not a file name")
-    targets = [path, checksum_path(path)] if checksum else [path]
+    real = followed(path)
+    checksum = checksum or (force and _names_checksum_of(real))
+    targets = [real, checksum_path(real)] if checksum else [real]
     for target in targets:
         refuse_unwritable(target, force=force)
     parts = [target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial") for target in targets]
     try:
         with storage_errors(path):
-            _create(parts[0])
+            _create(parts[0], private=real.exists())
             yield parts[0]
-            _sync(parts[0])
+            _take_over(parts[0], real)
+            sync(parts[0])
             if checksum:
-                parts[1].write_bytes(_checksum_line(sha256_of(parts[0]), path.name))
-                _sync(parts[1])
+                parts[1].write_bytes(_checksum_line(sha256_of(parts[0]), real.name))
+                _take_over(parts[1], targets[1])
+                sync(parts[1])
         _move_into_place(parts, targets, force=force)
     finally:
         for leftover in parts:
             with suppress(OSError):
                 leftover.unlink(missing_ok=True)
-
-
-@contextmanager
-def replacing_folder(path: Path, *, force: bool = False) -> Iterator[Path]:
-    """Hand out an empty folder beside `path` and give it that name when the block ends well, as :func:`replacing`.
-
-    Raises
-    ------
-    OutputExistsError
-        Something has the name and `force` is not set, or what has it is not a folder.
-    UsageError, StorageError
-        As :func:`write_atomically`.
-    """
-    if not path.name or not path.parent.is_dir():
-        raise UsageError(f"{path}: the folder '{path.parent}' does not exist: make it first")
-    if path.exists() and not path.is_dir():
-        raise UsageError(f"{path}: is a file, give the name of a folder")
-    if path.exists() and not force:
-        raise OutputExistsError(f"{path}: exists; use --force to replace it")
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    aside = temporary.with_suffix(".old")
-    try:
-        with storage_errors(path):
-            temporary.mkdir()
-            yield temporary
-            if path.exists():
-                os.replace(path, aside)
-            os.replace(temporary, path)
-            _sync(path.parent)
-    except BaseException:
-        if aside.exists() and not path.exists():
-            os.replace(aside, path)
-        raise
-    finally:
-        for leftover in (temporary, aside):
-            shutil.rmtree(leftover, ignore_errors=True)
 
 
 def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
@@ -152,9 +122,11 @@ def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
     checksum_part, _ = _publishing_names(path)
     try:
         with storage_errors(path):
-            _sync(part)
+            _take_over(part, path)
+            sync(part)
             checksum_part.write_bytes(_checksum_line(digest, path.name))
-            _sync(checksum_part)
+            _take_over(checksum_part, checksum_path(path))
+            sync(checksum_part)
         _move_into_place([part, checksum_part], [path, checksum_path(path)], force=force)
     finally:
         with suppress(OSError):
@@ -164,7 +136,7 @@ def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
 def finish_publishing(path: Path) -> None:
     """Write the checksum of a file that :func:`publish` had just given its name when the process was killed."""
     write_checksum(path, force=True)
-    for leftover in _publishing_names(path):
+    for leftover in (*_publishing_names(path), _lock_path(path)):
         leftover.unlink(missing_ok=True)
 
 
@@ -176,6 +148,18 @@ def _publishing_names(path: Path) -> tuple[Path, Path]:
 
 def _move_into_place(parts: list[Path], targets: list[Path], *, force: bool) -> None:
     """Replace a file, and then its checksum; the old checksum steps aside first and returns if the file cannot go."""
+    if len(targets) == 1:
+        _replace(parts, targets, force=force)
+        return
+    with storage_errors(targets[0]), exclusive(_lock_path(targets[0]), targets[0]):  # both are of the same run
+        _replace(parts, targets, force=force)
+
+
+def _lock_path(path: Path) -> Path:
+    return path.with_name(f".{path.name}.lock")
+
+
+def _replace(parts: list[Path], targets: list[Path], *, force: bool) -> None:
     for target in targets:  # somebody else may have been faster
         refuse_unwritable(target, force=force)
     _, aside = _publishing_names(targets[0])
@@ -184,8 +168,8 @@ def _move_into_place(parts: list[Path], targets: list[Path], *, force: bool) -> 
             if len(targets) > 1 and targets[1].exists():
                 os.replace(targets[1], aside)
             for part, target in zip(parts, targets, strict=True):
-                os.replace(part, target)
-            _sync(targets[0].parent)
+                _move(part, target, force=force)
+            sync(targets[0].parent)
     except BaseException:
         if aside.exists() and parts[0].exists():  # the file is still the old one: give it its checksum back
             with suppress(OSError):
@@ -195,6 +179,16 @@ def _move_into_place(parts: list[Path], targets: list[Path], *, force: bool) -> 
         if not parts[0].exists():
             with suppress(OSError):
                 aside.unlink(missing_ok=True)
+
+
+def _move(part: Path, target: Path, *, force: bool) -> None:
+    if force:
+        os.replace(part, target)
+        return
+    try:
+        renames.rename_new(part, target)
+    except FileExistsError:  # somebody else was faster still
+        raise OutputExistsError(f"{target}: exists; use --force to replace it") from None
 
 
 def checksum_path(path: str | os.PathLike[str]) -> Path:
@@ -257,6 +251,10 @@ def read_checksum(path: str | os.PathLike[str]) -> str:
         There is no checksum file, it is not in the format of ``sha256sum``, or it is about another file.
     """
     path, beside = Path(path), checksum_path(path)
+    if path.is_symlink():  # a checksum beside the link holds; without one, that beside the file
+        real = Path(os.path.realpath(path))
+        if not beside.exists() or os.path.realpath(beside) == str(checksum_path(real)):
+            path, beside = real, checksum_path(real)
     try:
         text = os.fsdecode(beside.read_bytes())
     except OSError as error:
@@ -304,6 +302,8 @@ def has_matching_checksum(path: str | os.PathLike[str]) -> bool:
 
 def refuse_unwritable(path: Path, *, force: bool) -> None:
     """Refuse a name in no folder, of a folder or device, or of a file that exists unless `force` allows it."""
+    if path.is_symlink() and force:
+        path = followed(path)
     if not path.parent.is_dir():
         raise UsageError(f"{path}: the folder '{path.parent}' does not exist: make it first")
     try:
@@ -327,12 +327,52 @@ def storage_errors(path: Path) -> Iterator[None]:
         raise StorageError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
-def _create(path: Path) -> None:
-    # os.open lets the user's umask set the permissions; the tempfile module would make the file private.
-    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+def _create(path: Path, *, private: bool) -> None:
+    # A new file gets the permissions that the umask leaves; one that replaces another gets those at the end.
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600 if private else 0o666))
 
 
-def _sync(path: Path) -> None:
+def _take_over(part: Path, target: Path) -> None:
+    """Give a finished file the permissions, and where the system allows it the owner, of what it replaces."""
+    try:
+        old = target.stat()
+    except FileNotFoundError:
+        return
+    with suppress(PermissionError):
+        os.chown(part, old.st_uid, old.st_gid)
+    os.chmod(part, stat.S_IMODE(old.st_mode))
+
+
+def followed(path: Path) -> Path:
+    """Return the file or folder that a link leads to, or the path itself if it is no link.
+
+    Raises
+    ------
+    UsageError
+        The link leads in a circle, or a checksum beside the link would no longer be right.
+    """
+    if not path.is_symlink():
+        return path
+    real = Path(os.path.realpath(path))
+    if real.is_symlink():
+        raise UsageError(f"{path}: is a link that leads in a circle, give the name of a file")
+    beside = checksum_path(path)
+    if os.path.lexists(beside) and os.path.realpath(beside) != str(checksum_path(real)):
+        raise UsageError(f"{path}: is a link with a checksum of its own, '{beside.name}': give '{real}' instead")
+    return real
+
+
+def _names_checksum_of(path: Path) -> bool:
+    """Return whether a file has a checksum beside it, right or wrong."""
+    try:
+        read_checksum(path)
+    except InputFileError:
+        return False
+    return True
+
+
+def sync(path: Path) -> None:
+    """Have the content of a file, or the names in a folder, written to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

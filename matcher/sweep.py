@@ -5,17 +5,22 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark import InputFileError, OutputExistsError, UsageError
+from phasemark import InputFileError, OutputExistsError
 from phasemark.data import versions, write_atomically
+from phasemark.data.folder_marker import OwnedFiles, adding_to_folder
 from phasemark.data.hdf5 import check_format, open_hdf5, reading
-from phasemark.data.production import produce, refuse_unwritable_output
+from phasemark.data.production import outputs_of, produce
 from phasemark.data.progress import Progress
+from phasemark.data.same_file import named_files, refuse_inputs
 from phasemark.data.shards import difference
 from phasemark.matcher.sweep_job import FORMAT, SCHEMA_VERSION, Round, SweepJob, check_matcher
 from phasemark.matcher.sweep_plan import SweepPlan
@@ -23,6 +28,12 @@ from phasemark.matcher.sweep_tables import Cell, SweepTrials, csv_bytes, json_ro
 
 TRIALS_AT_ONCE = 50
 """Trials of a shard: of one batch of a method, whatever the number of workers, so that no rounding depends on it."""
+_PLAN = "plan.json"
+_TABLES = ("trials.csv", "cells.csv", "sweep.json", "report.html")
+_OF_A_SWEEP = re.compile(
+    r"(plan\.json|trials\.csv|cells\.csv|sweep\.json|report\.html|figures/[\w-]+\.(png|svg)"
+    r"|trials-\d{3}\.h5(\.sha256|\.partial|\.manifest)?)"
+)
 
 
 def run_sweep(
@@ -49,7 +60,7 @@ def run_sweep(
     resume : bool
         Whether to go on with what the folder holds, if it is of the same plan.
     force : bool
-        Whether to throw away what the folder holds of another sweep.
+        Whether to throw away what the folder holds of another sweep: the files that its marker lists, and no others.
     progress : callable (done, total), optional
         Trials of the current round.
 
@@ -62,7 +73,8 @@ def run_sweep(
     UsageError
         The plan cannot be run, or a method failed: with the condition and the trials. What was finished is kept.
     OutputExistsError
-        The folder holds a sweep already, or of another plan.
+        The folder holds a sweep already, or of another plan; another run is writing it; or it holds a file of somebody
+        else where one of the sweep's would be, which stays with `force` too.
     StorageError
         The disk is full or fails.
     """
@@ -71,12 +83,28 @@ def run_sweep(
         if ":" in method.method:
             check_matcher(method.method)
     folder = Path(folder)
-    _begin(plan, folder, resume=resume, force=force)
+    refuse_inputs(sweep_outputs(folder), named_files(plan.model_dump()))
+    with sweep_folder(folder) as ours:
+        return _run(plan, ours, workers, scheduler, resume=resume, force=force, progress=progress)
+
+
+def _run(
+    plan: SweepPlan,
+    ours: OwnedFiles,
+    workers: int | None,
+    scheduler: str,
+    *,
+    resume: bool,
+    force: bool,
+    progress: Progress | None,
+) -> SweepTrials:
+    folder = ours.folder
+    _begin(plan, ours, resume=resume, force=force)
     rounds: list[Round] = []
     following: Round | None = Round(0, tuple(range(len(plan.conditions()))), 0, plan.trials)
     while following is not None:
         path = _round_path(folder, following.number)
-        refuse_unwritable_output(path, force=force, resume=True)
+        ours.claim(*(output.name for output in outputs_of(path)))
         produce(
             SweepJob(plan, following), path, finished=_identity, resume=True, workers=workers,
             shard_items=TRIALS_AT_ONCE, scheduler=scheduler, progress=progress,
@@ -87,6 +115,11 @@ def run_sweep(
     write_atomically(folder / "trials.csv", trials_csv(trials), force=True)
     write_cells(plan, trials, folder)
     return trials
+
+
+def sweep_outputs(folder: Path) -> tuple[Path, ...]:
+    """Return what a sweep writes into its folder, but for later rounds and figures."""
+    return (*map(folder.joinpath, (_PLAN, *_TABLES)), *outputs_of(_round_path(folder, 0)))
 
 
 def read_plan_of(folder: str | os.PathLike[str]) -> SweepPlan:
@@ -148,7 +181,7 @@ def _round_path(folder: Path, number: int) -> Path:
 
 
 def _stored_plan(folder: Path) -> SweepPlan | None:
-    path = folder / "plan.json"
+    path = folder / _PLAN
     try:
         return SweepPlan(**json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
@@ -157,16 +190,36 @@ def _stored_plan(folder: Path) -> SweepPlan | None:
         raise InputFileError(f"{path}: cannot be read as the plan of a sweep ({error})") from None
 
 
-def _begin(plan: SweepPlan, folder: Path, *, resume: bool, force: bool) -> None:
-    """Make the folder a sweep's, or see that it is this one's."""
+@contextmanager
+def sweep_folder(folder: Path) -> Iterator[OwnedFiles]:
+    """Hold a sweep's folder against other runs, and know which of its files are the sweep's.
+
+    Raises
+    ------
+    OutputExistsError
+        Another run is writing it.
+    """
+    with adding_to_folder(folder, "sweep run", _adopted(folder)) as ours:
+        yield ours
+
+
+def _adopted(folder: Path) -> Iterator[str]:
+    """Yield the names of a sweep's files, if the folder holds a sweep of before there were markers."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise UsageError(f"{folder}: is no folder, or lies in something that is none") from None
-    old = None if force else _stored_plan(folder)
+        if _stored_plan(folder) is None:
+            return
+    except InputFileError:  # a file of that name which is not ours
+        return
+    names = [str(path.relative_to(folder)) for path in (*folder.iterdir(), *folder.glob("figures/*"))]
+    yield from filter(_OF_A_SWEEP.fullmatch, names)
+
+
+def _begin(plan: SweepPlan, ours: OwnedFiles, *, resume: bool, force: bool) -> None:
+    """Make the folder a sweep's, or see that it is this one's."""
+    folder = ours.folder
     if force:
-        for path in folder.glob("trials-[0-9][0-9][0-9].h5*"):
-            path.unlink()
+        ours.clear()
+    old = _stored_plan(folder) if _PLAN in ours.names else None
     if old is not None:
         if not resume:
             raise OutputExistsError(f"{folder}: holds a sweep: --resume goes on with it, --force starts over")
@@ -175,8 +228,9 @@ def _begin(plan: SweepPlan, folder: Path, *, resume: bool, force: bool) -> None:
             raise OutputExistsError(
                 f"{folder}: was begun with another plan ({'; '.join(changes[:4])}): --force starts over"
             )
-        return
-    write_atomically(folder / "plan.json", plan.model_dump_json(indent=1).encode(), force=True)
+    ours.claim(*(path.name for path in sweep_outputs(folder)))
+    if old is None:
+        write_atomically(folder / _PLAN, plan.model_dump_json(indent=1).encode(), force=True)
 
 
 def _identity(path: Path) -> dict[str, Any]:

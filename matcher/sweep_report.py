@@ -14,9 +14,11 @@ import matplotlib
 import numpy as np
 
 from phasemark.data import versions, write_atomically
+from phasemark.data.folder_marker import OwnedFiles
 from phasemark.data.page import embedded_png, figure_png, page_template
+from phasemark.data.store import storage_errors
 from phasemark.matcher.bounds import Estimate
-from phasemark.matcher.sweep import read_sweep, write_cells
+from phasemark.matcher.sweep import read_plan_of, read_sweep, sweep_folder, write_cells
 from phasemark.matcher.sweep_examples import worst_examples
 from phasemark.matcher.sweep_figures import sweep_figures
 from phasemark.matcher.sweep_plan import SweepPlan
@@ -54,19 +56,32 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     ------
     InputFileError
         The folder holds no sweep, or a damaged one.
+    OutputExistsError
+        A sweep is still writing the folder, or a file of somebody else has the name of one of ours.
     """
     folder = Path(folder)
+    read_plan_of(folder)
+    with sweep_folder(folder) as ours:
+        return _write_report(ours)
+
+
+def _write_report(ours: OwnedFiles) -> Path:
+    folder = ours.folder
     plan, trials = read_sweep(folder)
+    ours.claim("cells.csv", "sweep.json", "report.html")
     cells = write_cells(plan, trials, folder)
     landmarks = [cell for cell in cells if not cell.stranger]
-    (folder / "figures").mkdir(exist_ok=True)
+    with storage_errors(folder):
+        (folder / "figures").mkdir(exist_ok=True)
     shown = []
-    for figure in sweep_figures(plan, trials, cells):
+    figures = list(sweep_figures(plan, trials, cells))
+    ours.claim(*(f"figures/{figure.name}.{kind}" for figure in figures for kind in ("png", "svg")))
+    for figure in figures:
         png, svg = figure_png(figure.figure), io.BytesIO()
         with matplotlib.rc_context({"svg.hashsalt": "phasemark"}):  # or the names inside would differ each time
             figure.figure.savefig(svg, format="svg", metadata={"Date": None})
-        write_atomically(folder / "figures" / f"{figure.name}.png", png, force=True)
-        write_atomically(folder / "figures" / f"{figure.name}.svg", svg.getvalue(), force=True)
+        for kind, content in (("png", png), ("svg", svg.getvalue())):
+            write_atomically(folder / "figures" / f"{figure.name}.{kind}", content, force=True)
         wide = figure.figure.get_figwidth() > _READABLE_IN
         shown.append(
             {"title": figure.title, "text": figure.text, "image": embedded_png(png, figure.title), "wide": wide}

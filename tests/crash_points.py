@@ -5,12 +5,12 @@ usage: crash_points.py FOLDER kill|ENOSPC|EIO
 Prints how many points there were. Each run is a fork of this process, which has a single thread.
 """
 
-import errno
 import os
 import signal
 import sys
 from pathlib import Path
 
+from system_calls import Trap
 from toy_job import ToyJob, check_toy_file
 
 from phasemark import StorageError
@@ -18,26 +18,6 @@ from phasemark.data.shards import build, manifest_path, partial_path
 from phasemark.data.store import checksum_path, verify_checksum
 
 CALLS = ("pwrite", "write", "fsync", "replace", "posix_fallocate", "ftruncate")
-
-
-class Trap:
-    """Counts calls and acts at one of them."""
-
-    def __init__(self, at, action):
-        self.count, self.at, self.action = 0, at, action
-        for name in CALLS:
-            setattr(os, name, self.wrapped(getattr(os, name)))
-
-    def wrapped(self, call):
-        def trapped(*arguments, **options):
-            self.count += 1
-            if self.count == self.at:
-                if self.action == "kill":
-                    os.kill(os.getpid(), signal.SIGKILL)
-                raise OSError(getattr(errno, self.action), os.strerror(getattr(errno, self.action)))
-            return call(*arguments, **options)
-
-        return trapped
 
 
 def in_fork(function, *arguments):
@@ -53,7 +33,7 @@ def in_fork(function, *arguments):
 
 
 def fail_at(path, at, action, force):
-    trap = Trap(at, action)
+    trap = Trap(at, action, CALLS)
     try:
         build(ToyJob(mark=1), path, workers=1, shard_items=3, force=force)
     except StorageError:

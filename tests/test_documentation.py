@@ -1,11 +1,14 @@
 """Pages that are made from the program are up to date, and every page can be found."""
 
+import re
 import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from phasemark.cli import _OUTPUTS
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -33,6 +36,26 @@ def test_the_index_leads_to_every_page():
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     pages = sorted(page.name for page in (ROOT / "docs").glob("*.md") if page.name != "index.md")
     assert [page for page in pages if f"({page})" not in index] == []
+
+
+def test_every_test_that_a_promise_names_exists():
+    page = (ROOT / "docs" / "promises.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(test_\w+\.py)(?:::(test_\w+))?`", page)
+    assert len(named) > 15
+    for file, test in named:
+        text = (ROOT / "tests" / file).read_text(encoding="utf-8")
+        assert f"def {test}(" in text if test else "def test_" in text, f"{file}::{test}"
+
+
+def test_every_command_that_writes_has_its_promises(commands):
+    page = (ROOT / "docs" / "promises.md").read_text(encoding="utf-8")
+    found = commands["commands"](commands["typer"].main.get_command(commands["app"]), "phasemark")
+    writing = {path.removeprefix("phasemark ") for path, command in found if writes(command)} | {"sweep report"}
+    assert {path for path in writing if f"`{path}" not in page} == set()
+
+
+def writes(command):
+    return {parameter.name for parameter in command.params} & set(_OUTPUTS)
 
 
 def test_no_page_or_message_installs_extras_from_an_index():

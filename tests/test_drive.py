@@ -359,7 +359,7 @@ def test_the_command_writes_everything_and_replaces_nothing_unasked(tmp_path, ca
     arguments = ["drive", short_plan(tmp_path), "-o", str(tmp_path / "out"), "--seed", "3"]
     assert main(arguments) == 0
     printed = capsys.readouterr().out
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(OUTPUTS)
+    assert sorted(path.name for path in (tmp_path / "out").glob("[!.]*")) == sorted(OUTPUTS)
     assert all(str(tmp_path / "out" / name) in printed for name in OUTPUTS)
     assert "1 corrections at 1 stops" in printed
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["seed"] == 3

@@ -300,12 +300,14 @@ def matrix_of(q):
 
 def test_an_existing_folder_needs_force_and_is_replaced_whole(frames, tmp_path):
     folder = exported(frames, tmp_path, "ply")
-    (folder / "stray").write_text("x")
+    before = sorted(entry.name for entry in folder.iterdir())
     with pytest.raises(OutputExistsError, match="--force"):
         exported(frames, tmp_path, "ply")
+    export_frames(frames, folder, "png16", force=True)
+    assert not set(before) & {entry.name for entry in folder.glob("*.ply")}
     export_frames(frames, folder, "ply", force=True)
-    assert not (folder / "stray").exists()
-    assert len(list(folder.iterdir())) == 24
+    assert sorted(entry.name for entry in folder.iterdir()) == before
+    assert len(list(folder.glob("*.ply"))) == 24
     assert [entry.name for entry in tmp_path.iterdir()] == ["out-ply"]
 
 

@@ -13,6 +13,7 @@ import pytest
 from toy_job import ToyJob, check_toy_file
 
 from phasemark import OutputExistsError, StorageError, UsageError
+from phasemark.data import verify_checksum
 from phasemark.data.remote import open_maker
 from phasemark.data.shards import build, difference, manifest_path, partial_path
 
@@ -90,11 +91,25 @@ def test_a_shard_that_rotted_since_is_made_again(unfinished):
     check_toy_file(unfinished)
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "garbage", "half a line"])
+@pytest.mark.parametrize("damage", ["", "garbage", '{"format": "other"}\n'])
+def test_a_manifest_that_is_not_ours_is_refused_until_it_is_moved_away(unfinished, damage):
+    manifest_path(unfinished).write_text(damage)
+    with pytest.raises(OutputExistsError, match=r"toy\.manifest: exists and is not of an unfinished run"):
+        build(ToyJob(), unfinished, resume=True, force=True)
+    assert manifest_path(unfinished).read_text() == damage
+    manifest_path(unfinished).unlink()
+    with pytest.raises(OutputExistsError, match=r"toy\.partial: exists and is not of an unfinished run"):
+        build(ToyJob(), unfinished, force=True)
+    partial_path(unfinished).unlink()
+    build(ToyJob(), unfinished)
+    check_toy_file(unfinished)
+
+
+@pytest.mark.parametrize("damage", ["cut", "half a line"])
 def test_a_damaged_manifest_costs_work_but_nothing_else(unfinished, damage):
     manifest = manifest_path(unfinished)
     text = manifest.read_bytes()
-    changed = {"cut": text[:-20], "empty": b"", "garbage": b"\x00\xff" * 50, "half a line": text + b'{"shard": 7, "sh'}
+    changed = {"cut": text[:-20], "half a line": text + b'{"shard": 7, "sh'}
     manifest.write_bytes(changed[damage])
     build(ToyJob(), unfinished, resume=True, force=True)
     check_toy_file(unfinished)
@@ -247,3 +262,28 @@ def test_differences_are_named_by_key():
 def test_an_unknown_scheduler_is_named(scheduler):
     with pytest.raises(UsageError, match="--scheduler"):
         open_maker(scheduler, ToyJob())
+
+
+@pytest.mark.parametrize("options", [{}, {"force": True}, {"resume": True}])
+@pytest.mark.parametrize("name", [manifest_path, partial_path])
+def test_a_file_of_somebody_else_under_the_name_of_an_unfinished_run_stays(tmp_path, name, options):
+    theirs = name(tmp_path / "toy")
+    theirs.write_text("mine")
+    with pytest.raises(OutputExistsError, match="is not of an unfinished run"):
+        build(ToyJob(), tmp_path / "toy", **options)
+    assert theirs.read_text() == "mine"
+    assert names(tmp_path) == [theirs.name]
+
+
+def test_a_file_built_through_a_link_lies_where_the_link_leads_and_keeps_its_permissions(tmp_path):
+    (tmp_path / "real").mkdir()
+    path = build(ToyJob(mark=0), tmp_path / "real" / "toy")
+    path.chmod(0o600)
+    link = tmp_path / "link"
+    link.symlink_to("real/toy")
+    build(ToyJob(mark=1), link, force=True)
+    check_toy_file(path)
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert verify_checksum(link) == verify_checksum(path)
+    assert names(tmp_path) == ["link", "real"]
+    assert names(tmp_path / "real") == ["toy", "toy.sha256"]

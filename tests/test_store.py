@@ -4,12 +4,15 @@ import errno
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
-from phasemark.data import read_checksum, verify_checksum, write_atomically, write_checksum
+from phasemark.data import read_checksum, renames, verify_checksum, write_atomically, write_checksum
+
+HERE = Path(__file__).parent
 
 
 def names(folder: Path) -> list[str]:
@@ -118,7 +121,7 @@ def test_a_crash_between_the_two_renames_leaves_no_wrong_checksum(tmp_path, monk
 
 def test_content_is_on_disk_before_it_gets_its_name_and_the_name_after(tmp_path, monkeypatch):
     events = []
-    real_fsync, real_replace = os.fsync, os.replace
+    real_fsync, real_rename = os.fsync, renames.rename_new
 
     def fsync(descriptor):
         status = os.fstat(descriptor)
@@ -127,10 +130,10 @@ def test_content_is_on_disk_before_it_gets_its_name_and_the_name_after(tmp_path,
 
     def replace(source, target):
         events.append(("rename", os.stat(source).st_ino))
-        real_replace(source, target)
+        real_rename(source, target)
 
     monkeypatch.setattr(os, "fsync", fsync)
-    monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr(renames, "rename_new", replace)
     path = write_atomically(tmp_path / "a", b"content", checksum=True)
     file, sums, folder = path.stat().st_ino, (tmp_path / "a.sha256").stat().st_ino, tmp_path.stat().st_ino
     assert events == [("sync", file), ("sync", sums), ("rename", file), ("rename", sums), ("sync", folder)]
@@ -188,3 +191,96 @@ def test_a_useless_checksum_file_is_an_input_error(tmp_path, text, reason):
         (tmp_path / "a.sha256").write_text(text)
     with pytest.raises(InputFileError, match=reason):
         verify_checksum(path)
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o444])
+def test_a_replaced_file_keeps_its_permissions_and_so_does_its_checksum(tmp_path, mode):
+    path = write_atomically(tmp_path / "a", b"old", checksum=True)
+    path.chmod(mode)
+    write_atomically(path, b"new", force=True, checksum=True)
+    assert (path.read_bytes(), path.stat().st_mode & 0o777) == (b"new", mode)
+
+
+def test_new_content_of_a_private_file_is_never_open_to_others(tmp_path):
+    path = write_atomically(tmp_path / "a", b"old")
+    path.chmod(0o600)
+    seen = []
+
+    def pieces():
+        yield b"secret"
+        seen.extend(entry.stat().st_mode & 0o077 for entry in tmp_path.iterdir())
+
+    write_atomically(path, pieces(), force=True)
+    assert seen == [0, 0]
+
+
+def test_force_follows_a_link_and_leaves_it_a_link(tmp_path):
+    (tmp_path / "real").mkdir()
+    file = write_atomically(tmp_path / "real" / "a", b"old", checksum=True)
+    link = tmp_path / "link"
+    link.symlink_to("real/a")
+    with pytest.raises(OutputExistsError):
+        write_atomically(link, b"new")
+    write_atomically(link, b"new", force=True, checksum=True)
+    assert link.is_symlink()
+    assert file.read_bytes() == b"new"
+    assert verify_checksum(link) == verify_checksum(file)
+    assert names(tmp_path) == ["link", "real"]
+    assert names(tmp_path / "real") == ["a", "a.sha256"]
+
+
+def test_a_link_with_a_checksum_of_its_own_or_in_a_circle_is_refused(tmp_path):
+    file = write_atomically(tmp_path / "a", b"old", checksum=True)
+    link, circle = tmp_path / "link", tmp_path / "circle"
+    link.symlink_to("a")
+    (tmp_path / "link.sha256").write_bytes((tmp_path / "a.sha256").read_bytes().replace(b"  a", b"  link"))
+    verify_checksum(link)
+    circle.symlink_to("circle")
+    for path, reason in ((link, "link with a checksum of its own"), (circle, "in a circle")):
+        with pytest.raises(UsageError, match=reason):
+            write_atomically(path, b"new", force=True)
+    assert file.read_bytes() == b"old"
+
+
+def test_a_file_replaced_without_a_checksum_keeps_none_that_is_wrong(tmp_path):
+    path = write_atomically(tmp_path / "a", b"old", checksum=True)
+    write_atomically(path, b"new", force=True)
+    verify_checksum(path)
+
+
+def test_a_file_made_by_somebody_else_between_the_last_look_and_the_rename_stays(tmp_path, monkeypatch):
+    path, real = tmp_path / "a", renames.rename_new
+
+    def late(source, target):
+        path.write_bytes(b"theirs")
+        real(source, target)
+
+    monkeypatch.setattr(renames, "rename_new", late)
+    with pytest.raises(OutputExistsError, match="exists; use --force"):
+        write_atomically(path, b"mine")
+    assert path.read_bytes() == b"theirs"
+    assert names(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize("in_one_step", [True, False])
+def test_a_rename_that_replaces_nothing_refuses_an_existing_name(tmp_path, monkeypatch, in_one_step):
+    if not in_one_step:  # as on a file system that does not know it
+        monkeypatch.setattr(renames, "_renameat2", lambda source, target, flags: False)
+    (tmp_path / "a").write_bytes(b"a")
+    (tmp_path / "b").write_bytes(b"b")
+    with pytest.raises(FileExistsError):
+        renames.rename_new(tmp_path / "a", tmp_path / "b")
+    renames.rename_new(tmp_path / "a", tmp_path / "c")
+    assert {name: (tmp_path / name).read_bytes() for name in names(tmp_path)} == {"b": b"b", "c": b"a"}
+    if in_one_step and renames.exchange(tmp_path / "b", tmp_path / "c"):
+        assert (tmp_path / "b").read_bytes() == b"a"
+
+
+@pytest.mark.parametrize("action", ["kill", "ENOSPC", "EIO", "other"])
+def test_a_file_ended_at_any_call_to_the_system_is_the_old_or_the_new_one(tmp_path, action):
+    done = subprocess.run(
+        [sys.executable, HERE / "file_crash_points.py", tmp_path, action],
+        env={**os.environ, "PYTHONPATH": str(HERE)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 15

@@ -1,5 +1,9 @@
 """Sweeps as they are run: same numbers for any number of workers, resumed, refused, kept."""
 
+import os
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +12,13 @@ from own_matchers import Fails
 
 from phasemark import OutputExistsError, UsageError, cli
 from phasemark.cli import main
+from phasemark.data.folder_marker import MARKER
 from phasemark.matcher.plan_kinds import plan_schema
-from phasemark.matcher.sweep import read_sweep, run_sweep
+from phasemark.matcher.sweep import read_sweep, run_sweep, sweep_folder
 from phasemark.matcher.sweep_plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
+from phasemark.matcher.sweep_report import write_report
+
+HERE = Path(__file__).parent
 
 EXACT = ("condition", "trial", "truth", "estimate", "bound", "covariance", "chi2", "p_value", "found", "accepted")
 
@@ -232,3 +240,79 @@ def test_shipped_plans_are_plans():
         assert load_sweep(name).name == name
     # 4 classes and 2 strangers, at 3 distances and 3 angles
     assert len(load_sweep("paper").conditions()) == 36 + 18
+
+
+FOREIGN = (
+    "cells.csv",
+    "trials.csv",
+    "report.html",
+    "sweep.json",
+    "plan.json",
+    "trials-000.h5",
+    "trials-000.h5.partial",
+)
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_file_of_somebody_else_in_a_folder_without_a_sweep_stays(tmp_path, name, force):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(OutputExistsError, match=f"{name}: exists and was not written by 'phasemark sweep run'"):
+        run_sweep(plan(), tmp_path, force=force)
+    assert [(entry.name, entry.read_text()) for entry in tmp_path.iterdir()] == [(name, "mine")]
+
+
+def test_force_removes_the_files_of_a_sweep_and_no_others(reference, tmp_path):
+    run_sweep(plan(), tmp_path, workers=1)
+    mine = ("trials-001.h5.my-backup", "trials-007.h5", "notes.txt")
+    for name in mine:
+        (tmp_path / name).write_text("mine")
+    run_sweep(plan(seed=8), tmp_path, workers=1, force=True)
+    assert [(tmp_path / name).read_text() for name in mine] == ["mine"] * 3
+    assert read_sweep(tmp_path)[0].seed == 8
+
+
+def test_a_sweep_in_progress_is_left_alone_with_force_too(tmp_path):
+    run_sweep(plan(), tmp_path, workers=1)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with sweep_folder(tmp_path):
+        for options in ({"force": True}, {"resume": True}, {}):
+            with pytest.raises(OutputExistsError, match="another run is writing it"):
+                run_sweep(plan(), tmp_path, **options)
+        with pytest.raises(OutputExistsError, match="another run is writing it"):
+            write_report(tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_sweep_of_before_there_were_markers_goes_on_and_starts_over(reference, tmp_path):
+    run_sweep(plan(), tmp_path, workers=1)
+    (tmp_path / MARKER).unlink()
+    (tmp_path / "notes.txt").write_text("mine")
+    same(reference[1], run_sweep(plan(), tmp_path, resume=True))
+    (tmp_path / MARKER).unlink()
+    run_sweep(plan(), tmp_path, force=True)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_frames_of_a_trial_do_not_replace_a_file_of_the_sweep(tmp_path, capsys):
+    run_sweep(plan(), tmp_path, workers=1)
+    before = (tmp_path / "trials-000.h5").read_bytes()
+    frames = ["sweep", "frames", str(tmp_path), "0", "0", "--force", "-o"]
+    assert main([*frames, str(tmp_path / "trials-000.h5")]) == 2
+    assert "is an input too" in capsys.readouterr().err
+    assert (tmp_path / "trials-000.h5").read_bytes() == before
+    assert main([*frames, str(tmp_path / "frames.npz")]) == 0
+
+
+@pytest.mark.parametrize(
+    "action", ["kill", pytest.param("ENOSPC", marks=pytest.mark.soak), pytest.param("EIO", marks=pytest.mark.soak)]
+)
+def test_a_sweep_ended_at_any_call_to_the_system_goes_on_or_starts_over(action):
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    with tempfile.TemporaryDirectory(dir=memory) as folder:
+        done = subprocess.run(
+            [sys.executable, HERE / "sweep_crash_points.py", folder, action],
+            env={**os.environ, "PYTHONPATH": str(HERE)}, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 10

@@ -14,7 +14,9 @@ from phasemark.data.export.rosbag import write_rosbag
 from phasemark.data.export.tables import write_csv, write_npz
 from phasemark.data.frames import FrameSet
 from phasemark.data.measured import Quantity
-from phasemark.data.store import refuse_unwritable, replacing, replacing_folder
+from phasemark.data.replaced_folder import refuse_folder, replacing_folder
+from phasemark.data.same_file import refuse_inputs
+from phasemark.data.store import refuse_unwritable, replacing
 
 __all__ = ["EXPORTS", "export_frames"]
 
@@ -53,7 +55,8 @@ def export_frames(
     quantity : {"range", "z"}, optional
         What ``npz``, ``csv`` and ``png16`` hold; range if left out. BOP and ROS prescribe z.
     force : bool
-        Whether an existing file or folder may be replaced.
+        Whether an existing file may be replaced, or a folder that an earlier export wrote. Another folder, or one that
+        holds a file of somebody else, never is.
 
     Returns
     -------
@@ -63,7 +66,8 @@ def export_frames(
     Raises
     ------
     UsageError
-        The format is unknown or cannot hold the quantity, or what it needs is not installed.
+        The format is unknown or cannot hold the quantity, what it needs is not installed, or the file is the frame
+        set itself.
     OutputExistsError, StorageError
         As :func:`phasemark.data.write_atomically`.
     """
@@ -73,8 +77,10 @@ def export_frames(
     if quantity is not None and quantity not in quantities:
         raise UsageError(f"--quantity must be {' or '.join(quantities)} for {to}, got '{quantity}'")
     path = Path(path)
+    refuse_inputs([path], [frames.path])
     if is_folder:
-        with replacing_folder(path, force=force) as temporary:
+        refuse_folder(path, force=force)
+        with replacing_folder(path, f"frames export --to {to}", force=force) as temporary:
             write(frames, temporary, quantity or quantities[0])
     else:
         refuse_unwritable(path, force=force)

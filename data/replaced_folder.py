@@ -1,0 +1,183 @@
+"""Folders that are whole or not there: made beside their place, synced file by file, exchanged in one step."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from phasemark import OutputExistsError, UsageError
+from phasemark.data import renames
+from phasemark.data.folder_marker import (
+    MARKER,
+    entries_of,
+    foreign_entry,
+    is_marker_part,
+    read_marker,
+    remove_listed,
+    write_marker,
+)
+from phasemark.data.lock_file import exclusive
+from phasemark.data.store import followed, storage_errors, sync
+
+
+@contextmanager
+def replacing_folder(path: Path, content: str, *, force: bool = False) -> Iterator[Path]:
+    """Hand out an empty folder beside `path` and give it that name when the block ends well.
+
+    Whatever ends the block early removes the temporary folder and leaves `path` as it was. A link is followed, and a
+    folder that is replaced keeps its permissions. What a killed run left is tidied up by the next one.
+
+    Parameters
+    ----------
+    path : Path
+        The folder to write.
+    content : str
+        What it holds, for its marker.
+    force : bool
+        Whether a folder that carries our marker, and holds nothing else than it lists, may be replaced. A folder
+        without a marker never is.
+
+    Yields
+    ------
+    Path
+        The temporary folder.
+
+    Raises
+    ------
+    OutputExistsError
+        The folder exists and must not be replaced, or another run is writing it.
+    UsageError
+        The folder in which it should lie does not exist, or the name is that of a file.
+    StorageError
+        The disk is full or fails.
+    """
+    refuse_folder(path, force=force)
+    real = _followed(path)
+    staging, aside = (real.with_name(f".{real.name}.{kind}") for kind in ("partial", "old"))
+    with storage_errors(path), exclusive(real.with_name(f".{real.name}.lock"), path):
+        _recover(real, staging, aside)
+        refuse_folder(path, force=force)  # another run may have finished before the lock was ours
+        staging.mkdir(mode=0o700 if real.exists() else 0o777)
+        try:
+            write_marker(staging, content, None)
+            yield staging
+            _seal(staging, content)
+            refuse_folder(path, force=force)
+            if real.exists():
+                _take_over(staging, real)
+                _exchange(staging, real, aside)
+            else:
+                _rename(staging, real)
+            sync(real.parent)
+        finally:
+            _discard(staging)
+
+
+def refuse_folder(path: Path, *, force: bool) -> None:
+    """Refuse a folder that must not be written or replaced, before any work is done for it.
+
+    Raises
+    ------
+    OutputExistsError, UsageError, StorageError
+        As :func:`replacing_folder`.
+    """
+    real = _followed(path)
+    if not real.parent.is_dir():
+        raise UsageError(f"{path}: the folder '{real.parent}' does not exist: make it first")
+    if not real.exists():
+        return
+    if not path.is_dir():
+        raise UsageError(f"{path}: is a file, give the name of a folder")
+    with storage_errors(path):
+        marked, listed = read_marker(path)
+        stranger = foreign_entry(path, listed or set()) if marked else None
+    if not marked:
+        raise OutputExistsError(
+            f"{path}: exists and was not written by phasemark, so it is not replaced, even with --force: give another"
+            " folder"
+        )
+    if not force:
+        raise OutputExistsError(f"{path}: exists; use --force to replace it")
+    if stranger is not None:
+        raise OutputExistsError(
+            f"{path}: holds '{stranger}', which phasemark did not write, so it is not replaced, even with --force:"
+            " move that away, or give another folder"
+        )
+
+
+def _followed(path: Path) -> Path:
+    # '.' and 'a/..' are folders without a name of their own; a link is followed to the folder that it leads to
+    return Path(os.path.realpath(path)) if path.name in ("", "..") else followed(path)
+
+
+def _seal(folder: Path, content: str) -> None:
+    """List what a folder holds in its marker, and have all of it written to the disk."""
+    entries = list(entries_of(folder))
+    for entry in entries:
+        sync(folder / entry)
+    write_marker(folder, content, entries)
+
+
+def _take_over(staging: Path, real: Path) -> None:
+    """Give a folder the permissions, and where the system allows it the owner, of the one that it replaces."""
+    old = real.stat()
+    with suppress(PermissionError):
+        os.chown(staging, old.st_uid, old.st_gid)
+    os.chmod(staging, stat.S_IMODE(old.st_mode))
+
+
+def _exchange(staging: Path, real: Path, aside: Path) -> None:
+    """Give the new folder the name of the old one, and remove the old one."""
+    if renames.exchange(staging, real):
+        return  # the old folder has the temporary name now
+    os.replace(real, aside)
+    try:
+        os.replace(staging, real)
+    except BaseException:
+        os.replace(aside, real)
+        raise
+    _discard(aside)
+
+
+def _rename(staging: Path, real: Path) -> None:
+    try:
+        renames.rename_new(staging, real)
+    except FileExistsError:
+        raise OutputExistsError(f"{real}: exists; use --force to replace it") from None
+
+
+def _recover(real: Path, staging: Path, aside: Path) -> None:
+    """Tidy up what a killed run left: the old folder gets its name back unless the new one has it."""
+    if aside.is_dir() and not real.exists() and read_marker(aside)[0]:
+        os.replace(aside, real)
+    for leftover in (staging, aside):
+        _discard(leftover)
+
+
+def _discard(folder: Path) -> None:
+    """Remove a folder of ours that has a temporary name.
+
+    Raises
+    ------
+    OutputExistsError
+        It holds what is not ours.
+    """
+    if not os.path.lexists(folder):
+        return
+    marked, listed = read_marker(folder)
+    if marked and listed is None:  # nobody but the run that was killed knows the name
+        shutil.rmtree(folder)
+        return
+    if marked and listed is not None:
+        remove_listed(folder, listed)
+    ours = folder.is_dir() and not folder.is_symlink()
+    names = os.listdir(folder) if ours else []
+    if not ours or not all(name == MARKER or is_marker_part(name) for name in names):
+        raise OutputExistsError(f"{folder}: is not phasemark's, or holds what phasemark did not write: move it away")
+    for name in names:
+        (folder / name).unlink()
+    folder.rmdir()

@@ -1,0 +1,99 @@
+"""Kill or fail a sweep at its k-th call to the system, and resume it; a program, run by the tests.
+
+usage: sweep_crash_points.py FOLDER kill|ENOSPC|EIO
+
+A file of the user lies in the folder and stays. A second run with --force at every seventh call finds the lock. Each
+run is a fork of this process. The trials are as in an uninterrupted sweep. Prints how many points there were.
+"""
+
+import shutil
+import signal
+import sys
+from pathlib import Path
+
+import numpy as np
+from crash_points import in_fork
+from system_calls import Trap
+
+from phasemark import OutputExistsError, PhasemarkError, StorageError
+from phasemark.matcher.sweep import read_sweep, run_sweep
+from phasemark.matcher.sweep_plan import Method, SweepPlan
+
+PLAN = SweepPlan(
+    name="small", trials=4, classes=["cone"], axes={"distance_m": [1.0], "n_frames": [3]}, bank_distance_m=(0.9, 1.1),
+    spread=(0.01, 5.0), methods=[Method(name="mine", method="own_matchers:nearest_to_mean")],
+)  # fmt: skip
+MINE = "trials-001.h5.my-backup"
+
+
+def fail_at(folder, at, action, options):
+    trap = Trap(at, action)
+    try:
+        run_sweep(PLAN, folder, workers=1, **options)
+    except PhasemarkError as error:  # what cannot be read is a damaged input, or not known to be ours
+        return error.exit_code
+    except OSError:  # a table of the program itself, like a preset, cannot be read
+        return StorageError.exit_code
+    return 0 if trap.count < at else 6
+
+
+def finish(folder, options):
+    try:
+        run_sweep(PLAN, folder, workers=1, **options)
+    except OutputExistsError:
+        return 4
+    return 0
+
+
+def main(folder, action):
+    folder = Path(folder)
+    run_sweep(PLAN, folder / "reference", workers=1)
+    expected = read_sweep(folder / "reference")[1].estimate
+    points = 0
+    for options in ({}, {"force": True}):
+        step = 1 if action == "kill" and not options else 3
+        for at in range(1, 1000, step):
+            path = folder / "sweep"
+            path.mkdir()
+            (path / MINE).write_text("mine")
+            if options:
+                run_sweep(PLAN, path, workers=1)
+            code = in_fork(fail_at, path, at, action, options)
+            where = f"{action} at call {at}, exit code {code}"
+            assert (path / MINE).read_text() == "mine", where
+            if code != 0:
+                assert code in ((-signal.SIGKILL,) if action == "kill" else (3, 4, 5, 6)), where
+                assert in_fork(finish, path, {"resume": True}) == 0, f"{where}: does not go on"
+                points += 1
+            np.testing.assert_array_equal(read_sweep(path)[1].estimate, expected, err_msg=where)
+            shutil.rmtree(path)
+            if code == 0:
+                break
+    second_runs(folder / "sweep")
+    sys.stdout.write(f"{points}\n")
+
+
+def second_runs(path):
+    """Have a second run with --force start at every seventh call of a first one, which ends as if it were alone."""
+    for at in range(7, 1000, 7):
+        codes = []
+
+        def second(codes=codes):
+            codes.append(in_fork(finish, path, {"force": True}))
+
+        code = in_fork(first, path, at, second)
+        assert code in (0, 1), f"second run at call {at}: exit code {code}"
+        shutil.rmtree(path)
+        if code == 1:
+            return
+
+
+def first(path, at, second):
+    trap = Trap(at, second)
+    run_sweep(PLAN, path, workers=1)
+    read_sweep(path)
+    return int(trap.count < at)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

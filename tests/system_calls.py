@@ -1,0 +1,53 @@
+"""Act at the k-th call to the system: fail, kill this process, or do something of the test's own."""
+
+import builtins
+import errno
+import io
+import os
+import pathlib
+import signal
+
+from phasemark.data import renames
+
+CALLS = (
+    "pwrite", "write", "fsync", "replace", "rename", "posix_fallocate", "ftruncate", "mkdir", "rmdir", "unlink",
+    "chmod", "chown",
+)  # fmt: skip
+
+
+class Trap:
+    """Count calls and act at one of them.
+
+    Parameters
+    ----------
+    at : int
+        The number of the call, from 1.
+    action : str or callable
+        ``kill``, the name of an error number, or what is called before the call goes on.
+    calls : sequence of str
+        The functions of :mod:`os` that count.
+    """
+
+    def __init__(self, at, action, calls=CALLS):
+        self.count, self.at, self.action = 0, at, action
+        for name in calls:
+            setattr(os, name, self.wrapped(getattr(os, name)))
+        for name in ("rename_new", "exchange"):
+            setattr(renames, name, self.wrapped(getattr(renames, name)))
+        if "mkdir" in calls:  # files that Python's own objects write
+            opened = self.wrapped(io.open)
+            io.open = builtins.open = pathlib.io.open = opened
+
+    def wrapped(self, call):
+        def trapped(*arguments, **options):
+            self.count += 1
+            if self.count == self.at:
+                if callable(self.action):
+                    self.action()
+                elif self.action == "kill":
+                    os.kill(os.getpid(), signal.SIGKILL)
+                else:
+                    raise OSError(getattr(errno, self.action), os.strerror(getattr(errno, self.action)))
+            return call(*arguments, **options)
+
+        return trapped
