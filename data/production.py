@@ -12,7 +12,8 @@ from phasemark import UsageError
 from phasemark.data.progress import Progress
 from phasemark.data.remote import open_maker
 from phasemark.data.shards import Job, build, manifest_path, refuse_difference, refuse_unfinished
-from phasemark.data.store import checksum_path, refuse_unwritable
+from phasemark.data.store import refuse_unwritable
+from phasemark.files import checksum_path
 
 
 def refuse_unwritable_output(path: Path, *, force: bool, resume: bool) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import re
 import secrets
 import shutil
 import stat
@@ -13,9 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
-
-_BLOCK_BYTES = 1 << 20
-_CHECKSUM_LINE = re.compile(r"\\?(?P<digest>[0-9a-fA-F]{64}) [ *](?P<name>[^\n]+)\n?")
+from phasemark.files import checksum_line, checksum_path, sha256_of
 
 Buffer = bytes | bytearray | memoryview
 
@@ -85,7 +81,7 @@ def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bo
             yield parts[0]
             _sync(parts[0])
             if checksum:
-                parts[1].write_bytes(_checksum_line(sha256_of(parts[0]), path.name))
+                parts[1].write_bytes(checksum_line(sha256_of(parts[0]), path.name))
                 _sync(parts[1])
         _move_into_place(parts, targets, force=force)
     finally:
@@ -153,7 +149,7 @@ def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
     try:
         with storage_errors(path):
             _sync(part)
-            checksum_part.write_bytes(_checksum_line(digest, path.name))
+            checksum_part.write_bytes(checksum_line(digest, path.name))
             _sync(checksum_part)
         _move_into_place([part, checksum_part], [path, checksum_path(path)], force=force)
     finally:
@@ -197,21 +193,6 @@ def _move_into_place(parts: list[Path], targets: list[Path], *, force: bool) -> 
                 aside.unlink(missing_ok=True)
 
 
-def checksum_path(path: str | os.PathLike[str]) -> Path:
-    """Return where the checksum of a file lies: ``FILE.sha256`` beside it."""
-    path = Path(path)
-    return path.with_name(path.name + ".sha256")
-
-
-def sha256_of(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a file's content in hexadecimal."""
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(_BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
-
-
 def write_checksum(path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write ``FILE.sha256`` for an existing file, in the format of ``sha256sum``.
 
@@ -235,71 +216,11 @@ def write_checksum(path: str | os.PathLike[str], *, force: bool = False) -> Path
         As in :func:`write_atomically`.
     """
     path = Path(path)
-    return write_atomically(checksum_path(path), _checksum_line(_readable_sha256(path), path.name), force=force)
-
-
-def read_checksum(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 that ``FILE.sha256`` states for a file.
-
-    Parameters
-    ----------
-    path : path-like
-        The file, not its checksum.
-
-    Returns
-    -------
-    str
-        Lower-case hexadecimal.
-
-    Raises
-    ------
-    InputFileError
-        There is no checksum file, it is not in the format of ``sha256sum``, or it is about another file.
-    """
-    path, beside = Path(path), checksum_path(path)
     try:
-        text = os.fsdecode(beside.read_bytes())
+        digest = sha256_of(path)
     except OSError as error:
-        raise InputFileError(f"{beside}: cannot be read ({error.strerror})") from None
-    match = _CHECKSUM_LINE.fullmatch(text)
-    if match is None:
-        raise InputFileError(f"{beside}: must be one line '<SHA-256>  {path.name}', as sha256sum writes it")
-    if match["name"] != _escaped(path.name):
-        raise InputFileError(f"{beside}: must name '{path.name}', but names '{match['name']}'")
-    return match["digest"].lower()
-
-
-def verify_checksum(path: str | os.PathLike[str]) -> str:
-    """Compare a file with its ``FILE.sha256``.
-
-    Parameters
-    ----------
-    path : path-like
-        The file, not its checksum.
-
-    Returns
-    -------
-    str
-        The SHA-256 both agree on.
-
-    Raises
-    ------
-    InputFileError
-        The file or its checksum cannot be read, or they do not agree.
-    """
-    stated, actual = read_checksum(path), _readable_sha256(Path(path))
-    if stated != actual:
-        raise InputFileError(f"{path}: damaged: its SHA-256 is {actual}, but {checksum_path(path).name} says {stated}")
-    return actual
-
-
-def has_matching_checksum(path: str | os.PathLike[str]) -> bool:
-    """Return whether ``FILE.sha256`` is there and says what the file's SHA-256 is."""
-    try:
-        verify_checksum(path)
-    except InputFileError:
-        return False
-    return True
+        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    return write_atomically(checksum_path(path), checksum_line(digest, path.name), force=force)
 
 
 def refuse_unwritable(path: Path, *, force: bool) -> None:
@@ -338,20 +259,3 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _readable_sha256(path: Path) -> str:
-    try:
-        return sha256_of(path)
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
-
-
-def _escaped(name: str) -> str:
-    return name.replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
-
-
-def _checksum_line(digest: str, name: str) -> bytes:
-    # sha256sum starts the line with a backslash when the name needed escaping.
-    escaped = _escaped(name)
-    return os.fsencode(f"{'' if escaped == name else chr(92)}{digest}  {escaped}\n")
