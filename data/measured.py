@@ -39,8 +39,8 @@ _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
 _BEYOND_MAX_RANGE = 1.25
 """How far beyond `max_range_m` a direct sensor may still report: real chips exceed their data sheet by a little."""
-_MOST_BYTES = 1 << 28
-"""What is read of a text file or a pipe: a day of 8 × 8 readings a second."""
+_MOST_BYTES = 1 << 26
+"""What is read of a text file or a pipe: most of an hour of 16 × 16 readings, 15 a second."""
 _FREE_VALUES = 1 << 24
 """How many values frames may have whatever their file's size: 36 minutes of 16 × 16 pixels at 30 frames a second."""
 _VALUES_PER_BYTE = 2
