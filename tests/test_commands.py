@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from phasemark.cli import main
-from phasemark.data import verify_checksum
-from phasemark.files import checksum_path
+from phasemark.data import verify_checksum, write_checksum
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, capture, preset
 
@@ -453,9 +452,9 @@ def bad_files(folder):
         file.create_dataset("range", shape=(10**12, 16, 16), dtype="f4", chunks=(1, 16, 16))
     for name, damage in BANK_DAMAGE.items():
         shutil.copy(folder / "bank.h5", folder / name)
-        checksum_path(folder / name).unlink(missing_ok=True)
         with h5py.File(folder / name, "r+") as file:
             damage(file)
+        write_checksum(folder / name)  # what is wrong was wrong when the file was written
     return folder
 
 
