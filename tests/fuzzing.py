@@ -1,11 +1,12 @@
 """Damaged and hostile files for every reader, found by mutation that follows what code they reach.
 
-``python fuzzing.py KIND COUNT SEED FOLDER`` reads COUNT mutants in a process of its own and prints how it went; a crash of
-that process is then a finding as well. An input that reaches lines which no other has reached is mutated further. An
+``python fuzzing.py KIND COUNT SEED FOLDER`` reads COUNT mutants in a process of its own and prints how it went; a crash
+of that process is a finding as well. An input that reaches lines which no other has reached is mutated further. An
 input that ends in anything but an answer or a :class:`phasemark.PhasemarkError` is kept in FOLDER, and belongs into
-``tests/corpus/KIND`` once it is mended: all that is there is read by the ordinary tests and is where mutation begins.
+``tests/corpus/KIND`` once it is mended: the ordinary tests read all that is there, and mutation begins with it.
 """
 
+import io
 import json
 import random
 import resource
@@ -14,6 +15,7 @@ import signal
 import sys
 import time
 import warnings
+import zipfile
 import zlib
 from pathlib import Path
 
@@ -47,8 +49,9 @@ _MOST_SEEDS = 400
 WORDS = (
     b"0", b"-1", b"1e30", b"nan", b"inf", b"-inf", b"True", b"()", b"[]", b"{}", b"''", b"\0", b"\n", b",", b";", b"#",
     b"4294967295", b"2147483648", b"9223372036854775808", b"1e-320", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x80",
-    b"\xef\xbb\xbf", b"O", b"<f8", b"|O", b"<U9", b"<c16", b"|V0", b"t_ms", b"range_0", b"mm_0", b"status_0", b"=", b'"',
+    b"\xef\xbb\xbf", b"O", b"<f8", b"|O", b"<U9", b"<c16", b"|V0", b"t_ms", b"range_0", b"mm_0", b"status_0", b"=",
 )  # fmt: skip
+NUMBERS = (0, 1, 2**16 - 1, 2**31 - 1, 2**32 - 1)
 SAMPLES = ("bank", "frames", "h5")
 """Kinds that are read by a child process of the guard first, which takes a fraction of a second each."""
 
@@ -127,8 +130,6 @@ def _good_npz(folder):
     for save in (np.savez, np.savez_compressed):
         save(path, range=_image(), amplitude=_image(), t_ms=np.arange(2), unit="m", quantity="range")
         found.append(path.read_bytes())
-    import zipfile
-
     for method in (zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2):
         with zipfile.ZipFile(folder / "b.npz", "w", method) as archive:
             for name, value in (("range", _image()), ("unit", np.array("m")), ("quantity", np.array("z"))):
@@ -227,7 +228,8 @@ def _packed(path):
 
 GOOD = {
     "npy": _good_npy, "npz": _good_npz, "png": _good_png, "csv": _good_csv, "toml": _good_toml, "poses": _good_poses,
-    "manifest": _good_manifest, "checksum": _good_checksum, **{kind: _good_mesh(kind) for kind in ("stl", "ply", "obj", "off")},
+    "manifest": _good_manifest, "checksum": _good_checksum,
+    **{kind: _good_mesh(kind) for kind in ("stl", "ply", "obj", "off")},
     "bag": _good_bag, "h5": _good_h5, "bank": _good_bank, "frames": _good_frames,
 }  # fmt: skip
 
@@ -260,14 +262,15 @@ def mutate(content, others, rng):
             del data[rng.randrange(size) :]
         else:
             width = rng.choice((2, 4, 8))
-            data[at : at + width] = rng.choice((0, 1, 2**31 - 1, 2**32 - 1, 2**16 - 1, len(data))).to_bytes(
-                8, "little"
-            )[:width]
+            number = rng.choice((*NUMBERS, len(data)))
+            data[at : at + width] = number.to_bytes(8, "little")[:width]
     return bytes(data[: 1 << 18])
 
 
 def mend(kind, content, rng):
     """Give the chunks of a PNG their checksums back, most of the time: what lies behind them is to be reached."""
+    if kind == "npz" and rng.random() < 0.7:
+        return _archive(content, rng)
     if kind != "png" or rng.random() < 0.2:
         return content
     out, at = bytearray(content[:8]), 8
@@ -277,6 +280,26 @@ def mend(kind, content, rng):
         out += content[at : at + 4] + body + zlib.crc32(body).to_bytes(4, "big")
         at += 12 + length
     return bytes(out) + content[at:]
+
+
+def _archive(content, rng):
+    """Return an NPZ file, sound as an archive, one of whose members is a mutant."""
+    image, time_s = _npy(_image()), _npy(np.arange(2.0))
+    members = {"range": image, "t_s": time_s, "amplitude": image}
+    members |= {name: _npy(np.array(word)) for name, word in (("unit", "m"), ("quantity", "z"))}
+    victim = rng.choice(list(members))
+    members[victim] = mutate(members[victim], [content, *members.values()], rng)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+        for name, body in members.items():
+            archive.writestr(f"{name}.npy", body)
+    return buffer.getvalue()
+
+
+def _npy(values):
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    return buffer.getvalue()
 
 
 def put(kind, content, folder):
@@ -291,12 +314,6 @@ def put(kind, content, folder):
     at = 0
     while at < len(content):
         head = content[at : at + 300].split(b"\n", 2)
-        if (
-            len(head) < 3
-            or not head[1].isdigit()
-            or not head[0].decode("latin1").replace("_", "").replace(".", "").isalnum()
-        ):
-            break
         at += len(head[0]) + len(head[1]) + 2
         (path / head[0].decode("latin1")[:80]).write_bytes(content[at : at + int(head[1])])
         at += int(head[1])
@@ -321,7 +338,8 @@ def read_one(kind, content, folder):
             warnings.simplefilter("ignore", UserWarning)
             KINDS[kind][1](path)
     except PhasemarkError as error:
-        assert "\n" not in str(error), f"more than one line: {error}"
+        if "\n" in str(error):
+            raise AssertionError("the message has more than one line") from error
         return True
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)

@@ -292,7 +292,7 @@ def test_what_is_packed_to_fill_the_memory_is_refused_before_it_is_read(tmp_path
         archive.writestr("padding", archive_padding)
     (tmp_path / "packed.npz").write_bytes(buffer.getvalue())
     for name in ("packed.h5", "packed.npz"):
-        with pytest.raises(InputFileError, match="declares \\d+ values, far more than a file of this size holds"):
+        with pytest.raises(InputFileError, match=r"declares \d+ values, far more than a file of this size holds"):
             read_frames(tmp_path / name, sensor=SENSOR, **STATED)
 
 
