@@ -397,9 +397,9 @@ def _plain_size(size: object) -> object:
 
 
 def _npy_header(file: BinaryIO | zipfile.ZipExtFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    version = np.lib.format.read_magic(file)  # type: ignore[arg-type]
+    version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)  # type: ignore[arg-type]
+    shape, _, dtype = read(file)
     return shape, dtype
 
 

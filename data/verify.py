@@ -151,7 +151,7 @@ def _check_columns(file: h5py.File, path: Path, job: FrameJob) -> None:
 
 
 def _close(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
-    return np.isclose(one, other, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True)
+    return np.asarray(np.isclose(one, other, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True))
 
 
 def _compare(
