@@ -59,6 +59,7 @@ _DRAWN_ALL = 4
 _NEAREST_AT_ONCE, _REFINED_AT_ONCE = 256, 64
 """Positions matched before their answers are printed; refinement takes up to 50 ms each."""
 
+_NO_VERIFY = "--no-verify"
 _COMPLETION = "_PHASEMARK_COMPLETE"
 """Set by the script that ``--install-completion`` gives to a shell."""
 
@@ -237,8 +238,19 @@ def _start(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
+    no_verify: Annotated[
+        bool,
+        typer.Option(
+            _NO_VERIFY,
+            help="Read files without comparing them with their FILE.sha256; may stand behind any command, too.",
+        ),
+    ] = False,
 ) -> None:
     """Render, bank and match what a low-resolution time-of-flight camera sees of a 3D landmark."""
+    if no_verify:
+        from phasemark.files import unverified
+
+        context.with_resource(unverified())
     if context.invoked_subcommand is None:
         typer.echo(_FIRST_STEPS, nl=False)
 
@@ -387,6 +399,7 @@ def _sensor_fit(
             flip_h=flip_h,
             flip_v=flip_v,
             rotate=rotate,
+            untrusted=True,
         )
         for path in frames
     ]
@@ -2479,6 +2492,8 @@ def _terminate(signum: int, frame: FrameType | None) -> None:
 def _run(arguments: list[str]) -> None:
     """Parse and run one command; typer's own errors become ours."""
     command = typer.main.get_command(app)
+    if _NO_VERIFY in arguments:  # an option of the program, which users put behind the command as well
+        arguments = [_NO_VERIFY, *(word for word in arguments if word != _NO_VERIFY)]
     try:
         with command.make_context("phasemark", arguments) as context:
             command.invoke(context)
@@ -2511,11 +2526,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")  # before HDF5 is loaded: no file makes it load code
     # before NumPy is: its small products gain nothing from threads that fight our workers' for the processors
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from phasemark.files import pipes_read_once
+
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without '×' or 'σ' is no reason to fail
     try:
         try:
-            with _warnings_as_notes():
+            with _warnings_as_notes(), pipes_read_once():
                 _run(list(sys.argv[1:] if arguments is None else arguments))
         finally:
             sys.stdout.flush()

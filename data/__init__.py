@@ -14,8 +14,9 @@ from phasemark.data.plan import BankPlan, MeshPlan, load_plan, read_plan
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.simulated import SimulatedRecording, simulate_recording, write_recording
 from phasemark.data.size import planned_size
-from phasemark.data.store import read_checksum, verify_checksum, write_atomically, write_checksum
+from phasemark.data.store import write_atomically, write_checksum
 from phasemark.data.verify import verify_bank, verify_frames
+from phasemark.files import read_checksum, unverified, verify_checksum
 
 __all__ = [
     "Bank",
@@ -47,6 +48,7 @@ __all__ = [
     "read_plan",
     "simulate_recording",
     "summary_sentences",
+    "unverified",
     "verify_bank",
     "verify_checksum",
     "verify_frames",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark.files import is_vouched_for
 
 Z_TOPIC = "/camera/depth/image_rect"
 RANGE_TOPIC = "/camera/range/image"
@@ -50,6 +51,9 @@ def read_rosbag(path: Path, topic: str | None) -> tuple[dict[str, NDArray[Any]],
     """
     store = ros_types()
     try:
+        for file in sorted(path.iterdir()):
+            if file.is_file():
+                is_vouched_for(file)
         return _read(path, topic, store)
     except PhasemarkError:
         raise

@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.grid import format_grid
-from phasemark.data.hdf5 import check_format, dataset_of, frozen, group_of, json_attribute, open_hdf5, reading
+from phasemark.data.hdf5 import (
+    check_format,
+    dataset_of,
+    frozen,
+    group_of,
+    json_attribute,
+    open_hdf5,
+    reading,
+    whole_numbers,
+)
 from phasemark.data.notebook import facts_html
 from phasemark.data.plan import BankPlan
 from phasemark.render import PhasorImages, Sensor, Views
@@ -350,8 +359,8 @@ def read_mesh_group(file: h5py.File, class_name: str, path: Path) -> trimesh.Tri
     group = group_of(file, f"meshes/{class_name}", path)
     with reading(path):
         vertices = group["vertices"][...].astype(np.float64)
-        faces = group["faces"][...].astype(np.int64)
-        part = group["part"][...].astype(np.uint8) if "part" in group else None
+        faces = whole_numbers(group["faces"], path)
+        part = whole_numbers(group["part"], path) if "part" in group else None
         period_deg, albedo = float(group.attrs["delta_period_deg"]), float(group.attrs["albedo"])
     if not 1 <= period_deg <= 360:  # as the plan has it: a symmetry of 1 … 360
         raise InputFileError(f"{path}: 'delta_period_deg' of '{class_name}' must be in [1, 360], got {period_deg:g}")
@@ -359,13 +368,13 @@ def read_mesh_group(file: h5py.File, class_name: str, path: Path) -> trimesh.Tri
         raise InputFileError(f"{path}: 'meshes/{class_name}' must hold rows of three, of vertices and faces")
     if not (np.abs(vertices) <= _FARTHEST_VERTEX_M).all() or faces.min() < 0 or faces.max() >= len(vertices):
         raise InputFileError(f"{path}: 'meshes/{class_name}' has vertices that are not within 1 km, or not there")
-    if part is not None and part.shape != faces.shape[:1]:
-        raise InputFileError(f"{path}: 'meshes/{class_name}/part' must have one value for each face")
+    if part is not None and (part.shape != faces.shape[:1] or part.min() < 0 or part.max() > 1):
+        raise InputFileError(f"{path}: 'meshes/{class_name}/part' must have one value for each face, 0 or 1")
     return trimesh.Trimesh(
         vertices,
         faces,
         process=False,
-        face_attributes=None if part is None else {"part": part},
+        face_attributes=None if part is None else {"part": part.astype(np.uint8)},
         metadata={"name": class_name, "symmetry": round(360 / period_deg), "albedo": albedo},
     )
 

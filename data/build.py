@@ -30,6 +30,7 @@ from phasemark.data.bank import (
     open_bank,
 )
 from phasemark.data.layout import Layout
+from phasemark.data.narrow import narrowed
 from phasemark.data.plan import BankPlan, MeshPlan, factored_refusal
 from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.progress import Progress
@@ -132,7 +133,7 @@ def build_bank(
 
 
 def _finished_identity(path: Path) -> dict[str, Any]:
-    with open_bank(path) as bank:
+    with open_bank(path, untrusted=True) as bank:
         return bank.identity()
 
 
@@ -436,10 +437,10 @@ def write_mesh(group: h5py.Group, landmark: Landmark) -> None:
     vertices = group.create_dataset("vertices", data=np.asarray(landmark.mesh.vertices, dtype="<f8"))
     vertices.attrs["units"] = "m"
     vertices.attrs["long_name"] = "vertices x', y', z' in the landmark frame"
-    faces = group.create_dataset("faces", data=np.asarray(landmark.mesh.faces, dtype="<i4"))
+    faces = group.create_dataset("faces", data=narrowed(landmark.mesh.faces, "<i4", "vertices of a face"))
     faces.attrs["long_name"] = "three vertex indices of each face"
     if "part" in landmark.mesh.face_attributes:
-        part = group.create_dataset("part", data=np.asarray(landmark.mesh.face_attributes["part"], dtype=np.uint8))
+        part = group.create_dataset("part", data=narrowed(landmark.mesh.face_attributes["part"], "|u1", "parts"))
         part.attrs["long_name"] = "0 on faces of the lower part, 1 on those of the upper one"
     group.attrs["delta_period_deg"] = 360 / landmark.symmetry
     group.attrs["albedo"] = landmark.albedo

@@ -97,7 +97,7 @@ def build_frames(
 
 
 def _finished_identity(path: Path) -> dict[str, Any]:
-    with open_frames(path) as frames:
+    with open_frames(path, untrusted=True) as frames:
         return frames.identity()
 
 
@@ -218,6 +218,11 @@ class FrameJob:
                 write_mesh(file.create_group(f"meshes/{landmark.name}"), landmark)
         return layout, [places]
 
+    def columns(self) -> Iterator[tuple[str, NDArray[Any]]]:
+        """Yield name and values of every column of the file: which view each frame shows, and what is true of it."""
+        for name, values, _, _ in self._small(self.plan.views, self.plan.frames_per_view):
+            yield name, values
+
     def _small(self, n: int, per: int) -> Iterator[tuple[str, NDArray[Any], tuple[str, ...], dict[str, Any]]]:
         """Yield the datasets that are written with the header: which view each frame shows, and what is true of it."""
         frames = np.arange(n * per, dtype="<i8")
@@ -237,7 +242,7 @@ class FrameJob:
         yield (
             "split", truth["split_index"], ("view",),
             {
-                "long_name": "number of the split", "flag_values": np.arange(len(self.plan.splits), dtype=np.uint8),
+                "long_name": "number of the split", "flag_values": np.arange(len(self.plan.splits), dtype="|u1"),
                 "flag_meanings": " ".join(self.plan.splits),
             },
         )  # fmt: skip

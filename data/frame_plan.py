@@ -12,11 +12,14 @@ from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, Wi
 from scipy import special
 
 from phasemark import UsageError
+from phasemark.data.narrow import narrowed
 from phasemark.data.plan import MeshPlan, PlanModel, ScenePlan, find_symmetries
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec
 
 KINDS = ("fixed", "uniform", "normal", "sobol")
+MOST_SPLITS = 256
+"""The number of a view's split is a byte in the file."""
 Variant = Literal["hard", "mixed", "shot"]
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -221,6 +224,8 @@ class FramePlan(ScenePlan):
             raise UsageError(f"'albedo' must be in (0, 1] throughout, got {_to_plain(self.albedo)}")
         if not self.splits or abs(sum(self.splits.values()) - 1) > 1e-9:
             raise UsageError(f"'splits' must be shares that add up to 1, got {self.splits}")
+        if len(self.splits) > MOST_SPLITS:
+            raise UsageError(f"'splits' must be at most {MOST_SPLITS}, got {len(self.splits)}")
         if len(set(self.variants)) < len(self.variants):
             raise UsageError(f"'variants' must not repeat, got {list(self.variants)}")
         return self
@@ -272,7 +277,7 @@ class FramePlan(ScenePlan):
         landmarks: list[LandmarkSpec | MeshPlan] = [*self.landmarks, *self.meshes]
         truth: dict[str, NDArray[Any]] = {}
         of_class = self._uniform("class", start, stop) * len(landmarks)
-        truth["class_index"] = np.minimum(of_class.astype(np.int16), len(landmarks) - 1)
+        truth["class_index"] = narrowed(np.minimum(of_class.astype(np.int64), len(landmarks) - 1), "<i2", "classes")
         sobol = self._sobol(start, stop)
         for name in QUANTITIES:
             spread: Distribution | None = getattr(self, name)
@@ -287,7 +292,8 @@ class FramePlan(ScenePlan):
                 truth[name] = spread.values(self._uniform(name, start, stop))
         ends = np.cumsum(list(self.splits.values()))
         drawn = self._uniform("split", start, stop)
-        truth["split_index"] = np.minimum(np.searchsorted(ends, drawn, side="right"), len(ends) - 1).astype(np.uint8)
+        split = np.minimum(np.searchsorted(ends, drawn, side="right"), len(ends) - 1)
+        truth["split_index"] = narrowed(split, "|u1", "splits")
         return truth
 
     def _uniform(self, purpose: str, start: int, stop: int) -> NDArray[np.float64]:

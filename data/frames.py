@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -17,7 +18,16 @@ from numpy.typing import NDArray
 from phasemark import InputFileError, UsageError
 from phasemark.data.bank import read_mesh_group
 from phasemark.data.frame_plan import FramePlan
-from phasemark.data.hdf5 import check_format, dataset_of, frozen, group_of, json_attribute, open_hdf5, reading
+from phasemark.data.hdf5 import (
+    check_format,
+    dataset_of,
+    frozen,
+    group_of,
+    json_attribute,
+    open_hdf5,
+    reading,
+    whole_numbers,
+)
 from phasemark.data.notebook import facts_html
 from phasemark.render import Frames, Sensor
 
@@ -98,7 +108,7 @@ class FrameSet:
         wanted = ["range", "flags", "coverage"] + [name for name in ("amplitude", "intensity", "taps") if name in file]
         wanted += [f"range_{name}" for name in self.plan.variants]
         self._fields = {name: self._field(file, name, sizes) for name in wanted}
-        self.view_index = frozen(self._column(file, "view_index", sizes["frame"]).astype(np.int64))
+        self.view_index = frozen(self._whole(file, "view_index", sizes["frame"]))
         if self.view_index.min() < 0 or self.view_index.max() >= sizes["view"]:
             raise InputFileError(f"{path}: 'view_index' names views that are not there")
         self.truth = self._read_truth(file, sizes["view"])
@@ -126,10 +136,14 @@ class FrameSet:
             raise InputFileError(f"{self.path}: '{name}' must be {n} numbers, got {dataset.dtype} of {dataset.shape}")
         return np.asarray(dataset[...])
 
+    def _whole(self, file: h5py.File, name: str, n: int) -> NDArray[np.int64]:
+        self._column(file, name, n)
+        return whole_numbers(file[name], self.path)
+
     def _read_truth(self, file: h5py.File, n: int) -> dict[str, NDArray[Any]]:
         truth: dict[str, NDArray[Any]] = {
-            "class_index": self._column(file, "landmark_class", n).astype(np.int64),
-            "split_index": self._column(file, "split", n).astype(np.int64),
+            "class_index": self._whole(file, "landmark_class", n),
+            "split_index": self._whole(file, "split", n),
         }
         for name, count in (("class_index", len(self.classes)), ("split_index", len(self.splits))):
             if truth[name].min() < 0 or truth[name].max() >= count:
@@ -439,6 +453,8 @@ def is_frame_set(path: str | os.PathLike[str]) -> bool:
         False also if the file cannot be read.
     """
     try:
+        if not stat.S_ISREG(os.stat(path).st_mode):  # what is read of a pipe is gone for whoever reads it next
+            return False
         with open(path, "rb") as file:
             if file.read(8) != b"\x89HDF\r\n\x1a\n":
                 return False

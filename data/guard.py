@@ -27,6 +27,8 @@ EXPANSION = 200
 """How many times a file's own size its values may take; deflate reaches 1000."""
 FREE_BYTES = 1 << 24
 """What values may take whatever the file's size."""
+OWN_EXPANSION, OWN_FREE_BYTES = 4, 1 << 28
+"""The same two for our own files, which are read whole and are not packed unless somebody packs them afterwards."""
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
 
 _MEMORY_BYTES = 1 << 30  # address space, most of it never touched: what a bare interpreter with NumPy maps
@@ -43,13 +45,15 @@ class Refusal(Exception):
     """What a file contains and may not."""
 
 
-def refusal(path: str | os.PathLike[str]) -> str | None:
+def refusal(path: str | os.PathLike[str], *, expansion: int = EXPANSION, free_bytes: int = FREE_BYTES) -> str | None:
     """Return why a file must not be read, or None; no link is followed and no value read.
 
     Parameters
     ----------
     path : path-like
         An HDF5 file.
+    expansion, free_bytes : int
+        How many times the file's own size its values may take, and what they may take whatever its size.
 
     Raises
     ------
@@ -58,7 +62,7 @@ def refusal(path: str | os.PathLike[str]) -> str | None:
     """
     file = h5py.h5f.open(os.fsencode(path), h5py.h5f.ACC_RDONLY)
     try:
-        budget = FREE_BYTES + EXPANSION * os.path.getsize(path)
+        budget = free_bytes + expansion * os.path.getsize(path)
         for _, dataset in _objects(file):
             if isinstance(dataset, h5py.h5d.DatasetID):
                 budget -= _declared_bytes(dataset)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError, UsageError
-from phasemark.data.guard import first_reading, refusal
-from phasemark.data.store import has_matching_checksum
+from phasemark.data.guard import OWN_EXPANSION, OWN_FREE_BYTES, first_reading, refusal
+from phasemark.files import checksum_path, is_vouched_for, verifying
 
 
-def open_hdf5(path: Path, what: str, *, untrusted: bool = False) -> h5py.File:
-    """Open an HDF5 file that contains nothing which could lead out of it.
+def open_hdf5(path: Path, what: str, *, untrusted: bool = False, foreign: bool = False) -> h5py.File:
+    """Open an HDF5 file that is what its checksum says and contains nothing which could lead out of it.
 
     Parameters
     ----------
@@ -27,26 +28,42 @@ def open_hdf5(path: Path, what: str, *, untrusted: bool = False) -> h5py.File:
         What the file should be, for messages: "bank".
     untrusted : bool
         Whether a child process reads the file first, unless ``FILE.sha256`` vouches for it.
+    foreign : bool
+        Whether other programs write such files: they have no checksums, and may be packed.
 
     Raises
     ------
     InputFileError
-        The file cannot be read, is not HDF5, is damaged, or contains what is refused
+        The file cannot be read, contradicts its checksum, is not HDF5, is damaged, or contains what is refused
         (:func:`phasemark.data.guard.refusal`).
+
+    Warns
+    -----
+    UserWarning
+        The file is untrusted and one of ours, and has no checksum.
     """
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise InputFileError(f"{path}: is a pipe or device: HDF5 is read out of order, so copy it to a file first")
         with path.open("rb") as plain:
             signature = plain.read(8)
     except OSError as error:
         raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
     if signature != b"\x89HDF\r\n\x1a\n":
         raise InputFileError(f"{path}: not a {what} (not an HDF5 file)")
-    if untrusted and not has_matching_checksum(path):
+    vouched = is_vouched_for(path)
+    if untrusted and not vouched:
         reason = first_reading(path)
         if reason is not None:
             raise InputFileError(f"{path}: {reason}")
+        if verifying() and not foreign:
+            warnings.warn(
+                f"{path}: has no checksum '{checksum_path(path).name}' beside it, so damage may go unnoticed",
+                UserWarning,
+                stacklevel=2,
+            )
     try:
-        reason = refusal(path)
+        reason = refusal(path) if foreign else refusal(path, expansion=OWN_EXPANSION, free_bytes=OWN_FREE_BYTES)
     except Exception:  # whatever a damaged file makes h5py say
         raise InputFileError(f"{path}: damaged or cut off: HDF5 cannot open it") from None
     if reason is not None:
@@ -113,6 +130,22 @@ def dataset_of(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
     if not isinstance(group.get(name), h5py.Dataset):
         raise InputFileError(f"{path}: the dataset '{f'{group.name}/{name}'.strip('/')}' is missing")
     return group[name]
+
+
+def whole_numbers(dataset: h5py.Dataset, path: Path) -> NDArray[np.int64]:
+    """Return the values of a dataset that must hold whole numbers.
+
+    Raises
+    ------
+    InputFileError
+        It holds others, or some too large to count with.
+    """
+    if dataset.dtype.kind not in "iu":
+        raise InputFileError(f"{path}: '{dataset.name.strip('/')}' must hold whole numbers, got {dataset.dtype}")
+    values = np.asarray(dataset[...])
+    if values.size and int(values.max()) > np.iinfo(np.int64).max:
+        raise InputFileError(f"{path}: '{dataset.name.strip('/')}' has {values.max()}, which is no number of anything")
+    return values.astype(np.int64)
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:

@@ -24,7 +24,7 @@ from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.progress import Progress
 from phasemark.data.same_file import named_files
 from phasemark.data.shards import Job, Place, difference, make_shard, pieces
-from phasemark.data.store import verify_checksum
+from phasemark.files import verify_checksum
 
 FORMAT = "phasemark-part"
 SCHEMA_VERSION = 1
@@ -170,7 +170,7 @@ def build_part(
 
 
 def _finished_identity(path: Path) -> dict[str, Any]:
-    with open_hdf5(path, "shard") as file, reading(path):
+    with open_hdf5(path, "shard", untrusted=True) as file, reading(path):
         check_format(file, path, "shard", FORMAT, SCHEMA_VERSION)
         spec: dict[str, Any] = json.loads(file.attrs["identity"])
         start, stop, total = (int(k) for k in file.attrs["items"])
@@ -231,7 +231,7 @@ class _Part:
     def __init__(self, path: Path) -> None:
         verify_checksum(path)
         self.path = path
-        self.file: h5py.File = open_hdf5(path, "shard")
+        self.file: h5py.File = open_hdf5(path, "shard", untrusted=True)
         try:
             with reading(path):
                 check_format(self.file, path, "shard", FORMAT, SCHEMA_VERSION)

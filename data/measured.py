@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import math
 import os
-import tokenize
 import warnings
 import zipfile
-import zlib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 import h5py
 import numpy as np
@@ -26,6 +23,7 @@ from phasemark.data.csv_frames import MILLISECONDS, SECONDS, SECONDS_PER_TIME_UN
 from phasemark.data.guard import EXPANSION, FREE_BYTES
 from phasemark.data.hdf5 import open_hdf5
 from phasemark.data.store import write_atomically
+from phasemark.files import opened
 from phasemark.render import Frames, Sensor
 
 Unit = Literal["m", "cm", "mm"]
@@ -41,10 +39,14 @@ _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
 _BEYOND_MAX_RANGE = 1.25
 """How far beyond `max_range_m` a direct sensor may still report: real chips exceed their data sheet by a little."""
-_UNREADABLE = (
-    OSError, EOFError, ValueError, KeyError, RuntimeError, SyntaxError, zipfile.BadZipFile, csv.Error, zlib.error,
-    tokenize.TokenError,  # NumPy tokenizes the header of an NPY file
-)  # fmt: skip
+_MOST_BYTES = 1 << 26
+"""What is read of a text file or a pipe: most of an hour of 16 × 16 readings, 15 a second."""
+_FREE_VALUES = 1 << 24
+"""How many values frames may have whatever their file's size: 36 minutes of 16 × 16 pixels at 30 frames a second."""
+_VALUES_PER_BYTE = 2
+"""How many a file may hold for each of its bytes; what is packed more tightly than this was made to fill the memory."""
+_WORD_BYTES = 256
+"""Most that the words for unit and quantity take."""
 
 
 @dataclass(frozen=True)
@@ -323,61 +325,151 @@ def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None
     try:
         if path.is_dir():
             return _Raw(*read_rosbag(path, topic)) if (path / "metadata.yaml").exists() else _read_pngs(path)
-        with path.open("rb") as file:
+        with opened(path, most_bytes=_MOST_BYTES) as file:
             start = file.read(8)
-        if not start:
-            raise InputFileError(f"{path}: is empty")
-        if start.startswith(b"\x93NUMPY"):
-            return _Raw({"range": np.asarray(np.load(path, allow_pickle=False))})
-        if start.startswith(b"PK"):
-            return _read_npz(path)
-        if start == b"\x89PNG\r\n\x1a\n":
-            return _read_pngs(path)
-        if start.startswith(b"\x89HDF"):
-            return _read_hdf5(path, untrusted)
-        found = parse_csv(path.read_bytes(), shape, path)
-        return _Raw(found.arrays, found.stated, found.time_s, flat=True, named=found.named)
+            file.seek(0)
+            if not start.startswith(b"\x89HDF"):
+                return _read_open(file, start, shape, path)
+        return _read_hdf5(path, untrusted)
     except PhasemarkError:
         raise
     except MemoryError:
         raise InputFileError(f"{path}: holds or announces more frames than fit into memory") from None
-    except _UNREADABLE as error:
+    except Exception as error:  # whatever a damaged file makes NumPy, zipfile, Pillow and h5py say
         reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
         raise InputFileError(f"{path}: cannot be read ({reason})") from None
 
 
+def _read_open(file: BinaryIO, start: bytes, shape: tuple[int, int], path: Path) -> _Raw:
+    """Read an open file of any kind but HDF5."""
+    if not start:
+        raise InputFileError(f"{path}: is empty")
+    if start.startswith(b"\x93NUMPY"):
+        room = _Room(path, _size(file))
+        room.take_array(file, "range")
+        file.seek(0)
+        return _Raw({"range": np.lib.format.read_array(file, allow_pickle=False)})
+    if start.startswith(b"PK"):
+        return _read_npz(file, path)
+    if start == b"\x89PNG\r\n\x1a\n":
+        return _of_images([_read_png(file, path)], path)
+    if _size(file) > _MOST_BYTES:
+        raise InputFileError(f"{path}: has more than {_MOST_BYTES / 1e6:.3g} MB of text: give it in parts, or as NPZ")
+    found = parse_csv(file.read(), shape, path)
+    return _Raw(found.arrays, found.stated, found.time_s, flat=True, named=found.named)
+
+
+def _size(file: BinaryIO) -> int:
+    size = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    return size
+
+
+class _Room:
+    """How many values a file may still hold, so that a small file cannot fill the memory."""
+
+    def __init__(self, path: Path, size: int) -> None:
+        self._path = path
+        self._left = max(_FREE_VALUES, _VALUES_PER_BYTE * size)
+
+    def take(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        """Refuse an array that is not of plain numbers, or holds more of them than is left."""
+        if dtype.kind not in "fiub" or dtype.shape:
+            raise InputFileError(f"{self._path}: '{name}' must hold real numbers, got {dtype}")
+        if not all(isinstance(size, int) and size >= 0 for size in map(_plain_size, shape)):
+            raise InputFileError(f"{self._path}: '{name}' has the shape {shape}, which no array has")
+        count = math.prod(map(int, shape))
+        self._left -= count
+        if self._left < 0:
+            raise InputFileError(
+                f"{self._path}: refused: '{name}' declares {count} values, far more than a file of this size holds"
+            )
+
+    def take_array(self, file: BinaryIO | zipfile.ZipExtFile, name: str) -> None:
+        """Take what the header of an NPY array declares."""
+        shape, dtype = _npy_header(file)
+        self.take(name, shape, dtype)
+
+
+def _plain_size(size: object) -> object:
+    """Return a size of a shape; a truth value is none, though Python takes it for a number."""
+    return None if isinstance(size, bool) else int(size) if isinstance(size, np.integer) else size
+
+
+def _npy_header(file: BinaryIO | zipfile.ZipExtFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    return shape, dtype
+
+
+def _read_png(file: BinaryIO, path: Path) -> tuple[NDArray[np.float64], str | None, str | None]:
+    """Return the codes of a 16-bit grey image, and what it says of scale and quantity."""
+    if _size(file) > FREE_BYTES:
+        raise InputFileError(f"{path}: refused: is far too large for a frame")
+    header = file.read(24)
+    file.seek(0)
+    width, height = (int.from_bytes(header[at : at + 4], "big") for at in (16, 20))
+    if width * height > _MOST_PIXELS:  # before Pillow warns of it, or makes room for it
+        raise InputFileError(f"{path}: must be an image of at most {_MOST_PIXELS} pixels, got {width} × {height}")
+    with Image.open(file, formats=("PNG",)) as image:
+        if image.width * image.height > _MOST_PIXELS or not image.mode.startswith("I"):
+            raise InputFileError(f"{path}: must be a 16-bit grey image of at most {_MOST_PIXELS} pixels")
+        codes = np.asarray(image, dtype=np.float64)
+        text = getattr(image, "text", {})  # read with the image
+        return codes, text.get("metres_per_unit"), text.get("quantity")
+
+
 def _read_pngs(path: Path) -> _Raw:
-    """Read a 16-bit grey image, or a folder of them."""
-    files = sorted(path.glob("*.png")) if path.is_dir() else [path]
+    """Read a folder of 16-bit grey images."""
+    files = sorted(path.glob("*.png"))
     if not files:
         raise InputFileError(f"{path}: is a folder without PNG images, and no ROS bag")
-    images, told = [], set()
-    for file in files:
-        if file.stat().st_size > FREE_BYTES:
-            raise InputFileError(f"{file}: refused: is far too large for a frame")
-        with Image.open(file, formats=("PNG",)) as image:
-            if image.width * image.height > _MOST_PIXELS or not image.mode.startswith("I"):
-                raise InputFileError(f"{file}: must be a 16-bit grey image of at most {_MOST_PIXELS} pixels")
-            images.append(np.asarray(image, dtype=np.float64))
-            text = getattr(image, "text", {})  # read with the image
-            told.add((text.get("metres_per_unit"), text.get("quantity")))
+    found = []
+    room = _Room(path, sum(file.stat().st_size for file in files))
+    for name in files:
+        with opened(name, most_bytes=FREE_BYTES) as file:
+            try:
+                found.append(_read_png(file, name))
+            except (PhasemarkError, MemoryError):
+                raise
+            except Exception as error:  # whatever a damaged image makes Pillow say
+                raise InputFileError(f"{name}: cannot be read ({' '.join(str(error).split())})") from None
+        room.take("range", found[-1][0].shape, found[-1][0].dtype)
+    return _of_images(found, path)
+
+
+def _of_images(found: Sequence[tuple[NDArray[np.float64], str | None, str | None]], path: Path) -> _Raw:
+    images, told = [image for image, *_ in found], {(scale, quantity) for _, scale, quantity in found}
     if len(told) > 1 or len({image.shape for image in images}) > 1:
         raise InputFileError(f"{path}: its images must all have one size, scale and quantity")
     scale, quantity = told.pop()
     codes = np.stack(images)
     stated = {} if quantity is None else {"quantity": quantity}
     if scale is not None:
-        codes = codes * float(scale)
+        try:
+            codes = codes * float(scale)
+        except ValueError:
+            raise InputFileError(f"{path}: its 'metres_per_unit' must be a number, got {scale[:80]!r}") from None
         stated["unit"] = "m"
     return _Raw({"range": np.where(codes == 0, np.nan, codes)}, stated)
 
 
-def _read_npz(path: Path) -> _Raw:
-    # A handle of our own: np.load leaves its file open when the archive is cut off.
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+def _read_npz(file: BinaryIO, path: Path) -> _Raw:
+    size = _size(file)
+    with np.load(file, allow_pickle=False) as archive:
         declared = sum(member.file_size for member in archive.zip.infolist())
-        if declared > FREE_BYTES + EXPANSION * path.stat().st_size:
+        if declared > FREE_BYTES + EXPANSION * size:
             raise InputFileError(f"{path}: refused: declares {declared} bytes, far more than its size can hold")
+        members = {member.filename.removesuffix(".npy"): member for member in archive.zip.infolist()}
+        room = _Room(path, size)
+        for name in (*_FIELDS, *SECONDS_PER_TIME_UNIT):
+            if name in members:
+                with archive.zip.open(members[name]) as inner:
+                    room.take_array(inner, name)
+        for name in ("unit", "quantity"):
+            if name in members and members[name].file_size > _WORD_BYTES + 128:
+                raise InputFileError(f"{path}: '{name}' must be a word, got {members[name].file_size} bytes")
         if "range" not in archive:
             raise InputFileError(f"{path}: must have an array 'range', got {', '.join(archive) or 'nothing'}")
         arrays = {name: np.asarray(archive[name]) for name in _FIELDS if name in archive}
@@ -387,7 +479,7 @@ def _read_npz(path: Path) -> _Raw:
 
 
 def _read_hdf5(path: Path, untrusted: bool) -> _Raw:
-    with open_hdf5(path, "file of frames", untrusted=untrusted) as file:
+    with open_hdf5(path, "file of frames", untrusted=untrusted, foreign=True) as file:
         if not isinstance(file.get("range"), h5py.Dataset):
             kind = file.attrs.get("format")
             raise InputFileError(
@@ -399,15 +491,19 @@ def _read_hdf5(path: Path, untrusted: bool) -> _Raw:
             units = datasets[name].attrs.get("units") if name in datasets else None
             if units is not None and units not in _ELECTRONS:
                 raise InputFileError(f"{path}: '{name}' must be in electrons (units 'e-'), got {units!r}")
+        stamps = {name: file[name] for name in SECONDS_PER_TIME_UNIT if isinstance(file.get(name), h5py.Dataset)}
+        room = _Room(path, path.stat().st_size)
+        for name, dataset in {**datasets, **stamps}.items():
+            if dataset.shape is None:
+                raise InputFileError(f"{path}: '{name}' holds nothing")
+            room.take(name, dataset.shape, dataset.dtype)
         attributes = {"unit": "units", "quantity": "quantity"}
         stated = {
             name: str(datasets["range"].attrs[key])
             for name, key in attributes.items()
             if key in datasets["range"].attrs
         }
-        times = {
-            name: np.asarray(file[name]) for name in SECONDS_PER_TIME_UNIT if isinstance(file.get(name), h5py.Dataset)
-        }
+        times = {name: np.asarray(dataset[...]) for name, dataset in stamps.items()}
         arrays = {name: np.asarray(dataset[...]) for name, dataset in datasets.items()}
         return _Raw(arrays, stated, _times_s(times, path))
 

@@ -29,6 +29,7 @@ from pydantic import (
 
 from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.data.grid import drop_repeated_stop, format_grid, parse_grid
+from phasemark.files import MOST_TOML_BYTES, read_text
 from phasemark.landmarks import MAX_SYMMETRY, LandmarkSpec, MeshWarning, catalog, mesh_symmetry, read_mesh
 from phasemark.render import Sensor, preset
 
@@ -76,6 +77,9 @@ _Grid = Annotated[
     PlainSerializer(format_grid, return_type=str),
     WithJsonSchema(_GRID_SCHEMA),
 ]
+
+MOST_LANDMARKS = 1000
+"""More than any bank has; their numbers take two bytes in files."""
 
 
 class PlanModel(BaseModel):
@@ -184,6 +188,8 @@ class ScenePlan(PlanModel, ABC):
         named = self.classes or (() if self.landmarks or self.meshes else tuple(catalog()))
         specs: list[LandmarkSpec] = [*(_from_catalog(name) for name in named), *self.landmarks]
         names = [*(spec.name for spec in specs), *(mesh.name for mesh in self.meshes)]
+        if len(names) > MOST_LANDMARKS:
+            raise UsageError(f"there must be at most {MOST_LANDMARKS} landmarks, got {len(names)}")
         for name in names:
             if names.count(name) > 1 or name == "none":
                 problem = "stands for no landmark" if name == "none" else "names two landmarks"
@@ -381,10 +387,8 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:  # the last: nested without end
+        return tomllib.loads(read_text(path, most_bytes=MOST_TOML_BYTES))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:  # the last: nested without end
         raise InputFileError(f"{path}: not a TOML file ({error})") from None
 
 

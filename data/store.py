@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import re
 import secrets
 import stat
 from collections.abc import Iterable, Iterator
@@ -14,9 +12,7 @@ from pathlib import Path
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data import renames
 from phasemark.data.lock_file import exclusive
-
-_BLOCK_BYTES = 1 << 20
-_CHECKSUM_LINE = re.compile(r"\\?(?P<digest>[0-9a-fA-F]{64}) [ *](?P<name>[^\n]+)\n?")
+from phasemark.files import checksum_line, checksum_path, read_checksum, sha256_of
 
 Buffer = bytes | bytearray | memoryview
 
@@ -90,7 +86,7 @@ def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bo
             _take_over(parts[0], real)
             sync(parts[0])
             if checksum:
-                parts[1].write_bytes(_checksum_line(sha256_of(parts[0]), real.name))
+                parts[1].write_bytes(checksum_line(sha256_of(parts[0]), real.name))
                 _take_over(parts[1], targets[1])
                 sync(parts[1])
         _move_into_place(parts, targets, force=force)
@@ -124,7 +120,7 @@ def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
         with storage_errors(path):
             _take_over(part, path)
             sync(part)
-            checksum_part.write_bytes(_checksum_line(digest, path.name))
+            checksum_part.write_bytes(checksum_line(digest, path.name))
             _take_over(checksum_part, checksum_path(path))
             sync(checksum_part)
         _move_into_place([part, checksum_part], [path, checksum_path(path)], force=force)
@@ -191,21 +187,6 @@ def _move(part: Path, target: Path, *, force: bool) -> None:
         raise OutputExistsError(f"{target}: exists; use --force to replace it") from None
 
 
-def checksum_path(path: str | os.PathLike[str]) -> Path:
-    """Return where the checksum of a file lies: ``FILE.sha256`` beside it."""
-    path = Path(path)
-    return path.with_name(path.name + ".sha256")
-
-
-def sha256_of(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a file's content in hexadecimal."""
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(_BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
-
-
 def write_checksum(path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write ``FILE.sha256`` for an existing file, in the format of ``sha256sum``.
 
@@ -229,75 +210,11 @@ def write_checksum(path: str | os.PathLike[str], *, force: bool = False) -> Path
         As in :func:`write_atomically`.
     """
     path = Path(path)
-    return write_atomically(checksum_path(path), _checksum_line(_readable_sha256(path), path.name), force=force)
-
-
-def read_checksum(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 that ``FILE.sha256`` states for a file.
-
-    Parameters
-    ----------
-    path : path-like
-        The file, not its checksum.
-
-    Returns
-    -------
-    str
-        Lower-case hexadecimal.
-
-    Raises
-    ------
-    InputFileError
-        There is no checksum file, it is not in the format of ``sha256sum``, or it is about another file.
-    """
-    path, beside = Path(path), checksum_path(path)
-    if path.is_symlink():  # a checksum beside the link holds; without one, that beside the file
-        real = Path(os.path.realpath(path))
-        if not beside.exists() or os.path.realpath(beside) == str(checksum_path(real)):
-            path, beside = real, checksum_path(real)
     try:
-        text = os.fsdecode(beside.read_bytes())
+        digest = sha256_of(path)
     except OSError as error:
-        raise InputFileError(f"{beside}: cannot be read ({error.strerror})") from None
-    match = _CHECKSUM_LINE.fullmatch(text)
-    if match is None:
-        raise InputFileError(f"{beside}: must be one line '<SHA-256>  {path.name}', as sha256sum writes it")
-    if match["name"] != _escaped(path.name):
-        raise InputFileError(f"{beside}: must name '{path.name}', but names '{match['name']}'")
-    return match["digest"].lower()
-
-
-def verify_checksum(path: str | os.PathLike[str]) -> str:
-    """Compare a file with its ``FILE.sha256``.
-
-    Parameters
-    ----------
-    path : path-like
-        The file, not its checksum.
-
-    Returns
-    -------
-    str
-        The SHA-256 both agree on.
-
-    Raises
-    ------
-    InputFileError
-        The file or its checksum cannot be read, or they do not agree.
-    """
-    stated, actual = read_checksum(path), _readable_sha256(Path(path))
-    if stated != actual:
-        raise InputFileError(f"{path}: damaged: its SHA-256 is {actual}, but {checksum_path(path).name} says {stated}")
-    return actual
-
-
-def has_matching_checksum(path: str | os.PathLike[str]) -> bool:
-    """Return whether ``FILE.sha256`` is there and says what the file's SHA-256 is."""
-    try:
-        verify_checksum(path)
-    except InputFileError:
-        return False
-    return True
+        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    return write_atomically(checksum_path(path), checksum_line(digest, path.name), force=force)
 
 
 def refuse_unwritable(path: Path, *, force: bool) -> None:
@@ -378,20 +295,3 @@ def sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _readable_sha256(path: Path) -> str:
-    try:
-        return sha256_of(path)
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
-
-
-def _escaped(name: str) -> str:
-    return name.replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
-
-
-def _checksum_line(digest: str, name: str) -> bytes:
-    # sha256sum starts the line with a backslash when the name needed escaping.
-    escaped = _escaped(name)
-    return os.fsencode(f"{'' if escaped == name else chr(92)}{digest}  {escaped}\n")

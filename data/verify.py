@@ -18,7 +18,7 @@ from phasemark.data.frames import FrameSet, open_frames
 from phasemark.data.hdf5 import reading
 from phasemark.data.provenance import mesh_sha256
 from phasemark.data.seeds import stream
-from phasemark.data.store import verify_checksum
+from phasemark.files import verify_checksum
 from phasemark.render import wrap_difference_m
 
 TOLERANCE_M = 1e-5
@@ -91,6 +91,8 @@ def _verify(
 ) -> dict[str, Any]:
     with h5py.File(path, "r") as file, reading(path):
         values = _check_values(file, path)
+        if isinstance(job, FrameJob):
+            _check_columns(file, path, job)
         for landmark in job.landmarks:
             if mesh_sha256(landmark.mesh) != file[f"meshes/{landmark.name}"].attrs["sha256"]:
                 raise InputFileError(f"{path}: the mesh of '{landmark.name}' is not what its sha256 says")
@@ -134,6 +136,22 @@ def _check_values(file: h5py.File, path: Path) -> int:
 
     file.visititems(check)
     return count
+
+
+def _check_columns(file: h5py.File, path: Path, job: FrameJob) -> None:
+    """Refuse columns, truth and splits among them, that are not what the plan draws."""
+    for name, expected in job.columns():
+        stored = np.asarray(file[name][...])
+        same = expected == stored if expected.dtype.kind in "iu" else _close(expected, stored)
+        if stored.shape != expected.shape or not same.all():
+            k = int(np.argmin(same)) if stored.shape == expected.shape else 0
+            raise InputFileError(
+                f"{path}: '{name}' is not what its plan draws: number {k} is {stored[k]}, must be {expected[k]}"
+            )
+
+
+def _close(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
+    return np.asarray(np.isclose(one, other, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True))
 
 
 def _compare(

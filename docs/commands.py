@@ -21,6 +21,7 @@ to standard error; [exit codes](../README.md#when-something-is-wrong) say what w
 
 `phasemark` alone says what to do first, `phasemark --version` prints the version, and `phasemark --install-completion`
 teaches commands and options to bash, zsh, fish or PowerShell (`--show-completion` prints what it would install).
+`--no-verify`, before a command or behind it, reads files [that contradict their checksum](formats.md) all the same.
 """
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, UsageError
+from phasemark.files import read_text
 from phasemark.render import Frames
 
 POLAR = ("distance_m", "delta_deg")
@@ -28,6 +29,8 @@ COLUMNS = (
 POSE_UNITS = (("distance_mm", 1e3), ("delta_deg", math.degrees(1)), ("bearing_deg", math.degrees(1)))
 """How the errors of a pose are told."""
 _FARTHEST_M = 20.0
+_MOST_BYTES = 1 << 26
+"""A pose is a line: this is half a million of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,12 +206,7 @@ def read_poses(
         line that names file, line and column.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputFileError(f"{path}: is no text file") from None
+    text = read_text(path, most_bytes=_MOST_BYTES)
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
     if not lines:
         raise InputFileError(f"{path}: is empty; its columns must be {COLUMNS}")

@@ -22,6 +22,7 @@ from phasemark.data.production import outputs_of, produce
 from phasemark.data.progress import Progress
 from phasemark.data.same_file import named_files, refuse_inputs
 from phasemark.data.shards import difference
+from phasemark.files import MOST_TOML_BYTES, read_text
 from phasemark.matcher.sweep_job import FORMAT, SCHEMA_VERSION, Round, SweepJob, check_matcher
 from phasemark.matcher.sweep_plan import SweepPlan
 from phasemark.matcher.sweep_tables import Cell, SweepTrials, csv_bytes, json_rows, trials_csv
@@ -182,11 +183,12 @@ def _round_path(folder: Path, number: int) -> Path:
 
 def _stored_plan(folder: Path) -> SweepPlan | None:
     path = folder / _PLAN
-    try:
-        return SweepPlan(**json.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError:
+    if not os.path.lexists(path):
         return None
-    except (OSError, ValueError, TypeError) as error:
+    text = read_text(path, most_bytes=MOST_TOML_BYTES)
+    try:
+        return SweepPlan(**json.loads(text))
+    except (ValueError, TypeError, RecursionError) as error:
         raise InputFileError(f"{path}: cannot be read as the plan of a sweep ({error})") from None
 
 
@@ -234,7 +236,7 @@ def _begin(plan: SweepPlan, ours: OwnedFiles, *, resume: bool, force: bool) -> N
 
 
 def _identity(path: Path) -> dict[str, Any]:
-    with open_hdf5(path, "sweep") as file, reading(path):
+    with open_hdf5(path, "sweep", untrusted=True) as file, reading(path):
         check_format(file, path, "sweep", FORMAT, SCHEMA_VERSION)
         found: dict[str, Any] = json.loads(file.attrs["identity"])
         return found
@@ -265,7 +267,7 @@ def _read(plan: SweepPlan, folder: Path, n_rounds: int) -> SweepTrials:
     )  # fmt: skip
     for number in range(n_rounds):
         path = _round_path(folder, number)
-        with open_hdf5(path, "sweep") as file, reading(path):
+        with open_hdf5(path, "sweep", untrusted=True) as file, reading(path):
             check_format(file, path, "sweep", FORMAT, SCHEMA_VERSION)
             for name in names:
                 parts.setdefault(name, []).append(file[name][...])

@@ -26,6 +26,7 @@ from phasemark import PhasemarkError, UsageError
 from phasemark.data import Bank, build_bank, mesh_sha256, versions
 from phasemark.data.build import read_landmarks
 from phasemark.data.layout import Layout
+from phasemark.data.narrow import narrowed
 from phasemark.data.seeds import stream
 from phasemark.data.shards import Place
 from phasemark.matcher.agreement import counts
@@ -148,7 +149,9 @@ class SweepJob:
             file.attrs["format"] = FORMAT
             file.attrs["schema_version"] = SCHEMA_VERSION
             file.attrs["identity"] = json.dumps(self.identity(), sort_keys=True, ensure_ascii=False)
-            file.create_dataset("condition", data=np.repeat(self.of.conditions, self.items).astype("<i4"))
+            file.create_dataset(
+                "condition", data=narrowed(np.repeat(self.of.conditions, self.items), "<i4", "conditions")
+            )
             numbers = np.concatenate([self.of.first + np.arange(count) for count in self.items])
             file.create_dataset("trial", data=numbers.astype("<i8"))
             first = []
@@ -189,7 +192,7 @@ class SweepJob:
             out["seconds"][:, m] = (time.perf_counter() - begun) / len(views)
             out["bound"][:, m] = bounds[what]
             for name, values in self._table(matches, method).items():
-                out[name][:, m] = values
+                out[name][:, m] = narrowed(values, out[name].dtype.str, name)
         confusion = self.confusion(number, views, first)
         return [truth.astype("<f8"), confusion.astype("<f8"), *(out[name] for name, *_ in _FIELDS)]
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from phasemark import InputFileError, UsageError
+from phasemark.files import MOST_TOML_BYTES, read_text
 from phasemark.render.correlation import (
     SQUARE_PEAK,
     Harmonic,
@@ -574,10 +575,8 @@ class Sensor(BaseModel):
         """
         path = Path(path)
         try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:  # the last: nested without end
+            table = tomllib.loads(read_text(path, most_bytes=MOST_TOML_BYTES))
+        except (tomllib.TOMLDecodeError, RecursionError) as error:  # the last: nested without end
             raise InputFileError(f"{path}: not a TOML file ({error})") from None
         try:
             return cls(**table)

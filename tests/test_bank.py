@@ -17,6 +17,7 @@ import xarray
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data import BankPlan, build, build_bank, mesh_sha256, open_bank, verify_checksum, versions
 from phasemark.data.layout import Layout, SparseMemory
+from phasemark.files import checksum_path
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import PhasorImages, Renderer, preset
 
@@ -434,6 +435,7 @@ def changed_sensor(file):
     ],
 )
 def test_a_damaged_bank_is_refused_when_opened(bank_file, change, reason):
+    checksum_path(bank_file).unlink(missing_ok=True)
     with h5py.File(bank_file, "r+") as file:
         change(file)
     with pytest.raises(InputFileError, match=reason) as caught:
@@ -444,6 +446,7 @@ def test_a_damaged_bank_is_refused_when_opened(bank_file, change, reason):
 
 @pytest.mark.parametrize("field", ["phasor", "intensity", "coverage"])
 def test_values_that_are_not_finite_are_refused_when_read(bank_file, field):
+    checksum_path(bank_file).unlink(missing_ok=True)
     with h5py.File(bank_file, "r+") as file:
         spoiled(f"lower/{field}", np.inf)(file)
     with open_bank(bank_file) as bank, pytest.raises(InputFileError, match=f"'lower/{field}' must be finite"):
@@ -452,6 +455,7 @@ def test_values_that_are_not_finite_are_refused_when_read(bank_file, field):
 
 @pytest.mark.parametrize(("name", "value"), [("vertices", np.nan), ("vertices", 1e60), ("faces", -1), ("faces", 10**6)])
 def test_a_damaged_mesh_is_refused_when_read(bank_file, name, value):
+    checksum_path(bank_file).unlink(missing_ok=True)
     with h5py.File(bank_file, "r+") as file:
         spoiled(f"meshes/cone/{name}", value)(file)
     with open_bank(bank_file) as bank, pytest.raises(InputFileError, match="'meshes/cone' has vertices"):
@@ -462,6 +466,7 @@ def test_a_damaged_mesh_is_refused_when_read(bank_file, name, value):
 def test_a_cut_off_bank_is_an_input_error_of_one_line(bank_file, share):
     content = bank_file.read_bytes()
     bank_file.write_bytes(content[: int(share * len(content))])
+    checksum_path(bank_file).unlink()
     with pytest.raises(InputFileError, match=r"damaged or cut off|not a bank") as caught:
         open_bank(bank_file)
     assert "\n" not in str(caught.value)

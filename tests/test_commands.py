@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from phasemark.cli import main
-from phasemark.data import verify_checksum
+from phasemark.data import verify_checksum, write_checksum
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, capture, preset
 
@@ -454,6 +454,7 @@ def bad_files(folder):
         shutil.copy(folder / "bank.h5", folder / name)
         with h5py.File(folder / name, "r+") as file:
             damage(file)
+        write_checksum(folder / name)  # what is wrong was wrong when the file was written
     return folder
 
 

@@ -30,6 +30,7 @@ from phasemark.data import (
 )
 from phasemark.data.jobs import job_for
 from phasemark.data.seeds import stream
+from phasemark.files import checksum_path
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, capture, preset
 
@@ -394,6 +395,7 @@ def test_verify_reports_every_flipped_bit_and_every_cut(frames_file, tmp_path, n
 def test_verify_finds_what_a_forged_checksum_hides(frames_file, tmp_path, name, change, message):
     path = tmp_path / "frames.h5"
     path.write_bytes(frames_file.read_bytes())
+    checksum_path(path).unlink(missing_ok=True)
     with h5py.File(path, "r+") as file:
         if np.isfinite(change) and name.startswith("range"):
             file[name][...] = file[name][...] + np.float32(change)
@@ -408,6 +410,7 @@ def test_verify_renders_a_bank_again(tmp_path):
     path = tmp_path / "bank.h5"
     build_bank(BankPlan(classes=["cone"], distance_m="0.9,1", delta_deg="0:90:45"), path).close()
     assert verify_bank(path)["rendered_again"] > 0
+    checksum_path(path).unlink(missing_ok=True)
     with h5py.File(path, "r+") as file:
         file["lower/phasor"][1, 1] *= 1.001
     write_checksum(path, force=True)
@@ -418,6 +421,7 @@ def test_verify_renders_a_bank_again(tmp_path):
 def test_a_file_of_a_newer_version_names_it(frames_file, tmp_path):
     path = tmp_path / "frames.h5"
     path.write_bytes(frames_file.read_bytes())
+    checksum_path(path).unlink(missing_ok=True)
     with h5py.File(path, "r+") as file:
         file.attrs["schema_version"] = 9
     with pytest.raises(InputFileError, match="has schema version 9, this phasemark reads 1: update phasemark"):
@@ -442,6 +446,7 @@ def test_a_distribution_knows_its_bounds():
 def test_values_that_no_run_writes_are_refused_when_they_are_read(frames_file, tmp_path, name, value, message):
     path = tmp_path / "frames.h5"
     path.write_bytes(frames_file.read_bytes())
+    checksum_path(path).unlink(missing_ok=True)
     with h5py.File(path, "r+") as file:
         file[name][0, 8, 8] = value
     with open_frames(path) as frames, pytest.raises(InputFileError, match=message):

@@ -473,7 +473,10 @@ def plain(tmp_path, content):
         (lambda t: npy(t, np.ones(6)), r"must have shape .*got \(6,\)"),
         (lambda t: npy(t, np.ones((0, 2, 3))), "holds no frames"),
         (lambda t: npy(t, np.ones((2, 3), complex)), "real numbers, got complex128"),
-        (lambda t: npy(t, np.array([[1, None, "x"]] * 2)), "cannot be read"),  # a pickle is never loaded
+        (
+            lambda t: npy(t, np.array([[1, None, "x"]] * 2)),
+            "must hold real numbers, got object",
+        ),  # a pickle is never loaded
         (lambda t: cut(npy(t, np.ones((2, 3))), 100), "cannot be read"),
         (lambda t: cut(npy(t, np.ones((2, 3))), 140), "cannot be read"),
         (lambda t: saved(t, z=IMAGE), "must have an array 'range', got z"),

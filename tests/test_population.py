@@ -11,6 +11,7 @@ import pytest
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank, open_bank, write_checksum
+from phasemark.files import checksum_path
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import grid_loss, noise_free
 from phasemark.render import Renderer, capture, predicted_range_std, preset
@@ -81,6 +82,7 @@ def test_the_matcher_itself_is_asked(banks, tmp_path):
     """Two classes whose images have changed places are taken for each other, each and every one."""
     path = tmp_path / "swapped.h5"
     path.write_bytes((banks / "fine").read_bytes())
+    checksum_path(path).unlink(missing_ok=True)
     with h5py.File(path, "r+") as file:
         for field in ("phasor", "intensity", "coverage"):
             file[f"upper/{field}"][...] = file[f"upper/{field}"][...][::-1]

@@ -1,0 +1,118 @@
+"""SHA-256 checksums beside files, in the format of ``sha256sum``."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from pathlib import Path
+from typing import BinaryIO
+
+from phasemark import InputFileError
+
+_BLOCK_BYTES = 1 << 20
+_MOST_BYTES = 1 << 14
+"""A checksum file is one line: a digest and the name of a file."""
+_CHECKSUM_LINE = re.compile(r"\\?(?P<digest>[0-9a-fA-F]{64}) [ *](?P<name>[^\n]+)\n?")
+
+
+def checksum_path(path: str | os.PathLike[str]) -> Path:
+    """Return where the checksum of a file lies: ``FILE.sha256`` beside it."""
+    path = Path(path)
+    return path.with_name(path.name + ".sha256")
+
+
+def with_checksum(path: Path) -> Path:
+    """Return the name of a file that its checksum has: that of a link if a checksum lies beside it, or the file's."""
+    if not path.is_symlink():
+        return path
+    real, beside = Path(os.path.realpath(path)), checksum_path(path)
+    return real if not beside.exists() or os.path.realpath(beside) == str(checksum_path(real)) else path
+
+
+def sha256_of(source: str | os.PathLike[str] | BinaryIO) -> str:
+    """Return the SHA-256 of a file's content, or of what is left of an open file, in hexadecimal."""
+    if isinstance(source, str | os.PathLike):
+        with open(source, "rb") as file:
+            return sha256_of(file)
+    digest = hashlib.sha256()
+    while block := source.read(_BLOCK_BYTES):
+        digest.update(block)
+    return digest.hexdigest()
+
+
+def read_checksum(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 that ``FILE.sha256`` states for a file.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, not its checksum.
+
+    Returns
+    -------
+    str
+        Lower-case hexadecimal.
+
+    Raises
+    ------
+    InputFileError
+        There is no checksum file, it is not in the format of ``sha256sum``, or it is about another file.
+    """
+    path = with_checksum(Path(path))
+    beside = checksum_path(path)
+    try:
+        with beside.open("rb") as file:
+            text = os.fsdecode(file.read(_MOST_BYTES))
+    except OSError as error:
+        raise InputFileError(f"{beside}: cannot be read ({error.strerror})") from None
+    match = _CHECKSUM_LINE.fullmatch(text)
+    if match is None:
+        raise InputFileError(f"{beside}: must be one line '<SHA-256>  {path.name}', as sha256sum writes it")
+    if match["name"] != _escaped(path.name):
+        raise InputFileError(f"{beside}: must name '{path.name}', but names '{match['name']}'")
+    return match["digest"].lower()
+
+
+def verify_checksum(path: str | os.PathLike[str]) -> str:
+    """Compare a file with its ``FILE.sha256``; every byte is read, whatever is remembered of the file.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, not its checksum.
+
+    Returns
+    -------
+    str
+        The SHA-256 both agree on.
+
+    Raises
+    ------
+    InputFileError
+        The file or its checksum cannot be read, or they do not agree.
+    """
+    stated = read_checksum(path)
+    try:
+        actual = sha256_of(path)
+    except OSError as error:
+        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    if stated != actual:
+        raise InputFileError(contradiction(Path(path), stated, actual))
+    return actual
+
+
+def contradiction(path: Path, stated: str, actual: str) -> str:
+    """Return the message on a file that is not what its checksum says."""
+    return f"{path}: damaged: its SHA-256 is {actual}, but {checksum_path(path).name} says {stated}"
+
+
+def checksum_line(digest: str, name: str) -> bytes:
+    """Return the content of the checksum file of a file with that digest and name."""
+    # sha256sum starts the line with a backslash when the name needed escaping.
+    escaped = _escaped(name)
+    return os.fsencode(f"{'' if escaped == name else chr(92)}{digest}  {escaped}\n")
+
+
+def _escaped(name: str) -> str:
+    return name.replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")

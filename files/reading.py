@@ -1,0 +1,138 @@
+"""Files opened once: whole ones with a limit on their size, and what a pipe delivers."""
+
+from __future__ import annotations
+
+import io
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import BinaryIO
+
+from phasemark import InputFileError
+from phasemark.files.vouching import is_vouched_for
+
+MOST_TOML_BYTES = 1 << 22
+"""Plans, maps and sensor files are written by hand, or by a program that writes a line a landmark."""
+_BLOCK_BYTES = 1 << 20
+
+_delivered: ContextVar[dict[tuple[int, int, int], bytes] | None] = ContextVar("delivered", default=None)
+
+
+@contextmanager
+def pipes_read_once() -> Iterator[None]:
+    """Read each pipe once within the block: whoever asks for it again is given what it delivered the first time.
+
+    A plan and its sensor are read when they are checked and again when they are used.
+    """
+    token = _delivered.set({})
+    try:
+        yield
+    finally:
+        _delivered.reset(token)
+
+
+@contextmanager
+def opened(path: Path, *, most_bytes: int) -> Iterator[BinaryIO]:
+    """Open a file to be read, once, and compare it with its checksum.
+
+    Parameters
+    ----------
+    path : Path
+        A file, or a pipe or device, which is read to its end first.
+    most_bytes : int
+        How much a pipe or device may deliver.
+
+    Yields
+    ------
+    BinaryIO
+        At its beginning, and seekable.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be opened, is not what its checksum says, or delivers too much.
+    """
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            plain: BinaryIO = io.BytesIO(_content(path, most_bytes))
+        else:
+            plain = path.open("rb")
+    except OSError as error:
+        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    with plain:
+        if not isinstance(plain, io.BytesIO):
+            is_vouched_for(path, plain)
+        yield plain
+
+
+def read_whole(path: str | os.PathLike[str], *, most_bytes: int) -> bytes:
+    """Return the content of a file that is opened once, is not too large, and is what its checksum says.
+
+    Parameters
+    ----------
+    path : path-like
+        A file, pipe or device.
+    most_bytes : int
+        How large it may be; not more than that is read.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, is larger, or is not what its checksum says.
+    """
+    path = Path(path)
+    try:
+        content = _content(path, most_bytes)
+    except OSError as error:
+        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    is_vouched_for(path, content)
+    return content
+
+
+def read_text(path: str | os.PathLike[str], *, most_bytes: int) -> str:
+    """Return a text file's content, UTF-8 with or without a byte order mark, read as :func:`read_whole` does.
+
+    Raises
+    ------
+    InputFileError
+        As :func:`read_whole`, or it is not text.
+    """
+    content = read_whole(path, most_bytes=most_bytes)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputFileError(f"{path}: is no text file (byte {error.start} is not UTF-8)") from None
+
+
+def _content(path: Path, most_bytes: int) -> bytes:
+    status = path.stat()
+    if stat.S_ISREG(status.st_mode):
+        if status.st_size > most_bytes:
+            raise InputFileError(_too_large(path, most_bytes))
+        with path.open("rb") as file:
+            return _read(file, path, most_bytes)
+    known, key = _delivered.get(), (status.st_dev, status.st_ino, status.st_rdev)
+    if known is None or key not in known:
+        with path.open("rb") as file:
+            content = _read(file, path, most_bytes)
+        if known is None:
+            return content
+        known[key] = content
+    return known[key]
+
+
+def _read(file: BinaryIO, path: Path, most_bytes: int) -> bytes:
+    blocks, left = [], most_bytes + 1
+    while left and (block := file.read(min(left, _BLOCK_BYTES))):
+        blocks.append(block)
+        left -= len(block)
+    if not left:
+        raise InputFileError(_too_large(path, most_bytes))
+    return b"".join(blocks)
+
+
+def _too_large(path: Path, most_bytes: int) -> str:
+    return f"{path}: has more than {most_bytes / 1e6:.3g} MB, which is far too large for such a file"

@@ -1,0 +1,427 @@
+"""Damaged and hostile files for every reader, found by mutation that follows what code they reach.
+
+``python fuzzing.py KIND COUNT SEED FOLDER`` reads COUNT mutants in a process of its own and prints how it went; a crash
+of that process is a finding as well. An input that reaches lines which no other has reached is mutated further. An
+input that ends in anything but an answer or a :class:`phasemark.PhasemarkError` is kept in FOLDER, and belongs into
+``tests/corpus/KIND`` once it is mended: the ordinary tests read all that is there, and mutation begins with it.
+"""
+
+import io
+import json
+import random
+import resource
+import shutil
+import signal
+import sys
+import time
+import warnings
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from phasemark import PhasemarkError
+from phasemark.data import BankPlan, FramePlan, open_bank, open_frames, read_frames, read_plan
+from phasemark.data.shards import _Manifest
+from phasemark.files import checksum_path, read_checksum
+from phasemark.landmarks import build_mesh, catalog, export_mesh, read_mesh
+from phasemark.matcher import load_map
+from phasemark.matcher.calibrate_poses import read_poses
+from phasemark.render import Sensor, preset
+
+CORPUS = Path(__file__).parent / "corpus"
+SENSOR = preset("pmd-16x16").model_copy(update={"rows": 4, "cols": 4})
+MOST_SECONDS = 10
+MOST_BYTES = 2 << 30
+_TRACED = (
+    "/data/",
+    "/landmarks/",
+    "/files/",
+    "/render/sensor.py",
+    "/matcher/landmark_map.py",
+    "/matcher/calibrate_poses",
+)
+_TRACED += ("numpy/lib/", "/zipfile", "/PIL/Png", "trimesh/exchange", "/tomllib/")
+_TRACE_SHARE = 0.1
+"""Share of the mutants whose lines are followed, which takes ten times as long."""
+_MOST_SEEDS = 400
+WORDS = (
+    b"0", b"-1", b"1e30", b"nan", b"inf", b"-inf", b"True", b"()", b"[]", b"{}", b"''", b"\0", b"\n", b",", b";", b"#",
+    b"4294967295", b"2147483648", b"9223372036854775808", b"1e-320", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x80",
+    b"\xef\xbb\xbf", b"O", b"<f8", b"|O", b"<U9", b"<c16", b"|V0", b"t_ms", b"range_0", b"mm_0", b"status_0", b"=",
+)  # fmt: skip
+NUMBERS = (0, 1, 2**16 - 1, 2**31 - 1, 2**32 - 1)
+SAMPLES = ("bank", "frames", "h5")
+"""Kinds that are read by a child process of the guard first, which takes a fraction of a second each."""
+
+
+def frames(path):
+    read_frames(path, sensor=SENSOR, unit="m", quantity="range", valid_status=[5])
+
+
+def stated_frames(path):
+    read_frames(path, sensor=SENSOR, valid_status=[5], untrusted=True)
+
+
+def mesh(path):
+    read_mesh(path, unit="m")
+
+
+def toml(path):
+    for read in (lambda: read_plan(path, BankPlan), lambda: read_plan(path, FramePlan), lambda: load_map(path)):
+        try:
+            read()
+        except PhasemarkError:
+            pass
+    Sensor.from_toml(path)
+
+
+def whole_bank(path):
+    with open_bank(path, untrusted=True) as bank:
+        for group in (bank.lower, bank.upper, bank.full):
+            if group is not None:
+                for name in ("phasor", "intensity", "coverage"):
+                    getattr(group, name)
+        bank.info()
+        bank.mesh(bank.classes[0])
+
+
+def whole_frames(path):
+    with open_frames(path, untrusted=True) as found:
+        found.frames()
+        found.info()
+
+
+def checksum(path):
+    read_checksum(path.with_suffix(""))
+
+
+KINDS = {
+    "npy": (".npy", frames), "npz": (".npz", stated_frames), "png": (".png", stated_frames), "csv": (".csv", frames),
+    "toml": (".toml", toml), "poses": (".csv", read_poses), "manifest": (".manifest", _Manifest.read),
+    "checksum": (".sha256", checksum), "stl": (".stl", mesh), "ply": (".ply", mesh), "obj": (".obj", mesh),
+    "off": (".off", mesh), "bag": ("", stated_frames), "h5": (".h5", stated_frames), "bank": (".h5", whole_bank),
+    "frames": (".h5", whole_frames),
+}  # fmt: skip
+
+
+def seeds(kind, folder):
+    """Return small good files of a kind, and what is kept in the corpus; a bag is a list of files with their names."""
+    kept = [path.read_bytes() for path in sorted((CORPUS / kind).glob("*"))] if kind != "bag" else []
+    return kept + GOOD[kind](folder)
+
+
+def _image():
+    return np.random.default_rng(0).uniform(0.5, 2, (2, 4, 4))
+
+
+def _good_npy(folder):
+    path = folder / "a.npy"
+    found = []
+    for values in (_image(), _image().astype("<f4"), np.asfortranarray(_image()), (1e3 * _image()).astype("u2")):
+        np.save(path, values)
+        found.append(path.read_bytes())
+    return found
+
+
+def _good_npz(folder):
+    path, found = folder / "a.npz", []
+    for save in (np.savez, np.savez_compressed):
+        save(path, range=_image(), amplitude=_image(), t_ms=np.arange(2), unit="m", quantity="range")
+        found.append(path.read_bytes())
+    for method in (zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2):
+        with zipfile.ZipFile(folder / "b.npz", "w", method) as archive:
+            for name, value in (("range", _image()), ("unit", np.array("m")), ("quantity", np.array("z"))):
+                with archive.open(f"{name}.npy", "w") as member:
+                    np.lib.format.write_array(member, value)
+        found.append((folder / "b.npz").read_bytes())
+    return found
+
+
+def _good_png(folder):
+    from phasemark.data.export.images import encode_png16
+
+    return [encode_png16(_image()[0], 1e-4, "z")]
+
+
+def _good_csv(folder):
+    rows = [",".join(f"{v:.3f}" for v in frame.ravel()) for frame in _image()]
+    named = ["t_ms", *(f"mm_{k}" for k in range(16)), *(f"status_{k}" for k in range(16)), "truth_class"]
+    line = ",".join(["0", *("1000",) * 16, *("5",) * 16, "cone"])
+    return ["\n".join(rows).encode(), "\n".join([",".join(named), line, line]).encode()]
+
+
+def _good_toml(folder):
+    from phasemark.render.sensor_file import sensor_toml
+
+    plans = [Path(__file__).parent.parent / "data" / "plans" / f"{name}.toml" for name in ("bank", "frames")]
+    a_map = b'[[landmark]]\nname = "door"\nclass = "cone"\nx_m = 2.0\ny_m = 1.0\nyaw_deg = 30.0\n'
+    camera = sensor_toml(preset("vl53l5cx"), {}, header=["a"], otherwise="b") if "vl53l5cx" in _presets() else ""
+    return [*(path.read_bytes() for path in plans if path.exists()), a_map, camera.encode() or b"rows = 4\n"]
+
+
+def _presets():
+    from phasemark.render import preset_names
+
+    return preset_names()
+
+
+def _good_poses(folder):
+    polar = b"distance_m,delta_deg,t_s,frames\n1.0,10,0.1,3\n1.2,20,0.2,3\n"
+    return [polar, b"x_m;y_m;heading_deg\n1,0;0,5;180\n"]
+
+
+def _good_manifest(folder):
+    head = _Manifest({"plan": {"views": 3}}, 2, 1000, "a" * 64).head()
+    return [head + b"".join(json.dumps({"shard": k, "sha256": "b" * 64}).encode() + b"\n" for k in range(3))]
+
+
+def _good_checksum(folder):
+    return [b"a" * 64 + b"  input\n", b"\\" + b"a" * 64 + b" *input\n"]
+
+
+def _good_mesh(kind):
+    return lambda folder: [export_mesh(build_mesh(catalog()[name]), kind) for name in ("post", "cone")][:1]
+
+
+def _good_h5(folder):
+    import h5py
+
+    found = []
+    for options in ({}, {"compression": "gzip", "shuffle": True, "chunks": (1, 4, 4)}):
+        with h5py.File(folder / "a.h5", "w") as file:
+            dataset = file.create_dataset("range", data=_image(), **options)
+            dataset.attrs["units"], dataset.attrs["quantity"] = "m", "range"
+            file["t_ms"] = np.arange(2)
+        found.append((folder / "a.h5").read_bytes())
+    return found
+
+
+def _good_bank(folder):
+    from phasemark.data import build_bank
+
+    build_bank(BankPlan(classes=["cone"], distance_m="1", delta_deg="0:90:45", model="planar"), folder / "b.h5").close()
+    return [(folder / "b.h5").read_bytes()]
+
+
+def _good_frames(folder):
+    from phasemark.data import build_frames
+
+    build_frames(FramePlan(classes=["cone"], views=2), folder / "f.h5").close()
+    return [(folder / "f.h5").read_bytes()]
+
+
+def _good_bag(folder):
+    from phasemark.data import build_frames, export_frames
+
+    plan = FramePlan(classes=["cone"], views=2, sensor_overrides={"rows": 4, "cols": 4})
+    with build_frames(plan, folder / "g.h5") as found:
+        export_frames(found, folder / "bag", "rosbag")
+    return [b"".join(_packed(path) for path in sorted((folder / "bag").iterdir()))]
+
+
+def _packed(path):
+    content = path.read_bytes()
+    return f"{path.name}\n{len(content)}\n".encode() + content
+
+
+GOOD = {
+    "npy": _good_npy, "npz": _good_npz, "png": _good_png, "csv": _good_csv, "toml": _good_toml, "poses": _good_poses,
+    "manifest": _good_manifest, "checksum": _good_checksum,
+    **{kind: _good_mesh(kind) for kind in ("stl", "ply", "obj", "off")},
+    "bag": _good_bag, "h5": _good_h5, "bank": _good_bank, "frames": _good_frames,
+}  # fmt: skip
+
+
+def mutate(content, others, rng):
+    """Return a mutant: bits, numbers, words and pieces changed, moved, repeated, or taken from another file."""
+    data = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 3, 6))):
+        size = max(1, len(data))
+        at = rng.randrange(size) if rng.random() < 0.5 else rng.randrange(min(size, 256))
+        length = min(size - at, int(2 ** rng.uniform(0, 8)))
+        kind = rng.randrange(9)
+        if kind == 0 and data:
+            data[at] ^= 1 << rng.randrange(8)
+        elif kind == 1 and data:
+            data[at] = rng.choice((0, 1, 0x7F, 0x80, 0xFF, 0x20, 0x30, 0x39, rng.randrange(256)))
+        elif kind == 2:
+            data[at : at + rng.choice((0, 1, 4, length))] = rng.choice(WORDS)
+        elif kind == 3:
+            del data[at : at + length]
+        elif kind == 4:
+            data[at:at] = data[at : at + length] * rng.choice((1, 1, 2, 50))
+        elif kind == 5:
+            data[at : at + length] = rng.randbytes(length)
+        elif kind == 6:
+            other = rng.choice(others)
+            start = rng.randrange(max(1, len(other)))
+            data[at : at + length] = other[start : start + length]
+        elif kind == 7:
+            del data[rng.randrange(size) :]
+        else:
+            width = rng.choice((2, 4, 8))
+            number = rng.choice((*NUMBERS, len(data)))
+            data[at : at + width] = number.to_bytes(8, "little")[:width]
+    return bytes(data[: 1 << 18])
+
+
+def mend(kind, content, rng):
+    """Give the chunks of a PNG their checksums back, most of the time: what lies behind them is to be reached."""
+    if kind == "npz" and rng.random() < 0.7:
+        return _archive(content, rng)
+    if kind != "png" or rng.random() < 0.2:
+        return content
+    out, at = bytearray(content[:8]), 8
+    while at + 12 <= len(content):
+        length = int.from_bytes(content[at : at + 4], "big")
+        body = content[at + 4 : at + 8 + length]
+        out += content[at : at + 4] + body + zlib.crc32(body).to_bytes(4, "big")
+        at += 12 + length
+    return bytes(out) + content[at:]
+
+
+def _archive(content, rng):
+    """Return an NPZ file, sound as an archive, one of whose members is a mutant."""
+    image, time_s = _npy(_image()), _npy(np.arange(2.0))
+    members = {"range": image, "t_s": time_s, "amplitude": image}
+    members |= {name: _npy(np.array(word)) for name, word in (("unit", "m"), ("quantity", "z"))}
+    victim = rng.choice(list(members))
+    members[victim] = mutate(members[victim], [content, *members.values()], rng)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+        for name, body in members.items():
+            archive.writestr(f"{name}.npy", body)
+    return buffer.getvalue()
+
+
+def _npy(values):
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    return buffer.getvalue()
+
+
+def put(kind, content, folder):
+    """Write an input where its reader finds it; return that path."""
+    suffix, _ = KINDS[kind]
+    path = folder / f"input{suffix}"
+    if kind != "bag":
+        path.write_bytes(content)
+        return path
+    shutil.rmtree(path, ignore_errors=True)
+    path.mkdir()
+    at = 0
+    while at < len(content):
+        head = content[at : at + 300].split(b"\n", 2)
+        at += len(head[0]) + len(head[1]) + 2
+        (path / head[0].decode("latin1")[:80]).write_bytes(content[at : at + int(head[1])])
+        at += int(head[1])
+    return path
+
+
+class Hang(BaseException):
+    """A reader that has not answered in time."""
+
+
+def _ring(number, frame):
+    raise Hang(f"no answer within {MOST_SECONDS} s")
+
+
+def read_one(kind, content, folder):
+    """Have the reader of a kind read an input; return whether it was refused, or raise what it raised."""
+    path = put(kind, content, folder)
+    signal.signal(signal.SIGALRM, _ring)
+    signal.setitimer(signal.ITIMER_REAL, MOST_SECONDS)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            KINDS[kind][1](path)
+    except PhasemarkError as error:
+        if "\n" in str(error):
+            raise AssertionError("the message has more than one line") from error
+        return True
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    return False
+
+
+class Lines:
+    """Follows which lines of the readers are run."""
+
+    def __init__(self):
+        self.seen = set()
+        self.fresh = 0
+
+    def _local(self, frame, event, _):
+        key = (frame.f_code, frame.f_lineno)
+        if key not in self.seen:
+            self.seen.add(key)
+            self.fresh += 1
+        return self._local
+
+    def _global(self, frame, event, _):
+        return self._local if any(part in frame.f_code.co_filename for part in _TRACED) else None
+
+    def __enter__(self):
+        self.fresh = 0
+        sys.settrace(self._global)
+        return self
+
+    def __exit__(self, *_):
+        sys.settrace(None)
+
+
+def fuzz(kind, count, seed, folder):
+    """Read mutants of a kind; return what was found, as plain numbers and text."""
+    rng = random.Random(f"{kind} {seed}")
+    work = folder / f"work-{kind}"
+    work.mkdir(parents=True, exist_ok=True)
+    pool = seeds(kind, work)
+    put("checksum", b"a" * 64 + b"  input\n", work)
+    lines, refused, longest, found = Lines(), 0, 0.0, []
+    if kind != "checksum":
+        checksum_path(work / "input").unlink()
+    for number in range(count):
+        if kind == "bag":  # names and sizes stay, so that each mutant is a bag again
+            content = _mutated_bag(rng.choice(pool), rng)
+        else:
+            content = mend(kind, mutate(rng.choice(pool), pool, rng), rng)
+        begun = time.monotonic()
+        follow = kind not in SAMPLES and rng.random() < _TRACE_SHARE
+        try:
+            if follow:
+                with lines:
+                    refused += read_one(kind, content, work)
+            else:
+                refused += read_one(kind, content, work)
+        except (Exception, Hang) as error:
+            sys.settrace(None)
+            place = folder / f"{kind}-{seed}-{number}"
+            place.write_bytes(content)
+            found.append(f"{place.name}: {type(error).__name__}: {str(error)[:200]}")
+        longest = max(longest, time.monotonic() - begun)
+        if follow and lines.fresh and len(pool) < _MOST_SEEDS:
+            pool.append(content)
+    shutil.rmtree(work)
+    peak = 1024 * max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return {
+        "kind": kind, "inputs": count, "refused": refused, "longest_s": longest, "peak_bytes": peak,
+        "lines": len(lines.seen), "kept": len(pool), "found": found[:20], "n_found": len(found),
+    }  # fmt: skip
+
+
+def _mutated_bag(content, rng):
+    files, at = [], 0
+    while at < len(content):
+        name, size, _ = content[at : at + 300].split(b"\n", 2)
+        at += len(name) + len(size) + 2
+        files.append([name, content[at : at + int(size)]])
+        at += int(size)
+    victim = rng.choice(files)
+    victim[1] = mutate(victim[1], [victim[1]], rng)
+    return b"".join(b"%s\n%d\n" % (name, len(body)) + body for name, body in files)
+
+
+if __name__ == "__main__":
+    print(json.dumps(fuzz(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4]))))

@@ -1,0 +1,315 @@
+"""Files as they are read: what contradicts its checksum is refused, pipes are read once, and numbers do not wrap."""
+
+import io
+import os
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import threading
+import zipfile
+import zlib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from phasemark import InputFileError, UsageError
+from phasemark.cli import main
+from phasemark.data import (
+    BankPlan,
+    FramePlan,
+    build_bank,
+    build_frames,
+    export_frames,
+    open_bank,
+    read_frames,
+    unverified,
+    verify_frames,
+    write_checksum,
+)
+from phasemark.data.narrow import narrowed
+from phasemark.files import checksum_path, is_vouched_for, read_whole, remembered, sha256_of
+from phasemark.landmarks import read_mesh
+from phasemark.render import Sensor, preset
+
+SENSOR = preset("pmd-16x16")
+STATED = {"unit": "m", "quantity": "range"}
+BANK = BankPlan(classes=["cone"], distance_m="1", delta_deg="0:90:45", model="planar")
+FRAMES = FramePlan(classes=["cone"], views=3, frames_per_view=2)
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("good")
+    build_bank(BANK, folder / "bank.h5").close()
+    with build_frames(FRAMES, folder / "frames.h5") as frames:
+        export_frames(frames, folder / "z.csv", "csv", quantity="z")
+    return folder
+
+
+@pytest.fixture
+def folder(good, tmp_path, monkeypatch):
+    shutil.copytree(good, tmp_path / "files")
+    monkeypatch.chdir(tmp_path / "files")
+    return tmp_path / "files"
+
+
+def flip_last_value(path):
+    """Change one byte of the values of an HDF5 file, which it opens with all the same."""
+    with h5py.File(path) as file:
+        dataset = file["lower/phasor"] if "lower" in file else file["range"]
+        place = dataset.id.get_offset() + dataset.nbytes - 4
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
+
+
+READ = {
+    "match": ["match", "bank.h5", "frames.h5"],
+    "match frames": ["match", "bank.h5", "z.csv"],
+    "bank info": ["bank", "info", "bank.h5"],
+    "bank resume": [
+        "bank", "build", "--class", "cone", "--distance", "1", "--delta", "0:90:45", "--model", "planar", "--resume",
+        "-o", "bank.h5",
+    ],
+    "frames info": ["frames", "info", "frames.h5"],
+    "frames export": ["frames", "export", "frames.h5", "--to", "npz", "-o", "out.npz"],
+    "frames show": ["frames", "show", "frames.h5", "-o", "out.png"],
+    "frames import": ["frames", "import", "z.csv", "-o", "out.npz"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("command", READ)
+def test_a_file_that_its_checksum_contradicts_is_refused_by_every_command(folder, capsys, command):
+    victim = {"match frames": "z.csv", "frames import": "z.csv"}.get(command)
+    victim = folder / (victim or ("bank.h5" if "bank.h5" in READ[command] else "frames.h5"))
+    if victim.suffix == ".csv":
+        write_checksum(victim)
+        victim.write_bytes(victim.read_bytes() + b"\n")
+    else:
+        flip_last_value(victim)
+    before = sorted(os.listdir(folder))
+    assert main(READ[command]) == 3
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert re.fullmatch(rf"error: {victim.name}: damaged: its SHA-256 is \w+, but .* \(--no-verify .*\)\n", err)
+    assert sorted(os.listdir(folder)) == before
+
+
+def test_no_verify_reads_it_all_the_same_before_and_behind_the_command(folder, capsys):
+    flip_last_value(folder / "bank.h5")
+    assert main(["--no-verify", "bank", "info", "bank.h5"]) == 0
+    assert main(["bank", "info", "bank.h5", "--no-verify"]) == 0
+    assert capsys.readouterr().err == ""
+    assert main(["bank", "info", "bank.h5"]) == 3  # it holds for one command
+    with pytest.raises(InputFileError, match="damaged"):
+        open_bank("bank.h5")
+    with unverified(), open_bank("bank.h5") as bank:
+        assert bank.classes == ("cone",)
+
+
+def test_a_missing_checksum_is_a_note(folder, capsys):
+    checksum_path(folder / "bank.h5").unlink()
+    assert main(["bank", "info", "bank.h5"]) == 0
+    assert capsys.readouterr().err == (
+        "note: bank.h5: has no checksum 'bank.h5.sha256' beside it, so damage may go unnoticed\n"
+    )
+
+
+def test_other_files_are_compared_with_a_checksum_they_have(tmp_path):
+    for name, read in (
+        ("part.stl", lambda path: read_mesh(path, unit="m")),
+        ("camera.toml", Sensor.from_toml),
+        ("frames.npy", lambda path: read_frames(path, sensor=SENSOR, **STATED)),
+    ):
+        (tmp_path / name).write_bytes(b"content")
+        write_checksum(tmp_path / name)
+        (tmp_path / name).write_bytes(b"Content")
+        with pytest.raises(InputFileError, match=f"{name}: damaged: its SHA-256"):
+            read(tmp_path / name)
+
+
+def test_a_digest_is_remembered_until_the_file_changes(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(remembered, "_SMALLEST_BYTES", 1)
+    monkeypatch.setattr(remembered, "_SETTLED_NS", 0)
+    path = tmp_path / "large"
+    path.write_bytes(b"one")
+    write_checksum(path)
+    read = []
+    monkeypatch.setattr("phasemark.files.vouching.sha256_of", lambda file: read.append(1) or sha256_of(file))
+    assert is_vouched_for(path)
+    assert is_vouched_for(path)
+    assert len(read) == 1
+    times = path.stat()
+    path.write_bytes(b"two")
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # size and time of content are as before
+    with pytest.raises(InputFileError, match="damaged"):
+        is_vouched_for(path)
+    remembered.cache_file().write_text("[" * 10_000)  # a damaged memory is none
+    with pytest.raises(InputFileError, match="damaged"):
+        is_vouched_for(path)
+
+
+def test_a_file_that_was_just_written_is_not_remembered(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(remembered, "_SMALLEST_BYTES", 1)
+    path = tmp_path / "new"
+    path.write_bytes(b"one")
+    write_checksum(path)
+    assert is_vouched_for(path)
+    assert not remembered.cache_file().exists()
+
+
+def test_a_pipe_delivers_every_frame(folder, capsys):
+    frames = np.random.default_rng(1).uniform(0.5, 2, (40, 256))
+    text = "# unit=m quantity=range\n" + "\n".join(",".join(f"{v:.6f}" for v in row) for row in frames) + "\n"
+    out = folder / "o.npz"
+    command = [sys.executable, "-m", "phasemark", "frames", "import", "/dev/stdin", "-o", str(out)]
+    subprocess.run(command, input=text.encode(), check=True, capture_output=True)
+    np.testing.assert_allclose(np.load(out)["range"].reshape(40, 256), frames, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz", "csv", "png"])
+def test_a_named_pipe_is_read_once_for_every_kind(folder, tmp_path, kind):
+    with build_frames(FRAMES, folder / "again.h5") as frames:
+        values = np.nan_to_num(frames[:]["range_m"])
+        export_frames(frames, folder / "png", "png16", quantity="range")
+    np.save(folder / "a.npy", values)
+    np.savez(folder / "a.npz", range=values)
+    np.savetxt(folder / "a.csv", values.reshape(len(values), -1), delimiter=",")
+    source = folder / f"a.{kind}" if kind != "png" else folder / "png" / "00000000.png"
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=lambda: pipe.write_bytes(source.read_bytes()))
+    writer.start()
+    stated = {} if kind == "png" else STATED
+    through = read_frames(pipe, sensor=SENSOR, **stated)
+    writer.join(10)
+    np.testing.assert_array_equal(through.range_m, read_frames(source, sensor=SENSOR, **stated).range_m)
+
+
+def test_a_plan_and_its_camera_may_come_from_a_pipe_that_is_asked_twice(folder):
+    run = [sys.executable, "-m", "phasemark", "plan", "check", "/dev/stdin"]
+    plan = subprocess.run([*run[:4], "example", "frames"], capture_output=True, check=True).stdout
+    done = subprocess.run(run, input=plan, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_hdf5_from_a_pipe_is_one_line(folder):
+    run = [sys.executable, "-m", "phasemark", "frames", "info", "/dev/stdin"]
+    done = subprocess.run(run, input=(folder / "frames.h5").read_bytes(), capture_output=True, check=False)
+    assert done.returncode == 3
+    assert b"copy it to a file first" in done.stderr
+
+
+def test_more_splits_than_their_numbers_have_bytes_for_are_refused(tmp_path):
+    splits = {f"s{k}": 1 / 256 for k in range(256)}
+    plan = FramePlan(classes=["cone"], views=300, splits=splits)
+    assert plan.resolve().draw_truth()["split_index"].max() > 200
+    with pytest.raises(UsageError, match="'splits' must be at most 256, got 300"):
+        FramePlan(views=1, splits={f"s{k}": 1 / 300 for k in range(300)})
+
+
+@pytest.mark.parametrize(("value", "kind"), [(256, "|u1"), (-1, "|u1"), (32768, "<i2"), (2**31, "<i4"), (-129, "|i1")])
+def test_a_number_that_does_not_fit_its_type_is_refused(value, kind):
+    with pytest.raises(UsageError, match=f"got {value}"):
+        narrowed([0, value], kind, "splits")
+
+
+def test_verify_finds_a_column_that_the_plan_does_not_draw(folder):
+    path = folder / "frames.h5"
+    for name, change in (("split", 1), ("distance", 0.1), ("seed_index", 1)):
+        copy = folder / f"{name}.h5"
+        shutil.copy(path, copy)
+        with h5py.File(copy, "r+") as file:
+            values = file[name][...]
+            file[name][...] = (values + change) % 3 if name == "split" else values + change
+        write_checksum(copy)
+        with pytest.raises(InputFileError, match=f"'{name}' is not what its plan draws"):
+            verify_frames(copy)
+
+
+def npy(header, values=b""):
+    text = header.encode() + b" " * (-(len(header) + 11) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + values
+
+
+def png(width, height):
+    def chunk(name, body):
+        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(bytes(100))) + chunk(b"IEND", b"")
+
+
+def damaged_lzma():
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_LZMA) as archive, archive.open("range.npy", "w") as member:
+        np.lib.format.write_array(member, np.random.default_rng(0).random((1, 16, 16)))
+    content = bytearray(buffer.getvalue())
+    content[60:400] = bytes(340)
+    return bytes(content)
+
+
+FOREIGN = {
+    "descr.npy": npy("{'descr': (), 'fortran_order': False, 'shape': (1, 16, 16), }"),
+    "huge.npy": npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1e30, 16, 16), }"),
+    "truth.npy": npy("{'descr': '<f8', 'fortran_order': False, 'shape': (True, 16, 16), }", bytes(2048)),
+    "large.npy": npy("{'descr': '<f8', 'fortran_order': False, 'shape': (4000000000, 16, 16), }", bytes(2048)),
+    "record.npy": npy("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1, 16, 16), }", bytes(2048)),
+    "lzma.npz": damaged_lzma(),
+    "wide.png": png(65535, 65535),
+    "widest.png": png(2**31 - 1, 2**31 - 1),
+    "bomb.png": png(4096, 4096),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_what_foreign_decoders_stumble_over_is_one_line(tmp_path, capsys, name):
+    path = tmp_path / name
+    path.write_bytes(FOREIGN[name])
+    assert main(["frames", "import", str(path), "-o", str(tmp_path / "o.npz"), "--unit", "m", "--quantity", "z"]) == 3
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert re.fullmatch(rf"error: {re.escape(str(path))}: [^\n]+\n", err)
+    assert os.listdir(tmp_path) == [name]
+
+
+def test_what_is_packed_to_fill_the_memory_is_refused_before_it_is_read(tmp_path):
+    with h5py.File(tmp_path / "packed.h5", "w") as file:
+        values = file.create_dataset("range", (300_000, 16, 16), "u1", chunks=(1000, 16, 16), compression=4)
+        values[:1] = 1
+        file["padding"] = np.random.default_rng(0).integers(0, 255, 1 << 20, np.uint8)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("range.npy", "w") as member:
+        np.lib.format.write_array(member, np.zeros((1 << 17, 16, 16), np.uint8))
+        archive_padding = np.random.default_rng(0).bytes(1 << 18)
+    with zipfile.ZipFile(buffer, "a") as archive:
+        archive.writestr("padding", archive_padding)
+    (tmp_path / "packed.npz").write_bytes(buffer.getvalue())
+    for name in ("packed.h5", "packed.npz"):
+        with pytest.raises(InputFileError, match=r"declares \d+ values, far more than a file of this size holds"):
+            read_frames(tmp_path / name, sensor=SENSOR, **STATED)
+
+
+def test_our_own_files_may_not_expand_as_those_of_others(folder):
+    with h5py.File(folder / "bank.h5", "r+") as file:
+        del file["lower/coverage"]
+        file.create_dataset("lower/coverage", (80_000_000,), "f4", chunks=(1 << 20,), compression=9)
+    checksum_path(folder / "bank.h5").unlink()
+    with pytest.raises(InputFileError, match="declares far more values"):
+        open_bank("bank.h5")
+
+
+def test_files_that_are_read_whole_have_a_size_they_may_have(tmp_path):
+    for name, read in (("a.stl", lambda path: read_mesh(path, unit="m")), ("a.toml", Sensor.from_toml)):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(1 << 40)
+        with pytest.raises(InputFileError, match="far too large for such a file"):
+            read(tmp_path / name)
+    with pytest.raises(InputFileError, match="far too large"):
+        read_whole(Path("/dev/zero"), most_bytes=1000)
