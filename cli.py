@@ -736,7 +736,7 @@ def _bank_build(
     if not layout_stated and (reason := factored_refusal(resolved)) is not None:
         plan = plan.model_copy(update={"layout": "full"})
         if not plan.meshes:
-            typer.echo(f"note: a full bank, every class at every D and δ: {reason}", err=True)
+            _tell(f"note: a full bank, every class at every D and δ: {reason}")
     _build(build_bank, plan, out, shard, dry_run, max_size, as_json, workers, resume, force, shard_size, scheduler)
 
 
@@ -1104,7 +1104,7 @@ def _build(
         refuse_unwritable_output(out, force=force, resume=resume)
         threads = workers or processors()
         seconds = estimate(plan, workers=threads, trial_seconds=_TRIAL_SECONDS)["seconds"] / parts
-        typer.echo(f"note: {described}; about {_duration(seconds)} on {threads} processors here", err=True)
+        _tell(f"note: {described}; about {_duration(seconds)} on {threads} processors here")
     with _Progress("rendering") as progress:
         options: dict[str, Any] = {
             "workers": workers, "resume": resume, "force": force, "shard_items": shard_size, "scheduler": scheduler,
@@ -1432,7 +1432,7 @@ def _match(
             diagnosis = replace(diagnose(matcher, refused[1], 0, background=background), index=refused[0])
             given = _ReadOptions(unit, flip_h, flip_v, rotate, method == "nearest", fix == "bearing")
             message = _diagnosis_text(diagnosis, given)
-            typer.echo(f"note: {message}", err=True)
+            _tell(f"note: {message}")
             if as_json:
                 answers[diagnosis.index]["diagnosis"] = {**diagnosis.as_dict(), "message": message}
         if as_json:
@@ -1932,10 +1932,9 @@ def _plots_by_position(plot: Path, chosen: str | None, n: int) -> dict[int, Path
 def _note_plots(plots: Mapping[int, Path], chosen: str | None, n: int) -> None:
     """Say how to have more positions drawn than the first."""
     if plots and chosen is None and len(plots) < n:
-        typer.echo(
+        _tell(
             f"note: drew the first of {n} positions; --plot-index 0,{n // 2}:{min(n // 2 + 9, n - 1)} draws others"
-            " (some seconds each)",
-            err=True,
+            " (some seconds each)"
         )
 
 
@@ -1949,10 +1948,9 @@ def _note_motion(measured: Frames, file: Path) -> None:
     if moved.size:
         n = len(measured)
         where = "the file" if n == 1 else f"{len(moved)} of {n} positions, the first being {moved[0]}"
-        typer.echo(
+        _tell(
             f"note: {file}: the camera or the scene moved during {where}, so that the mean of the frames is no single"
-            " view; --moving matches every frame by itself",
-            err=True,
+            " view; --moving matches every frame by itself"
         )
 
 
@@ -2167,7 +2165,7 @@ def _with_symmetry(meshes: Sequence[MeshPlan], found: Sequence[MeshPlan]) -> tup
                 "has no symmetry about its axis z' (if it has one about another, --origin base brings z' into the"
                 " middle of its bounding box)"
             )
-        typer.echo(f"note: '{after.name}' {what}; --symmetry N, or 'symmetry' in a plan, overrides this", err=True)
+        _tell(f"note: '{after.name}' {what}; --symmetry N, or 'symmetry' in a plan, overrides this")
     return tuple(one.model_copy(update={"symmetry": other.symmetry}) for one, other in zip(meshes, found, strict=True))
 
 
@@ -2191,7 +2189,7 @@ def _note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None]) -> No
     for name, distance_m in distances_m.items():
         described = None if distance_m is None else sensor.describe_beyond_range(name, distance_m)
         if described is not None:
-            typer.echo(f"note: {described}", err=True)
+            _tell(f"note: {described}")
 
 
 def _note_plan_too_far(plan: ScenePlan | DrivePlan) -> None:
@@ -2273,8 +2271,7 @@ class _Progress:
 
     def _write_lines(self) -> None:
         while not self._ended.wait(_PROGRESS_SECONDS):
-            with suppress(OSError, ValueError):  # a closed stderr is no reason to end the work
-                typer.echo(self._line(), err=True)
+            _tell(self._line())
 
     def _line(self) -> str:
         done = "" if self._reported is None else f" {self._reported[0]}/{self._reported[1]},"
@@ -2313,7 +2310,7 @@ def _warnings_as_notes() -> Iterator[None]:
     """Write each thing the library warns of as one line, ``note: …``, to stderr."""
 
     def show(message: Warning | str, *where: object, **more: object) -> None:
-        typer.echo(f"note: {_one_line(str(message))}", err=True)
+        _tell(f"note: {_one_line(str(message))}")
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
@@ -2396,11 +2393,48 @@ def _report_error(message: str) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    Console(stderr=True).print(Text.assemble(("error: ", "bold red"), _one_line(message)), soft_wrap=True)
+    with _messages_may_be_lost():
+        Console(stderr=True).print(Text.assemble(("error: ", "bold red"), _one_line(message)), soft_wrap=True)
+
+
+def _tell(message: str) -> None:
+    """Write a line to stderr."""
+    with _messages_may_be_lost():
+        typer.echo(message, err=True)
+
+
+@contextmanager
+def _messages_may_be_lost() -> Iterator[None]:
+    """Let messages to a stderr that takes none be lost: they change neither the work nor its exit code."""
+    try:
+        yield
+    except (OSError, ValueError):
+        with suppress(OSError, ValueError):  # what is left in the buffer must not fail at exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 def _one_line(message: str) -> str:
-    return "".join(char if char.isprintable() else " " for char in message)
+    r"""Return a message without line breaks and control characters; bytes of a name that are not UTF-8 as ``\xNN``."""
+    return "".join(char if char.isprintable() else " " for char in _readable(message))
+
+
+def _readable(name: str) -> str:
+    r"""Return text that can be written as UTF-8: bytes of a file's name that are not become ``\xNN``."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def _open_closed_streams() -> None:
+    """Open the null device for standard streams that are closed, or the next file would take their numbers."""
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)
+            if opened != number:
+                os.dup2(opened, number)
+                os.close(opened)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
@@ -2438,11 +2472,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Python prints its traceback and exits with 1.
     """
     signal.signal(signal.SIGTERM, _terminate)
+    _open_closed_streams()
     if arguments is None and _COMPLETION in os.environ:  # the shell asks what may follow
         app(prog_name="phasemark")
     os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")  # before HDF5 is loaded: no file makes it load code
     # before NumPy is: its small products gain nothing from threads that fight our workers' for the processors
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ["MPLBACKEND"] = "agg"  # pictures become files: a window that is not there is no reason to fail
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without '×' or 'σ' is no reason to fail
     try:
@@ -2453,7 +2489,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
     except PhasemarkError as error:
         for note in getattr(error, "__notes__", ()):  # the traceback of a user's own code
-            typer.echo(note, err=True)
+            _tell(note)
         _report_error(str(error))
         return error.exit_code
     except BrokenPipeError:
