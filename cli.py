@@ -287,7 +287,7 @@ def _sensor_characterise(
     _make_folder(out)
     with _Progress("measuring"):
         found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
-        report = write_characterisation(found, name_or_file, out, seed=seed, force=force)[0]
+        report = write_characterisation(found, _readable(name_or_file), out, seed=seed, force=force)[0]
     if as_json:
         facts = found.as_dict()
         _echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
@@ -371,7 +371,7 @@ def _sensor_fit(
         amplitude_unit=amplitude_unit,  # type: ignore[arg-type]  # fit_sensor says what is right
         distance_std_m=distance_std or None,
     )
-    write_atomically(out, fit.to_toml(base_name=sensor).encode(), force=force)
+    write_atomically(out, fit.to_toml(base_name=_readable(sensor)).encode(), force=force)
     if as_json:
         _echo_json({"file": str(out), **fit.as_dict()})
         return
@@ -431,7 +431,7 @@ def _landmark_show(
     _refuse_existing([picture, page], force)
     _make_folder(folder)
     write_atomically(picture, mesh_picture(mesh), force=force)
-    write_atomically(page, mesh_html(mesh, name).encode(), force=force)
+    write_atomically(page, mesh_html(mesh, _readable(name)).encode(), force=force)
     typer.echo(picture)
     typer.echo(page)
 
@@ -994,14 +994,15 @@ def _frames_simulate(
     )
     recording = simulate_recording(
         mesh,
-        name,
+        _readable(name),
         _load_sensor(sensor),
         views,
         seed=seed,
         albedo=mesh.metadata.get("albedo", 0.8),
         background=_background(wall, floor),
     )
-    description = f"landmark={name} sensor={Path(sensor).name} seed={seed} {'moving' if moving else 'still'}"
+    described = _readable(f"landmark={name} sensor={Path(sensor).name}")
+    description = f"{described} seed={seed} {'moving' if moving else 'still'}"
     typer.echo(write_recording(recording, out, description=description, force=force))
 
 
@@ -1633,7 +1634,7 @@ def _calibrate(
     buffer = bytes_io.BytesIO()
     residual_picture(found).savefig(buffer, format="png", dpi=100)
     write_atomically(picture, buffer.getvalue(), force=force)
-    write_atomically(out, calibration_toml(found, base_name=base_name).encode(), force=force)
+    write_atomically(out, calibration_toml(found, base_name=_readable(base_name)).encode(), force=force)
     if as_json:
         _echo_json({"file": str(out), "picture": str(picture), **calibration_dict(found)})
         return

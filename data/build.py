@@ -29,6 +29,7 @@ from phasemark.data.bank import (
     group_rows,
     open_bank,
 )
+from phasemark.data.json_text import json_text
 from phasemark.data.layout import Layout
 from phasemark.data.plan import BankPlan, MeshPlan, factored_refusal
 from phasemark.data.production import produce, refuse_unwritable_output
@@ -245,8 +246,8 @@ class BankJob:
             file.attrs["schema_version"] = SCHEMA_VERSION
             file.attrs["layout"] = plan.layout
             file.attrs["model"] = plan.model
-            file.attrs["plan"] = plan.model_dump_json()
-            file.attrs["sensor"] = self.sensor.model_dump_json()
+            file.attrs["plan"] = json_text(plan)
+            file.attrs["sensor"] = json_text(self.sensor)
             file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
             for name in LAYOUT_GROUPS[plan.layout]:
                 names = [landmark.name for landmark in self.landmarks]

@@ -24,6 +24,7 @@ from phasemark.data.frames import (
     FrameSet,
     open_frames,
 )
+from phasemark.data.json_text import json_text
 from phasemark.data.layout import Layout
 from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.progress import Progress
@@ -183,8 +184,8 @@ class FrameJob:
             file = layout.file
             file.attrs["format"] = FORMAT
             file.attrs["schema_version"] = SCHEMA_VERSION
-            file.attrs["plan"] = plan.model_dump_json()
-            file.attrs["sensor"] = sensor.model_dump_json()
+            file.attrs["plan"] = json_text(plan)
+            file.attrs["sensor"] = json_text(sensor)
             file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
             scales = {
                 name: _scale(file, name, values, units, long_name)

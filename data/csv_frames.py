@@ -23,7 +23,7 @@ SECONDS_PER_TIME_UNIT: dict[str, float] = {MILLISECONDS: 1e-3, SECONDS: 1.0}
 
 _SEPARATORS = (";", "\t", ",")
 _STATED = re.compile(r"\b(unit|quantity)=(\S+)")
-_NUMBERED = re.compile(r"([a-z]+)_(\d+)")
+_NUMBERED = re.compile(r"([a-z]+)_([0-9]{1,9})")
 _PIXELS: dict[str, dict[str, str]] = {"mm": {"unit": "mm"}, "range": {"quantity": "range"}, "z": {"quantity": "z"}}
 """Prefixes of pixel columns, and what each states about the values."""
 _OTHER_GROUPS = ("status", "amplitude", "intensity")

@@ -17,7 +17,9 @@ from phasemark import InputFileError, OutputExistsError, UsageError
 from phasemark.data.build import BankJob
 from phasemark.data.build_frames import FrameJob
 from phasemark.data.frame_plan import FramePlan
+from phasemark.data.grid import as_count
 from phasemark.data.hdf5 import check_format, open_hdf5, reading
+from phasemark.data.json_text import json_text
 from phasemark.data.layout import Layout
 from phasemark.data.plan import BankPlan
 from phasemark.data.production import produce, refuse_unwritable_output
@@ -48,6 +50,10 @@ def job_of(spec: dict[str, Any]) -> Job:
     return BankJob(BankPlan(**spec["plan"])) if spec["kind"] == "bank" else FrameJob(FramePlan(**spec["plan"]))
 
 
+MOST_PARTS = 1_000_000
+"""Of a job that is built in parts."""
+
+
 def parse_part(text: str) -> tuple[int, int]:
     """Read ``i/n``, part i of n, counted from 1.
 
@@ -64,10 +70,11 @@ def parse_part(text: str) -> tuple[int, int]:
     UsageError
         It is something else.
     """
-    first, separator, last = text.partition("/")
-    if not (separator and first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last) <= 1_000_000):
-        raise UsageError(f"--shard must be I/N with 1 ≤ I ≤ N, 2/8 for instance, got '{text}'")
-    return int(first), int(last)
+    first, _, last = text.partition("/")
+    part, parts = as_count(first), as_count(last)
+    if part is None or parts is None or not 1 <= part <= parts <= MOST_PARTS:
+        raise UsageError(f"--shard must be I/N with 1 ≤ I ≤ N ≤ {MOST_PARTS}, 2/8 for instance, got '{text[:40]}'")
+    return part, parts
 
 
 class PartJob:
@@ -109,8 +116,8 @@ class PartJob:
             file = layout.file
             file.attrs["format"] = FORMAT
             file.attrs["schema_version"] = SCHEMA_VERSION
-            file.attrs["spec"] = json.dumps(self._job.spec(), ensure_ascii=False)
-            file.attrs["identity"] = json.dumps(self._job.identity(), sort_keys=True, ensure_ascii=False)
+            file.attrs["spec"] = json_text(self._job.spec())
+            file.attrs["identity"] = json_text(self._job.identity(), sort_keys=True)
             file.attrs["header_sha256"] = whole.sha256()
             file.attrs["items"] = np.array([self.start, self.stop, self._total], dtype="<i8")
             for k, (slab, start, stop) in enumerate(self._pieces):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import math
 import os
-import tomllib
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -27,10 +26,12 @@ from pydantic import (
     model_validator,
 )
 
-from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark import PhasemarkError, UsageError, refuse_truth_values
 from phasemark.data.grid import drop_repeated_stop, format_grid, parse_grid
 from phasemark.landmarks import MAX_SYMMETRY, LandmarkSpec, MeshWarning, catalog, mesh_symmetry, read_mesh
 from phasemark.render import Sensor, preset
+from phasemark.render.toml_file import read_toml
+from phasemark.render.view import FARTHEST_M
 
 DEFAULT_DISTANCE_M = "0.7:2.1:0.01"
 DEFAULT_DELTA_STEP_DEG = 1.0
@@ -62,6 +63,8 @@ def _to_grid(value: Any, info: ValidationInfo) -> tuple[float, ...]:
 def _positive(values: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
     if values[0] <= 0:
         raise UsageError(f"'{info.field_name}' must be positive throughout, got {values[0]!r}")
+    if values[-1] > FARTHEST_M:
+        raise UsageError(f"'{info.field_name}' must be at most {FARTHEST_M:g} m throughout, got {values[-1]!r}")
     return values
 
 
@@ -83,6 +86,7 @@ class PlanModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     def __init__(self, **data: Any) -> None:
+        refuse_truth_values(data, type(self).model_fields)
         try:
             super().__init__(**data)
         except ValidationError as error:
@@ -368,23 +372,6 @@ def read_plan(path: str | os.PathLike[str], model: type[P]) -> P:
 
 def _is_file(sensor: str) -> bool:
     return sensor.endswith(".toml") or "/" in sensor
-
-
-def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises
-    ------
-    InputFileError
-        The file cannot be read or is not TOML.
-    """
-    path = Path(path)
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:  # the last: nested without end
-        raise InputFileError(f"{path}: not a TOML file ({error})") from None
 
 
 def factored_refusal(plan: BankPlan) -> str | None:

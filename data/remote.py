@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from phasemark import PhasemarkError, StorageError, UsageError
 from phasemark.data.executor import Maker
+from phasemark.data.grid import as_count
 from phasemark.data.shards import Job, difference, make_shard
 
 ATTEMPTS = 20
@@ -36,6 +37,7 @@ CONNECT_SECONDS = 10
 PATIENCE_SECONDS = 10
 """How long a shard may take before a look whether the cluster has any worker."""
 
+MOST_PROCESSES = 1024
 _LENGTH = struct.Struct("<q")
 
 
@@ -57,9 +59,12 @@ def open_maker(scheduler: str, job: Job) -> Maker | None:
         return None
     kind, _, count = scheduler.partition(":")
     if kind == "local":
-        if not (count.isdecimal() and 1 <= int(count) <= 1024):
-            raise UsageError(f"--scheduler local:N needs a number of processes, got '{scheduler}'")
-        return ProcessMaker(job, int(count))
+        n = as_count(count)
+        if n is None or not 1 <= n <= MOST_PROCESSES:
+            raise UsageError(
+                f"--scheduler local:N needs a number of processes, 1 to {MOST_PROCESSES}, got '{scheduler[:40]}'"
+            )
+        return ProcessMaker(job, n)
     if "://" not in scheduler:
         raise UsageError(
             f"--scheduler must be threads, local:N or an address such as tcp://HOST:8786, got '{scheduler}'"

@@ -112,9 +112,10 @@ def parse_size(text: str, name: str) -> int:
     1500000000
     """
     found = re.fullmatch(r"(\d+(?:\.\d+)?) ?([kMGT]?B|)", text.strip())
-    if found is None:
-        raise UsageError(f"{name} must be a number with B, kB, MB, GB or TB, such as 20GB, got '{text}'")
-    return round(float(found[1]) * _UNITS[found[2]])
+    size = math.nan if found is None else float(found[1]) * _UNITS[found[2]]
+    if not math.isfinite(size):
+        raise UsageError(f"{name} must be a number with B, kB, MB, GB or TB, such as 20GB, got '{text[:40]}'")
+    return round(size)
 
 
 def format_size(size: int) -> str:

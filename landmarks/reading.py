@@ -135,6 +135,8 @@ def read_mesh(
             content = path.read_bytes()
         except OSError as error:
             raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+        except ValueError as error:  # a NUL in the name
+            raise InputFileError(f"{path}: cannot be read ({error})") from None
     kind = (file_type or "").lower()
     if kind not in FORMATS:
         raise InputFileError(f"{name}: unknown mesh format '{kind}': the formats are {', '.join(FORMATS)}")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from phasemark import InputFileError, OutputExistsError, UsageError
 from phasemark.data import versions, write_atomically
 from phasemark.data.hdf5 import check_format, open_hdf5, reading
+from phasemark.data.json_text import json_text
 from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.progress import Progress
 from phasemark.data.shards import difference
@@ -138,7 +139,7 @@ def write_cells(plan: SweepPlan, trials: SweepTrials, folder: Path) -> tuple[Cel
         folder / "cells.csv", csv_bytes({name: [row[name] for row in rows] for name in rows[0]}), force=True
     )
     table = {"plan": plan.model_dump(mode="json"), "versions": versions(), "cells": json_rows(rows)}
-    text = json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False)
+    text = json_text(table, indent=1, allow_nan=False)
     write_atomically(folder / "sweep.json", text.encode(), force=True)
     return cells
 
@@ -176,7 +177,7 @@ def _begin(plan: SweepPlan, folder: Path, *, resume: bool, force: bool) -> None:
                 f"{folder}: was begun with another plan ({'; '.join(changes[:4])}): --force starts over"
             )
         return
-    write_atomically(folder / "plan.json", plan.model_dump_json(indent=1).encode(), force=True)
+    write_atomically(folder / "plan.json", json_text(plan, indent=1).encode(), force=True)
 
 
 def _identity(path: Path) -> dict[str, Any]:

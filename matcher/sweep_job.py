@@ -8,7 +8,6 @@ trial depend on the seed, its condition and its number alone, so all methods see
 from __future__ import annotations
 
 import importlib
-import json
 import math
 import numbers
 import signal
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from phasemark import PhasemarkError, UsageError
 from phasemark.data import Bank, build_bank, mesh_sha256, versions
 from phasemark.data.build import read_landmarks
+from phasemark.data.json_text import json_text
 from phasemark.data.layout import Layout
 from phasemark.data.seeds import stream
 from phasemark.data.shards import Place
@@ -147,7 +147,7 @@ class SweepJob:
             file = layout.file
             file.attrs["format"] = FORMAT
             file.attrs["schema_version"] = SCHEMA_VERSION
-            file.attrs["identity"] = json.dumps(self.identity(), sort_keys=True, ensure_ascii=False)
+            file.attrs["identity"] = json_text(self.identity(), sort_keys=True)
             file.create_dataset("condition", data=np.repeat(self.of.conditions, self.items).astype("<i4"))
             numbers = np.concatenate([self.of.first + np.arange(count) for count in self.items])
             file.create_dataset("trial", data=numbers.astype("<i8"))
@@ -358,7 +358,7 @@ class SweepJob:
 
     def _bank(self, method: Method) -> Bank:
         plan = self.plan.bank_plan(method)
-        key = plan.model_dump_json()
+        key = json_text(plan)
         if key not in self._banks:
             self._banks[key] = build_bank(plan, workers=1)
         return self._banks[key]
