@@ -1074,7 +1074,7 @@ def _build(
     from phasemark.data import build_part, estimate, parse_part, planned_size
     from phasemark.data.executor import processors
     from phasemark.data.production import refuse_unwritable_output
-    from phasemark.data.size import format_size, parse_size
+    from phasemark.data.size import format_size, parse_size, too_many
 
     limit = parse_size(max_size, "--max-size")
     part, parts = (1, 1) if shard is None else parse_part(shard)
@@ -1083,8 +1083,9 @@ def _build(
     counts = {name: n // parts for name, n in facts.items()}
     size = counts.pop("bytes")
     if dry_run:
-        about = "not tried: the file would be larger than --max-size"
-        if size <= limit:
+        many = too_many(facts)
+        about = f"not tried: {many or 'the file would be larger than --max-size'}"
+        if size <= limit and many is None:
             facts = estimate(plan, workers=workers or processors())
             about = f"about {facts['seconds']:.3g}"
         if as_json:
@@ -1762,6 +1763,9 @@ def _sweep_run(
         str | None,
         typer.Option("--matcher", metavar="MODULE:NAME", help="Your own matcher, beside the plan's methods."),
     ] = None,
+    trust_plan: Annotated[
+        bool, typer.Option("--trust-plan", help="Run the programs (MODULE:NAME) that the plan itself names.")
+    ] = False,
     workers: _Workers = None,
     scheduler: Annotated[
         str, typer.Option("--scheduler", help="threads, local:N (processes), or a Dask scheduler's address.")
@@ -1771,15 +1775,18 @@ def _sweep_run(
 ) -> None:
     """Run a sweep and write its tables and report."""
     from phasemark.matcher.sweep import run_sweep
-    from phasemark.matcher.sweep_plan import Method, SweepPlan, load_sweep
+    from phasemark.matcher.sweep_plan import Method, SweepPlan, load_sweep, refuse_programs
     from phasemark.matcher.sweep_report import write_report
 
     loaded = load_sweep(plan)
     changes: dict[str, Any] = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
-    sys.path.append(str(Path.cwd()))  # a matcher of one's own lies here; an installed program does not look here itself
-    if matcher is not None:
+    if not trust_plan:
+        refuse_programs(loaded, () if matcher is None else (matcher,), plan)
+    if matcher is not None and matcher not in [method.method for method in loaded.methods]:
         changes["methods"] = (*loaded.methods, Method(name=matcher, method=matcher))
     changed = SweepPlan(**{**loaded.model_dump(), **changes})
+    if any(method.is_program for method in changed.methods):
+        sys.path.append(str(Path.cwd()))  # where one's own matcher lies; an installed program does not look here itself
     _note_plan_too_far(changed)
     with _Progress("trials") as progress:
         run_sweep(changed, out, workers=workers, scheduler=scheduler, resume=resume, force=force, progress=progress)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -25,12 +26,17 @@ from phasemark.data.plan import BankPlan
 from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.progress import Progress
 from phasemark.data.shards import Job, Place, difference, make_shard, pieces
+from phasemark.data.size import planned_size
 from phasemark.data.store import verify_checksum
 
 FORMAT = "phasemark-part"
 SCHEMA_VERSION = 1
 
 _TRIAL_ITEMS = 64
+_TRIED_WHOLE = 200_000
+"""Most images or views of a plan whose time is estimated on the plan itself; of larger ones a sample is tried."""
+_TRIED_VIEWS = 4096
+_TRIED_VALUES = 64
 _GOLDEN = (5**0.5 - 1) / 2
 
 
@@ -325,8 +331,13 @@ def estimate(plan: BankPlan | FramePlan, *, workers: int = 1, trial_seconds: flo
     dict
         ``images`` or ``views`` and ``frames``, ``bytes``, ``seconds``.
     """
-    job = job_for(plan)
+    planned = planned_size(plan)
+    total = planned["images" if isinstance(plan, BankPlan) else "views"]
+    tried = _thinned(plan) if total > _TRIED_WHOLE else plan
+    job = job_for(tried)
     layout, _ = job.lay_out()
+    header_bytes = layout.size - planned_size(tried)["bytes"]
+    scale = total / sum(job.items)
     total = sum(job.items)
     make_shard(job, 0, 1)  # compiled code is loaded
     count = min(_TRIAL_ITEMS, total)
@@ -342,9 +353,18 @@ def estimate(plan: BankPlan | FramePlan, *, workers: int = 1, trial_seconds: flo
         make_shard(job, first, min(first + run, total))
         if trial_seconds is not None and time.perf_counter() - begun > trial_seconds:
             break
-    seconds = (time.perf_counter() - begun) / made * total / workers
+    seconds = (time.perf_counter() - begun) / made * total * scale / workers
+    return {**planned, "bytes": planned["bytes"] + header_bytes, "seconds": seconds}
+
+
+def _thinned(plan: BankPlan | FramePlan) -> BankPlan | FramePlan:
+    """Return a plan whose images or views are a sample of those of a large plan, and take as long each."""
     if isinstance(plan, FramePlan):
-        items = {"views": total, "frames": total * plan.frames_per_view}
-    else:
-        items = {"images": total}
-    return {**items, "bytes": layout.size, "seconds": seconds}
+        return plan.model_copy(update={"views": _TRIED_VIEWS})
+    plan = plan.resolve()
+    assert plan.delta_deg is not None
+    fewer = {
+        name: values[:: math.ceil(len(values) / _TRIED_VALUES)]
+        for name, values in (("distance_m", plan.distance_m), ("delta_deg", plan.delta_deg))
+    }
+    return plan.model_copy(update=fewer)

@@ -33,6 +33,8 @@ from phasemark.render import Sensor, preset
 from phasemark.render.toml_file import read_toml
 from phasemark.render.view import FARTHEST_M
 
+MOST_LANDMARKS = 256
+"""Of a plan: each takes one or two scenes of the ray caster, which can hold some hundreds."""
 DEFAULT_DISTANCE_M = "0.7:2.1:0.01"
 DEFAULT_DELTA_STEP_DEG = 1.0
 
@@ -182,9 +184,12 @@ class ScenePlan(PlanModel, ABC):
         Raises
         ------
         UsageError
-            A class is unknown, or two landmarks have one name.
+            A class is unknown, two landmarks have one name, or there are more than 256.
         """
         named = self.classes or (() if self.landmarks or self.meshes else tuple(catalog()))
+        count = len(named) + len(self.landmarks) + len(self.meshes)
+        if count > MOST_LANDMARKS:
+            raise UsageError(f"a plan can have at most {MOST_LANDMARKS} landmarks, got {count}: make several of it")
         specs: list[LandmarkSpec] = [*(_from_catalog(name) for name in named), *self.landmarks]
         names = [*(spec.name for spec in specs), *(mesh.name for mesh in self.meshes)]
         for name in names:

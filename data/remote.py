@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import importlib
 import json
+import os
 import queue
 import struct
 import subprocess
@@ -164,8 +165,11 @@ class _Process:
     """One worker process."""
 
     def __init__(self, spec: str, identity: str) -> None:
+        # -P: the working folder is no place for modules unless it is one here
+        modules = os.pathsep.join(entry for entry in sys.path if entry)
         self._child = subprocess.Popen(
-            [sys.executable, "-c", "from phasemark.data.remote import serve; serve()"],
+            [sys.executable, "-P", "-c", "from phasemark.data.remote import serve; serve()"],
+            env={**os.environ, "PYTHONPATH": modules},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C is for the program that asks, which then ends its workers

@@ -69,7 +69,7 @@ def run_sweep(
     """
     plan = plan.resolve()
     for method in plan.methods:
-        if ":" in method.method:
+        if method.is_program:
             check_matcher(method.method)
     folder = Path(folder)
     _begin(plan, folder, resume=resume, force=force)

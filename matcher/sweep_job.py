@@ -338,7 +338,7 @@ class SweepJob:
             return self._matchers[method.name, wall_m]
 
     def _matcher(self, method: Method, wall_m: float) -> Callable[[FilteredFrames], Sequence[Match]]:
-        if ":" in method.method:
+        if method.is_program:
             return _imported(method.method)
         bank = self._bank(method)
         background: Background | Literal["auto"] | None = Background(wall_m=wall_m) if wall_m else None
@@ -367,7 +367,7 @@ class SweepJob:
         method = self.plan.methods[m]
         where = f"method '{method.name}', condition {number}, trials {first} … {first + len(frames) - 1}"
         match = self.matcher(number, m)
-        if ":" in method.method:
+        if method.is_program:
             matches = _matches_of_plugin(match, method.method, frames, where)
         else:
             try:

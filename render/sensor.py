@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from phasemark import UsageError, refuse_truth_values
 from phasemark.render.correlation import (
@@ -26,7 +26,15 @@ SPEED_OF_LIGHT_M_S = 299_792_458.0
 
 _LARGEST = 1e12
 """Of any number of a sensor: the square of none overflows, and the reciprocal of none is infinite."""
-_Positive = Annotated[float, Field(ge=1 / _LARGEST, le=_LARGEST, allow_inf_nan=False)]
+
+
+def _not_vanishing(value: float) -> float:
+    if value < 1 / _LARGEST:
+        raise ValueError(f"must be at least {1 / _LARGEST:g}")
+    return value
+
+
+_Positive = Annotated[float, Field(gt=0, le=_LARGEST, allow_inf_nan=False), AfterValidator(_not_vanishing)]
 _NonNegative = Annotated[float, Field(ge=0, le=_LARGEST, allow_inf_nan=False)]
 _Fraction = Annotated[float, Field(gt=0, le=1)]
 _HalfAngleDeg = Annotated[float, Field(gt=0, lt=85)]
