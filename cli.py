@@ -53,6 +53,8 @@ _ORIGIN_HELP = "What becomes the origin: file (its own), base (centre of its foo
 
 _DRAWN_ALL = 4
 """Most positions that are drawn unless the user says which; a picture takes two seconds."""
+_RECORDED_PIXELS = 5_000_000
+"""Most pixels of a simulated recording, all frames together: some hundred bytes of memory each."""
 _NEAREST_AT_ONCE, _REFINED_AT_ONCE = 256, 64
 """Positions matched before their answers are printed; refinement takes up to 50 ms each."""
 
@@ -976,6 +978,13 @@ def _frames_simulate(
         if value is not None and not moving:
             raise UsageError(f"{option} goes with --moving: a camera at rest keeps its view")
     recording_format(out)
+    camera = _load_sensor(sensor)
+    if n_frames * camera.rows * camera.cols > _RECORDED_PIXELS:
+        most = _RECORDED_PIXELS // (camera.rows * camera.cols)
+        raise UsageError(
+            f"--frames must be at most {most} for {camera.rows} × {camera.cols} pixels: a recording is"
+            " made in memory; phasemark frames build makes large sets"
+        )
     _refuse_unwritable([out], force)
     if class_name is not None:
         name, mesh = _load_landmark(class_name, None, "z", "file", from_catalog=True)
@@ -995,7 +1004,7 @@ def _frames_simulate(
     recording = simulate_recording(
         mesh,
         _readable(name),
-        _load_sensor(sensor),
+        camera,
         views,
         seed=seed,
         albedo=mesh.metadata.get("albedo", 0.8),

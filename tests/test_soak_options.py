@@ -51,7 +51,7 @@ SMALL = {
     "sensor list": (),
     "sensor show": ("ideal",),
 }
-"""Arguments with which a command does little; others are run with the option alone and so mostly say what is missing."""
+"""Arguments with which a command does little; others get the option alone, and mostly say what is missing."""
 
 
 def commands(group, path=()):
