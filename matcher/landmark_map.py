@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict, Field, model_validator
 
 from phasemark import UsageError
-from phasemark.data.plan import PlanModel, read_toml
+from phasemark.data.plan import PlanModel
 from phasemark.matcher.robot import RobotPose, ViewEstimate, robot_poses
+from phasemark.render.toml_file import read_toml
 
 Coordinate = Annotated[float, Field(allow_inf_nan=False)]
 Std = Annotated[float, Field(ge=0, allow_inf_nan=False)]

@@ -42,13 +42,14 @@ def prepare_compile_cache() -> None:
     for parent in _temporary_folders():
         folder = parent / f"phasemark-numba-{os.getuid()}"
         if _make_private(folder):
-            numba.config.CACHE_DIR = str(folder)
+            numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
             if _can_keep():
                 _note(f"it is kept in {folder}")
                 return
-            numba.config.CACHE_DIR = ""
+            numba.config.CACHE_DIR = ""  # type: ignore[attr-defined]
     _note("every start compiles again, which takes a minute")
-    Dispatcher.enable_caching = lambda self: None  # what numba does for a function without a cache
+    # what numba does for a function without a cache
+    Dispatcher.enable_caching = lambda self: None  # type: ignore[method-assign]
 
 
 def _note(what: str) -> None:

@@ -15,8 +15,9 @@ from pydantic import Field, model_validator
 
 from phasemark import UsageError
 from phasemark.data import BankPlan
-from phasemark.data.plan import PlanModel, factored_refusal, read_toml
+from phasemark.data.plan import PlanModel, factored_refusal
 from phasemark.render import Sensor
+from phasemark.render.toml_file import read_toml
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _AtLeastZero = Annotated[float, Field(ge=0, allow_inf_nan=False)]

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from phasemark import UsageError
-from phasemark.data.plan import PlanModel, read_toml
+from phasemark.data.plan import PlanModel
 from phasemark.matcher.landmark_map import LandmarkMap, Point, Std, load_map
 from phasemark.render import Sensor, preset
+from phasemark.render.toml_file import read_toml
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Share = Annotated[float, Field(gt=0, lt=1)]
