@@ -56,6 +56,8 @@ _ORIGIN_HELP = "What becomes the origin: file (its own), base (centre of its foo
 
 _DRAWN_ALL = 4
 """Most positions that are drawn unless the user says which; a picture takes two seconds."""
+_RECORDED_PIXELS = 5_000_000
+"""Most pixels of a simulated recording, all frames together: some hundred bytes of memory each."""
 _NEAREST_AT_ONCE, _REFINED_AT_ONCE = 256, 64
 """Positions matched before their answers are printed; refinement takes up to 50 ms each."""
 
@@ -327,7 +329,7 @@ def _sensor_characterise(
     sensor = _load_sensor(name_or_file)
     with _output_folder(out, "sensor characterise", NAMES, force), _Progress("measuring"):
         found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
-        report = write_characterisation(found, name_or_file, out, seed=seed, force=force)[0]
+        report = write_characterisation(found, _readable(name_or_file), out, seed=seed, force=force)[0]
     if as_json:
         facts = found.as_dict()
         _echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
@@ -412,7 +414,7 @@ def _sensor_fit(
         amplitude_unit=amplitude_unit,  # type: ignore[arg-type]  # fit_sensor says what is right
         distance_std_m=distance_std or None,
     )
-    write_atomically(out, fit.to_toml(base_name=sensor).encode(), force=force)
+    write_atomically(out, fit.to_toml(base_name=_readable(sensor)).encode(), force=force)
     if as_json:
         _echo_json({"file": str(out), **fit.as_dict()})
         return
@@ -472,7 +474,7 @@ def _landmark_show(
     _refuse_existing([picture, page], force)
     _make_folder(folder)
     write_atomically(picture, mesh_picture(mesh), force=force)
-    write_atomically(page, mesh_html(mesh, name).encode(), force=force)
+    write_atomically(page, mesh_html(mesh, _readable(name)).encode(), force=force)
     typer.echo(picture)
     typer.echo(page)
 
@@ -777,7 +779,7 @@ def _bank_build(
     if not layout_stated and (reason := factored_refusal(resolved)) is not None:
         plan = plan.model_copy(update={"layout": "full"})
         if not plan.meshes:
-            typer.echo(f"note: a full bank, every class at every D and δ: {reason}", err=True)
+            _tell(f"note: a full bank, every class at every D and δ: {reason}")
     _build(build_bank, plan, out, shard, dry_run, max_size, as_json, workers, resume, force, shard_size, scheduler)
 
 
@@ -1018,6 +1020,13 @@ def _frames_simulate(
         if value is not None and not moving:
             raise UsageError(f"{option} goes with --moving: a camera at rest keeps its view")
     recording_format(out)
+    camera = _load_sensor(sensor)
+    if n_frames * camera.rows * camera.cols > _RECORDED_PIXELS:
+        most = _RECORDED_PIXELS // (camera.rows * camera.cols)
+        raise UsageError(
+            f"--frames must be at most {most} for {camera.rows} × {camera.cols} pixels: a recording is"
+            " made in memory; phasemark frames build makes large sets"
+        )
     _refuse_unwritable([out], force)
     if class_name is not None:
         name, mesh = _load_landmark(class_name, None, "z", "file", from_catalog=True)
@@ -1036,14 +1045,15 @@ def _frames_simulate(
     )
     recording = simulate_recording(
         mesh,
-        name,
-        _load_sensor(sensor),
+        _readable(name),
+        camera,
         views,
         seed=seed,
         albedo=mesh.metadata.get("albedo", 0.8),
         background=_background(wall, floor),
     )
-    description = f"landmark={name} sensor={Path(sensor).name} seed={seed} {'moving' if moving else 'still'}"
+    described = _readable(f"landmark={name} sensor={Path(sensor).name}")
+    description = f"{described} seed={seed} {'moving' if moving else 'still'}"
     typer.echo(write_recording(recording, out, description=description, force=force))
 
 
@@ -1115,7 +1125,7 @@ def _build(
     from phasemark.data import build_part, estimate, parse_part, planned_size
     from phasemark.data.executor import processors
     from phasemark.data.production import outputs_of, refuse_unwritable_output
-    from phasemark.data.size import format_size, parse_size
+    from phasemark.data.size import format_size, parse_size, too_many
 
     limit = parse_size(max_size, "--max-size")
     part, parts = (1, 1) if shard is None else parse_part(shard)
@@ -1124,8 +1134,9 @@ def _build(
     counts = {name: n // parts for name, n in facts.items()}
     size = counts.pop("bytes")
     if dry_run:
-        about = "not tried: the file would be larger than --max-size"
-        if size <= limit:
+        many = too_many(facts)
+        about = f"not tried: {many or 'the file would be larger than --max-size'}"
+        if size <= limit and many is None:
             facts = estimate(plan, workers=workers or processors())
             about = f"about {facts['seconds']:.3g}"
         if as_json:
@@ -1147,7 +1158,7 @@ def _build(
         refuse_unwritable_output(out, force=force, resume=resume)
         threads = workers or processors()
         seconds = estimate(plan, workers=threads, trial_seconds=_TRIAL_SECONDS)["seconds"] / parts
-        typer.echo(f"note: {described}; about {_duration(seconds)} on {threads} processors here", err=True)
+        _tell(f"note: {described}; about {_duration(seconds)} on {threads} processors here")
     with _Progress("rendering") as progress:
         options: dict[str, Any] = {
             "workers": workers, "resume": resume, "force": force, "shard_items": shard_size, "scheduler": scheduler,
@@ -1477,7 +1488,7 @@ def _match(
             diagnosis = replace(diagnose(matcher, refused[1], 0, background=background), index=refused[0])
             given = _ReadOptions(unit, flip_h, flip_v, rotate, method == "nearest", fix == "bearing")
             message = _diagnosis_text(diagnosis, given)
-            typer.echo(f"note: {message}", err=True)
+            _tell(f"note: {message}")
             if as_json:
                 answers[diagnosis.index]["diagnosis"] = {**diagnosis.as_dict(), "message": message}
         if as_json:
@@ -1678,7 +1689,7 @@ def _calibrate(
     buffer = bytes_io.BytesIO()
     residual_picture(found).savefig(buffer, format="png", dpi=100)
     write_atomically(picture, buffer.getvalue(), force=force)
-    write_atomically(out, calibration_toml(found, base_name=base_name).encode(), force=force)
+    write_atomically(out, calibration_toml(found, base_name=_readable(base_name)).encode(), force=force)
     if as_json:
         _echo_json({"file": str(out), "picture": str(picture), **calibration_dict(found)})
         return
@@ -1808,6 +1819,9 @@ def _sweep_run(
         str | None,
         typer.Option("--matcher", metavar="MODULE:NAME", help="Your own matcher, beside the plan's methods."),
     ] = None,
+    trust_plan: Annotated[
+        bool, typer.Option("--trust-plan", help="Run the programs (MODULE:NAME) that the plan itself names.")
+    ] = False,
     workers: _Workers = None,
     scheduler: Annotated[
         str, typer.Option("--scheduler", help="threads, local:N (processes), or a Dask scheduler's address.")
@@ -1817,15 +1831,18 @@ def _sweep_run(
 ) -> None:
     """Run a sweep and write its tables and report."""
     from phasemark.matcher.sweep import run_sweep, sweep_outputs
-    from phasemark.matcher.sweep_plan import Method, SweepPlan, load_sweep
+    from phasemark.matcher.sweep_plan import Method, SweepPlan, load_sweep, refuse_programs
     from phasemark.matcher.sweep_report import write_report
 
     loaded = load_sweep(plan)
     changes: dict[str, Any] = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
-    sys.path.append(str(Path.cwd()))  # a matcher of one's own lies here; an installed program does not look here itself
-    if matcher is not None:
+    if not trust_plan:
+        refuse_programs(loaded, () if matcher is None else (matcher,), plan)
+    if matcher is not None and matcher not in [method.method for method in loaded.methods]:
         changes["methods"] = (*loaded.methods, Method(name=matcher, method=matcher))
     changed = SweepPlan(**{**loaded.model_dump(), **changes})
+    if any(method.is_program for method in changed.methods):
+        sys.path.append(str(Path.cwd()))  # where one's own matcher lies; an installed program does not look here itself
     _note_plan_too_far(changed)
     _refuse_inputs(sweep_outputs(out), changed)
     with _Progress("trials") as progress:
@@ -1982,10 +1999,9 @@ def _plots_by_position(plot: Path, chosen: str | None, n: int) -> dict[int, Path
 def _note_plots(plots: Mapping[int, Path], chosen: str | None, n: int) -> None:
     """Say how to have more positions drawn than the first."""
     if plots and chosen is None and len(plots) < n:
-        typer.echo(
+        _tell(
             f"note: drew the first of {n} positions; --plot-index 0,{n // 2}:{min(n // 2 + 9, n - 1)} draws others"
-            " (some seconds each)",
-            err=True,
+            " (some seconds each)"
         )
 
 
@@ -1999,10 +2015,9 @@ def _note_motion(measured: Frames, file: Path) -> None:
     if moved.size:
         n = len(measured)
         where = "the file" if n == 1 else f"{len(moved)} of {n} positions, the first being {moved[0]}"
-        typer.echo(
+        _tell(
             f"note: {file}: the camera or the scene moved during {where}, so that the mean of the frames is no single"
-            " view; --moving matches every frame by itself",
-            err=True,
+            " view; --moving matches every frame by itself"
         )
 
 
@@ -2217,7 +2232,7 @@ def _with_symmetry(meshes: Sequence[MeshPlan], found: Sequence[MeshPlan]) -> tup
                 "has no symmetry about its axis z' (if it has one about another, --origin base brings z' into the"
                 " middle of its bounding box)"
             )
-        typer.echo(f"note: '{after.name}' {what}; --symmetry N, or 'symmetry' in a plan, overrides this", err=True)
+        _tell(f"note: '{after.name}' {what}; --symmetry N, or 'symmetry' in a plan, overrides this")
     return tuple(one.model_copy(update={"symmetry": other.symmetry}) for one, other in zip(meshes, found, strict=True))
 
 
@@ -2241,7 +2256,7 @@ def _note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None]) -> No
     for name, distance_m in distances_m.items():
         described = None if distance_m is None else sensor.describe_beyond_range(name, distance_m)
         if described is not None:
-            typer.echo(f"note: {described}", err=True)
+            _tell(f"note: {described}")
 
 
 def _note_plan_too_far(plan: ScenePlan | DrivePlan) -> None:
@@ -2354,8 +2369,7 @@ class _Progress:
 
     def _write_lines(self) -> None:
         while not self._ended.wait(_PROGRESS_SECONDS):
-            with suppress(OSError, ValueError):  # a closed stderr is no reason to end the work
-                typer.echo(self._line(), err=True)
+            _tell(self._line())
 
     def _line(self) -> str:
         done = "" if self._reported is None else f" {self._reported[0]}/{self._reported[1]},"
@@ -2394,7 +2408,7 @@ def _warnings_as_notes() -> Iterator[None]:
     """Write each thing the library warns of as one line, ``note: …``, to stderr."""
 
     def show(message: Warning | str, *where: object, **more: object) -> None:
-        typer.echo(f"note: {_one_line(str(message))}", err=True)
+        _tell(f"note: {_one_line(str(message))}")
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
@@ -2477,11 +2491,48 @@ def _report_error(message: str) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    Console(stderr=True).print(Text.assemble(("error: ", "bold red"), _one_line(message)), soft_wrap=True)
+    with _messages_may_be_lost():
+        Console(stderr=True).print(Text.assemble(("error: ", "bold red"), _one_line(message)), soft_wrap=True)
+
+
+def _tell(message: str) -> None:
+    """Write a line to stderr."""
+    with _messages_may_be_lost():
+        typer.echo(message, err=True)
+
+
+@contextmanager
+def _messages_may_be_lost() -> Iterator[None]:
+    """Let messages to a stderr that takes none be lost: they change neither the work nor its exit code."""
+    try:
+        yield
+    except (OSError, ValueError):
+        with suppress(OSError, ValueError):  # what is left in the buffer must not fail at exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 def _one_line(message: str) -> str:
-    return "".join(char if char.isprintable() else " " for char in message)
+    r"""Return a message without line breaks and control characters; bytes of a name that are not UTF-8 as ``\xNN``."""
+    return "".join(char if char.isprintable() else " " for char in _readable(message))
+
+
+def _readable(name: str) -> str:
+    r"""Return text that can be written as UTF-8: bytes of a file's name that are not become ``\xNN``."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def _open_closed_streams() -> None:
+    """Open the null device for standard streams that are closed, or the next file would take their numbers."""
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)
+            if opened != number:
+                os.dup2(opened, number)
+                os.close(opened)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
@@ -2521,11 +2572,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Python prints its traceback and exits with 1.
     """
     signal.signal(signal.SIGTERM, _terminate)
+    _open_closed_streams()
     if arguments is None and _COMPLETION in os.environ:  # the shell asks what may follow
         app(prog_name="phasemark")
     os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")  # before HDF5 is loaded: no file makes it load code
     # before NumPy is: its small products gain nothing from threads that fight our workers' for the processors
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ["MPLBACKEND"] = "agg"  # pictures become files: a window that is not there is no reason to fail
     from phasemark.files import pipes_read_once
 
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -2538,7 +2591,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
     except PhasemarkError as error:
         for note in getattr(error, "__notes__", ()):  # the traceback of a user's own code
-            typer.echo(note, err=True)
+            _tell(note)
         _report_error(str(error))
         return error.exit_code
     except BrokenPipeError:

@@ -29,6 +29,7 @@ from phasemark.data.bank import (
     group_rows,
     open_bank,
 )
+from phasemark.data.json_text import json_text
 from phasemark.data.layout import Layout
 from phasemark.data.narrow import narrowed
 from phasemark.data.plan import BankPlan, MeshPlan, factored_refusal
@@ -37,6 +38,7 @@ from phasemark.data.progress import Progress
 from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.same_file import named_files
 from phasemark.data.shards import Place
+from phasemark.data.size import planned_size, too_many
 from phasemark.landmarks import (
     LandmarkSpec,
     MeshWarning,
@@ -248,8 +250,8 @@ class BankJob:
             file.attrs["schema_version"] = SCHEMA_VERSION
             file.attrs["layout"] = plan.layout
             file.attrs["model"] = plan.model
-            file.attrs["plan"] = plan.model_dump_json()
-            file.attrs["sensor"] = self.sensor.model_dump_json()
+            file.attrs["plan"] = json_text(plan)
+            file.attrs["sensor"] = json_text(self.sensor)
             file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
             for name in LAYOUT_GROUPS[plan.layout]:
                 names = [landmark.name for landmark in self.landmarks]
@@ -301,6 +303,9 @@ def _slabs(plan: BankPlan, sensor: Sensor, landmarks: list[Landmark]) -> Iterato
 
 
 def _refuse_impossible(plan: BankPlan) -> None:
+    many = too_many(planned_size(plan))
+    if many is not None:
+        raise UsageError(f"{many}: thin 'distance_m' or 'delta_deg', or make several of it")
     reason = factored_refusal(plan) if plan.layout == "factored" else None
     if reason is not None:
         raise UsageError(f"no factored bank: {reason}; build a full one (--full, layout = 'full')")

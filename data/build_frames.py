@@ -24,6 +24,7 @@ from phasemark.data.frames import (
     FrameSet,
     open_frames,
 )
+from phasemark.data.json_text import json_text
 from phasemark.data.layout import Layout
 from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.progress import Progress
@@ -31,7 +32,7 @@ from phasemark.data.provenance import mesh_sha256, versions
 from phasemark.data.same_file import named_files
 from phasemark.data.seeds import stream
 from phasemark.data.shards import Place
-from phasemark.data.size import frame_set_fields
+from phasemark.data.size import frame_set_fields, planned_size, too_many
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture
 
 _KEYS = ("class_index", "albedo", "wall_m", "floor_m")
@@ -113,6 +114,9 @@ class FrameJob:
 
     def __init__(self, plan: FramePlan, stored_mesh: StoredMesh | None = None) -> None:
         self.plan = plan.resolve()
+        many = too_many(planned_size(self.plan))
+        if many is not None:
+            raise UsageError(f"{many}: take fewer, or make several sets with seeds of their own")
         self.sensor = self.plan.build_sensor()
         self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
         self._renderers = [Renderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks]
@@ -185,8 +189,8 @@ class FrameJob:
             file = layout.file
             file.attrs["format"] = FORMAT
             file.attrs["schema_version"] = SCHEMA_VERSION
-            file.attrs["plan"] = plan.model_dump_json()
-            file.attrs["sensor"] = sensor.model_dump_json()
+            file.attrs["plan"] = json_text(plan)
+            file.attrs["sensor"] = json_text(sensor)
             file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
             scales = {
                 name: _scale(file, name, values, units, long_name)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from pathlib import Path
 
+from phasemark.data.json_text import json_text
 from phasemark.data.page import embedded_png, figure_png, page_template
 from phasemark.data.provenance import versions
 from phasemark.data.store import write_atomically
@@ -74,7 +74,7 @@ def write_characterisation(
     facts = {"name": name, "seed": seed, "versions": versions(), **found.as_dict()}
     files = {
         REPORT: _report(found, name, seed, pictures).encode(),
-        "characterisation.json": (json.dumps(facts, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode(),
+        "characterisation.json": (json_text(facts, indent=1, allow_nan=False) + "\n").encode(),
         "points.csv": _points_csv(found).encode(),
         **{f"{title}.png": png for title, png in pictures.items()},
     }

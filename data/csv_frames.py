@@ -23,7 +23,7 @@ SECONDS_PER_TIME_UNIT: dict[str, float] = {MILLISECONDS: 1e-3, SECONDS: 1.0}
 
 _SEPARATORS = (";", "\t", ",")
 _STATED = re.compile(r"\b(unit|quantity)=(\S+)")
-_NUMBERED = re.compile(r"([a-z]+)_(\d+)")
+_NUMBERED = re.compile(r"([a-z]+)_([0-9]{1,9})")
 _PIXELS: dict[str, dict[str, str]] = {"mm": {"unit": "mm"}, "range": {"quantity": "range"}, "z": {"quantity": "z"}}
 """Prefixes of pixel columns, and what each states about the values."""
 _OTHER_GROUPS = ("status", "amplitude", "intensity")
@@ -107,7 +107,8 @@ def parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> CsvFrames:
         names = [name.lower() for name in _cells(lines[0][1], mark)] if lines else []
         if any(name in SECONDS_PER_TIME_UNIT or _group_of(name) for name in names):
             return _parse_named(names, lines, mark, stated, shape, path)
-    header = bool(lines) and _is_header(_cells(lines[0][1], separator), separator)
+    # quotation marks aside: one that is not closed would make a single cell, and so a header, of a frame
+    header = bool(lines) and _is_header(_cells(lines[0][1].replace('"', ""), separator), separator)
     pixels = f"{shape[0]} × {shape[1]} pixels"
     body = _Text(path, lines[1 if header else 0 :], separator, math.prod(shape), pixels)
     return CsvFrames({"range": _numbers(body, range(body.expected))}, stated)

@@ -16,6 +16,7 @@ from phasemark.data.narrow import narrowed
 from phasemark.data.plan import MeshPlan, PlanModel, ScenePlan, find_symmetries
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec
+from phasemark.render.view import FARTHEST_M
 
 KINDS = ("fixed", "uniform", "normal", "sobol")
 MOST_SPLITS = 256
@@ -220,6 +221,12 @@ class FramePlan(ScenePlan):
             if spread is not None and spread.lowest <= 0:
                 hint = "; cut the normal's tail with 'within'" if spread.normal and not spread.within else ""
                 raise UsageError(f"'{name}' must be positive throughout, got {_to_plain(spread)}{hint}")
+        for name in ("distance_m", "height_m", "wall_m", "floor_m"):
+            spread = getattr(self, name)
+            if spread is not None and any(
+                math.isfinite(end) and abs(end) > FARTHEST_M for end in (spread.lowest, spread.highest)
+            ):
+                raise UsageError(f"'{name}' must be at most {FARTHEST_M:g} m throughout, got {_to_plain(spread)}")
         if self.albedo is not None and not 0 < self.albedo.lowest <= self.albedo.highest <= 1:
             raise UsageError(f"'albedo' must be in (0, 1] throughout, got {_to_plain(self.albedo)}")
         if not self.splits or abs(sum(self.splits.values()) - 1) > 1e-9:

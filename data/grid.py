@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 
 MAX_POINTS = 100_000
+_MOST_DIGITS = 18
 _DECIMALS = 12  # values are rounded to this, so that 0.7 + 1 · 0.01 is the number 0.71
 _ON_GRID = 1e-6  # STOP lies on the grid when it is this close, in steps
 
@@ -109,12 +110,20 @@ def parse_indices(text: str, n: int, name: str = "index") -> list[int]:
     found: set[int] = set()
     for part in text.split(","):
         ends = part.strip().split(":")
-        if len(ends) > 2 or not all(end.isascii() and end.isdigit() for end in ends) or int(ends[0]) > int(ends[-1]):
+        bounds = [count for end in ends if (count := as_count(end)) is not None]
+        if len(bounds) != len(ends) or len(bounds) > 2 or bounds[0] > bounds[-1]:
             raise UsageError(f"{name} must be numbers and ranges such as 0,17,200:210, got {_shown(text)}")
-        if int(ends[-1]) >= n:
-            raise UsageError(f"{name} must be below {n}, the number of positions, got {part.strip()}")
-        found.update(range(int(ends[0]), int(ends[-1]) + 1))
+        if bounds[-1] >= n:
+            raise UsageError(f"{name} must be below {n}, the number of positions, got {_shown(part.strip())}")
+        found.update(range(bounds[0], bounds[-1] + 1))
     return sorted(found)
+
+
+def as_count(text: str) -> int | None:
+    """Return the number that decimal digits write, or None for other text; one beyond 10¹⁸ counts as 10¹⁸."""
+    if not (text.isascii() and text.isdigit()):
+        return None
+    return int(text) if len(text.lstrip("0")) <= _MOST_DIGITS else 10**_MOST_DIGITS
 
 
 def drop_repeated_stop(delta_deg: NDArray[np.float64], period_deg: float) -> NDArray[np.float64]:
@@ -142,7 +151,7 @@ def _span(text: str, name: str) -> NDArray[np.float64]:
 def _number(part: str | float, grid: object, name: str) -> float:
     try:
         value = math.nan if isinstance(part, bool) else float(part)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         value = math.nan
     if not math.isfinite(value):
         raise UsageError(f"'{name}' must hold finite numbers, got {_shown(grid)}")

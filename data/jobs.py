@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -17,19 +18,26 @@ from phasemark import InputFileError, OutputExistsError, UsageError
 from phasemark.data.build import BankJob
 from phasemark.data.build_frames import FrameJob
 from phasemark.data.frame_plan import FramePlan
+from phasemark.data.grid import as_count
 from phasemark.data.hdf5 import check_format, open_hdf5, reading
+from phasemark.data.json_text import json_text
 from phasemark.data.layout import Layout
 from phasemark.data.plan import BankPlan
 from phasemark.data.production import produce, refuse_unwritable_output
 from phasemark.data.progress import Progress
 from phasemark.data.same_file import named_files
 from phasemark.data.shards import Job, Place, difference, make_shard, pieces
+from phasemark.data.size import planned_size
 from phasemark.files import verify_checksum
 
 FORMAT = "phasemark-part"
 SCHEMA_VERSION = 1
 
 _TRIAL_ITEMS = 64
+_TRIED_WHOLE = 200_000
+"""Most images or views of a plan whose time is estimated on the plan itself; of larger ones a sample is tried."""
+_TRIED_VIEWS = 4096
+_TRIED_VALUES = 64
 _GOLDEN = (5**0.5 - 1) / 2
 
 
@@ -49,6 +57,10 @@ def job_of(spec: dict[str, Any]) -> Job:
     return BankJob(BankPlan(**spec["plan"])) if spec["kind"] == "bank" else FrameJob(FramePlan(**spec["plan"]))
 
 
+MOST_PARTS = 1_000_000
+"""Of a job that is built in parts."""
+
+
 def parse_part(text: str) -> tuple[int, int]:
     """Read ``i/n``, part i of n, counted from 1.
 
@@ -65,10 +77,11 @@ def parse_part(text: str) -> tuple[int, int]:
     UsageError
         It is something else.
     """
-    first, separator, last = text.partition("/")
-    if not (separator and first.isdecimal() and last.isdecimal() and 1 <= int(first) <= int(last) <= 1_000_000):
-        raise UsageError(f"--shard must be I/N with 1 ≤ I ≤ N, 2/8 for instance, got '{text}'")
-    return int(first), int(last)
+    first, _, last = text.partition("/")
+    part, parts = as_count(first), as_count(last)
+    if part is None or parts is None or not 1 <= part <= parts <= MOST_PARTS:
+        raise UsageError(f"--shard must be I/N with 1 ≤ I ≤ N ≤ {MOST_PARTS}, 2/8 for instance, got '{text[:40]}'")
+    return part, parts
 
 
 class PartJob:
@@ -110,8 +123,8 @@ class PartJob:
             file = layout.file
             file.attrs["format"] = FORMAT
             file.attrs["schema_version"] = SCHEMA_VERSION
-            file.attrs["spec"] = json.dumps(self._job.spec(), ensure_ascii=False)
-            file.attrs["identity"] = json.dumps(self._job.identity(), sort_keys=True, ensure_ascii=False)
+            file.attrs["spec"] = json_text(self._job.spec())
+            file.attrs["identity"] = json_text(self._job.identity(), sort_keys=True)
             file.attrs["header_sha256"] = whole.sha256()
             file.attrs["items"] = np.array([self.start, self.stop, self._total], dtype="<i8")
             for k, (slab, start, stop) in enumerate(self._pieces):
@@ -320,8 +333,13 @@ def estimate(plan: BankPlan | FramePlan, *, workers: int = 1, trial_seconds: flo
     dict
         ``images`` or ``views`` and ``frames``, ``bytes``, ``seconds``.
     """
-    job = job_for(plan)
+    planned = planned_size(plan)
+    total = planned["images" if isinstance(plan, BankPlan) else "views"]
+    tried = _thinned(plan) if total > _TRIED_WHOLE else plan
+    job = job_for(tried)
     layout, _ = job.lay_out()
+    header_bytes = layout.size - planned_size(tried)["bytes"]
+    scale = total / sum(job.items)
     total = sum(job.items)
     make_shard(job, 0, 1)  # compiled code is loaded
     count = min(_TRIAL_ITEMS, total)
@@ -337,9 +355,18 @@ def estimate(plan: BankPlan | FramePlan, *, workers: int = 1, trial_seconds: flo
         make_shard(job, first, min(first + run, total))
         if trial_seconds is not None and time.perf_counter() - begun > trial_seconds:
             break
-    seconds = (time.perf_counter() - begun) / made * total / workers
+    seconds = (time.perf_counter() - begun) / made * total * scale / workers
+    return {**planned, "bytes": planned["bytes"] + header_bytes, "seconds": seconds}
+
+
+def _thinned(plan: BankPlan | FramePlan) -> BankPlan | FramePlan:
+    """Return a plan whose images or views are a sample of those of a large plan, and take as long each."""
     if isinstance(plan, FramePlan):
-        items = {"views": total, "frames": total * plan.frames_per_view}
-    else:
-        items = {"images": total}
-    return {**items, "bytes": layout.size, "seconds": seconds}
+        return plan.model_copy(update={"views": _TRIED_VIEWS})
+    plan = plan.resolve()
+    assert plan.delta_deg is not None
+    fewer = {
+        name: values[:: math.ceil(len(values) / _TRIED_VALUES)]
+        for name, values in (("distance_m", plan.distance_m), ("delta_deg", plan.delta_deg))
+    }
+    return plan.model_copy(update=fewer)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import math
 import os
-import tomllib
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -27,12 +26,15 @@ from pydantic import (
     model_validator,
 )
 
-from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark import PhasemarkError, UsageError, refuse_truth_values
 from phasemark.data.grid import drop_repeated_stop, format_grid, parse_grid
-from phasemark.files import MOST_TOML_BYTES, read_text
+from phasemark.files.toml_file import read_toml
 from phasemark.landmarks import MAX_SYMMETRY, LandmarkSpec, MeshWarning, catalog, mesh_symmetry, read_mesh
 from phasemark.render import Sensor, preset
+from phasemark.render.view import FARTHEST_M
 
+MOST_LANDMARKS = 256
+"""Of a plan: each takes one or two scenes of the ray caster, which can hold some hundreds."""
 DEFAULT_DISTANCE_M = "0.7:2.1:0.01"
 DEFAULT_DELTA_STEP_DEG = 1.0
 
@@ -64,6 +66,8 @@ def _to_grid(value: Any, info: ValidationInfo) -> tuple[float, ...]:
 def _positive(values: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
     if values[0] <= 0:
         raise UsageError(f"'{info.field_name}' must be positive throughout, got {values[0]!r}")
+    if values[-1] > FARTHEST_M:
+        raise UsageError(f"'{info.field_name}' must be at most {FARTHEST_M:g} m throughout, got {values[-1]!r}")
     return values
 
 
@@ -78,9 +82,6 @@ _Grid = Annotated[
     WithJsonSchema(_GRID_SCHEMA),
 ]
 
-MOST_LANDMARKS = 1000
-"""More than any bank has; their numbers take two bytes in files."""
-
 
 class PlanModel(BaseModel):
     """A frozen table of a plan; what is wrong with it is a UsageError of one line."""
@@ -88,6 +89,7 @@ class PlanModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     def __init__(self, **data: Any) -> None:
+        refuse_truth_values(data, type(self).model_fields)
         try:
             super().__init__(**data)
         except ValidationError as error:
@@ -183,13 +185,14 @@ class ScenePlan(PlanModel, ABC):
         Raises
         ------
         UsageError
-            A class is unknown, or two landmarks have one name.
+            A class is unknown, two landmarks have one name, or there are more than 256.
         """
         named = self.classes or (() if self.landmarks or self.meshes else tuple(catalog()))
+        count = len(named) + len(self.landmarks) + len(self.meshes)
+        if count > MOST_LANDMARKS:
+            raise UsageError(f"a plan can have at most {MOST_LANDMARKS} landmarks, got {count}: make several of it")
         specs: list[LandmarkSpec] = [*(_from_catalog(name) for name in named), *self.landmarks]
         names = [*(spec.name for spec in specs), *(mesh.name for mesh in self.meshes)]
-        if len(names) > MOST_LANDMARKS:
-            raise UsageError(f"there must be at most {MOST_LANDMARKS} landmarks, got {len(names)}")
         for name in names:
             if names.count(name) > 1 or name == "none":
                 problem = "stands for no landmark" if name == "none" else "names two landmarks"
@@ -375,21 +378,6 @@ def read_plan(path: str | os.PathLike[str], model: type[P]) -> P:
 
 def _is_file(sensor: str) -> bool:
     return sensor.endswith(".toml") or "/" in sensor
-
-
-def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises
-    ------
-    InputFileError
-        The file cannot be read or is not TOML.
-    """
-    path = Path(path)
-    try:
-        return tomllib.loads(read_text(path, most_bytes=MOST_TOML_BYTES))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:  # the last: nested without end
-        raise InputFileError(f"{path}: not a TOML file ({error})") from None
 
 
 def factored_refusal(plan: BankPlan) -> str | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import importlib
 import json
+import os
 import queue
 import struct
 import subprocess
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 
 from phasemark import PhasemarkError, StorageError, UsageError
 from phasemark.data.executor import Maker
+from phasemark.data.grid import as_count
 from phasemark.data.shards import Job, difference, make_shard
 
 ATTEMPTS = 20
@@ -36,6 +38,7 @@ CONNECT_SECONDS = 10
 PATIENCE_SECONDS = 10
 """How long a shard may take before a look whether the cluster has any worker."""
 
+MOST_PROCESSES = 1024
 _LENGTH = struct.Struct("<q")
 
 
@@ -57,9 +60,12 @@ def open_maker(scheduler: str, job: Job) -> Maker | None:
         return None
     kind, _, count = scheduler.partition(":")
     if kind == "local":
-        if not (count.isdecimal() and 1 <= int(count) <= 1024):
-            raise UsageError(f"--scheduler local:N needs a number of processes, got '{scheduler}'")
-        return ProcessMaker(job, int(count))
+        n = as_count(count)
+        if n is None or not 1 <= n <= MOST_PROCESSES:
+            raise UsageError(
+                f"--scheduler local:N needs a number of processes, 1 to {MOST_PROCESSES}, got '{scheduler[:40]}'"
+            )
+        return ProcessMaker(job, n)
     if "://" not in scheduler:
         raise UsageError(
             f"--scheduler must be threads, local:N or an address such as tcp://HOST:8786, got '{scheduler}'"
@@ -159,8 +165,11 @@ class _Process:
     """One worker process."""
 
     def __init__(self, spec: str, identity: str) -> None:
+        # -P: the working folder is no place for modules unless it is one here
+        modules = os.pathsep.join(entry for entry in sys.path if entry)
         self._child = subprocess.Popen(
-            [sys.executable, "-c", "from phasemark.data.remote import serve; serve()"],
+            [sys.executable, "-P", "-c", "from phasemark.data.remote import serve; serve()"],
+            env={**os.environ, "PYTHONPATH": modules},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C is for the program that asks, which then ends its workers

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from phasemark import OutputExistsError, UsageError
 from phasemark.data.executor import Maker, processors, run_tasks
+from phasemark.data.json_text import json_text
 from phasemark.data.layout import Layout, place
 from phasemark.data.lock_file import lock_file
 from phasemark.data.progress import Progress
@@ -237,7 +238,7 @@ class _Manifest:
 
 
 def _line(**entry: Any) -> bytes:
-    return json.dumps(entry, sort_keys=True, ensure_ascii=False).encode() + b"\n"
+    return json_text(entry, sort_keys=True).encode() + b"\n"
 
 
 class _Run:

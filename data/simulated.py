@@ -15,6 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark import UsageError, __version__
+from phasemark.data.csv_cell import as_cell
 from phasemark.data.seeds import stream
 from phasemark.data.store import replacing, write_atomically
 from phasemark.render import Background, Flag, Frames, Renderer, Sensor, Views, capture
@@ -236,5 +237,5 @@ def _csv(recording: SimulatedRecording, told: str) -> str:
     text.write(f"# {told} unit={unit} quantity={quantity}\n")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
+    writer.writerows(map(as_cell, row) for row in zip(*columns.values(), strict=True))
     return text.getvalue()

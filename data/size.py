@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -14,6 +15,12 @@ from phasemark.data.frames import FRAME_FIELDS, VIEW_FIELDS
 from phasemark.data.plan import BankPlan
 from phasemark.render import Sensor
 
+MOST_IMAGES = 20_000_000
+"""Of a bank: their views are kept in memory while it is built, 32 bytes each."""
+MOST_VIEWS = 5_000_000
+"""Of a frame set: its truth is drawn and written at once, some 200 bytes a view."""
+MOST_FRAMES = 50_000_000
+"""Of a frame set: their numbers are written at once, 16 bytes each."""
 _UNITS = {"": 1, "B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _BYTES_OF_A_FRAME = 24  # its number, its view and its seed
 _BYTES_OF_A_VIEW = 67  # its number, class, split and truth
@@ -48,6 +55,26 @@ def planned_size(plan: BankPlan | FramePlan) -> dict[str, int]:
     plan = plan.resolve()
     sensor = plan.build_sensor()
     return _bank_size(plan, sensor) if isinstance(plan, BankPlan) else _frames_size(plan, sensor)
+
+
+def too_many(counts: Mapping[str, int]) -> str | None:
+    """Return why a bank or frame set of this size cannot be one file, or None.
+
+    Parameters
+    ----------
+    counts : mapping of str to int
+        As :func:`planned_size` returns them.
+
+    Examples
+    --------
+    >>> too_many({"images": 30_000_000, "bytes": 123})
+    'a bank can have at most 20000000 images, and this would have 30000000'
+    """
+    limits = {"images": ("bank", MOST_IMAGES), "views": ("frame set", MOST_VIEWS), "frames": ("frame set", MOST_FRAMES)}
+    for name, (what, most) in limits.items():
+        if counts.get(name, 0) > most:
+            return f"a {what} can have at most {most} {name}, and this would have {counts[name]}"
+    return None
 
 
 def _bank_size(plan: BankPlan, sensor: Sensor) -> dict[str, int]:
@@ -112,9 +139,10 @@ def parse_size(text: str, name: str) -> int:
     1500000000
     """
     found = re.fullmatch(r"(\d+(?:\.\d+)?) ?([kMGT]?B|)", text.strip())
-    if found is None:
-        raise UsageError(f"{name} must be a number with B, kB, MB, GB or TB, such as 20GB, got '{text}'")
-    return round(float(found[1]) * _UNITS[found[2]])
+    size = math.nan if found is None else float(found[1]) * _UNITS[found[2]]
+    if not math.isfinite(size):
+        raise UsageError(f"{name} must be a number with B, kB, MB, GB or TB, such as 20GB, got '{text[:40]}'")
+    return round(size)
 
 
 def format_size(size: int) -> str:

@@ -60,8 +60,8 @@ def opened(path: Path, *, most_bytes: int) -> Iterator[BinaryIO]:
             plain: BinaryIO = io.BytesIO(_content(path, most_bytes))
         else:
             plain = path.open("rb")
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    except (OSError, ValueError) as error:  # the second: a NUL in the name
+        raise _unreadable(path, error) from None
     with plain:
         if not isinstance(plain, io.BytesIO):
             is_vouched_for(path, plain)
@@ -86,8 +86,8 @@ def read_whole(path: str | os.PathLike[str], *, most_bytes: int) -> bytes:
     path = Path(path)
     try:
         content = _content(path, most_bytes)
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    except (OSError, ValueError) as error:  # the second: a NUL in the name
+        raise _unreadable(path, error) from None
     is_vouched_for(path, content)
     return content
 
@@ -105,6 +105,11 @@ def read_text(path: str | os.PathLike[str], *, most_bytes: int) -> str:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputFileError(f"{path}: is no text file (byte {error.start} is not UTF-8)") from None
+
+
+def _unreadable(path: Path, error: OSError | ValueError) -> InputFileError:
+    reason = error.strerror if isinstance(error, OSError) else error
+    return InputFileError(f"{path}: cannot be read ({reason})")
 
 
 def _content(path: Path, most_bytes: int) -> bytes:

@@ -232,7 +232,11 @@ def _parse(content: bytes, kind: str, name: str) -> tuple[NDArray[np.float64], N
 
     The loader drops or repairs in silence what is damaged, so the file is checked before and what comes out after.
     """
+    if kind == "off":
+        content = _without_comments(content)
     {"stl": _check_stl, "ply": _check_ply, "obj": _check_obj, "off": _check_off}[kind](content, name)
+    if kind == "obj":
+        content = _with_absolute_indices(content, name)
     try:
         with np.errstate(all="ignore"):
             loaded: Any = trimesh.load(
@@ -317,7 +321,7 @@ def _check_ply(content: bytes, name: str) -> None:
 
 
 def _check_off(content: bytes, name: str) -> None:
-    text = re.sub(rb"#[^\n]*", b"", content).split()
+    text = content.split()
     if not text or not text[0].upper().endswith(b"OFF"):
         raise InputFileError(f"{name}: not OFF (the first word must be OFF)")
     try:
@@ -327,8 +331,48 @@ def _check_off(content: bytes, name: str) -> None:
     if n_faces <= 0 or n_vertices <= 0:
         raise InputFileError(f"{name}: has no faces")
     _refuse_too_many(n_faces, name)
-    if len(text) < 4 + 3 * n_vertices + 4 * n_faces:
+    first, *others = content.splitlines()
+    counts = first.split()[1:] or others[0].split()  # some leave out the third, of edges
+    if len(text) < 1 + min(len(counts), 3) + 3 * n_vertices + 4 * n_faces:
         raise InputFileError(f"{name}: cut off ({n_vertices} vertices and {n_faces} faces announced, fewer there)")
+
+
+def _without_comments(content: bytes) -> bytes:
+    """Return the lines of an OFF file that count, without comments and blanks around them."""
+    lines = (line.partition(b"#")[0].strip() for line in content.splitlines())
+    return b"\n".join(line for line in lines if line)
+
+
+def _with_absolute_indices(content: bytes, name: str) -> bytes:
+    """Return an OBJ file whose faces count vertices from the first one.
+
+    A negative index counts back from the face itself. The loader would count from the end of the file.
+    """
+    if not re.search(rb"^\s*f\s[^\n]*-", content, re.MULTILINE):
+        return content
+    seen = {b"v": 0, b"vt": 0, b"vn": 0}
+    lines = content.replace(b"\\\n", b" ").splitlines()
+    for k, line in enumerate(lines):
+        word, *rest = line.partition(b"#")[0].split() or [b""]
+        if word in seen:
+            seen[word] += 1
+        elif word == b"f" and b"-" in line:
+            corners = [_absolute(corner, list(seen.values()), f"{name}: line {k + 1}") for corner in rest]
+            lines[k] = b" ".join([b"f", *corners])
+    return b"\n".join(lines) + b"\n"
+
+
+def _absolute(corner: bytes, counts: list[int], where: str) -> bytes:
+    """Return a corner of a face, vertex/texture/normal, with each index counted from the first."""
+    found = []
+    for index, count in zip(corner.split(b"/"), counts, strict=False):
+        if index.startswith(b"-") and index[1:].isdigit() and len(index) < 12:
+            back = int(index)
+            if count + back < 0 or back == 0:
+                raise InputFileError(f"{where}: names vertex {back}, but only {count} come before it")
+            index = b"%d" % (count + back + 1)
+        found.append(index)
+    return b"/".join(found)
 
 
 def _check_obj(content: bytes, name: str) -> None:

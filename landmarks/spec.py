@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from phasemark import UsageError
+from phasemark import UsageError, refuse_truth_values
 
 _Length = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
 _Coordinate = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
@@ -19,6 +19,7 @@ class _Spec(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     def __init__(self, **data: Any) -> None:
+        refuse_truth_values(data, type(self).model_fields)
         try:
             super().__init__(**data)
         except ValidationError as error:

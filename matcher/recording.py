@@ -11,6 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
+from phasemark.data.csv_cell import as_cell
 from phasemark.matcher.filters import FilteredFrames
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
@@ -122,7 +123,7 @@ class EstimateTable:
                 std = np.sqrt(np.maximum(np.diag(match.covariance), 0.0))
                 scale = np.outer(std, std)
                 np.divide(match.covariance, scale, out=correlation, where=scale > 0)
-        cells: list[str | int] = [match.class_name or "", "true" if match.accepted else "false"]
+        cells: list[str | int] = [as_cell(match.class_name or ""), "true" if match.accepted else "false"]
         for k, parameter in enumerate(self._free):
             scale_to_unit = _COLUMNS[parameter][2]
             cells += [_cell(scale_to_unit * values[k]), _cell(scale_to_unit * std[k])]

@@ -18,6 +18,7 @@ from phasemark import InputFileError, OutputExistsError
 from phasemark.data import versions, write_atomically
 from phasemark.data.folder_marker import OwnedFiles, adding_to_folder
 from phasemark.data.hdf5 import check_format, open_hdf5, reading
+from phasemark.data.json_text import json_text
 from phasemark.data.production import outputs_of, produce
 from phasemark.data.progress import Progress
 from phasemark.data.same_file import named_files, refuse_inputs
@@ -81,7 +82,7 @@ def run_sweep(
     """
     plan = plan.resolve()
     for method in plan.methods:
-        if ":" in method.method:
+        if method.is_program:
             check_matcher(method.method)
     folder = Path(folder)
     refuse_inputs(sweep_outputs(folder), named_files(plan.model_dump()))
@@ -172,7 +173,7 @@ def write_cells(plan: SweepPlan, trials: SweepTrials, folder: Path) -> tuple[Cel
         folder / "cells.csv", csv_bytes({name: [row[name] for row in rows] for name in rows[0]}), force=True
     )
     table = {"plan": plan.model_dump(mode="json"), "versions": versions(), "cells": json_rows(rows)}
-    text = json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False)
+    text = json_text(table, indent=1, allow_nan=False)
     write_atomically(folder / "sweep.json", text.encode(), force=True)
     return cells
 
@@ -232,7 +233,7 @@ def _begin(plan: SweepPlan, ours: OwnedFiles, *, resume: bool, force: bool) -> N
             )
     ours.claim(*(path.name for path in sweep_outputs(folder)))
     if old is None:
-        write_atomically(folder / _PLAN, plan.model_dump_json(indent=1).encode(), force=True)
+        write_atomically(folder / _PLAN, json_text(plan, indent=1).encode(), force=True)
 
 
 def _identity(path: Path) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from phasemark.matcher.sweep_style import (
     AXIS_LABEL,
     NOMINAL,
     SHOWN,
+    as_written,
     is_as_told,
     logarithmic,
     median,
@@ -50,18 +51,18 @@ def against_axis(cells: Sequence[Cell], axis: str, axes: Sequence[str]) -> Figur
             ]
             bias = [_mean([cell.bias[parameter] for cell in along[value]], scale) for value in values]
             look = {"color": colour, "marker": mark, "linestyle": stroke, "markersize": 4, "capsize": 2, "linewidth": 1}
-            _with_bars(rows[0][column], x, rmse, {**look, "label": method})
+            _with_bars(rows[0][column], x, rmse, {**look, "label": as_written(method)})
             if any(value > 1.02 * one.value for value, one in zip(whole, rmse, strict=True)):
                 rows[0][column].plot(
                     x, whole, color=colour, linewidth=0.7, alpha=0.6, marker="_" if axis in NOMINAL else None,
-                    linestyle=stroke if axis in NOMINAL else "-", label=f"{method}, with outliers",
+                    linestyle=stroke if axis in NOMINAL else "-", label=f"{as_written(method)}, with outliers",
                 )  # fmt: skip
             _with_bars(rows[1][column], x, bias, look)
             bound = tuple(median([cell.bound[parameter] * scale for cell in along[value]]) for value in values)
             bounds.setdefault(bound, []).append(method)
         by_size = sorted(bounds.items(), key=lambda item: -len(item[1]))
         for k, (bound, methods) in enumerate(by_size):
-            label_of = "Cramér–Rao bound" if k == 0 else f"bound, {', '.join(methods)}"
+            label_of = "Cramér–Rao bound" if k == 0 else f"bound, {', '.join(map(as_written, methods))}"
             drawn: dict[str, Any] = {"color": "black", "linewidth": 1.2, "linestyle": (0, (1 + 2 * k, 1))}
             x = _places(axis, values, 0)
             if axis in NOMINAL:
@@ -105,7 +106,7 @@ def maps(cells: Sequence[Cell], quantity: str) -> Figure:
             panel.set_yticks(range(len(y)), [f"{d:g}" for d in y])
             panel.set_xlabel(AXIS_LABEL["delta_deg"])
             panel.set_ylabel(AXIS_LABEL["distance_m"])
-            panel.set_title(f"{method}: {label}", fontsize=9)
+            panel.set_title(f"{as_written(method)}: {label}", fontsize=9)
             figure.colorbar(shown, ax=panel, label="RMSE / bound" if quantity == "ratio" else f"RMSE ({unit})")
     return figure
 
@@ -124,7 +125,7 @@ def bias_arrows(cells: Sequence[Cell]) -> Figure:
         arrows = np.array([[one.value for one in mean[name]] for name in ("delta_rad", "distance_m")])
         sure = np.array([[one.low > 0 or one.high < 0 for one in mean[name]] for name in SHOWN]).any(axis=0)
         _arrows(panel, places, arrows, sure)
-        panel.set_title(method, fontsize=9, loc="left", pad=10)
+        panel.set_title(as_written(method), fontsize=9, loc="left", pad=10)
     for panel in [panel for row in rows for panel in row][len(methods) :]:
         panel.set_axis_off()
     return figure
@@ -167,7 +168,7 @@ def position_in_cell(trials: SweepTrials, methods: Sequence[Method], first_m: fl
     error = trials.error
     limits = (trials.outlier[0], math.radians(trials.outlier[1]))
     for k, method in enumerate(methods):
-        if ":" in method.method:
+        if method.is_program:
             continue
         steps = (method.bank_step[0], math.radians(method.bank_step[1]))
         with np.errstate(invalid="ignore"):
@@ -180,7 +181,9 @@ def position_in_cell(trials: SweepTrials, methods: Sequence[Method], first_m: fl
             used = [b for b in range(_BINS) if (bins == b).sum() > 1]
             means = [mean_interval(scale * error[inner, k, column][bins == b]) for b in used]
             look = {"color": colour, "marker": mark, "linestyle": stroke, "markersize": 4, "capsize": 2, "linewidth": 1}
-            _with_bars(panel, [(b + 0.5) / _BINS - 0.5 for b in used], means, {**look, "label": method.name})
+            _with_bars(
+                panel, [(b + 0.5) / _BINS - 0.5 for b in used], means, {**look, "label": as_written(method.name)}
+            )
             panel.axhline(0, color="black", linewidth=0.8)
             panel.set_xlabel(f"position along {label} from the grid point, in steps")
             panel.set_ylabel(f"mean error of {label} ({unit})")
@@ -221,7 +224,7 @@ def model_comparison(trials: SweepTrials, methods: Sequence[Method]) -> Figure:
                     )  # fmt: skip
                 panel.set_xlabel(f"RMSE of {label} ({unit})")
                 panel.set_ylim(len(chosen) - 0.4, -0.6)
-                panel.set_yticks(range(len(chosen)), [methods[j].name for j in chosen], fontsize=8)
+                panel.set_yticks(range(len(chosen)), [as_written(methods[j].name) for j in chosen], fontsize=8)
                 panel.grid(which="both", linewidth=0.3)
                 panel.margins(x=0.25)
     for panel in row:

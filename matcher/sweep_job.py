@@ -8,7 +8,6 @@ trial depend on the seed, its condition and its number alone, so all methods see
 from __future__ import annotations
 
 import importlib
-import json
 import math
 import numbers
 import signal
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from phasemark import PhasemarkError, UsageError
 from phasemark.data import Bank, build_bank, mesh_sha256, versions
 from phasemark.data.build import read_landmarks
+from phasemark.data.json_text import json_text
 from phasemark.data.layout import Layout
 from phasemark.data.narrow import narrowed
 from phasemark.data.seeds import stream
@@ -148,7 +148,7 @@ class SweepJob:
             file = layout.file
             file.attrs["format"] = FORMAT
             file.attrs["schema_version"] = SCHEMA_VERSION
-            file.attrs["identity"] = json.dumps(self.identity(), sort_keys=True, ensure_ascii=False)
+            file.attrs["identity"] = json_text(self.identity(), sort_keys=True)
             file.create_dataset(
                 "condition", data=narrowed(np.repeat(self.of.conditions, self.items), "<i4", "conditions")
             )
@@ -341,7 +341,7 @@ class SweepJob:
             return self._matchers[method.name, wall_m]
 
     def _matcher(self, method: Method, wall_m: float) -> Callable[[FilteredFrames], Sequence[Match]]:
-        if ":" in method.method:
+        if method.is_program:
             return _imported(method.method)
         bank = self._bank(method)
         background: Background | Literal["auto"] | None = Background(wall_m=wall_m) if wall_m else None
@@ -361,7 +361,7 @@ class SweepJob:
 
     def _bank(self, method: Method) -> Bank:
         plan = self.plan.bank_plan(method)
-        key = plan.model_dump_json()
+        key = json_text(plan)
         if key not in self._banks:
             self._banks[key] = build_bank(plan, workers=1)
         return self._banks[key]
@@ -370,7 +370,7 @@ class SweepJob:
         method = self.plan.methods[m]
         where = f"method '{method.name}', condition {number}, trials {first} … {first + len(frames) - 1}"
         match = self.matcher(number, m)
-        if ":" in method.method:
+        if method.is_program:
             matches = _matches_of_plugin(match, method.method, frames, where)
         else:
             try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 from importlib import resources
 from pathlib import Path
@@ -155,6 +156,11 @@ class Method(PlanModel):
         if self.method == "nearest" and self.knows == "auto":
             raise UsageError(f"methods: '{self.name}' is nearest, and cannot estimate a background")
         return self
+
+    @property
+    def is_program(self) -> bool:
+        """Whether the method is a callable of the user's, ``module:name``: running it runs a program."""
+        return ":" in self.method
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -343,6 +349,30 @@ class SweepPlan(ScenePlan):
         if factored_refusal(plan) is not None:
             fields["layout"] = "full"
         return BankPlan(**fields).resolve()
+
+
+def refuse_programs(plan: SweepPlan, trusted: Collection[str], where: str) -> None:
+    """Refuse a plan that names a program which the user has not named himself.
+
+    Parameters
+    ----------
+    plan : SweepPlan
+    trusted : collection of str
+        Each ``module:name`` that may run.
+    where : str
+        The plan's file, for the message.
+
+    Raises
+    ------
+    UsageError
+        Naming the method and what would let it run.
+    """
+    for method in plan.methods:
+        if method.is_program and method.method not in trusted:
+            raise UsageError(
+                f"{where}: the method '{method.name}' would run the program '{method.method}': name it with"
+                f" --matcher {method.method}, or give --trust-plan if you trust whoever wrote the plan"
+            )
 
 
 def load_sweep(name_or_file: str | os.PathLike[str]) -> SweepPlan:

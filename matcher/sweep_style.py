@@ -56,6 +56,17 @@ def style(k: int) -> tuple[str, str, str]:
     return _STYLES[k % len(_STYLES)]
 
 
+def as_written(name: str) -> str:
+    r"""Return a user's name as matplotlib has to be given it: between two ``$`` it would read a formula.
+
+    Examples
+    --------
+    >>> print(as_written("5$ camera, 9$ lens"))
+    5\$ camera, 9\$ lens
+    """
+    return name.replace("$", r"\$")
+
+
 def methods_of(cells: Sequence[Cell]) -> list[str]:
     """Return the names of the methods in the plan's order."""
     return list(dict.fromkeys(cell.method for cell in cells))

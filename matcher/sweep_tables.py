@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from phasemark.data.csv_cell import as_cell
 from phasemark.matcher.bounds import Estimate, nees
 from phasemark.matcher.intervals import mean_interval, rms_interval, wilson
 from phasemark.matcher.models import VIEW
@@ -317,7 +318,7 @@ def csv_bytes(table: Mapping[str, Sequence[Any]], *, header: bool = True) -> byt
     writer = csv.writer(text, lineterminator="\n")
     if header:
         writer.writerow(table)
-    writer.writerows(zip(*(["" if v != v else v for v in column] for column in table.values()), strict=True))
+    writer.writerows(zip(*(["" if v != v else as_cell(v) for v in column] for column in table.values()), strict=True))
     return text.getvalue().encode()
 
 

@@ -12,7 +12,7 @@ from scipy import stats
 from phasemark.matcher.bounds import nees
 from phasemark.matcher.intervals import wilson
 from phasemark.matcher.models import VIEW
-from phasemark.matcher.sweep_style import logarithmic, methods_of, panels, style
+from phasemark.matcher.sweep_style import as_written, logarithmic, methods_of, panels, style
 from phasemark.matcher.sweep_tables import LEVELS, Cell, SweepTrials
 
 _MOST_POINTS = 2000
@@ -39,7 +39,7 @@ def nees_quantiles(trials: SweepTrials) -> Figure:
         keep = np.unique(np.linspace(0, n - 1, min(n, _MOST_POINTS)).astype(int))
         expected = stats.chi2.ppf((keep + 0.5) / n, len(at))
         colour, mark, _ = style(m)
-        panel.plot(expected, squared[keep], mark, color=colour, markersize=2.5, label=method)
+        panel.plot(expected, squared[keep], mark, color=colour, markersize=2.5, label=as_written(method))
         top = max(top, float(expected[-1]))
     panel.plot([0, top], [0, top], color="black", linewidth=0.8, label="honest")
     panel.set_ylim(0, 1.5 * top)
@@ -63,7 +63,7 @@ def coverage(cells: Sequence[Cell]) -> Figure:
             )
             panel.vlines(x, low, high, color=colour, linewidth=0.5, alpha=min(1.0, _CLEAR_BARS / max(1, len(mine))))
             if mine:
-                panel.plot(x, shares, mark, color=colour, markersize=2, label=method)
+                panel.plot(x, shares, mark, color=colour, markersize=2, label=as_written(method))
         panel.axhline(100 * level, color="black", linewidth=0.8)
         panel.set_title(f"{100 * level:g} %", fontsize=9)
         panel.set_xlabel("cell")
@@ -94,7 +94,7 @@ def confusion(trials: SweepTrials) -> Figure:
         panel.set_yticks(range(len(present)), present, fontsize=8)
         panel.set_xlabel("found")
         panel.set_ylabel("shown")
-        panel.set_title(trials.methods[m], fontsize=9)
+        panel.set_title(as_written(trials.methods[m]), fontsize=9)
     for panel in every[methods:]:
         panel.set_axis_off()
     return figure
@@ -116,7 +116,9 @@ def confusion_bound(cells: Sequence[Cell]) -> Figure:
         never = np.array([one.value == 0 for one in wrong], np.bool_)
         share = np.array([one.value for one in wrong])
         panel.vlines(x[~never], [one.low for one in wrong if one.value], high[~never], color=colour, linewidth=0.7)
-        panel.plot(x[~never], share[~never], mark, color=colour, markersize=4, label=method, linestyle="none")
+        panel.plot(
+            x[~never], share[~never], mark, color=colour, markersize=4, label=as_written(method), linestyle="none"
+        )
         panel.plot(x[never], high[never], marker=7, color=colour, markersize=4, linestyle="none", alpha=0.6)
         least = min(least, *high, *share[~never])
     ends = np.array([_LEAST_BOUND, 1.0])
@@ -144,7 +146,7 @@ def risk(trials: SweepTrials) -> Figure:
         rms = np.sqrt(np.cumsum(squares) / kept)
         show = np.unique(np.linspace(len(rms) // 50, len(rms) - 1, min(len(rms), 500)).astype(int))
         colour, _, stroke = style(m)
-        panel.plot(100 * kept[show] / landmarks, rms[show], color=colour, linestyle=stroke, label=method)
+        panel.plot(100 * kept[show] / landmarks, rms[show], color=colour, linestyle=stroke, label=as_written(method))
     logarithmic(panel.yaxis)
     panel.set_xlabel("trials kept (%)")
     panel.set_ylabel("RMSE of distance, with outliers (mm)")
@@ -168,7 +170,7 @@ def roc(trials: SweepTrials) -> Figure:
         keep = np.unique(np.linspace(0, len(limits) - 1, min(len(limits), _MOST_POINTS)).astype(int))
         panel.plot(
             100 * strangers[keep], 100 * landmarks[keep], color=colour, linestyle=stroke,
-            label=f"{method}, area {area:.3f}",
+            label=f"{as_written(method)}, area {area:.3f}",
         )  # fmt: skip
         accepted = [wilson(int(trials.accepted[rows, m].sum()), int(rows.sum())) for rows in (strange, ~strange)]
         at = [100 * one.value for one in accepted]

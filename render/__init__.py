@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from phasemark.render import compile_cache  # noqa: F401 - first, for the modules below compile functions
 from phasemark.render.ablation import Ablation, ablate
 from phasemark.render.background import Background
 from phasemark.render.capture import capture, capture_moving

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render.view import Views
+from phasemark.render.view import FARTHEST_M, Views
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,8 @@ class Background:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise UsageError(f"'{name}' must be a positive number of metres, got {value!r}")
+            if value is not None and not 1 / FARTHEST_M <= value <= FARTHEST_M:
+                raise UsageError(f"'{name}' must be within {1 / FARTHEST_M:g} … {FARTHEST_M:g} m, got {value!r}")
         for name in ("wall_albedo", "floor_albedo"):
             value = getattr(self, name)
             if not 0 <= value <= 1:

@@ -7,7 +7,8 @@ float64 by whoever asked.
 from __future__ import annotations
 
 import importlib.util
-from typing import Protocol
+import weakref
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numba import njit
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 
 _LEAF = 4
+MOST_SCENES = 800
+"""Embree ends the process when about a thousand scenes are open."""
 
 
 class Intersector(Protocol):
@@ -27,9 +30,23 @@ class Intersector(Protocol):
 
 
 class EmbreeIntersector:
-    """Embree, called without a wrapper between. It releases the GIL, so threads scale."""
+    """Embree, called without a wrapper between. It releases the GIL, so threads scale.
+
+    Raises
+    ------
+    UsageError
+        As many scenes are open as Embree can hold.
+    """
+
+    _open: ClassVar[weakref.WeakSet[EmbreeIntersector]] = weakref.WeakSet()
 
     def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
+        if len(self._open) >= MOST_SCENES:
+            raise UsageError(
+                f"at most {MOST_SCENES} landmarks can be rendered at the same time: let go of renderers, or use"
+                " intersector='float64'"
+            )
+        self._open.add(self)
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 

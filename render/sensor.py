@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from phasemark import InputFileError, UsageError
-from phasemark.files import MOST_TOML_BYTES, read_text
+from phasemark import UsageError, refuse_truth_values
+from phasemark.files.toml_file import read_toml
 from phasemark.render.correlation import (
     SQUARE_PEAK,
     Harmonic,
@@ -24,8 +24,18 @@ from phasemark.render.correlation import (
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_LARGEST = 1e12
+"""Of any number of a sensor: the square of none overflows, and the reciprocal of none is infinite."""
+
+
+def _not_vanishing(value: float) -> float:
+    if value < 1 / _LARGEST:
+        raise ValueError(f"must be at least {1 / _LARGEST:g}")
+    return value
+
+
+_Positive = Annotated[float, Field(gt=0, le=_LARGEST, allow_inf_nan=False), AfterValidator(_not_vanishing)]
+_NonNegative = Annotated[float, Field(ge=0, le=_LARGEST, allow_inf_nan=False)]
 _Fraction = Annotated[float, Field(gt=0, le=1)]
 _HalfAngleDeg = Annotated[float, Field(gt=0, lt=85)]
 _TiltDeg = Annotated[float, Field(ge=-45, le=45)]
@@ -33,11 +43,11 @@ _TurnDeg = Annotated[float, Field(ge=-180, le=180)]
 _MountHeight = Annotated[float, Field(ge=-10, le=10)]
 _PixelCount = Annotated[int, Field(ge=1, le=4096)]
 _Share = Annotated[float, Field(ge=0, lt=1)]
-_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Finite = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST, allow_inf_nan=False)]
 _Order = Annotated[int, Field(ge=2, le=199)]
 _Pixel = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 _Row = tuple[_Finite, ...]
-_PulseShape = tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...]
+_PulseShape = tuple[_NonNegative, ...]
 
 PATTERN_BOUND = 3.0
 """Fixed patterns are normal and end at this many standard deviations: no pixel of a camera that works lies beyond."""
@@ -328,6 +338,7 @@ class Sensor(BaseModel):
     systematic_time_s: _NonNegative = 0.0
 
     def __init__(self, **data: Any) -> None:
+        refuse_truth_values(data, type(self).model_fields)
         try:
             super().__init__(**data)
         except ValidationError as error:
@@ -574,10 +585,7 @@ class Sensor(BaseModel):
             A key or value is wrong.
         """
         path = Path(path)
-        try:
-            table = tomllib.loads(read_text(path, most_bytes=MOST_TOML_BYTES))
-        except (tomllib.TOMLDecodeError, RecursionError) as error:  # the last: nested without end
-            raise InputFileError(f"{path}: not a TOML file ({error})") from None
+        table = read_toml(path)
         try:
             return cls(**table)
         except UsageError as error:

@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from phasemark.render.sensor import Sensor
 
 
+FARTHEST_M = 1e6
+"""No distance and no height is larger: beyond it float32 images and squared ranges lose their meaning."""
+
+
 @dataclass(frozen=True)
 class Views:
     """A batch of views of the landmark; four arrays of one length.
@@ -52,14 +56,14 @@ class Views:
         Raises
         ------
         UsageError
-            A value is not finite, a distance is not positive, or the shapes do not broadcast.
+            A value is not finite, a distance is not positive or above 1e6 m, or the shapes do not broadcast.
         """
         names = ("distance_m", "delta_rad", "bearing_rad", "height_m")
         values = []
         for name, given in zip(names, (distance_m, delta_rad, bearing_rad, height_m), strict=True):
             try:
                 values.append(np.asarray(given, dtype=float))
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 raise UsageError(f"'{name}' must be numbers, got {given!r}") from None
         for name, value in zip(names, values, strict=True):
             bad = value[~np.isfinite(value)]
@@ -67,6 +71,10 @@ class Views:
                 raise UsageError(f"'{name}' must be finite, got {bad.flat[0]}")
         if values[0].size and values[0].min() <= 0:
             raise UsageError(f"'distance_m' must be positive, got {values[0].min()}")
+        for name, value in (("distance_m", values[0]), ("height_m", values[3])):
+            if value.size and np.abs(value).max() > FARTHEST_M:
+                largest = value.flat[np.abs(value).argmax()]
+                raise UsageError(f"'{name}' must be at most {FARTHEST_M:g} m, got {largest:g}")
         try:
             arrays = np.broadcast_arrays(*values)
         except ValueError:

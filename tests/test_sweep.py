@@ -183,7 +183,7 @@ def test_what_a_matcher_raises_is_shown_with_its_own_traceback(
         encoding="utf-8",
     )
     monkeypatch.setattr(cli, "_PROGRESS_SECONDS", 1e6)  # no line of progress among those of the error
-    options = ["--scheduler", scheduler, "-o", str(tmp_path / "out")]
+    options = ["--scheduler", scheduler, "--trust-plan", "-o", str(tmp_path / "out")]
     assert main(["sweep", "run", str(tmp_path / "plan.toml"), *options]) == 2
     *traceback, error = capsys.readouterr().err.splitlines()
     assert error.startswith("error: method 'mine', condition 0, trials 0 … 1: ")
@@ -204,6 +204,27 @@ def test_a_module_that_fails_when_imported_is_shown_with_its_own_traceback(tmp_p
     assert [line.split('"')[1] for line in traceback if line.startswith("  File ")] == [
         str(tmp_path / "broken_matcher.py")
     ]
+
+
+@pytest.mark.parametrize("options", [(), ("--matcher", "own_matchers:refined")])
+def test_a_plan_that_names_a_program_does_not_run_it_unasked(options, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "program.py").write_text("open('ran', 'w').close()\n", encoding="utf-8")
+    (tmp_path / "plan.toml").write_text(
+        'name = "theirs"\ntrials = 2\nmethods = [{ name = "mine", method = "program:match" }]\n', encoding="utf-8"
+    )
+    assert main(["sweep", "run", "plan.toml", "-o", "out", *options]) == 2
+    assert "--trust-plan" in capsys.readouterr().err
+    assert not (tmp_path / "ran").exists()
+    assert str(tmp_path) not in sys.path
+    assert main(["plan", "check", "plan.toml"]) == 0
+    assert not (tmp_path / "ran").exists()
+    for trusting in (("--trust-plan",), ("--matcher", "program:match")):
+        sys.modules.pop("program", None)
+        assert main(["sweep", "run", "plan.toml", "-o", "out", *trusting]) == 2  # it has no 'match'
+        assert (tmp_path / "ran").exists()
+        (tmp_path / "ran").unlink()
 
 
 def test_a_folder_with_a_sweep_is_not_overwritten_unasked(reference):

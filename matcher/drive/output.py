@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data import write_atomically
+from phasemark.data.csv_cell import as_cell
 from phasemark.matcher.bounds import nees
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
 
@@ -158,5 +159,5 @@ def _csv(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(header)
-    writer.writerows(rows)
+    writer.writerows(map(as_cell, row) for row in rows)
     return buffer.getvalue()
