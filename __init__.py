@@ -5,9 +5,6 @@ The work is done in four rooms: :mod:`phasemark.landmarks` (what stands in the w
 concludes). This module holds the version and the error taxonomy, one class per exit code of the command line.
 """
 
-from collections.abc import Iterable, Mapping
-from typing import Any
-
 __version__ = "0.1.0"
 
 __all__ = ["InputFileError", "OutputExistsError", "PhasemarkError", "StorageError", "UsageError", "__version__"]
@@ -119,35 +116,3 @@ class StorageError(PhasemarkError):
     """The disk is full or fails (exit code 5)."""
 
     exit_code = 5
-
-
-def refuse_truth_values(data: Mapping[str, Any], fields: Mapping[str, Any]) -> None:
-    """Refuse true and false where a field of a pydantic model is a number: pydantic would read them as 1 and 0.
-
-    Parameters
-    ----------
-    data : mapping
-        What a model is about to be made of.
-    fields : mapping of str to FieldInfo
-        The ``model_fields`` of the model.
-
-    Raises
-    ------
-    UsageError
-        With one line that names the key and its value.
-    """
-    for key, field in fields.items():
-        kind = repr(field.annotation)
-        if ("int" in kind or "float" in kind) and "bool" not in kind and "Any" not in kind:
-            for value in _scalars(data.get(key)):
-                if isinstance(value, bool):
-                    raise UsageError(f"'{key}' must be a number, got {str(value).lower()}")
-
-
-def _scalars(value: Any) -> Iterable[Any]:
-    """Yield a value, or those of a list, however nested; tables are models of their own."""
-    if isinstance(value, list | tuple):
-        for one in value:
-            yield from _scalars(one)
-    else:
-        yield value

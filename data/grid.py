@@ -114,7 +114,7 @@ def parse_indices(text: str, n: int, name: str = "index") -> list[int]:
         if len(bounds) != len(ends) or len(bounds) > 2 or bounds[0] > bounds[-1]:
             raise UsageError(f"{name} must be numbers and ranges such as 0,17,200:210, got {_shown(text)}")
         if bounds[-1] >= n:
-            raise UsageError(f"{name} must be below {n}, the number of positions, got {_shown(part.strip())}")
+            raise UsageError(f"{name} must be below {n}, the number of positions, got {bounds[-1]}")
         found.update(range(bounds[0], bounds[-1] + 1))
     return sorted(found)
 

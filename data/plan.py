@@ -26,8 +26,9 @@ from pydantic import (
     model_validator,
 )
 
-from phasemark import PhasemarkError, UsageError, refuse_truth_values
+from phasemark import PhasemarkError, UsageError
 from phasemark.data.grid import drop_repeated_stop, format_grid, parse_grid
+from phasemark.files import refuse_truth_values
 from phasemark.files.toml_file import read_toml
 from phasemark.landmarks import MAX_SYMMETRY, LandmarkSpec, MeshWarning, catalog, mesh_symmetry, read_mesh
 from phasemark.render import Sensor, preset

@@ -2,6 +2,7 @@
 
 from phasemark.files.checksum import checksum_line, checksum_path, read_checksum, sha256_of, verify_checksum
 from phasemark.files.reading import MOST_TOML_BYTES, opened, pipes_read_once, read_text, read_whole
+from phasemark.files.truth_values import refuse_truth_values
 from phasemark.files.vouching import is_vouched_for, unverified, verifying
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "read_checksum",
     "read_text",
     "read_whole",
+    "refuse_truth_values",
     "sha256_of",
     "unverified",
     "verify_checksum",

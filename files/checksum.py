@@ -17,7 +17,16 @@ _CHECKSUM_LINE = re.compile(r"\\?(?P<digest>[0-9a-fA-F]{64}) [ *](?P<name>[^\n]+
 
 
 def checksum_path(path: str | os.PathLike[str]) -> Path:
-    """Return where the checksum of a file lies: ``FILE.sha256`` beside it."""
+    """Return where the checksum of a file lies: ``FILE.sha256`` beside it.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    Path
+    """
     path = Path(path)
     return path.with_name(path.name + ".sha256")
 
@@ -31,7 +40,16 @@ def with_checksum(path: Path) -> Path:
 
 
 def sha256_of(source: str | os.PathLike[str] | BinaryIO) -> str:
-    """Return the SHA-256 of a file's content, or of what is left of an open file, in hexadecimal."""
+    """Return the SHA-256 of a file's content, or of what is left of an open file, in hexadecimal.
+
+    Parameters
+    ----------
+    source : path-like or binary file
+
+    Returns
+    -------
+    str
+    """
     if isinstance(source, str | os.PathLike):
         with open(source, "rb") as file:
             return sha256_of(file)
@@ -108,7 +126,15 @@ def contradiction(path: Path, stated: str, actual: str) -> str:
 
 
 def checksum_line(digest: str, name: str) -> bytes:
-    """Return the content of the checksum file of a file with that digest and name."""
+    """Return the content of the checksum file of a file with that digest and name.
+
+    Parameters
+    ----------
+    digest : str
+        Hexadecimal.
+    name : str
+        Without a folder.
+    """
     # sha256sum starts the line with a backslash when the name needed escaping.
     escaped = _escaped(name)
     return os.fsencode(f"{'' if escaped == name else chr(92)}{digest}  {escaped}\n")

@@ -26,6 +26,10 @@ def pipes_read_once() -> Iterator[None]:
     """Read each pipe once within the block: whoever asks for it again is given what it delivered the first time.
 
     A plan and its sensor are read when they are checked and again when they are used.
+
+    Yields
+    ------
+    None
     """
     token = _delivered.set({})
     try:
@@ -94,6 +98,17 @@ def read_whole(path: str | os.PathLike[str], *, most_bytes: int) -> bytes:
 
 def read_text(path: str | os.PathLike[str], *, most_bytes: int) -> str:
     """Return a text file's content, UTF-8 with or without a byte order mark, read as :func:`read_whole` does.
+
+    Parameters
+    ----------
+    path : path-like
+        A file, pipe or device.
+    most_bytes : int
+        How large it may be.
+
+    Returns
+    -------
+    str
 
     Raises
     ------

@@ -27,7 +27,12 @@ def verifying() -> bool:
 
 @contextmanager
 def unverified() -> Iterator[None]:
-    """Read files in the block without comparing them with their checksums, as ``--no-verify`` does."""
+    """Read files in the block without comparing them with their checksums, as ``--no-verify`` does.
+
+    Yields
+    ------
+    None
+    """
     token = _verifying.set(False)
     try:
         yield

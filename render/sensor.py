@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from phasemark import UsageError, refuse_truth_values
+from phasemark import UsageError
+from phasemark.files import refuse_truth_values
 from phasemark.files.toml_file import read_toml
 from phasemark.render.correlation import (
     SQUARE_PEAK,

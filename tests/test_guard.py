@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import zlib
 
 import h5py
 import numpy as np
@@ -73,7 +74,10 @@ def declares_8_terabytes(file, canary):
 
 
 def deflate_bomb(file, canary):
-    file.create_dataset("range", data=np.zeros((2**16, 16, 16), "f4"), chunks=(2**10, 16, 16), compression=9)
+    bomb = file.create_dataset("range", (2**19, 16, 16), "f4", chunks=(2**14, 16, 16), compression=9)
+    packed = zlib.compress(bytes(bomb.chunks[0] * 16 * 16 * 4), 9)
+    for start in range(0, len(bomb), bomb.chunks[0]):
+        bomb.id.write_direct_chunk((start, 0, 0), packed)
 
 
 def groups_without_end(file, canary):

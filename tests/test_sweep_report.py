@@ -67,7 +67,8 @@ def folder(tmp_path_factory):
     """A sweep and its report, made on the command line."""
     place = tmp_path_factory.mktemp("report")
     (place / "plan.toml").write_text(PLAN, encoding="utf-8")
-    assert main(["sweep", "run", str(place / "plan.toml"), "-o", str(place / "out"), "--workers", "2"]) == 0
+    command = ["sweep", "run", str(place / "plan.toml"), "-o", str(place / "out"), "--workers", "2", "--trust-plan"]
+    assert main(command) == 0
     return place / "out"
 
 
@@ -253,7 +254,7 @@ def test_the_commands_tell_what_is_wrong_in_one_line(folder, tmp_path, capsys):
 def test_a_matcher_of_ones_own_joins_the_methods(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("phasemark.matcher.sweep_report.write_report", lambda folder: folder / "report.html")
     plan = folder.parent / "plan.toml"
-    options = ["--trials", "2", "--matcher", "own_matchers:off_by_3_mm", "-o", str(tmp_path / "own")]
+    options = ["--trials", "2", "--matcher", "own_matchers:off_by_3_mm", "--trust-plan", "-o", str(tmp_path / "own")]
     assert main(["sweep", "run", str(plan), *options]) == 0
     capsys.readouterr()
     assert main(["sweep", "report", str(tmp_path / "own"), "--json"]) == 0
