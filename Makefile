@@ -44,7 +44,7 @@ wheel-check: $(VENV)/.installed-test
 
 clean:
 	rm -rf build dist out .typing .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis *.egg-info
-	find __init__.py __main__.py cli.py files landmarks render data matcher tests -name __pycache__ -prune -exec rm -rf {} +
+	find __init__.py __main__.py cli.py inputs landmarks render data matcher tests -name __pycache__ -prune -exec rm -rf {} +
 
 # A name like python3.12 may exist and still not run (version managers leave such shims), so each candidate is tried.
 # PYTHON=/path/to/python overrides the choice. A leftover build/ would be shipped again by the next install.

@@ -250,7 +250,7 @@ def _start(
 ) -> None:
     """Render, bank and match what a low-resolution time-of-flight camera sees of a 3D landmark."""
     if no_verify:
-        from phasemark.files import unverified
+        from phasemark.inputs import unverified
 
         context.with_resource(unverified())
     if context.invoked_subcommand is None:
@@ -2579,7 +2579,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # before NumPy is: its small products gain nothing from threads that fight our workers' for the processors
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ["MPLBACKEND"] = "agg"  # pictures become files: a window that is not there is no reason to fail
-    from phasemark.files import pipes_read_once
+    from phasemark.inputs import pipes_read_once
 
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without '×' or 'σ' is no reason to fail

@@ -16,7 +16,7 @@ from phasemark.data.simulated import SimulatedRecording, simulate_recording, wri
 from phasemark.data.size import planned_size
 from phasemark.data.store import write_atomically, write_checksum
 from phasemark.data.verify import verify_bank, verify_frames
-from phasemark.files import read_checksum, unverified, verify_checksum
+from phasemark.inputs import read_checksum, unverified, verify_checksum
 
 __all__ = [
     "Bank",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError, UsageError
-from phasemark.files import is_vouched_for
+from phasemark.inputs import is_vouched_for
 
 Z_TOPIC = "/camera/depth/image_rect"
 RANGE_TOPIC = "/camera/range/image"

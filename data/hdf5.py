@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.data.guard import OWN_EXPANSION, OWN_FREE_BYTES, first_reading, refusal
-from phasemark.files import checksum_path, is_vouched_for, verifying
+from phasemark.inputs import checksum_path, is_vouched_for, verifying
 
 
 def open_hdf5(path: Path, what: str, *, untrusted: bool = False, foreign: bool = False) -> h5py.File:

@@ -28,7 +28,7 @@ from phasemark.data.progress import Progress
 from phasemark.data.same_file import named_files
 from phasemark.data.shards import Job, Place, difference, make_shard, pieces
 from phasemark.data.size import planned_size
-from phasemark.files import verify_checksum
+from phasemark.inputs import verify_checksum
 
 FORMAT = "phasemark-part"
 SCHEMA_VERSION = 1

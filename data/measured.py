@@ -23,7 +23,7 @@ from phasemark.data.csv_frames import MILLISECONDS, SECONDS, SECONDS_PER_TIME_UN
 from phasemark.data.guard import EXPANSION, FREE_BYTES
 from phasemark.data.hdf5 import open_hdf5
 from phasemark.data.store import write_atomically
-from phasemark.files import opened
+from phasemark.inputs import opened
 from phasemark.render import Frames, Sensor
 
 Unit = Literal["m", "cm", "mm"]

@@ -14,7 +14,7 @@ from phasemark.data.remote import open_maker
 from phasemark.data.same_file import refuse_inputs
 from phasemark.data.shards import Job, build, manifest_path, partial_path, refuse_difference, refuse_unfinished
 from phasemark.data.store import followed, refuse_unwritable
-from phasemark.files import checksum_path
+from phasemark.inputs import checksum_path
 
 
 def refuse_unwritable_output(path: Path, *, force: bool, resume: bool, inputs: Iterable[Path] = ()) -> None:

@@ -30,7 +30,7 @@ from phasemark.data.layout import Layout, place
 from phasemark.data.lock_file import lock_file
 from phasemark.data.progress import Progress
 from phasemark.data.store import finish_publishing, followed, publish, refuse_unwritable, storage_errors
-from phasemark.files import checksum_path, sha256_of
+from phasemark.inputs import checksum_path, sha256_of
 
 SHARD_BYTES = 1 << 22
 """About how much of the file a shard holds; what a killed run loses is a few of these."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data import renames
 from phasemark.data.lock_file import exclusive
-from phasemark.files import checksum_line, checksum_path, read_checksum, sha256_of
+from phasemark.inputs import checksum_line, checksum_path, read_checksum, sha256_of
 
 Buffer = bytes | bytearray | memoryview
 

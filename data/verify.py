@@ -18,7 +18,7 @@ from phasemark.data.frames import FrameSet, open_frames
 from phasemark.data.hdf5 import reading
 from phasemark.data.provenance import mesh_sha256
 from phasemark.data.seeds import stream
-from phasemark.files import verify_checksum
+from phasemark.inputs import verify_checksum
 from phasemark.render import wrap_difference_m
 
 TOLERANCE_M = 1e-5

@@ -17,7 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError, UsageError
-from phasemark.files import read_whole
+from phasemark.inputs import read_whole
 from phasemark.landmarks.mesh import MAX_FACES
 from phasemark.landmarks.symmetry import mesh_symmetry
 

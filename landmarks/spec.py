@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from phasemark import UsageError
-from phasemark.files import refuse_truth_values
+from phasemark.inputs import refuse_truth_values
 
 _Length = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
 _Coordinate = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, UsageError
-from phasemark.files import read_text
+from phasemark.inputs import read_text
 from phasemark.render import Frames
 
 POLAR = ("distance_m", "delta_deg")

@@ -14,7 +14,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from phasemark import UsageError
 from phasemark.data.plan import PlanModel
-from phasemark.files.toml_file import read_toml
+from phasemark.inputs.toml_file import read_toml
 from phasemark.matcher.robot import RobotPose, ViewEstimate, robot_poses
 
 Coordinate = Annotated[float, Field(allow_inf_nan=False)]

@@ -23,7 +23,7 @@ from phasemark.data.production import outputs_of, produce
 from phasemark.data.progress import Progress
 from phasemark.data.same_file import named_files, refuse_inputs
 from phasemark.data.shards import difference
-from phasemark.files import MOST_TOML_BYTES, read_text
+from phasemark.inputs import MOST_TOML_BYTES, read_text
 from phasemark.matcher.sweep_job import FORMAT, SCHEMA_VERSION, Round, SweepJob, check_matcher
 from phasemark.matcher.sweep_plan import SweepPlan
 from phasemark.matcher.sweep_tables import Cell, SweepTrials, csv_bytes, json_rows, trials_csv

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from phasemark import UsageError
-from phasemark.files import refuse_truth_values
-from phasemark.files.toml_file import read_toml
+from phasemark.inputs import refuse_truth_values
+from phasemark.inputs.toml_file import read_toml
 from phasemark.render.correlation import (
     SQUARE_PEAK,
     Harmonic,

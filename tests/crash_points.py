@@ -15,7 +15,7 @@ from toy_job import ToyJob, check_toy_file
 
 from phasemark import StorageError
 from phasemark.data.shards import build, manifest_path, partial_path
-from phasemark.files import checksum_path, verify_checksum
+from phasemark.inputs import checksum_path, verify_checksum
 
 CALLS = ("pwrite", "write", "fsync", "replace", "posix_fallocate", "ftruncate")
 

@@ -15,7 +15,7 @@ from system_calls import Trap
 
 from phasemark import OutputExistsError, StorageError
 from phasemark.data import verify_checksum, write_atomically
-from phasemark.files import checksum_path
+from phasemark.inputs import checksum_path
 
 
 def second(path, force):

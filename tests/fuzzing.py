@@ -24,7 +24,7 @@ import numpy as np
 from phasemark import PhasemarkError
 from phasemark.data import BankPlan, FramePlan, open_bank, open_frames, read_frames, read_plan
 from phasemark.data.shards import _Manifest
-from phasemark.files import checksum_path, read_checksum
+from phasemark.inputs import checksum_path, read_checksum
 from phasemark.landmarks import build_mesh, catalog, export_mesh, read_mesh
 from phasemark.matcher import load_map
 from phasemark.matcher.calibrate_poses import read_poses
@@ -37,7 +37,7 @@ MOST_BYTES = 2 << 30
 _TRACED = (
     "/data/",
     "/landmarks/",
-    "/files/",
+    "/inputs/",
     "/render/sensor.py",
     "/matcher/landmark_map.py",
     "/matcher/calibrate_poses",

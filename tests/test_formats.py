@@ -16,7 +16,7 @@ from regenerate_golden import BANK, BANK_PLAN, FRAMES, FRAMES_PLAN
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
 from phasemark.data import build_bank, build_frames, open_bank, open_frames, verify_bank, verify_frames
-from phasemark.files import checksum_path
+from phasemark.inputs import checksum_path
 from phasemark.matcher.plan_kinds import KINDS, check_plan, plan_example, plan_schema
 
 DOCS = Path(__file__).parent.parent / "docs"

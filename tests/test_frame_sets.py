@@ -30,7 +30,7 @@ from phasemark.data import (
 )
 from phasemark.data.jobs import job_for
 from phasemark.data.seeds import stream
-from phasemark.files import checksum_path
+from phasemark.inputs import checksum_path
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, capture, preset
 

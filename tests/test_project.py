@@ -20,7 +20,7 @@ import pytest
 import phasemark
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ("files", "data", "landmarks", "matcher", "render")
+ROOMS = ("inputs", "data", "landmarks", "matcher", "render")
 BIN = Path(sys.executable).parent
 MODULES = ["phasemark", *(found.name for found in pkgutil.walk_packages(phasemark.__path__, "phasemark."))]
 PACKAGES = ["phasemark", *(f"phasemark.{room}" for room in ROOMS)]

@@ -31,7 +31,7 @@ from phasemark.data import (
     write_checksum,
 )
 from phasemark.data.narrow import narrowed
-from phasemark.files import checksum_path, is_vouched_for, read_whole, remembered, sha256_of
+from phasemark.inputs import checksum_path, is_vouched_for, read_whole, remembered, sha256_of
 from phasemark.landmarks import read_mesh
 from phasemark.render import Sensor, preset
 
@@ -140,7 +140,7 @@ def test_a_digest_is_remembered_until_the_file_changes(tmp_path, monkeypatch):
     path.write_bytes(b"one")
     write_checksum(path)
     read = []
-    monkeypatch.setattr("phasemark.files.vouching.sha256_of", lambda file: read.append(1) or sha256_of(file))
+    monkeypatch.setattr("phasemark.inputs.vouching.sha256_of", lambda file: read.append(1) or sha256_of(file))
     assert is_vouched_for(path)
     assert is_vouched_for(path)
     assert len(read) == 1

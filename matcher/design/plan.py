@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from phasemark import UsageError
 from phasemark.data import BankPlan
 from phasemark.data.plan import PlanModel, factored_refusal
-from phasemark.files.toml_file import read_toml
+from phasemark.inputs.toml_file import read_toml
 from phasemark.render import Sensor
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

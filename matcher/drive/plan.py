@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from phasemark import UsageError
 from phasemark.data.plan import PlanModel
-from phasemark.files.toml_file import read_toml
+from phasemark.inputs.toml_file import read_toml
 from phasemark.matcher.landmark_map import LandmarkMap, Point, Std, load_map
 from phasemark.render import Sensor, preset
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from phasemark import InputFileError
-from phasemark.files.checksum import checksum_path, contradiction, read_checksum, sha256_of, with_checksum
-from phasemark.files.remembered import remember_digest, remembered_digest
+from phasemark.inputs.checksum import checksum_path, contradiction, read_checksum, sha256_of, with_checksum
+from phasemark.inputs.remembered import remember_digest, remembered_digest
 
 _ATTEMPTS = 3
 """How often file and checksum are compared while somebody replaces both."""

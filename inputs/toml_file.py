@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from phasemark import InputFileError
-from phasemark.files.reading import MOST_TOML_BYTES, read_text
+from phasemark.inputs.reading import MOST_TOML_BYTES, read_text
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -1,9 +1,9 @@
 """How files are read: opened once, no larger than such a file is, and compared with the checksum beside them."""
 
-from phasemark.files.checksum import checksum_line, checksum_path, read_checksum, sha256_of, verify_checksum
-from phasemark.files.reading import MOST_TOML_BYTES, opened, pipes_read_once, read_text, read_whole
-from phasemark.files.truth_values import refuse_truth_values
-from phasemark.files.vouching import is_vouched_for, unverified, verifying
+from phasemark.inputs.checksum import checksum_line, checksum_path, read_checksum, sha256_of, verify_checksum
+from phasemark.inputs.reading import MOST_TOML_BYTES, opened, pipes_read_once, read_text, read_whole
+from phasemark.inputs.truth_values import refuse_truth_values
+from phasemark.inputs.vouching import is_vouched_for, unverified, verifying
 
 __all__ = [
     "MOST_TOML_BYTES",

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from phasemark import InputFileError
-from phasemark.files.vouching import is_vouched_for
+from phasemark.inputs.vouching import is_vouched_for
 
 MOST_TOML_BYTES = 1 << 22
 """Plans, maps and sensor files are written by hand, or by a program that writes a line a landmark."""
