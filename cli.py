@@ -1706,7 +1706,7 @@ def _names(text: str) -> list[str]:
 def _open_bank(path: Path) -> Bank:
     """Open a bank from anywhere; say of a mesh how a bank is made of it."""
     from phasemark.data import open_bank
-    from phasemark.landmarks.reading import FORMATS
+    from phasemark.landmarks.mesh_files import FORMATS
 
     if path.exists() and path.suffix.lower().removeprefix(".") in FORMATS:
         mesh, out = shlex.quote(f"part={path}"), shlex.quote(f"{path.stem}.h5")

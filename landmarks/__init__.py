@@ -4,12 +4,12 @@ from typing import TYPE_CHECKING
 
 from phasemark.landmarks.catalog import catalog
 from phasemark.landmarks.mesh import DEFAULT_TOLERANCE_M, LOWER, MAX_FACES, UPPER, build_mesh
-from phasemark.landmarks.reading import MeshReport, MeshWarning, check_mesh, export_mesh, read_mesh
+from phasemark.landmarks.mesh_files import MeshReport, MeshWarning, check_mesh, export_mesh, read_mesh
 from phasemark.landmarks.spec import Box, Cone, Cylinder, LandmarkSpec, Revolution, Sphere
 from phasemark.landmarks.symmetry import MAX_SYMMETRY, has_symmetry, mesh_symmetry, symmetry_tolerance_m
 
 if TYPE_CHECKING:
-    from phasemark.landmarks.picture import mesh_html, mesh_picture
+    from phasemark.landmarks.figures import mesh_html, mesh_picture
 
 __all__ = [
     "DEFAULT_TOLERANCE_M",
@@ -41,7 +41,7 @@ __all__ = [
 def __getattr__(name: str) -> object:
     """Import pictures when they are asked for: matplotlib takes half a second to load."""
     if name in ("mesh_html", "mesh_picture"):
-        from phasemark.landmarks import picture
+        from phasemark.landmarks import figures as picture
 
         return getattr(picture, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

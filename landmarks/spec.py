@@ -226,7 +226,7 @@ class LandmarkSpec(_Spec):
 
     def _repr_png_(self) -> bytes:
         """Show the landmark in a notebook."""
+        from phasemark.landmarks.figures import mesh_picture
         from phasemark.landmarks.mesh import build_mesh
-        from phasemark.landmarks.picture import mesh_picture
 
         return mesh_picture(build_mesh(self))
