@@ -324,7 +324,7 @@ def _sensor_characterise(
     from phasemark.data import summary_sentences, write_characterisation
     from phasemark.data.characterisation import NAMES
     from phasemark.data.seeds import stream
-    from phasemark.render import characterise
+    from phasemark.render.bench import data_sheet as characterise
 
     sensor = _load_sensor(name_or_file)
     with _output_folder(out, "sensor characterise", NAMES, force), _Progress("measuring"):
@@ -553,7 +553,7 @@ def _landmark_design(
 
 def _echo_design(facts: Mapping[str, Any]) -> None:
     """Print a design beside the catalogue."""
-    from phasemark.render.rounding import with_interval
+    from phasemark.render.integral.rounding import with_interval
 
     def within(interval: Mapping[str, float | None], scale: float) -> str:
         value, low, high = (
@@ -2160,7 +2160,7 @@ _FREE = {"bearing": "bearing_rad", "height": "height_m"}
 
 def _estimated(answer: dict[str, Any], value: float, name: str, scale: float, form: str) -> str:
     """Return one parameter of a match as text: with its standard deviation if the match is accepted and has one."""
-    from phasemark.render.rounding import with_error
+    from phasemark.render.integral.rounding import with_error
 
     if not answer["accepted"] or answer["covariance"] is None:
         return f"{value:{form}}"
@@ -2434,7 +2434,7 @@ def _sensor_facts(sensor: Sensor) -> dict[str, Any]:
 
 def _value_and_error_of(value: object, estimate: Estimate) -> tuple[str, str]:
     """Write a fitted field and its standard error, rounded alike; pixels are counted and have no error."""
-    from phasemark.render.rounding import value_and_error
+    from phasemark.render.integral.rounding import value_and_error
 
     if estimate.std_error is None:
         return _short(value), "assumed"

@@ -10,9 +10,9 @@ from phasemark.data.json_text import json_text
 from phasemark.data.page import embedded_png, figure_png, page_template
 from phasemark.data.provenance import versions
 from phasemark.data.store import write_atomically
-from phasemark.render.characterise import ALBEDOS, Z95, Characterisation, Quantity
-from phasemark.render.noise import predicted_range_std
-from phasemark.render.rounding import value_and_error
+from phasemark.render.bench.data_sheet import ALBEDOS, Z95, Characterisation, Quantity
+from phasemark.render.integral.rounding import value_and_error
+from phasemark.render.sensor.range_noise import predicted_range_std
 
 REPORT = "report.html"
 FIGURES = ("photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold")
@@ -68,7 +68,7 @@ def write_characterisation(
     OutputExistsError, StorageError
         As in :func:`phasemark.data.write_atomically`.
     """
-    from phasemark.render.characterise_plot import characterisation_figures
+    from phasemark.render.bench.figures import characterisation_figures
 
     pictures = {title: figure_png(figure) for title, figure in characterisation_figures(found).items()}
     facts = {"name": name, "seed": seed, "versions": versions(), **found.as_dict()}

@@ -26,7 +26,7 @@ from phasemark.landmarks import build_mesh, catalog, mesh_picture
 from phasemark.matcher import kalman_filter
 from phasemark.matcher.drive import default_drive, drive_picture, run_drive
 from phasemark.render import Background, Renderer, capture, preset
-from phasemark.render.plot import draw_range
+from phasemark.render.figures import draw_range
 
 IMAGES = Path(__file__).parent / "images"
 OUT = Path(__file__).parent.parent / "out"

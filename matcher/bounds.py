@@ -27,7 +27,7 @@ from phasemark.matcher.systematic import (
     declared_covariance,
 )
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, predicted_range_std
-from phasemark.render.noise import phase_image_variance
+from phasemark.render.sensor.range_noise import phase_image_variance
 
 _WALL_STEP_M = 1e-4
 NUISANCES = ("albedo", "wall_m", "wall_albedo")

@@ -32,7 +32,7 @@ from phasemark.matcher.filters import FilteredFrames, PixelState, assumed_std_m,
 from phasemark.matcher.likelihood import Evidence, Quantity
 from phasemark.matcher.stamps import spread_stamps, stamp_jitter
 from phasemark.render import Background, Frames, Sensor, wrap_difference_m, wrap_range_m
-from phasemark.render.sensor_file import rounded
+from phasemark.render.sensor.sensor_file import rounded
 
 FEWEST_POSES = 3
 """Unless fewer numbers than that are free."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from phasemark.matcher.calibrate_model import PARAMETERS
 from phasemark.matcher.calibrate_poses import KnownPoses
-from phasemark.render.rounding import error_text
+from phasemark.render.integral.rounding import error_text
 
 TITLES = {
     "pitch": "pitch",

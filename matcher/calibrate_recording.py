@@ -28,7 +28,7 @@ from scipy import ndimage, optimize
 from phasemark.matcher.calibrate_model import ALL_NAMES, SCALE, STEP, CalibrationModel, Images, clipped
 from phasemark.matcher.likelihood import Evidence
 from phasemark.render import Sensor
-from phasemark.render.noise import direct_range_std
+from phasemark.render.sensor.range_noise import direct_range_std
 
 _Float = NDArray[np.float64]
 _Bool = NDArray[np.bool_]

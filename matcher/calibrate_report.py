@@ -13,9 +13,9 @@ from scipy import stats
 from phasemark.matcher.calibrate import Calibration
 from phasemark.matcher.calibrate_model import ALL_NAMES, NAMES, PARAMETERS
 from phasemark.matcher.calibrate_poses import POSE_UNITS
-from phasemark.render.plot import draw_difference
-from phasemark.render.rounding import error_text, value_and_error
-from phasemark.render.sensor_file import sensor_toml
+from phasemark.render.figures import draw_difference
+from phasemark.render.integral.rounding import error_text, value_and_error
+from phasemark.render.sensor.sensor_file import sensor_toml
 
 USES = {"albedo": "of the landmark: phasemark bank build --albedo, or 'albedo' in a plan"}
 """Where the numbers go that a sensor file has no place for."""

@@ -17,9 +17,9 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.render.frames import Flag, Frames
-from phasemark.render.noise import measured_range_std, predicted_range_std
-from phasemark.render.phasor import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
-from phasemark.render.sensor import Sensor
+from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
+from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
+from phasemark.render.sensor.sensor import Sensor
 
 _LEAST_POOLED = 1e-4
 """Least variance over that of the law; frames without any scatter are simulated, or frozen."""
@@ -135,7 +135,7 @@ class FilteredFrames:
     def _repr_png_(self) -> bytes | None:
         """Show range and standard deviation of the first position in a notebook; nothing where there is none."""
         from phasemark.matcher.picture import filtered_picture
-        from phasemark.render.plot import figure_png
+        from phasemark.render.figures import figure_png
 
         return figure_png(filtered_picture(self)) if len(self) else None
 

@@ -20,7 +20,7 @@ from phasemark.matcher.agreement import DISAGREEMENT, one_frame_limit_m
 from phasemark.matcher.coarse import Observation
 from phasemark.matcher.filters import FilteredFrames
 from phasemark.render import Sensor
-from phasemark.render.noise import phase_image_variance
+from phasemark.render.sensor.range_noise import phase_image_variance
 
 Quantity = Literal["ranges", "phasors"]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from phasemark.data.notebook import table_html
 from phasemark.render import Background
-from phasemark.render.rounding import with_error
+from phasemark.render.integral.rounding import with_error
 
 Reason = Literal["", "no landmark", "poor fit", "undetermined", "ambiguous"]
 """Why an answer is refused; empty if it is accepted."""

@@ -14,7 +14,7 @@ from phasemark.matcher.filters import FilteredFrames
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import background_image
 from phasemark.render import Background, Renderer, phasor_to_range_m, predicted_range_std, wrap_difference_m
-from phasemark.render.plot import draw_difference, draw_map, draw_range
+from phasemark.render.figures import draw_difference, draw_map, draw_range
 
 
 def model_range_m(bank: Bank, match: Match, background: Background | None) -> NDArray[np.float64]:

@@ -25,7 +25,7 @@ from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.models import VIEW, closing_period
 from phasemark.render import PhasorImages, Renderer, Views
-from phasemark.render.noise import phase_image_variance
+from phasemark.render.sensor.range_noise import phase_image_variance
 
 N_FRAMES = 50
 """Frames that are averaged before matching (PHYSICS section 6)."""

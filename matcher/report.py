@@ -16,7 +16,7 @@ from phasemark.data.page import embedded_png, figure_png, page_template, short_n
 from phasemark.landmarks import mesh_picture
 from phasemark.matcher.demo import LANDMARK_XY_M, SHIFT_STEPS, WALL_M, CellResult, DemoResult, cell_rows
 from phasemark.matcher.picture import describe, match_picture
-from phasemark.render.plot import RANGE_COLOURS, draw_range
+from phasemark.render.figures import RANGE_COLOURS, draw_range
 
 _ANGLE_STYLES = (("#0072B2", "o", "-"), ("#D55E00", "s", "--"), ("#009E73", "^", ":"), ("#CC79A7", "D", "-."))
 """Colours that differ for the colour-blind, with marks and strokes that differ without colour."""

@@ -23,7 +23,7 @@ from phasemark.matcher.sweep_examples import worst_examples
 from phasemark.matcher.sweep_figures import sweep_figures
 from phasemark.matcher.sweep_plan import SweepPlan
 from phasemark.matcher.sweep_tables import Cell, SweepTrials, condition_axes
-from phasemark.render.rounding import with_interval
+from phasemark.render.integral.rounding import with_interval
 
 _MOST_ROWS = 80
 _READABLE_IN = 6.5

@@ -3,24 +3,24 @@
 from typing import TYPE_CHECKING
 
 from phasemark.render import compile_cache  # noqa: F401 - first, for the modules below compile functions
-from phasemark.render.ablation import Ablation, ablate
 from phasemark.render.background import Background
-from phasemark.render.capture import capture, capture_moving
-from phasemark.render.characterise import Characterisation, Comparison, Quantity, characterise
-from phasemark.render.correlation import Harmonic, pulse_harmonics, square_harmonics
-from phasemark.render.fit import Estimate, SensorFit, fit_sensor
+from phasemark.render.bench.data_sheet import Characterisation, Comparison, Quantity, characterise
+from phasemark.render.bench.fit import Estimate, SensorFit, fit_sensor
+from phasemark.render.exposure.ablation import Ablation, ablate
+from phasemark.render.exposure.capture import capture, capture_moving
+from phasemark.render.exposure.motion import Motion, render_moving
 from phasemark.render.frames import Flag, Frames
-from phasemark.render.motion import Motion, render_moving
-from phasemark.render.noise import measured_range_std, predicted_range_std
-from phasemark.render.phasor import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
+from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
 from phasemark.render.planar import PlanarLandmark, planar_images
 from phasemark.render.renderer import Renderer
-from phasemark.render.sensor import Sensor, preset, preset_names
-from phasemark.render.unit import CameraUnit, camera_unit
+from phasemark.render.sensor.camera_unit import CameraUnit, camera_unit
+from phasemark.render.sensor.correlation import Harmonic, pulse_harmonics, square_harmonics
+from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
+from phasemark.render.sensor.sensor import Sensor, preset, preset_names
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:
-    from phasemark.render.plot import PAPER_CMAP, range_picture, terminal_picture
+    from phasemark.render.figures import PAPER_CMAP, range_picture, terminal_picture
 
 __all__ = [
     "PAPER_CMAP",
@@ -68,7 +68,7 @@ _PICTURES = ("PAPER_CMAP", "range_picture", "terminal_picture")
 def __getattr__(name: str) -> object:
     """Import pictures when they are asked for: matplotlib takes half a second to load."""
     if name in _PICTURES:
-        from phasemark.render import plot
+        from phasemark.render import figures as plot
 
         return getattr(plot, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
-from phasemark.render.sensor import Sensor
+from phasemark.render.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -190,12 +190,12 @@ class Frames:
 
     def plot(self, index: int = 0, frame: int = 0) -> Figure:
         """Draw range, amplitude and flags of one frame for a first look."""
-        from phasemark.render.plot import plot_frame
+        from phasemark.render.figures import plot_frame
 
         return plot_frame(self, index, frame)
 
     def _repr_png_(self) -> bytes | None:
         """Show the first frame in a notebook; nothing where there is none."""
-        from phasemark.render.plot import figure_png
+        from phasemark.render.figures import figure_png
 
         return figure_png(self.plot()) if self.range_m.size else None

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render.phasor import PhasorImages
-from phasemark.render.sensor import Sensor
+from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
 Profile = Sequence[tuple[float, float]] | Callable[[NDArray[np.float64]], NDArray[np.float64]]

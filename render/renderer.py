@@ -18,9 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
-from phasemark.render.edges import MeshTopology
-from phasemark.render.footprint import Scratch
-from phasemark.render.integrate import (
+from phasemark.render.integral.accumulate import (
     UNTRUSTED,
     add_background,
     aim,
@@ -29,10 +27,12 @@ from phasemark.render.integrate import (
     share_faces,
     sum_samples,
 )
-from phasemark.render.intersect import make_intersector
-from phasemark.render.phasor import PhasorImages
-from phasemark.render.sensor import Sensor
-from phasemark.render.shells import unite_shells
+from phasemark.render.integral.edge_projection import MeshTopology
+from phasemark.render.integral.footprint import Scratch
+from phasemark.render.integral.intersect import make_intersector
+from phasemark.render.integral.shells import unite_shells
+from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
 Variant = Literal["exact", "hard"]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 
 if TYPE_CHECKING:
-    from phasemark.render.sensor import Sensor
+    from phasemark.render.sensor.sensor import Sensor
 
 
 FARTHEST_M = 1e6

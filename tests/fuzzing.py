@@ -153,7 +153,7 @@ def _good_csv(folder):
 
 
 def _good_toml(folder):
-    from phasemark.render.sensor_file import sensor_toml
+    from phasemark.render.sensor.sensor_file import sensor_toml
 
     plans = [Path(__file__).parent.parent / "data" / "plans" / f"{name}.toml" for name in ("bank", "frames")]
     a_map = b'[[landmark]]\nname = "door"\nclass = "cone"\nx_m = 2.0\ny_m = 1.0\nyaw_deg = 30.0\n'

@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from phasemark.render import Views
-from phasemark.render.intersect import make_intersector
+from phasemark.render.integral.intersect import make_intersector
 
 
 def image_points(sensor, row, col, n):

@@ -19,8 +19,8 @@ from phasemark.render import (
     predicted_range_std,
     preset,
 )
-from phasemark.render.taps import demodulate, tap_means
-from phasemark.render.unit import camera_unit
+from phasemark.render.exposure.taps import demodulate, tap_means
+from phasemark.render.sensor.camera_unit import camera_unit
 
 # The chain's module; its function of the same name hides it from `import phasemark.render.capture as ...`.
 chain = importlib.import_module("phasemark.render.capture")

@@ -21,11 +21,11 @@ from phasemark.render import (
     pulse_harmonics,
     square_harmonics,
 )
-from phasemark.render import electrons as read_out
-from phasemark.render.correlation import correlation_curve, correlation_peak
-from phasemark.render.sensor import PATTERN_BOUND
-from phasemark.render.stray import spread_light
-from phasemark.render.streams import fill_normal, fill_uniform, philox, uniform_pair
+from phasemark.render.exposure import photoelectrons as read_out
+from phasemark.render.exposure.random_streams import fill_normal, fill_uniform, philox, uniform_pair
+from phasemark.render.exposure.stray_light import spread_light
+from phasemark.render.sensor.correlation import correlation_curve, correlation_peak
+from phasemark.render.sensor.sensor import PATTERN_BOUND
 
 chain = importlib.import_module("phasemark.render.capture")  # hidden by its function of the same name
 PMD = preset("pmd-16x16")

@@ -15,12 +15,12 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.render import Sensor, camera_unit, capture, characterise, preset
-from phasemark.render.characterise import fit_line
-from phasemark.render.characterise_plot import characterisation_figures
-from phasemark.render.flat_field import board_image, expected_flat_field, flat_field
-from phasemark.render.noise import exact_phase_moments, phase_density
+from phasemark.render.bench.data_sheet import fit_line
+from phasemark.render.bench.figures import characterisation_figures
+from phasemark.render.bench.flat_field import board_image, expected_flat_field, flat_field
+from phasemark.render.sensor.range_noise import exact_phase_moments, phase_density
 
-bench = importlib.import_module("phasemark.render.characterise")  # hidden by its function of the same name
+bench = importlib.import_module("phasemark.render.bench.data_sheet")  # hidden by its function of the same name
 N = 30  # frames a point, 7 680 readings of a 16 × 16 camera
 
 

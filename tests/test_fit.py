@@ -11,10 +11,10 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.render import Flag, Frames, Sensor, camera_unit, capture, fit_sensor, preset
-from phasemark.render.correlation import correlation_curve
-from phasemark.render.fit import FEWEST_FRAMES
-from phasemark.render.flat_field import board_image
-from phasemark.render.stray import spread_light
+from phasemark.render.bench.fit import FEWEST_FRAMES
+from phasemark.render.bench.flat_field import board_image
+from phasemark.render.exposure.stray_light import spread_light
+from phasemark.render.sensor.correlation import correlation_curve
 
 PMD, BAD_DAY = preset("pmd-16x16"), preset("pmd-16x16-wiggle")
 FAR = (0.8, 1.2, 2.0, 3.0, 4.0, 5.0)

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from phasemark import UsageError
 from phasemark.render import Background, Motion, Renderer, Views, capture, capture_moving, preset, render_moving
-from phasemark.render.motion import phase_image_times_s
+from phasemark.render.exposure.motion import phase_image_times_s
 
 IDEAL = preset("ideal")
 

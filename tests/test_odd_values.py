@@ -16,7 +16,7 @@ from phasemark.data.csv_frames import parse_csv
 from phasemark.data.jobs import estimate
 from phasemark.landmarks import build_mesh, catalog, export_mesh, mesh_html, read_mesh
 from phasemark.render import Background, Renderer, Views, preset
-from phasemark.render.intersect import MOST_SCENES, EmbreeIntersector
+from phasemark.render.integral.intersect import MOST_SCENES, EmbreeIntersector
 
 HUGE = "9" * 5000
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "v 0 0 1\n"
@@ -121,7 +121,7 @@ def test_a_plan_of_very_many_landmarks_is_refused():
 def test_the_ray_caster_refuses_the_scene_that_would_end_the_process(monkeypatch):
     pytest.importorskip("embreex")
     assert MOST_SCENES < 1000  # where Embree 4.4 crashes
-    monkeypatch.setattr("phasemark.render.intersect.MOST_SCENES", len(EmbreeIntersector._open))
+    monkeypatch.setattr("phasemark.render.integral.intersect.MOST_SCENES", len(EmbreeIntersector._open))
     with pytest.raises(UsageError, match="landmarks can be rendered at the same time"):
         Renderer(build_mesh(catalog()["cone"]), preset("ideal"))
 

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from phasemark import UsageError
 from phasemark.render import PAPER_CMAP, Flag, Frames, PhasorImages, Views, preset, range_picture, terminal_picture
-from phasemark.render.plot import RANGE_COLOURS
+from phasemark.render.figures import RANGE_COLOURS
 
 SENSOR = preset("ideal")
 

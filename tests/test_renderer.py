@@ -22,7 +22,7 @@ from oracles import (
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, Sensor, preset
-from phasemark.render.intersect import make_intersector
+from phasemark.render.integral.intersect import make_intersector
 
 PMD = preset("pmd-16x16")
 POINT = PMD.with_(fill_factor=(1e-4, 1e-4))

@@ -12,9 +12,9 @@ from phasemark.data.characterisation import _quantity_row
 from phasemark.matcher import Match
 from phasemark.matcher.bounds import Estimate as Interval
 from phasemark.matcher.sweep_report import _with_interval
-from phasemark.render.characterise import Quantity
-from phasemark.render.fit import Estimate
-from phasemark.render.rounding import error_text, value_and_error, with_error, with_interval
+from phasemark.render.bench.data_sheet import Quantity
+from phasemark.render.bench.fit import Estimate
+from phasemark.render.integral.rounding import error_text, value_and_error, with_error, with_interval
 
 
 @pytest.mark.parametrize(

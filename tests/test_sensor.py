@@ -26,7 +26,7 @@ from phasemark.render import (
     preset,
     preset_names,
 )
-from phasemark.render.sensor_file import sensor_toml
+from phasemark.render.sensor.sensor_file import sensor_toml
 
 PMD = preset("pmd-16x16")
 DIRECT = preset("vl53l5cx-8x8")

@@ -12,7 +12,7 @@ from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.bounds import nees
 from phasemark.matcher.drive import Equipment, default_drive, pose_error, run_drive
 from phasemark.render import Background, Renderer, capture, predicted_range_std, preset
-from phasemark.render.intersect import make_intersector
+from phasemark.render.integral.intersect import make_intersector
 
 pytestmark = pytest.mark.soak
 

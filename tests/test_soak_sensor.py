@@ -18,7 +18,7 @@ from chain_cells import (
 from scipy import integrate, stats
 
 from phasemark.render import capture
-from phasemark.render import electrons as read_out
+from phasemark.render.exposure import photoelectrons as read_out
 
 pytestmark = pytest.mark.soak
 

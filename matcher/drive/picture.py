@@ -17,7 +17,7 @@ from scipy import stats
 
 from phasemark.landmarks import catalog
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
-from phasemark.render.plot import draw_range
+from phasemark.render.figures import draw_range
 
 _TRUE, _DEAD, _CORRECTED, _MARK = "#1a1a1a", "#c8553d", "#2a6fbb", "#5b8c5a"
 _ENLARGED = 10.0

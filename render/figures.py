@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
     from phasemark.render.frames import Frames
-    from phasemark.render.phasor import PhasorImages
+    from phasemark.render.phasor_images import PhasorImages
 
 PAPER_CMAP = LinearSegmentedColormap.from_list("paper", ["#ffffff", "#2f6fe4", "#000000"])
 """The colours of the paper's figure 4, as :data:`RANGE_COLOURS` explains them."""

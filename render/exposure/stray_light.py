@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.render.sensor import Sensor
+from phasemark.render.sensor.sensor import Sensor
 
 _Number = TypeVar("_Number", np.float64, np.complex128)
 

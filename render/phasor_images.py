@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
-from phasemark.render.sensor import Sensor
+from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:
@@ -188,12 +188,12 @@ class PhasorImages:
 
     def plot(self, index: int = 0) -> Figure:
         """Draw range, amplitude and coverage of one view for a first look."""
-        from phasemark.render.plot import plot_phasor_image
+        from phasemark.render.figures import plot_phasor_image
 
         return plot_phasor_image(self, index)
 
     def _repr_png_(self) -> bytes | None:
         """Show the first view in a notebook; nothing where there is none."""
-        from phasemark.render.plot import figure_png
+        from phasemark.render.figures import figure_png
 
         return figure_png(self.plot()) if len(self) else None

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from phasemark.render.sensor import Sensor
+from phasemark.render.sensor.sensor import Sensor
 
 _DIGITS = 7  # of a number in a sensor file
 

@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from phasemark import UsageError
 from phasemark.inputs import refuse_truth_values
 from phasemark.inputs.toml_file import read_toml
-from phasemark.render.correlation import (
+from phasemark.render.sensor.correlation import (
     SQUARE_PEAK,
     Harmonic,
     correlation_peak,
@@ -784,7 +784,7 @@ def _check_table(name: str, table: tuple[_Row, ...], rows: int, cols: int, what:
 
 def preset_names() -> list[str]:
     """Return the names of the shipped presets."""
-    files = resources.files("phasemark.render").iterdir()
+    files = resources.files("phasemark.render.sensor").joinpath("presets").iterdir()
     return sorted(entry.name.removesuffix(".toml") for entry in files if entry.name.endswith(".toml"))
 
 
@@ -808,5 +808,5 @@ def preset(name: str) -> Sensor:
     """
     if name not in preset_names():
         raise UsageError(f"unknown sensor '{name}': the presets are {', '.join(preset_names())}")
-    text = resources.files("phasemark.render").joinpath(f"{name}.toml").read_text(encoding="utf-8")
+    text = resources.files("phasemark.render.sensor").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")
     return Sensor(**tomllib.loads(text))

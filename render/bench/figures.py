@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from phasemark.render.characterise import Characterisation, Comparison
-from phasemark.render.plot import draw_map
+from phasemark.render.bench.data_sheet import Characterisation, Comparison
+from phasemark.render.figures import draw_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

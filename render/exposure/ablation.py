@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from phasemark.render.capture import capture
+from phasemark.render.exposure.capture import capture
 from phasemark.render.frames import Frames
-from phasemark.render.phasor import PhasorImages
-from phasemark.render.sensor import Sensor
+from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.sensor.sensor import Sensor
 
 
 class Ablation(NamedTuple):

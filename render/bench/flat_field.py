@@ -15,14 +15,14 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.render.background import Background
-from phasemark.render.correlation import correlation_curve
-from phasemark.render.electrons import EXACT_POISSON_BELOW
-from phasemark.render.noise import exact_phase_moments
-from phasemark.render.phasor import PhasorImages
+from phasemark.render.exposure.photoelectrons import EXACT_POISSON_BELOW
+from phasemark.render.exposure.stray_light import spread_light
+from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.renderer import Renderer
-from phasemark.render.sensor import Sensor
-from phasemark.render.stray import spread_light
-from phasemark.render.unit import camera_unit
+from phasemark.render.sensor.camera_unit import camera_unit
+from phasemark.render.sensor.correlation import correlation_curve
+from phasemark.render.sensor.range_noise import exact_phase_moments
+from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
 _CLEAR_SIGMAS = 6.0  # a tap this far from its limits reaches them in one of 1e9 readings

@@ -11,8 +11,8 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phasemark.render.sensor import Sensor
-from phasemark.render.unit import CameraUnit
+from phasemark.render.sensor.camera_unit import CameraUnit
+from phasemark.render.sensor.sensor import Sensor
 
 N_PHASES = 4
 N_TAPS = 2

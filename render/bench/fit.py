@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 
 from phasemark import UsageError
-from phasemark.render.correlation import Harmonic, correlation_curve, correlation_peak
-from phasemark.render.flat_field import board_image
+from phasemark.render.bench.flat_field import board_image
 from phasemark.render.frames import Frames
-from phasemark.render.noise import exact_phase_moments
-from phasemark.render.phasor import wrap_difference_m
-from phasemark.render.rounding import error_text, with_error
-from phasemark.render.sensor import Sensor
-from phasemark.render.sensor_file import rounded, sensor_toml
+from phasemark.render.integral.rounding import error_text, with_error
+from phasemark.render.phasor_images import wrap_difference_m
+from phasemark.render.sensor.correlation import Harmonic, correlation_curve, correlation_peak
+from phasemark.render.sensor.range_noise import exact_phase_moments
+from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor_file import rounded, sensor_toml
 
 AmplitudeUnit = Literal["electrons", "arbitrary"]
 

@@ -26,18 +26,18 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.render.background import Background
-from phasemark.render.direct import capture_direct
-from phasemark.render.electrons import ReadOut, read_taps
+from phasemark.render.exposure.direct_sensor import capture_direct
+from phasemark.render.exposure.motion import Motion, render_moving
+from phasemark.render.exposure.photoelectrons import ReadOut, read_taps
+from phasemark.render.exposure.random_streams import draw_key
+from phasemark.render.exposure.stray_light import spread_light
+from phasemark.render.exposure.taps import N_PHASES, N_TAPS, collect, demodulate, tap_means
 from phasemark.render.frames import Flag, Frames
-from phasemark.render.motion import Motion, render_moving
-from phasemark.render.noise import phase_image_variance
-from phasemark.render.phasor import PhasorImages, phasor_to_range_m
+from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m
 from phasemark.render.renderer import Renderer
-from phasemark.render.sensor import Sensor
-from phasemark.render.stray import spread_light
-from phasemark.render.streams import draw_key
-from phasemark.render.taps import N_PHASES, N_TAPS, collect, demodulate, tap_means
-from phasemark.render.unit import CameraUnit, camera_unit
+from phasemark.render.sensor.camera_unit import CameraUnit, camera_unit
+from phasemark.render.sensor.range_noise import phase_image_variance
+from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
 # float32 files may round |S_1| just above the intensity; anything more is not an image.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from phasemark.render.sensor import Sensor
+from phasemark.render.sensor.sensor import Sensor
 
 _HOPELESS_STD_RAD = 100.0  # π²/3 of phase variance to one part in 1e2; no law describes a signal so low
 

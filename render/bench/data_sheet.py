@@ -1,7 +1,7 @@
 """Characterise a sensor as EMVA 1288 and the literature on PMD cameras would: by flat fields, beside predictions.
 
-Every figure stands beside what closed forms predict (:mod:`~phasemark.render.flat_field`), with its number of samples
-and its standard error; :attr:`Comparison.chi2` says whether the two agree.
+Every figure stands beside what closed forms predict (:mod:`~phasemark.render.bench.flat_field`), with its number of
+samples and its standard error; :attr:`Comparison.chi2` says whether the two agree.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from scipy import special
 
 from phasemark import UsageError
-from phasemark.render.capture import capture
-from phasemark.render.flat_field import ExpectedFlatField, expected_flat_field, flat_field
+from phasemark.render.bench.flat_field import ExpectedFlatField, expected_flat_field, flat_field
+from phasemark.render.exposure.capture import capture
 from phasemark.render.frames import Flag, Frames
-from phasemark.render.noise import direct_range_std, exact_phase_moments, predicted_range_std
-from phasemark.render.phasor import wrap_difference_m
-from phasemark.render.sensor import Sensor
-from phasemark.render.unit import camera_unit
+from phasemark.render.phasor_images import wrap_difference_m
+from phasemark.render.sensor.camera_unit import camera_unit
+from phasemark.render.sensor.range_noise import direct_range_std, exact_phase_moments, predicted_range_std
+from phasemark.render.sensor.sensor import Sensor
 
 ALBEDOS = (0.1, 0.4, 0.8)
 """Albedos of the flat fields, dark to bright."""

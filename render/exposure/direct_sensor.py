@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from phasemark.render.exposure.random_streams import Term, draw_key, fill_normal, fill_uniform
 from phasemark.render.frames import Flag, Frames
-from phasemark.render.noise import direct_range_std
-from phasemark.render.phasor import PhasorImages
-from phasemark.render.sensor import Sensor
-from phasemark.render.streams import Term, draw_key, fill_normal, fill_uniform
-from phasemark.render.unit import camera_unit
+from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.sensor.camera_unit import camera_unit
+from phasemark.render.sensor.range_noise import direct_range_std
+from phasemark.render.sensor.sensor import Sensor
 
 
 def capture_direct(
@@ -25,8 +25,8 @@ def capture_direct(
     The range of a pixel is the light-weighted mean over its footprint: the phasor's modulation is so slow that its
     argument is that mean. A pixel drops out (:attr:`Flag.NO_RETURN`) where nothing returns, where less than
     `min_intensity` does, or beyond `max_range_m`. The noise is that of
-    :func:`~phasemark.render.noise.direct_range_std`; `range_offset_m` and `zone_offset_m` are added. There is no
-    amplitude.
+    :func:`~phasemark.render.sensor.range_noise.direct_range_std`; `range_offset_m` and `zone_offset_m` are added.
+    There is no amplitude.
     """
     shape = (len(image), n_frames, sensor.rows, sensor.cols)
     range_m = np.repeat(image.range_m[:, None] + sensor.range_offset_m, n_frames, axis=1)

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 
 from phasemark.render.background import background_edge, background_hit
-from phasemark.render.edges import project_edges
-from phasemark.render.footprint import bin_segments, gauss_legendre, sample_pixel
+from phasemark.render.integral.edge_projection import project_edges
+from phasemark.render.integral.footprint import bin_segments, gauss_legendre, sample_pixel
 
 _NODES, _WEIGHTS = gauss_legendre(4)
 

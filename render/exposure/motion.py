@@ -9,10 +9,10 @@ import numpy as np
 
 from phasemark import UsageError
 from phasemark.render.background import Background
-from phasemark.render.phasor import PhasorImages
+from phasemark.render.exposure.taps import N_PHASES
+from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.renderer import Renderer
-from phasemark.render.sensor import Sensor
-from phasemark.render.taps import N_PHASES
+from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
 _SAME_LINE_RAD = 1e-9  # rounding of an angle, or of metres

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from phasemark.render.sensor import Sensor
-from phasemark.render.streams import Term, fill_normal, fill_uniform, uniform_pair
+from phasemark.render.exposure.random_streams import Term, fill_normal, fill_uniform, uniform_pair
+from phasemark.render.sensor.sensor import Sensor
 
 EXACT_POISSON_BELOW = 500.0
 """Mean in electrons below which counts are drawn from the Poisson distribution itself. Above it one normal of the same

@@ -1,0 +1,1 @@
+"""The exact area integral of PHYSICS section 3: edges, pieces of pixels, rays and their sum."""

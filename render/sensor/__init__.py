@@ -1,0 +1,1 @@
+"""What the camera is: its parameters, presets, files, correlation and range noise."""
