@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
     from phasemark.data import Bank, BankPlan, FramePlan, MeshPlan
-    from phasemark.data.plan import ScenePlan
+    from phasemark.data.plans.bank_plan import ScenePlan
     from phasemark.landmarks import LandmarkSpec
     from phasemark.matcher import (
         Calibration,
@@ -119,7 +119,7 @@ class _Command(TyperCommand):
     """A command that notes which files it was given to read, so that none of them becomes its output."""
 
     def invoke(self, ctx: Any) -> Any:
-        from phasemark.data.same_file import named_files
+        from phasemark.data.files.same_file import named_files
 
         given = {name: value for name, value in ctx.params.items() if name not in _OUTPUTS}
         _inputs.set(tuple(named_files(given)))
@@ -322,7 +322,7 @@ def _sensor_characterise(
 ) -> None:
     """Measure a sensor before flat fields, as EMVA 1288 would, and compare it with what its numbers predict."""
     from phasemark.data import summary_sentences, write_characterisation
-    from phasemark.data.characterisation import NAMES
+    from phasemark.data.pages.characterisation import NAMES
     from phasemark.data.seeds import stream
     from phasemark.render.bench import data_sheet as characterise
 
@@ -745,7 +745,7 @@ def _bank_build(
 ) -> None:
     """Build a bank of noise-free model images."""
     from phasemark.data import BankPlan, MeshPlan, build_bank, load_plan
-    from phasemark.data.plan import factored_refusal
+    from phasemark.data.plans.bank_plan import factored_refusal
     from phasemark.landmarks import catalog
 
     if plan_file is not None and str(plan_file) in catalog():
@@ -1009,7 +1009,7 @@ def _frames_simulate(
     import numpy as np
 
     from phasemark.data import simulate_recording, write_recording
-    from phasemark.data.simulated import recording_format
+    from phasemark.data.measured.simulated import recording_format
     from phasemark.render import Views
 
     if (class_name is None) == (mesh_file is None):
@@ -1123,8 +1123,8 @@ def _build(
 ) -> None:
     """Build a bank or frame set, whole or in part; or say what that would take."""
     from phasemark.data import build_part, estimate, parse_part, planned_size
-    from phasemark.data.executor import processors
-    from phasemark.data.production import outputs_of, refuse_unwritable_output
+    from phasemark.data.shards.executor import processors
+    from phasemark.data.shards.run import outputs_of, refuse_unwritable_output
     from phasemark.data.size import format_size, parse_size, too_many
 
     limit = parse_size(max_size, "--max-size")
@@ -1176,7 +1176,7 @@ def _build(
 
 def _merge(shards: Sequence[Path], out: Path, resume: bool, force: bool) -> None:
     from phasemark.data import merge_parts
-    from phasemark.data.production import outputs_of
+    from phasemark.data.shards.run import outputs_of
 
     _refuse_inputs(outputs_of(out))
     with _Progress("merging") as progress:
@@ -1222,7 +1222,7 @@ def _plan_check(
     as_json: _Json = False,
 ) -> None:
     """Check a plan and say what it is; with --json print it with every default made explicit."""
-    from phasemark.data.plan import ScenePlan
+    from phasemark.data.plans.bank_plan import ScenePlan
     from phasemark.matcher.drive import DrivePlan
     from phasemark.matcher.plan_kinds import check_plan
 
@@ -1606,7 +1606,7 @@ def _calibrate(
     import io as bytes_io
 
     from phasemark.data import read_frames, write_atomically
-    from phasemark.data.executor import processors
+    from phasemark.data.shards.executor import processors
     from phasemark.matcher import PoseStd, calibrate, filter_poses, frames_of_poses, kalman_filter, read_poses
     from phasemark.matcher.calibrate_model import Mounting
     from phasemark.matcher.calibrate_report import calibration_dict, calibration_toml, residual_picture
@@ -1776,7 +1776,7 @@ def _demo(
     force: _Force = False,
 ) -> None:
     """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°."""
-    from phasemark.data.production import outputs_of
+    from phasemark.data.shards.run import outputs_of
     from phasemark.matcher.demo import cell_rows, run_demo, write_demo
     from phasemark.matcher.report import summary_rows
 
@@ -1884,8 +1884,8 @@ def _sweep_frames(
 ) -> None:
     """Take the frames of one trial of a sweep again, bit for bit."""
     from phasemark.data import write_measured
-    from phasemark.data.folder_marker import read_marker
-    from phasemark.data.same_file import refuse_inputs
+    from phasemark.data.files.folder_marker import read_marker
+    from phasemark.data.files.same_file import refuse_inputs
     from phasemark.matcher.sweep_examples import sweep_frames
 
     refuse_inputs([out], map(folder.joinpath, read_marker(folder)[1] or ()))
@@ -1987,7 +1987,7 @@ def _drive(
 
 def _plots_by_position(plot: Path, chosen: str | None, n: int) -> dict[int, Path]:
     """Return which of n positions to draw, and into which files; those of several have a number before the suffix."""
-    from phasemark.data.grid import parse_indices
+    from phasemark.data.plans.grid_axis import parse_indices
 
     if chosen is not None:
         indices = parse_indices(chosen, n, "--plot-index")
@@ -2054,7 +2054,7 @@ def _diagnosis_text(diagnosis: Diagnosis, given: _ReadOptions) -> str:
 
 def _flags(change: Change, given: _ReadOptions) -> str:
     """Return the options that make one change."""
-    from phasemark.data.measured import METRES_PER_UNIT
+    from phasemark.data.measured.reading import METRES_PER_UNIT
 
     value = change.value
     refine = "--method refine " if given.nearest else ""
@@ -2275,7 +2275,7 @@ def _make_folder(path: Path) -> None:
 
 def _refuse_inputs(outputs: Iterable[Path], plan: BaseModel | None = None) -> None:
     """Refuse outputs that are the same file as an argument of the running command, or as one that a plan names."""
-    from phasemark.data.same_file import named_files, refuse_inputs
+    from phasemark.data.files.same_file import named_files, refuse_inputs
 
     of_plan = () if plan is None else named_files(plan.model_dump())
     refuse_inputs(outputs, [*_inputs.get(), *of_plan])
@@ -2295,7 +2295,7 @@ def _output_folder(
 
     `names` must not exist unless they are ours and `force` is set; `also` are ours too, and looked at by their writer.
     """
-    from phasemark.data.folder_marker import adding_to_folder
+    from phasemark.data.files.folder_marker import adding_to_folder
 
     _refuse_existing([folder / name for name in names], force, plan)
     with adding_to_folder(folder, command) as ours:
@@ -2319,7 +2319,7 @@ _PROGRESS_SECONDS = 10.0
 
 def _refuse_unwritable(paths: Iterable[Path], force: bool) -> None:
     """Refuse outputs that exist or cannot be written, before any work is done."""
-    from phasemark.data.store import refuse_unwritable
+    from phasemark.data.files.atomic_write import refuse_unwritable
 
     _refuse_existing(paths := list(paths), force)
     for path in paths:

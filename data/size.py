@@ -9,10 +9,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from phasemark import UsageError
-from phasemark.data.bank import LAYOUT_GROUPS, VIEW_DIMS, group_rows
-from phasemark.data.frame_plan import FramePlan
-from phasemark.data.frames import FRAME_FIELDS, VIEW_FIELDS
-from phasemark.data.plan import BankPlan
+from phasemark.data.bank.bank_file import LAYOUT_GROUPS, VIEW_DIMS, group_rows
+from phasemark.data.frames.frame_set_file import FRAME_FIELDS, VIEW_FIELDS
+from phasemark.data.plans.bank_plan import BankPlan
+from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.render import Sensor
 
 MOST_IMAGES = 20_000_000

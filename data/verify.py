@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError
-from phasemark.data.bank import Bank, open_bank
-from phasemark.data.build import BankJob
-from phasemark.data.build_frames import FrameJob
-from phasemark.data.frames import FrameSet, open_frames
-from phasemark.data.hdf5 import reading
-from phasemark.data.provenance import mesh_sha256
+from phasemark.data.bank.bank_file import Bank, open_bank
+from phasemark.data.bank.build_bank import BankJob
+from phasemark.data.files.hdf5_reading import reading
+from phasemark.data.files.provenance import mesh_sha256
+from phasemark.data.frames.build_frames import FrameJob
+from phasemark.data.frames.frame_set_file import FrameSet, open_frames
 from phasemark.data.seeds import stream
 from phasemark.inputs import verify_checksum
 from phasemark.render import wrap_difference_m

@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark.data import Bank
-from phasemark.data.bank import BankGroup, group_rows
+from phasemark.data.bank.bank_file import BankGroup, group_rows
 from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.coarse import Observation, Templates
 from phasemark.matcher.models import closing_period

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
-from phasemark.data.build import rebuild_bank
+from phasemark.data.bank.build_bank import rebuild_bank
 from phasemark.matcher.diagnosis_search import SIZES, Fit, Search, fitted_wall, wider
 from phasemark.matcher.filters import FilteredFrames, PixelState
 from phasemark.matcher.match import Match

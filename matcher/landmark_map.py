@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict, Field, model_validator
 
 from phasemark import UsageError
-from phasemark.data.plan import PlanModel
+from phasemark.data.plans.bank_plan import PlanModel
 from phasemark.inputs.toml_file import read_toml
 from phasemark.matcher.robot import RobotPose, ViewEstimate, robot_poses
 

@@ -10,7 +10,7 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.data.notebook import table_html
+from phasemark.data.pages.notebook import table_html
 from phasemark.render import Background
 from phasemark.render.integral.rounding import with_error
 

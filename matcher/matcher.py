@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
-from phasemark.data.bank import BankGroup
+from phasemark.data.bank.bank_file import BankGroup
 from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.coarse import Observation, Templates
 from phasemark.matcher.estimator import (

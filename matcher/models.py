@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark.data import Bank
-from phasemark.data.bank import BankGroup
+from phasemark.data.bank.bank_file import BankGroup
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 
 VIEW = ("distance_m", "delta_rad", "bearing_rad", "height_m")

@@ -12,8 +12,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from phasemark import InputFileError, UsageError
-from phasemark.data.frame_plan import FramePlan
-from phasemark.data.plan import BankPlan, ScenePlan, read_plan
+from phasemark.data.plans.bank_plan import BankPlan, ScenePlan, read_plan
+from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.inputs.toml_file import read_toml
 from phasemark.matcher.design import DesignPlan, example_design, load_design_plan
 from phasemark.matcher.drive import DrivePlan, example_drive, load_drive_plan

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
-from phasemark.data.build import BankJob
+from phasemark.data.bank.build_bank import BankJob
 from phasemark.data.seeds import stream
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.bounds import cramer_rao

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from phasemark.data.csv_cell import as_cell
+from phasemark.data.files.csv_cell import as_cell
 from phasemark.matcher.filters import FilteredFrames
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher

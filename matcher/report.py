@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from phasemark.data import versions
-from phasemark.data.page import embedded_png, figure_png, page_template, short_number
+from phasemark.data.pages.page import embedded_png, figure_png, page_template, short_number
 from phasemark.landmarks import mesh_picture
 from phasemark.matcher.demo import LANDMARK_XY_M, SHIFT_STEPS, WALL_M, CellResult, DemoResult, cell_rows
 from phasemark.matcher.picture import describe, match_picture

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from phasemark import InputFileError, OutputExistsError
 from phasemark.data import versions, write_atomically
-from phasemark.data.folder_marker import OwnedFiles, adding_to_folder
-from phasemark.data.hdf5 import check_format, open_hdf5, reading
-from phasemark.data.json_text import json_text
-from phasemark.data.production import outputs_of, produce
+from phasemark.data.files.folder_marker import OwnedFiles, adding_to_folder
+from phasemark.data.files.hdf5_reading import check_format, open_hdf5, reading
+from phasemark.data.files.json_text import json_text
+from phasemark.data.files.same_file import named_files, refuse_inputs
 from phasemark.data.progress import Progress
-from phasemark.data.same_file import named_files, refuse_inputs
-from phasemark.data.shards import difference
+from phasemark.data.shards.build import difference
+from phasemark.data.shards.run import outputs_of, produce
 from phasemark.inputs import MOST_TOML_BYTES, read_text
 from phasemark.matcher.sweep_job import FORMAT, SCHEMA_VERSION, Round, SweepJob, check_matcher
 from phasemark.matcher.sweep_plan import SweepPlan

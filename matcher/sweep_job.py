@@ -1,8 +1,8 @@
 """The trials of a sweep: worlds rendered, frames captured once, and every method tried on them.
 
-A sweep's trials are a file built in shards (:mod:`phasemark.data.shards`): interrupted runs go on, and the bytes depend
-neither on the number of workers nor on where they run. Slabs are conditions and items are trials. Truth and noise of a
-trial depend on the seed, its condition and its number alone, so all methods see the same frames.
+A sweep's trials are a file built in shards (:mod:`phasemark.data.shards.build`): interrupted runs go on, and the bytes
+depend neither on the number of workers nor on where they run. Slabs are conditions and items are trials. Truth and
+noise of a trial depend on the seed, its condition and its number alone, so all methods see the same frames.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from phasemark import PhasemarkError, UsageError
 from phasemark.data import Bank, build_bank, mesh_sha256, versions
-from phasemark.data.build import read_landmarks
-from phasemark.data.json_text import json_text
-from phasemark.data.layout import Layout
-from phasemark.data.narrow import narrowed
+from phasemark.data.bank.build_bank import read_landmarks
+from phasemark.data.files.hdf5_layout import Layout
+from phasemark.data.files.json_text import json_text
+from phasemark.data.files.narrow import narrowed
 from phasemark.data.seeds import stream
-from phasemark.data.shards import Place
+from phasemark.data.shards.build import Place
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.bounds import confusion_probability, cramer_rao
 from phasemark.matcher.estimator import LIKELY
@@ -92,7 +92,7 @@ class Round:
 
 
 class SweepJob:
-    """One round of a sweep (:class:`phasemark.data.shards.Job`).
+    """One round of a sweep (:class:`phasemark.data.shards.build.Job`).
 
     Parameters
     ----------

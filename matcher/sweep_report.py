@@ -14,9 +14,9 @@ import matplotlib
 import numpy as np
 
 from phasemark.data import versions, write_atomically
-from phasemark.data.folder_marker import OwnedFiles
-from phasemark.data.page import embedded_png, figure_png, page_template
-from phasemark.data.store import storage_errors
+from phasemark.data.files.atomic_write import storage_errors
+from phasemark.data.files.folder_marker import OwnedFiles
+from phasemark.data.pages.page import embedded_png, figure_png, page_template
 from phasemark.matcher.bounds import Estimate
 from phasemark.matcher.sweep import read_plan_of, read_sweep, sweep_folder, write_cells
 from phasemark.matcher.sweep_examples import worst_examples

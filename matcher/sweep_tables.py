@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from phasemark.data.csv_cell import as_cell
+from phasemark.data.files.csv_cell import as_cell
 from phasemark.matcher.bounds import Estimate, nees
 from phasemark.matcher.intervals import mean_interval, rms_interval, wilson
 from phasemark.matcher.models import VIEW

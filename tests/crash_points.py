@@ -14,7 +14,7 @@ from system_calls import Trap
 from toy_job import ToyJob, check_toy_file
 
 from phasemark import StorageError
-from phasemark.data.shards import build, manifest_path, partial_path
+from phasemark.data.shards.build import build, manifest_path, partial_path
 from phasemark.inputs import checksum_path, verify_checksum
 
 CALLS = ("pwrite", "write", "fsync", "replace", "posix_fallocate", "ftruncate")

@@ -22,7 +22,7 @@ def worker(address):
     """
     program = (
         "import asyncio, os, sys; from distributed import Worker\n"
-        "from phasemark.data import FramePlan; from phasemark.data.build_frames import FrameJob\n"
+        "from phasemark.data import FramePlan; from phasemark.data.frames.build_frames import FrameJob\n"
         "FrameJob(FramePlan(classes=['cone'], views=1)).make(0, 0, 1)\n"
         "async def main(): await (await Worker(sys.argv[1], nthreads=1, name=os.getpid())).finished()\n"
         "asyncio.run(main())"

@@ -12,9 +12,9 @@ from pathlib import Path
 from distributed import LocalCluster
 
 from phasemark.data import FramePlan, build_frames
-from phasemark.data.build_frames import FrameJob
-from phasemark.data.remote import ProcessMaker
-from phasemark.data.shards import build
+from phasemark.data.frames.build_frames import FrameJob
+from phasemark.data.shards.build import build
+from phasemark.data.shards.remote import ProcessMaker
 
 PLAN = FramePlan(classes=["cone", "post"], views=130, frames_per_view=2, seed=7, wall_m=4.0)
 

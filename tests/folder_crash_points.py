@@ -16,8 +16,8 @@ from crash_points import in_fork
 from system_calls import Trap
 
 from phasemark import OutputExistsError, StorageError
-from phasemark.data import renames
-from phasemark.data.replaced_folder import replacing_folder
+from phasemark.data.files import renames
+from phasemark.data.files.replaced_folder import replacing_folder
 
 
 def write(path, mark, *, force):

@@ -23,7 +23,7 @@ import numpy as np
 
 from phasemark import PhasemarkError
 from phasemark.data import BankPlan, FramePlan, open_bank, open_frames, read_frames, read_plan
-from phasemark.data.shards import _Manifest
+from phasemark.data.shards.build import _Manifest
 from phasemark.inputs import checksum_path, read_checksum
 from phasemark.landmarks import build_mesh, catalog, export_mesh, read_mesh
 from phasemark.matcher import load_map
@@ -206,7 +206,7 @@ def _good_bank(folder):
 
 
 def _good_frames(folder):
-    from phasemark.data import build_frames
+    from phasemark.data.frames import build_frames
 
     build_frames(FramePlan(classes=["cone"], views=2), folder / "f.h5").close()
     return [(folder / "f.h5").read_bytes()]

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from phasemark.cli import main as phasemark
-from phasemark.data.shards import partial_path
+from phasemark.data.shards.build import partial_path
 
 PLAN = 'views = {views}\nframes_per_view = 2\nseed = 7\nwall_m = 4.0\nclasses = ["cone", "post"]\n'
 

@@ -7,7 +7,7 @@ import os
 import pathlib
 import signal
 
-from phasemark.data import renames
+from phasemark.data.files import renames
 
 CALLS = (
     "pwrite", "write", "fsync", "replace", "rename", "posix_fallocate", "ftruncate", "mkdir", "rmdir", "unlink",

@@ -16,7 +16,7 @@ import xarray
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data import BankPlan, build, build_bank, mesh_sha256, open_bank, verify_checksum, versions
-from phasemark.data.layout import Layout, SparseMemory
+from phasemark.data.files.hdf5_layout import Layout, SparseMemory
 from phasemark.inputs import checksum_path
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import PhasorImages, Renderer, preset

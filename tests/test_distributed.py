@@ -12,9 +12,9 @@ import pytest
 
 from phasemark import OutputExistsError, UsageError
 from phasemark.data import FramePlan, build_frames
-from phasemark.data.build_frames import FrameJob
-from phasemark.data.remote import ProcessMaker
-from phasemark.data.shards import build, manifest_path, partial_path
+from phasemark.data.frames.build_frames import FrameJob
+from phasemark.data.shards.build import build, manifest_path, partial_path
+from phasemark.data.shards.remote import ProcessMaker
 
 HERE = Path(__file__).parent
 PROGRAM = [sys.executable, "-c", "import sys; from phasemark.cli import main; sys.exit(main())"]
@@ -114,10 +114,10 @@ def test_a_worker_that_would_make_other_bytes_is_refused():
 def test_a_scheduler_that_does_not_answer_is_named():
     pytest.importorskip("distributed")
     program = (
-        "from phasemark.data.remote import open_maker\n"
-        "from phasemark.data.build_frames import FrameJob\n"
+        "from phasemark.data.shards.remote import open_maker\n"
+        "from phasemark.data.frames.build_frames import FrameJob\n"
         "from phasemark.data import FramePlan\n"
-        "import phasemark.data.remote as remote\n"
+        "import phasemark.data.shards.remote as remote\n"
         "remote.CONNECT_SECONDS = 1\n"
         "open_maker('tcp://127.0.0.1:9', FrameJob(FramePlan(classes=['cone'], views=1)))\n"
     )

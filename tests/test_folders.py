@@ -12,9 +12,9 @@ import pytest
 
 from phasemark import OutputExistsError, StorageError, UsageError
 from phasemark.cli import main
-from phasemark.data import renames
-from phasemark.data.folder_marker import LOCK, MARKER, adding_to_folder, read_marker
-from phasemark.data.replaced_folder import replacing_folder
+from phasemark.data.files import renames
+from phasemark.data.files.folder_marker import LOCK, MARKER, adding_to_folder, read_marker
+from phasemark.data.files.replaced_folder import replacing_folder
 
 HERE = Path(__file__).parent
 

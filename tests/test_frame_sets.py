@@ -28,7 +28,7 @@ from phasemark.data import (
     verify_frames,
     write_checksum,
 )
-from phasemark.data.jobs import job_for
+from phasemark.data.partial_outputs import job_for
 from phasemark.data.seeds import stream
 from phasemark.inputs import checksum_path
 from phasemark.landmarks import build_mesh, catalog

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from phasemark import UsageError
 from phasemark.data import format_grid, parse_grid
-from phasemark.data.grid import MAX_POINTS, drop_repeated_stop
+from phasemark.data.plans.grid_axis import MAX_POINTS, drop_repeated_stop
 
 
 def test_default_distances_are_141_exactly_rounded_decimals():

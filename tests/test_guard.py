@@ -12,7 +12,7 @@ from mutants import COMMANDS, check_mutants
 
 from phasemark import InputFileError
 from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_bank, open_frames, read_frames
-from phasemark.data.guard import first_reading, refusal
+from phasemark.data.files.guard import first_reading, refusal
 from phasemark.render import preset
 
 SENSOR = preset("pmd-16x16")
@@ -119,7 +119,7 @@ def test_each_trick_is_refused_by_its_name(trick, tmp_path, canary, recwarn):
 def test_refusing_takes_little_memory(tmp_path, canary, recwarn):
     paths = [write(trick, tmp_path / f"{trick.__name__}.h5", canary) for trick in TRICKS]
     program = (
-        "import resource, sys; from phasemark.data.guard import refusal\n"
+        "import resource, sys; from phasemark.data.files.guard import refusal\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "assert all(map(refusal, sys.argv[1:]))\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"

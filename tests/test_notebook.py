@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from phasemark.data import BankPlan, FramePlan, build_bank, build_frames
-from phasemark.data.notebook import facts_html, table_html
+from phasemark.data.pages.notebook import facts_html, table_html
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Match, Matches, kalman_filter
 from phasemark.render import Frames, Renderer, capture, preset

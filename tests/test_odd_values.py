@@ -11,9 +11,9 @@ import pytest
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.data import BankPlan, FramePlan, planned_size
-from phasemark.data.csv_cell import as_cell
-from phasemark.data.csv_frames import parse_csv
-from phasemark.data.jobs import estimate
+from phasemark.data.files.csv_cell import as_cell
+from phasemark.data.measured.csv_frames import parse_csv
+from phasemark.data.partial_outputs import estimate
 from phasemark.landmarks import build_mesh, catalog, export_mesh, mesh_html, read_mesh
 from phasemark.render import Background, Renderer, Views, preset
 from phasemark.render.integral.intersect import MOST_SCENES, EmbreeIntersector
@@ -185,7 +185,7 @@ def test_a_name_that_a_spreadsheet_would_run_is_written_as_text(answer):
 def test_pages_forbid_whatever_they_do_not_hold():
     page = mesh_html(build_mesh(catalog()["cone"]), "cone")
     assert "Content-Security-Policy\" content=\"default-src 'none'; script-src 'unsafe-inline'" in page
-    source = Path(sys.modules["phasemark.data.page"].__file__ or "").with_name("page.html.j2").read_text("utf-8")
+    source = Path(sys.modules["phasemark.data.pages.page"].__file__ or "").with_name("page.html.j2").read_text("utf-8")
     assert (
         "Content-Security-Policy\" content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\"" in source
     )

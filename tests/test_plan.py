@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from phasemark import InputFileError, UsageError
 from phasemark.data import BankPlan, MeshPlan, load_plan
-from phasemark.data.plan import factored_refusal
+from phasemark.data.plans.bank_plan import factored_refusal
 from phasemark.landmarks import catalog
 from phasemark.matcher.plan_kinds import KINDS, plan_schema
 from phasemark.render import preset

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from phasemark.cli import _value_and_error_of
-from phasemark.data.characterisation import _quantity_row
+from phasemark.data.pages.characterisation import _quantity_row
 from phasemark.matcher import Match
 from phasemark.matcher.bounds import Estimate as Interval
 from phasemark.matcher.sweep_report import _with_interval

@@ -8,7 +8,7 @@ import typer
 from phasemark import UsageError
 from phasemark.cli import _OUTPUTS, app, main
 from phasemark.data import BankPlan, MeshPlan, build_bank
-from phasemark.data.same_file import refuse_inputs
+from phasemark.data.files.same_file import refuse_inputs
 from phasemark.landmarks import build_mesh, catalog, export_mesh
 
 SENSOR = "rows = 8\ncols = 8\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\n"

@@ -14,8 +14,8 @@ from toy_job import ToyJob, check_toy_file
 
 from phasemark import OutputExistsError, StorageError, UsageError
 from phasemark.data import verify_checksum
-from phasemark.data.remote import open_maker
-from phasemark.data.shards import build, difference, manifest_path, partial_path
+from phasemark.data.shards.build import build, difference, manifest_path, partial_path
+from phasemark.data.shards.remote import open_maker
 
 HERE = Path(__file__).parent
 
@@ -204,7 +204,7 @@ def test_an_interrupted_command_exits_with_its_code_and_can_be_resumed(tmp_path,
     program = f"""
 import sys
 from phasemark import cli
-from phasemark.data.shards import build
+from phasemark.data.shards.build import build
 from toy_job import ToyJob
 
 def run(arguments):

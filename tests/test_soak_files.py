@@ -14,7 +14,7 @@ import pytest
 from toy_job import ToyJob, check_toy_file
 
 from phasemark import InputFileError, StorageError
-from phasemark.data.shards import build, manifest_path, partial_path
+from phasemark.data.shards.build import build, manifest_path, partial_path
 from phasemark.landmarks import build_mesh, catalog, export_mesh, read_mesh
 from phasemark.render import Renderer, preset
 
@@ -23,7 +23,7 @@ HERE = Path(__file__).parent
 PROGRAM = """
 import sys
 from phasemark import cli
-from phasemark.data.shards import build
+from phasemark.data.shards.build import build
 from toy_job import ToyJob
 cli._run = lambda arguments: build(ToyJob(items=(400, 3), seconds=0.02), arguments[0], workers=2, shard_items=1)
 sys.exit(cli.main(sys.argv[1:]))

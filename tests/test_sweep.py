@@ -12,7 +12,7 @@ from own_matchers import Fails
 
 from phasemark import OutputExistsError, UsageError, cli
 from phasemark.cli import main
-from phasemark.data.folder_marker import MARKER
+from phasemark.data.files.folder_marker import MARKER
 from phasemark.matcher.plan_kinds import plan_schema
 from phasemark.matcher.sweep import read_sweep, run_sweep, sweep_folder
 from phasemark.matcher.sweep_plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, load_sweep

@@ -30,7 +30,7 @@ from phasemark.data import (
     verify_frames,
     write_checksum,
 )
-from phasemark.data.narrow import narrowed
+from phasemark.data.files.narrow import narrowed
 from phasemark.inputs import checksum_path, is_vouched_for, read_whole, remembered, sha256_of
 from phasemark.landmarks import read_mesh
 from phasemark.render import Sensor, preset

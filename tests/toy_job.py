@@ -5,8 +5,8 @@ import time
 import h5py
 import numpy as np
 
-from phasemark.data.layout import Layout
-from phasemark.data.shards import Place
+from phasemark.data.files.hdf5_layout import Layout
+from phasemark.data.shards.build import Place
 
 WIDTH = 25_000  # an item's 100 kB are more than a page of the layout
 

@@ -12,11 +12,11 @@ from phasemark.data.export.clouds import write_ply
 from phasemark.data.export.images import write_png16
 from phasemark.data.export.rosbag import write_rosbag
 from phasemark.data.export.tables import write_csv, write_npz
-from phasemark.data.frames import FrameSet
-from phasemark.data.measured import Quantity
-from phasemark.data.replaced_folder import refuse_folder, replacing_folder
-from phasemark.data.same_file import refuse_inputs
-from phasemark.data.store import refuse_unwritable, replacing
+from phasemark.data.files.atomic_write import refuse_unwritable, replacing
+from phasemark.data.files.replaced_folder import refuse_folder, replacing_folder
+from phasemark.data.files.same_file import refuse_inputs
+from phasemark.data.frames.frame_set_file import FrameSet
+from phasemark.data.measured.reading import Quantity
 
 __all__ = ["EXPORTS", "export_frames"]
 

@@ -20,8 +20,8 @@ from scipy.spatial.distance import pdist
 
 from phasemark.data.export.images import scale_of, to_codes
 from phasemark.data.export.samples import CAM2OPTICAL, blocks, pinhole, quantity_m
-from phasemark.data.frames import FrameSet
-from phasemark.data.measured import Quantity
+from phasemark.data.frames.frame_set_file import FrameSet
+from phasemark.data.measured.reading import Quantity
 from phasemark.render import Views
 
 IMAGES_PER_SCENE = 1000

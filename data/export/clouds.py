@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from phasemark.data.export.samples import blocks
-from phasemark.data.frames import FrameSet
-from phasemark.data.measured import Quantity
+from phasemark.data.frames.frame_set_file import FrameSet
+from phasemark.data.measured.reading import Quantity
 
 
 def write_ply(frames: FrameSet, folder: Path, quantity: Quantity) -> None:

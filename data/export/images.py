@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
 from phasemark.data.export.samples import blocks, quantity_m, truth_columns
-from phasemark.data.frames import FrameSet
-from phasemark.data.measured import Quantity
+from phasemark.data.frames.frame_set_file import FrameSet
+from phasemark.data.measured.reading import Quantity
 
 FULL_SCALE = 65535
 

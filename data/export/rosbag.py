@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import StorageError
-from phasemark.data.bags import AMPLITUDE_TOPIC, INFO_TOPIC, RANGE_TOPIC, Z_TOPIC, ros_types
 from phasemark.data.export.samples import CAM2OPTICAL, blocks, pinhole, quaternion
-from phasemark.data.frames import FrameSet
-from phasemark.data.measured import Quantity
+from phasemark.data.frames.frame_set_file import FrameSet
+from phasemark.data.measured.bags import AMPLITUDE_TOPIC, INFO_TOPIC, RANGE_TOPIC, Z_TOPIC, ros_types
+from phasemark.data.measured.reading import Quantity
 from phasemark.render import Views
 
 NAME = "frames"

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.data.frames import FrameSet, Sample
-from phasemark.data.measured import Quantity
+from phasemark.data.frames.frame_set_file import FrameSet, Sample
+from phasemark.data.measured.reading import Quantity
 
 BLOCK = 1024
 """Frames read at a time."""

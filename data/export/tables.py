@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from phasemark.data.export.samples import blocks, quantity_m, truth_columns
-from phasemark.data.frames import FrameSet
-from phasemark.data.measured import Quantity
+from phasemark.data.frames.frame_set_file import FrameSet
+from phasemark.data.measured.reading import Quantity
 
 
 def write_npz(frames: FrameSet, path: Path, quantity: Quantity) -> None:

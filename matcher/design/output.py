@@ -13,7 +13,7 @@ from typing import Any
 import trimesh
 
 from phasemark.data import write_atomically
-from phasemark.data.page import figure_png
+from phasemark.data.pages.page import figure_png
 from phasemark.landmarks import LandmarkSpec, build_mesh, export_mesh
 from phasemark.matcher.bounds import Estimate, confusion_probability
 from phasemark.matcher.design.bound import RangeBound

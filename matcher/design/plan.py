@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from phasemark import UsageError
 from phasemark.data import BankPlan
-from phasemark.data.plan import PlanModel, factored_refusal
+from phasemark.data.plans.bank_plan import PlanModel, factored_refusal
 from phasemark.inputs.toml_file import read_toml
 from phasemark.render import Sensor
 

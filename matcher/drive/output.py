@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data import write_atomically
-from phasemark.data.csv_cell import as_cell
+from phasemark.data.files.csv_cell import as_cell
 from phasemark.matcher.bounds import nees
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
 

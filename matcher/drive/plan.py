@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from phasemark import UsageError
-from phasemark.data.plan import PlanModel
+from phasemark.data.plans.bank_plan import PlanModel
 from phasemark.inputs.toml_file import read_toml
 from phasemark.matcher.landmark_map import LandmarkMap, Point, Std, load_map
 from phasemark.render import Sensor, preset

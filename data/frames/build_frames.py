@@ -14,9 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.data.build import StoredMesh, read_landmarks, write_mesh
-from phasemark.data.frame_plan import FramePlan
-from phasemark.data.frames import (
+from phasemark.data.bank.build_bank import StoredMesh, read_landmarks, write_mesh
+from phasemark.data.files.hdf5_layout import Layout
+from phasemark.data.files.json_text import json_text
+from phasemark.data.files.provenance import mesh_sha256, versions
+from phasemark.data.files.same_file import named_files
+from phasemark.data.frames.frame_set_file import (
     FORMAT,
     FRAME_FIELDS,
     SCHEMA_VERSION,
@@ -24,14 +27,11 @@ from phasemark.data.frames import (
     FrameSet,
     open_frames,
 )
-from phasemark.data.json_text import json_text
-from phasemark.data.layout import Layout
-from phasemark.data.production import produce, refuse_unwritable_output
+from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.data.progress import Progress
-from phasemark.data.provenance import mesh_sha256, versions
-from phasemark.data.same_file import named_files
 from phasemark.data.seeds import stream
-from phasemark.data.shards import Place
+from phasemark.data.shards.build import Place
+from phasemark.data.shards.run import produce, refuse_unwritable_output
 from phasemark.data.size import frame_set_fields, planned_size, too_many
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture
 
@@ -103,7 +103,7 @@ def _finished_identity(path: Path) -> dict[str, Any]:
 
 
 class FrameJob:
-    """A frame set to be built (:class:`phasemark.data.shards.Job`): one slab, its items are views.
+    """A frame set to be built (:class:`phasemark.data.shards.build.Job`): one slab, its items are views.
 
     Parameters
     ----------

@@ -10,8 +10,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
-from phasemark.data import renames
-from phasemark.data.lock_file import exclusive
+from phasemark.data.files import renames
+from phasemark.data.files.lock_file import exclusive
 from phasemark.inputs import checksum_line, checksum_path, read_checksum, sha256_of
 
 Buffer = bytes | bytearray | memoryview

@@ -17,12 +17,14 @@ _DPI = 110
 
 
 def page_template(package: str, name: str) -> jinja2.Template:
-    """Return a template of a package; it may extend ``page.html.j2``, which has the style, a title and a content block.
+    """Return a template of a package; it may extend ``base.html.j2``, which has the style, a title and a content block.
 
     Its filter ``number`` is :func:`short_number`.
     """
     environment = jinja2.Environment(
-        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(package, "."), jinja2.PackageLoader("phasemark.data", ".")]),
+        loader=jinja2.ChoiceLoader(
+            [jinja2.PackageLoader(package, "."), jinja2.PackageLoader("phasemark.data.pages", ".")]
+        ),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
     )

@@ -14,8 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, UsageError
-from phasemark.data.grid import format_grid
-from phasemark.data.hdf5 import (
+from phasemark.data.files.hdf5_reading import (
     check_format,
     dataset_of,
     frozen,
@@ -25,8 +24,9 @@ from phasemark.data.hdf5 import (
     reading,
     whole_numbers,
 )
-from phasemark.data.notebook import facts_html
-from phasemark.data.plan import BankPlan
+from phasemark.data.pages.notebook import facts_html
+from phasemark.data.plans.bank_plan import BankPlan
+from phasemark.data.plans.grid_axis import format_grid
 from phasemark.render import PhasorImages, Sensor, Views
 
 FORMAT = "phasemark-bank"

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from phasemark import InputFileError, PhasemarkError, UsageError
-from phasemark.data.bags import read_rosbag
-from phasemark.data.csv_frames import MILLISECONDS, SECONDS, SECONDS_PER_TIME_UNIT, note_disorder, parse_csv
-from phasemark.data.guard import EXPANSION, FREE_BYTES
-from phasemark.data.hdf5 import open_hdf5
-from phasemark.data.store import write_atomically
+from phasemark.data.files.atomic_write import write_atomically
+from phasemark.data.files.guard import EXPANSION, FREE_BYTES
+from phasemark.data.files.hdf5_reading import open_hdf5
+from phasemark.data.measured.bags import read_rosbag
+from phasemark.data.measured.csv_frames import MILLISECONDS, SECONDS, SECONDS_PER_TIME_UNIT, note_disorder, parse_csv
 from phasemark.inputs import opened
 from phasemark.render import Frames, Sensor
 

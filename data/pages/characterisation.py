@@ -6,10 +6,10 @@ import csv
 import io
 from pathlib import Path
 
-from phasemark.data.json_text import json_text
-from phasemark.data.page import embedded_png, figure_png, page_template
-from phasemark.data.provenance import versions
-from phasemark.data.store import write_atomically
+from phasemark.data.files.atomic_write import write_atomically
+from phasemark.data.files.json_text import json_text
+from phasemark.data.files.provenance import versions
+from phasemark.data.pages.page import embedded_png, figure_png, page_template
 from phasemark.render.bench.data_sheet import ALBEDOS, Z95, Characterisation, Quantity
 from phasemark.render.integral.rounding import value_and_error
 from phasemark.render.sensor.range_noise import predicted_range_std
@@ -147,7 +147,7 @@ def _agreement_sentence(found: Characterisation) -> str:
 def _report(found: Characterisation, name: str, seed: int, pictures: dict[str, bytes]) -> str:
     sensor = found.sensor
     captions = _CAPTIONS if sensor.kind == "phase" else _DIRECT_CAPTIONS
-    return page_template("phasemark.data", "characterisation.html.j2").render(
+    return page_template("phasemark.data.pages", "characterisation.html.j2").render(
         name=name,
         summary=summary_sentences(found, name),
         notes=found.notes,

@@ -17,7 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.data.bank import (
+from phasemark.data.bank.bank_file import (
     FORMAT,
     IMAGE_DIMS,
     LAYOUT_GROUPS,
@@ -29,15 +29,15 @@ from phasemark.data.bank import (
     group_rows,
     open_bank,
 )
-from phasemark.data.json_text import json_text
-from phasemark.data.layout import Layout
-from phasemark.data.narrow import narrowed
-from phasemark.data.plan import BankPlan, MeshPlan, factored_refusal
-from phasemark.data.production import produce, refuse_unwritable_output
+from phasemark.data.files.hdf5_layout import Layout
+from phasemark.data.files.json_text import json_text
+from phasemark.data.files.narrow import narrowed
+from phasemark.data.files.provenance import mesh_sha256, versions
+from phasemark.data.files.same_file import named_files
+from phasemark.data.plans.bank_plan import BankPlan, MeshPlan, factored_refusal
 from phasemark.data.progress import Progress
-from phasemark.data.provenance import mesh_sha256, versions
-from phasemark.data.same_file import named_files
-from phasemark.data.shards import Place
+from phasemark.data.shards.build import Place
+from phasemark.data.shards.run import produce, refuse_unwritable_output
 from phasemark.data.size import planned_size, too_many
 from phasemark.landmarks import (
     LandmarkSpec,
@@ -202,7 +202,7 @@ class _Slab:
 
 
 class BankJob:
-    """A bank to be built (:class:`phasemark.data.shards.Job`): one slab of images for each class or part.
+    """A bank to be built (:class:`phasemark.data.shards.build.Job`): one slab of images for each class or part.
 
     Parameters
     ----------

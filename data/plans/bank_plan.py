@@ -27,7 +27,7 @@ from pydantic import (
 )
 
 from phasemark import PhasemarkError, UsageError
-from phasemark.data.grid import drop_repeated_stop, format_grid, parse_grid
+from phasemark.data.plans.grid_axis import drop_repeated_stop, format_grid, parse_grid
 from phasemark.inputs import refuse_truth_values
 from phasemark.inputs.toml_file import read_toml
 from phasemark.landmarks import MAX_SYMMETRY, LandmarkSpec, MeshWarning, catalog, mesh_symmetry, read_mesh

@@ -12,8 +12,8 @@ from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, Wi
 from scipy import special
 
 from phasemark import UsageError
-from phasemark.data.narrow import narrowed
-from phasemark.data.plan import MeshPlan, PlanModel, ScenePlan, find_symmetries
+from phasemark.data.files.narrow import narrowed
+from phasemark.data.plans.bank_plan import MeshPlan, PlanModel, ScenePlan, find_symmetries
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec
 from phasemark.render.view import FARTHEST_M

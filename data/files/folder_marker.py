@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from phasemark import OutputExistsError, StorageError, UsageError
-from phasemark.data.lock_file import exclusive
-from phasemark.data.store import storage_errors, sync, write_atomically
+from phasemark.data.files.atomic_write import storage_errors, sync, write_atomically
+from phasemark.data.files.lock_file import exclusive
 
 MARKER = ".phasemark-folder"
 LOCK = ".phasemark-lock"

@@ -15,18 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, OutputExistsError, UsageError
-from phasemark.data.build import BankJob
-from phasemark.data.build_frames import FrameJob
-from phasemark.data.frame_plan import FramePlan
-from phasemark.data.grid import as_count
-from phasemark.data.hdf5 import check_format, open_hdf5, reading
-from phasemark.data.json_text import json_text
-from phasemark.data.layout import Layout
-from phasemark.data.plan import BankPlan
-from phasemark.data.production import produce, refuse_unwritable_output
+from phasemark.data.bank.build_bank import BankJob
+from phasemark.data.files.hdf5_layout import Layout
+from phasemark.data.files.hdf5_reading import check_format, open_hdf5, reading
+from phasemark.data.files.json_text import json_text
+from phasemark.data.files.same_file import named_files
+from phasemark.data.frames.build_frames import FrameJob
+from phasemark.data.plans.bank_plan import BankPlan
+from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.data.plans.grid_axis import as_count
 from phasemark.data.progress import Progress
-from phasemark.data.same_file import named_files
-from phasemark.data.shards import Job, Place, difference, make_shard, pieces
+from phasemark.data.shards.build import Job, Place, difference, make_shard, pieces
+from phasemark.data.shards.run import produce, refuse_unwritable_output
 from phasemark.data.size import planned_size
 from phasemark.inputs import verify_checksum
 
@@ -51,7 +51,7 @@ def job_for(plan: BankPlan | FramePlan) -> BankJob | FrameJob:
 
 
 def job_of(spec: dict[str, Any]) -> Job:
-    """Return the job that :meth:`phasemark.data.shards.Job.spec` describes."""
+    """Return the job that :meth:`phasemark.data.shards.build.Job.spec` describes."""
     if spec["kind"] == "part":
         return PartJob(job_of(spec["of"]), spec["part"], spec["parts"])
     return BankJob(BankPlan(**spec["plan"])) if spec["kind"] == "bank" else FrameJob(FramePlan(**spec["plan"]))
@@ -85,7 +85,7 @@ def parse_part(text: str) -> tuple[int, int]:
 
 
 class PartJob:
-    """Part i of n of a job, in a file of its own (:class:`phasemark.data.shards.Job`).
+    """Part i of n of a job, in a file of its own (:class:`phasemark.data.shards.build.Job`).
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ class _Part:
 
 
 class MergeJob:
-    """A job whose items have been made already, in parts (:class:`phasemark.data.shards.Job`)."""
+    """A job whose items have been made already, in parts (:class:`phasemark.data.shards.build.Job`)."""
 
     def __init__(self, parts: Sequence[_Part]) -> None:
         first, *others = parts

@@ -10,8 +10,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from phasemark import OutputExistsError, UsageError
-from phasemark.data import renames
-from phasemark.data.folder_marker import (
+from phasemark.data.files import renames
+from phasemark.data.files.atomic_write import followed, storage_errors, sync
+from phasemark.data.files.folder_marker import (
     MARKER,
     entries_of,
     foreign_entry,
@@ -20,8 +21,7 @@ from phasemark.data.folder_marker import (
     remove_listed,
     write_marker,
 )
-from phasemark.data.lock_file import exclusive
-from phasemark.data.store import followed, storage_errors, sync
+from phasemark.data.files.lock_file import exclusive
 
 
 @contextmanager

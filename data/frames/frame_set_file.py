@@ -16,9 +16,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, UsageError
-from phasemark.data.bank import read_mesh_group
-from phasemark.data.frame_plan import FramePlan
-from phasemark.data.hdf5 import (
+from phasemark.data.bank.bank_file import read_mesh_group
+from phasemark.data.files.hdf5_reading import (
     check_format,
     dataset_of,
     frozen,
@@ -28,7 +27,8 @@ from phasemark.data.hdf5 import (
     reading,
     whole_numbers,
 )
-from phasemark.data.notebook import facts_html
+from phasemark.data.pages.notebook import facts_html
+from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.render import Frames, Sensor
 
 FORMAT = "phasemark-frames"

@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import PhasemarkError, StorageError, UsageError
-from phasemark.data.executor import Maker
-from phasemark.data.grid import as_count
-from phasemark.data.shards import Job, difference, make_shard
+from phasemark.data.plans.grid_axis import as_count
+from phasemark.data.shards.build import Job, difference, make_shard
+from phasemark.data.shards.executor import Maker
 
 ATTEMPTS = 20
 """How often a shard is tried again when workers die under it."""
@@ -81,7 +81,7 @@ def _job(spec: str, identity: str) -> Job:
     if separator:  # a kind that another package brings; what is sent comes from the program that asks, not from a file
         job: Job = getattr(importlib.import_module(module), name)(described)
     else:
-        from phasemark.data.jobs import job_of
+        from phasemark.data.partial_outputs import job_of
 
         job = job_of(described)
     changes = difference(json.loads(identity), json.loads(json.dumps(job.identity())))
@@ -168,7 +168,7 @@ class _Process:
         # -P: the working folder is no place for modules unless it is one here
         modules = os.pathsep.join(entry for entry in sys.path if entry)
         self._child = subprocess.Popen(
-            [sys.executable, "-P", "-c", "from phasemark.data.remote import serve; serve()"],
+            [sys.executable, "-P", "-c", "from phasemark.data.shards.remote import serve; serve()"],
             env={**os.environ, "PYTHONPATH": modules},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -15,9 +15,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark import UsageError, __version__
-from phasemark.data.csv_cell import as_cell
+from phasemark.data.files.atomic_write import replacing, write_atomically
+from phasemark.data.files.csv_cell import as_cell
 from phasemark.data.seeds import stream
-from phasemark.data.store import replacing, write_atomically
 from phasemark.render import Background, Flag, Frames, Renderer, Sensor, Views, capture
 
 STATUS_VALID = 5

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError, UsageError
-from phasemark.data.guard import OWN_EXPANSION, OWN_FREE_BYTES, first_reading, refusal
+from phasemark.data.files.guard import OWN_EXPANSION, OWN_FREE_BYTES, first_reading, refusal
 from phasemark.inputs import checksum_path, is_vouched_for, verifying
 
 
@@ -35,7 +35,7 @@ def open_hdf5(path: Path, what: str, *, untrusted: bool = False, foreign: bool =
     ------
     InputFileError
         The file cannot be read, contradicts its checksum, is not HDF5, is damaged, or contains what is refused
-        (:func:`phasemark.data.guard.refusal`).
+        (:func:`phasemark.data.files.guard.refusal`).
 
     Warns
     -----

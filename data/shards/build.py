@@ -24,12 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import OutputExistsError, UsageError
-from phasemark.data.executor import Maker, processors, run_tasks
-from phasemark.data.json_text import json_text
-from phasemark.data.layout import Layout, place
-from phasemark.data.lock_file import lock_file
+from phasemark.data.files.atomic_write import finish_publishing, followed, publish, refuse_unwritable, storage_errors
+from phasemark.data.files.hdf5_layout import Layout, place
+from phasemark.data.files.json_text import json_text
+from phasemark.data.files.lock_file import lock_file
 from phasemark.data.progress import Progress
-from phasemark.data.store import finish_publishing, followed, publish, refuse_unwritable, storage_errors
+from phasemark.data.shards.executor import Maker, processors, run_tasks
 from phasemark.inputs import checksum_path, sha256_of
 
 SHARD_BYTES = 1 << 22
@@ -52,7 +52,8 @@ class Job(Protocol):
     """What a file is made of: slabs of items, each item with the same few fields."""
 
     def spec(self) -> dict[str, Any]:
-        """Return what another process makes the same job from, in plain data (:func:`phasemark.data.jobs.job_of`)."""
+        """Return what another process makes the same job from, in plain data
+        (:func:`phasemark.data.partial_outputs.job_of`)."""
 
     @property
     def items(self) -> Sequence[int]:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from phasemark import UsageError
+from phasemark.data.files.atomic_write import followed, refuse_unwritable
+from phasemark.data.files.same_file import refuse_inputs
 from phasemark.data.progress import Progress
-from phasemark.data.remote import open_maker
-from phasemark.data.same_file import refuse_inputs
-from phasemark.data.shards import Job, build, manifest_path, partial_path, refuse_difference, refuse_unfinished
-from phasemark.data.store import followed, refuse_unwritable
+from phasemark.data.shards.build import Job, build, manifest_path, partial_path, refuse_difference, refuse_unfinished
+from phasemark.data.shards.remote import open_maker
 from phasemark.inputs import checksum_path
 
 
@@ -24,14 +24,14 @@ def refuse_unwritable_output(path: Path, *, force: bool, resume: bool, inputs: I
     ----------
     path : Path
     force, resume : bool
-        As for :func:`phasemark.data.shards.build`.
+        As for :func:`phasemark.data.shards.build.build`.
     inputs : iterable of Path
         The files that it is made from.
 
     Raises
     ------
     OutputExistsError, UsageError
-        As :func:`phasemark.data.shards.build`.
+        As :func:`phasemark.data.shards.build.build`.
     """
     real = followed(path)
     refuse_inputs(outputs_of(path), inputs)
@@ -73,11 +73,11 @@ def produce(
     job : Job
     path : path-like
     finished : callable
-        Returns the identity of a finished file, see :meth:`phasemark.data.shards.Job.identity`.
+        Returns the identity of a finished file, see :meth:`phasemark.data.shards.build.Job.identity`.
     scheduler : str
         ``threads``, ``local:N`` for N worker processes, or the address of a Dask scheduler.
     force, resume, workers, shard_items, progress
-        As for :func:`phasemark.data.shards.build`, which says what is raised.
+        As for :func:`phasemark.data.shards.build.build`, which says what is raised.
     """
     path = Path(path)
     begun = manifest_path(followed(path)).exists()

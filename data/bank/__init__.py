@@ -1,0 +1,1 @@
+"""Banks of model images: the file and how it is built."""

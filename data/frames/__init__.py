@@ -1,0 +1,1 @@
+"""Sets of simulated frames: the file and how it is built."""

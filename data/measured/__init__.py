@@ -1,0 +1,1 @@
+"""Measured frames: readers of every accepted form, and a simulated recording."""

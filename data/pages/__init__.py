@@ -1,0 +1,1 @@
+"""HTML pages and how objects show themselves in notebooks."""

@@ -1,0 +1,1 @@
+"""Plans of banks and frame sets, and the axes of their grids."""
