@@ -1362,8 +1362,8 @@ def _match(
     """
     from phasemark.data import read_frames, write_atomically
     from phasemark.matcher import Matcher, diagnose, kalman_filter, load_map, phasor_mean
-    from phasemark.matcher.estimator import BEARING_STD_RAD
-    from phasemark.matcher.recording import EstimateTable, match_in_batches
+    from phasemark.matcher.likelihood.estimator import BEARING_STD_RAD
+    from phasemark.matcher.recordings.estimates_table import EstimateTable, match_in_batches
 
     filters = {"kalman": kalman_filter, "phasor-mean": phasor_mean}
     if filter_name not in filters:
@@ -1608,8 +1608,8 @@ def _calibrate(
     from phasemark.data import read_frames, write_atomically
     from phasemark.data.shards.executor import processors
     from phasemark.matcher import PoseStd, calibrate, filter_poses, frames_of_poses, kalman_filter, read_poses
-    from phasemark.matcher.calibrate_model import Mounting
-    from phasemark.matcher.calibrate_report import calibration_dict, calibration_toml, residual_picture
+    from phasemark.matcher.calibrate.mounting_model import Mounting
+    from phasemark.matcher.calibrate.report import calibration_dict, calibration_toml, residual_picture
 
     if out.suffix.lower() != ".toml":
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")
@@ -1736,8 +1736,8 @@ def _calibration_target(landmark: str, class_name: str | None, sensor: str | Non
 
 def _echo_calibration(found: Calibration) -> None:
     """Print every number with its standard deviation and use, their correlations, the test of the fit and notes."""
-    from phasemark.matcher.calibrate_model import PARAMETERS
-    from phasemark.matcher.calibrate_report import USES, shown, shown_names, shown_std
+    from phasemark.matcher.calibrate.mounting_model import PARAMETERS
+    from phasemark.matcher.calibrate.report import USES, shown, shown_names, shown_std
 
     rows = []
     for name in shown_names(found):
@@ -1777,8 +1777,8 @@ def _demo(
 ) -> None:
     """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°."""
     from phasemark.data.shards.run import outputs_of
-    from phasemark.matcher.demo import cell_rows, run_demo, write_demo
-    from phasemark.matcher.report import summary_rows
+    from phasemark.matcher.demo.report import summary_rows
+    from phasemark.matcher.demo.run import cell_rows, run_demo, write_demo
 
     bank = out / "bank.h5"
     _refuse_existing([bank], force)
@@ -1830,9 +1830,9 @@ def _sweep_run(
     force: Annotated[bool, typer.Option("--force", help="Start over where the folder holds a sweep.")] = False,
 ) -> None:
     """Run a sweep and write its tables and report."""
-    from phasemark.matcher.sweep import run_sweep, sweep_outputs
-    from phasemark.matcher.sweep_plan import Method, SweepPlan, load_sweep, refuse_programs
-    from phasemark.matcher.sweep_report import write_report
+    from phasemark.matcher.sweep.plan import Method, SweepPlan, load_sweep, refuse_programs
+    from phasemark.matcher.sweep.report import write_report
+    from phasemark.matcher.sweep.run import run_sweep, sweep_outputs
 
     loaded = load_sweep(plan)
     changes: dict[str, Any] = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
@@ -1858,9 +1858,9 @@ def _sweep_report(
     as_json: _Json = False,
 ) -> None:
     """Write a sweep's tables, figures and report again."""
-    from phasemark.matcher.sweep import read_sweep
-    from phasemark.matcher.sweep_report import summary, write_report
-    from phasemark.matcher.sweep_tables import json_rows
+    from phasemark.matcher.sweep.report import summary, write_report
+    from phasemark.matcher.sweep.result_tables import json_rows
+    from phasemark.matcher.sweep.run import read_sweep
 
     with _Progress("writing the report"):
         report = write_report(folder)
@@ -1886,7 +1886,7 @@ def _sweep_frames(
     from phasemark.data import write_measured
     from phasemark.data.files.folder_marker import read_marker
     from phasemark.data.files.same_file import refuse_inputs
-    from phasemark.matcher.sweep_examples import sweep_frames
+    from phasemark.matcher.sweep.examples import sweep_frames
 
     refuse_inputs([out], map(folder.joinpath, read_marker(folder)[1] or ()))
     _refuse_existing([out], force)
@@ -1903,8 +1903,8 @@ def _sweep_compare(
     """Compare two sweeps cell by cell; significant differences are marked, corrected for their number."""
     import dataclasses
 
-    from phasemark.matcher.sweep import read_sweep
-    from phasemark.matcher.sweep_compare import compare_cells
+    from phasemark.matcher.sweep.compare import compare_cells
+    from phasemark.matcher.sweep.run import read_sweep
 
     found = compare_cells(*(read_sweep(folder)[1].cells() for folder in (first, second)))
     if as_json:
@@ -2028,7 +2028,7 @@ def _save_match_picture(
     import io as bytes_io
 
     from phasemark.data import write_atomically
-    from phasemark.matcher.picture import match_picture
+    from phasemark.matcher.figures import match_picture
 
     buffer = bytes_io.BytesIO()
     match_picture(filtered, match, bank, background).savefig(buffer, format="png", dpi=120)

@@ -14,7 +14,7 @@ import numpy as np
 from phasemark.data import Bank, BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, cramer_rao, efficiency, kalman_filter
-from phasemark.matcher.models import VIEW
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.render import Background, Renderer, Sensor, Views, capture
 
 N_VIEWS = 1000

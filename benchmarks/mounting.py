@@ -20,9 +20,9 @@ from scipy.optimize import least_squares
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import KnownPoses, Mounting, filter_poses
 from phasemark.matcher.agreement import DISAGREEMENT
-from phasemark.matcher.calibrate_fit import Fit
-from phasemark.matcher.calibrate_model import NAMES, SCALE, STEP, CalibrationModel
-from phasemark.matcher.likelihood import Evidence, Quantity
+from phasemark.matcher.calibrate.mounting_fit import Fit
+from phasemark.matcher.calibrate.mounting_model import NAMES, SCALE, STEP, CalibrationModel
+from phasemark.matcher.likelihood.residuals import Evidence, Quantity
 from phasemark.render import Frames, Renderer, Views, capture, preset
 
 SENSOR = preset("pmd-16x16")

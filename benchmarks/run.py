@@ -31,9 +31,9 @@ from tolerance import tolerance
 from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Conditions, FilteredFrames, Matcher, kalman_filter, phasor_mean
-from phasemark.matcher.coarse import Observation
-from phasemark.matcher.pruned import ExactSearch, nearest_search
-from phasemark.matcher.trials import noisy_frames
+from phasemark.matcher.accuracy.trials import noisy_frames
+from phasemark.matcher.nearest.search import ExactSearch, nearest_search
+from phasemark.matcher.nearest.templates import Observation
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, camera_unit, capture, preset
 
 ROOT = Path(__file__).resolve().parent.parent

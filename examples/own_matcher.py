@@ -17,7 +17,7 @@ import numpy as np
 
 from phasemark import PhasemarkError, UsageError
 from phasemark.matcher import FilteredFrames, Match, Method, SweepPlan, load_sweep, read_sweep, run_sweep
-from phasemark.matcher.sweep_report import write_report
+from phasemark.matcher.sweep.report import write_report
 
 AXIS_BEHIND_FACE_M = 0.10
 """How far the landmark's axis lies behind what is seen of it, roughly: the box is 24 × 16 cm."""

@@ -1,6 +1,6 @@
 """What the robot concludes: filters, matching, and its own position."""
 
-from phasemark.matcher.bounds import (
+from phasemark.matcher.accuracy.cramer_rao import (
     Bound,
     Estimate,
     confusion_probability,
@@ -10,11 +10,13 @@ from phasemark.matcher.bounds import (
     nees,
     share,
 )
-from phasemark.matcher.calibrate import Calibration, calibrate, filter_poses
-from phasemark.matcher.calibrate_model import Mounting
-from phasemark.matcher.calibrate_poses import KnownPoses, PoseStd, frames_of_poses, read_poses
-from phasemark.matcher.diagnosis import Change, Diagnosis, diagnose
-from phasemark.matcher.filters import (
+from phasemark.matcher.accuracy.grid_spacing import GridLoss, SpacingLoss, grid_loss
+from phasemark.matcher.accuracy.trials import Conditions, Trials, TrialSummary, run_trials
+from phasemark.matcher.calibrate.calibration import Calibration, calibrate, filter_poses
+from phasemark.matcher.calibrate.known_poses import KnownPoses, PoseStd, frames_of_poses, read_poses
+from phasemark.matcher.calibrate.mounting_model import Mounting
+from phasemark.matcher.diagnosis.diagnose import Change, Diagnosis, diagnose
+from phasemark.matcher.filters.filtered_frames import (
     FilteredFrames,
     PixelKalman,
     PixelState,
@@ -24,19 +26,17 @@ from phasemark.matcher.filters import (
     noise_free,
     phasor_mean,
 )
-from phasemark.matcher.landmark_map import LandmarkMap, MappedLandmark, Placement, load_map
+from phasemark.matcher.likelihood.background_estimate import Surroundings, estimate_surroundings
 from phasemark.matcher.match import Candidate, Match, Matches
 from phasemark.matcher.matcher import Matcher, background_image
-from phasemark.matcher.population import GridLoss, SpacingLoss, grid_loss
-from phasemark.matcher.robot import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
-from phasemark.matcher.stillness import MotionTest, motion_test
-from phasemark.matcher.surroundings import Surroundings, estimate_surroundings
-from phasemark.matcher.sweep import read_sweep, run_sweep
-from phasemark.matcher.sweep_compare import Difference, compare_cells
-from phasemark.matcher.sweep_examples import sweep_frames
-from phasemark.matcher.sweep_plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, load_sweep
-from phasemark.matcher.sweep_tables import Cell, SweepTrials
-from phasemark.matcher.trials import Conditions, Trials, TrialSummary, run_trials
+from phasemark.matcher.position.landmark_map import LandmarkMap, MappedLandmark, Placement, load_map
+from phasemark.matcher.position.robot_pose import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
+from phasemark.matcher.recordings.stillness import MotionTest, motion_test
+from phasemark.matcher.sweep.compare import Difference, compare_cells
+from phasemark.matcher.sweep.examples import sweep_frames
+from phasemark.matcher.sweep.plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, load_sweep
+from phasemark.matcher.sweep.result_tables import Cell, SweepTrials
+from phasemark.matcher.sweep.run import read_sweep, run_sweep
 
 __all__ = [
     "PRIOR_STD",

@@ -2,7 +2,7 @@
 
 The paper's minimum-distance classifier (its section 4.2) lives here: the lower pixels give distance and angle, then the
 upper pixels give the class, and the answer lies on the bank's grid. Maximum likelihood lives in
-:mod:`phasemark.matcher.estimator`.
+:mod:`phasemark.matcher.likelihood.estimator`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
 from phasemark.matcher.agreement import DISAGREEMENT
-from phasemark.matcher.coarse import Observation, Templates
-from phasemark.matcher.estimator import (
+from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.likelihood.estimator import (
     BEARING_STD_RAD,
     TOLERANCE_M,
     TOLERANCE_RAD,
@@ -27,12 +27,12 @@ from phasemark.matcher.estimator import (
     Pixels,
     p_values_of,
 )
-from phasemark.matcher.filters import FilteredFrames
-from phasemark.matcher.likelihood import Quantity
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.systematic import SYSTEMATICS, check_systematic
 from phasemark.matcher.match import Candidate, Match, Matches, Reason
-from phasemark.matcher.models import VIEW
-from phasemark.matcher.pruned import nearest_search
-from phasemark.matcher.systematic import SYSTEMATICS, check_systematic
+from phasemark.matcher.nearest.search import nearest_search
+from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, wrap_difference_m
 
 METHODS = ("nearest", "refine")

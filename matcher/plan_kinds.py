@@ -17,7 +17,7 @@ from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.inputs.toml_file import read_toml
 from phasemark.matcher.design import DesignPlan, example_design, load_design_plan
 from phasemark.matcher.drive import DrivePlan, example_drive, load_drive_plan
-from phasemark.matcher.sweep_plan import SweepPlan, load_sweep
+from phasemark.matcher.sweep.plan import SweepPlan, load_sweep
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class _Kind:
 
 
 def _shipped(package: str, name: str) -> Callable[[], str]:
-    return partial(resources.files(package).joinpath("plans", name).read_text, encoding="utf-8")
+    return partial(resources.files(package).joinpath(name).read_text, encoding="utf-8")
 
 
 def _load_scene(model: type[ScenePlan], path: str | os.PathLike[str]) -> BaseModel:
@@ -43,9 +43,13 @@ def _load_scene(model: type[ScenePlan], path: str | os.PathLike[str]) -> BaseMod
 
 _KINDS = {
     # first, for what might be any of them
-    "bank": _Kind(BankPlan, _shipped("phasemark.data", "bank.toml"), partial(_load_scene, BankPlan)),
-    "frames": _Kind(FramePlan, _shipped("phasemark.data", "frames.toml"), partial(_load_scene, FramePlan)),
-    "sweep": _Kind(SweepPlan, _shipped("phasemark.matcher", "paper.toml"), lambda path: load_sweep(path).resolve()),
+    "bank": _Kind(BankPlan, _shipped("phasemark.data.plans", "examples/bank.toml"), partial(_load_scene, BankPlan)),
+    "frames": _Kind(
+        FramePlan, _shipped("phasemark.data.plans", "examples/frames.toml"), partial(_load_scene, FramePlan)
+    ),
+    "sweep": _Kind(
+        SweepPlan, _shipped("phasemark.matcher.sweep", "plans/paper.toml"), lambda path: load_sweep(path).resolve()
+    ),
     "drive": _Kind(DrivePlan, example_drive, load_drive_plan),
     "design": _Kind(DesignPlan, example_design, load_design_plan),
 }

@@ -16,8 +16,8 @@ from crash_points import in_fork
 from system_calls import Trap
 
 from phasemark import OutputExistsError, PhasemarkError, StorageError
-from phasemark.matcher.sweep import read_sweep, run_sweep
-from phasemark.matcher.sweep_plan import Method, SweepPlan
+from phasemark.matcher.sweep.plan import Method, SweepPlan
+from phasemark.matcher.sweep.run import read_sweep, run_sweep
 
 PLAN = SweepPlan(
     name="small", trials=4, classes=["cone"], axes={"distance_m": [1.0], "n_frames": [3]}, bank_distance_m=(0.9, 1.1),

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from random_kills import code_of
 
-from phasemark.matcher.sweep import run_sweep
-from phasemark.matcher.sweep_plan import Method, SweepPlan
+from phasemark.matcher.sweep.plan import Method, SweepPlan
+from phasemark.matcher.sweep.run import run_sweep
 
 TABLES = ("trials.csv", "cells.csv")
 """Their last column is the time."""

@@ -9,7 +9,7 @@ from scipy import stats
 
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher.bounds import (
+from phasemark.matcher.accuracy.cramer_rao import (
     confusion_probability,
     covers,
     cramer_rao,

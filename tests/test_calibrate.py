@@ -25,12 +25,12 @@ from phasemark.matcher import (
     kalman_filter,
     read_poses,
 )
-from phasemark.matcher.calibrate_fit import Fit
-from phasemark.matcher.calibrate_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel
-from phasemark.matcher.calibrate_report import calibration_toml
-from phasemark.matcher.calibrate_track import PoseTrack
-from phasemark.matcher.likelihood import Evidence
-from phasemark.matcher.stamps import stamp_jitter
+from phasemark.matcher.calibrate.mounting_fit import Fit
+from phasemark.matcher.calibrate.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel
+from phasemark.matcher.calibrate.pose_track import PoseTrack
+from phasemark.matcher.calibrate.report import calibration_toml
+from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.recordings.stamps import stamp_jitter
 from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, preset
 
 PMD = preset("pmd-16x16")

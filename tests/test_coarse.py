@@ -7,9 +7,9 @@ import pytest
 
 from phasemark.data import BankPlan, build_bank
 from phasemark.matcher import Conditions, Matcher
-from phasemark.matcher.coarse import Observation
-from phasemark.matcher.pruned import ExactSearch, PrunedSearch, nearest_search
-from phasemark.matcher.trials import noisy_frames
+from phasemark.matcher.accuracy.trials import noisy_frames
+from phasemark.matcher.nearest.search import ExactSearch, PrunedSearch, nearest_search
+from phasemark.matcher.nearest.templates import Observation
 from phasemark.render import Background, Renderer, preset
 
 SENSOR = preset("pmd-16x16")

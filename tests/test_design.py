@@ -19,7 +19,7 @@ from phasemark.cli import main
 from phasemark.data import BankPlan, load_plan
 from phasemark.landmarks import Box, Cone, Cylinder, LandmarkSpec, Revolution, Sphere, build_mesh, catalog, read_mesh
 from phasemark.matcher import Matcher, cramer_rao, kalman_filter
-from phasemark.matcher.bounds import Estimate
+from phasemark.matcher.accuracy.cramer_rao import Estimate
 from phasemark.matcher.design import (
     ClassDistances,
     DesignPlan,
@@ -44,9 +44,9 @@ from phasemark.matcher.design import (
     turn_distance,
     write_design,
 )
-from phasemark.matcher.design.bound import box_alone
 from phasemark.matcher.design.confirm import root_mean_square
 from phasemark.matcher.design.drawing import scale_words
+from phasemark.matcher.design.position_bound import box_alone
 from phasemark.matcher.design.search import Search
 from phasemark.matcher.design.separation import upper_appearance
 from phasemark.matcher.design.shapes import Lattice, neighbours, sample_boxes, sample_uppers

@@ -13,7 +13,7 @@ from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, diagnose, kalman_filter
-from phasemark.matcher.diagnosis_search import _Seen
+from phasemark.matcher.diagnosis.search import _Seen
 from phasemark.render import Background, Renderer, capture, preset
 
 PRESETS = ("vl53l5cx-8x8", "pmd-16x16")

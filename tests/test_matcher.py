@@ -11,8 +11,8 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, Matches, PixelState, kalman_filter, noise_free
 from phasemark.matcher.agreement import DISAGREEMENT
-from phasemark.matcher.coarse import Observation, Templates
-from phasemark.matcher.picture import match_picture, model_range_m
+from phasemark.matcher.figures import match_picture, model_range_m
+from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.render import Background, Frames, PhasorImages, Renderer, capture, preset
 
 SENSOR = preset("pmd-16x16")

@@ -95,7 +95,7 @@ def test_the_matcher_itself_is_asked(banks, tmp_path):
 
 
 def test_views_lie_beyond_the_last_angle_where_the_grid_closes(tmp_path, monkeypatch):
-    from phasemark.matcher import population
+    from phasemark.matcher.accuracy import grid_spacing as population
 
     seen = []
     render = population.noise_free

@@ -14,7 +14,7 @@ from phasemark.cli import main
 from phasemark.data import open_bank, read_frames
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.matcher.recording import match_in_batches
+from phasemark.matcher.recordings.estimates_table import match_in_batches
 from phasemark.render import Background, Renderer, preset
 
 ZONES = preset("vl53l5cx-8x8")
@@ -62,7 +62,7 @@ def drawn(monkeypatch, capsys):
         printed.append(capsys.readouterr().out)
         return Figure(figsize=(1, 1))
 
-    monkeypatch.setattr("phasemark.matcher.picture.match_picture", picture)
+    monkeypatch.setattr("phasemark.matcher.figures.match_picture", picture)
     return printed
 
 

@@ -13,10 +13,10 @@ from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, noise_free
-from phasemark.matcher.likelihood import Evidence, gauss_newton_sums
-from phasemark.matcher.models import VIEW, BankModel, RenderedModel
-from phasemark.matcher.refine import Settings, _Problem
-from phasemark.matcher.trials import Conditions, noisy_frames, run_trials
+from phasemark.matcher.accuracy.trials import Conditions, noisy_frames, run_trials
+from phasemark.matcher.likelihood.descent import Settings, _Problem
+from phasemark.matcher.likelihood.images import VIEW, BankModel, RenderedModel
+from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
 from phasemark.render import Background, Frames, Renderer, Views, capture, predicted_range_std, preset
 
 SENSOR = preset("pmd-16x16")

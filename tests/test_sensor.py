@@ -13,7 +13,7 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.matcher import kalman_filter
 from phasemark.matcher.agreement import counts
-from phasemark.matcher.coarse import assumed_std_m
+from phasemark.matcher.nearest.templates import assumed_std_m
 from phasemark.render import (
     Background,
     Flag,

@@ -23,7 +23,7 @@ from phasemark.matcher import (
     run_trials,
     share,
 )
-from phasemark.matcher.models import VIEW
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.render import Background, PhasorImages, Renderer, Views, capture, preset
 
 pytestmark = pytest.mark.soak

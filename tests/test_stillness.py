@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from phasemark.matcher import motion_test
-from phasemark.matcher.stillness import _correlations
+from phasemark.matcher.recordings.stillness import _correlations
 from phasemark.render import Background, Frames, Renderer, capture, preset
 
 ZONES = preset("vl53l5cx-8x8")
@@ -39,7 +39,7 @@ def test_still_recordings_are_doubted_no_more_often_than_stated(kind, n_frames):
 
 @pytest.mark.parametrize("values", [[0, 1, 2], [1, 2, 2, 7], [3.0, 1.0, 4.0, 1.5, 9.0], [0, 0, 0, 1, 1]])
 def test_mean_and_variance_of_the_correlation_are_those_of_all_orders(values, monkeypatch):
-    monkeypatch.setattr("phasemark.matcher.stillness.FEWEST_FOR_ORDER", 3)
+    monkeypatch.setattr("phasemark.matcher.recordings.stillness.FEWEST_FOR_ORDER", 3)
     series = np.array(list(itertools.permutations(values)), dtype=float).T
     correlation, variance = _correlations(series)
     np.testing.assert_allclose(variance, correlation.var(), rtol=1e-12)

@@ -14,9 +14,9 @@ from phasemark import OutputExistsError, UsageError, cli
 from phasemark.cli import main
 from phasemark.data.files.folder_marker import MARKER
 from phasemark.matcher.plan_kinds import plan_schema
-from phasemark.matcher.sweep import read_sweep, run_sweep, sweep_folder
-from phasemark.matcher.sweep_plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
-from phasemark.matcher.sweep_report import write_report
+from phasemark.matcher.sweep.plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
+from phasemark.matcher.sweep.report import write_report
+from phasemark.matcher.sweep.run import read_sweep, run_sweep, sweep_folder
 
 HERE = Path(__file__).parent
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from sweep_ways import plan, tables
 
-from phasemark.matcher.sweep import run_sweep
+from phasemark.matcher.sweep.run import run_sweep
 
 HERE = Path(__file__).parent
 TRIALS = 60

@@ -16,14 +16,14 @@ from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.data import build_bank, read_frames
 from phasemark.landmarks import Box, Cylinder, LandmarkSpec, build_mesh, catalog
-from phasemark.matcher.filters import kalman_filter
-from phasemark.matcher.sweep import read_sweep, run_sweep
-from phasemark.matcher.sweep_compare import compare_cells
-from phasemark.matcher.sweep_examples import sweep_frames
-from phasemark.matcher.sweep_job import Round, SweepJob
-from phasemark.matcher.sweep_plan import Method, SweepPlan
-from phasemark.matcher.sweep_report import summary, write_report
-from phasemark.matcher.sweep_trust_figures import confusion
+from phasemark.matcher.filters.filtered_frames import kalman_filter
+from phasemark.matcher.sweep.compare import compare_cells
+from phasemark.matcher.sweep.examples import sweep_frames
+from phasemark.matcher.sweep.figures.trust import confusion
+from phasemark.matcher.sweep.job import Round, SweepJob
+from phasemark.matcher.sweep.plan import Method, SweepPlan
+from phasemark.matcher.sweep.report import summary, write_report
+from phasemark.matcher.sweep.run import read_sweep, run_sweep
 from phasemark.render import Renderer, preset
 
 BOX = {"length_m": 0.24, "width_m": 0.16, "height_m": 0.15}
@@ -58,7 +58,7 @@ method = "own_matchers:nearest_to_mean"
 def one_example_of_each_method():
     """Pictures take half a second each, and every report of these tests would draw six."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("phasemark.matcher.sweep_report._MOST_EXAMPLES", 3)
+        patch.setattr("phasemark.matcher.sweep.report._MOST_EXAMPLES", 3)
         yield
 
 
@@ -252,7 +252,7 @@ def test_the_commands_tell_what_is_wrong_in_one_line(folder, tmp_path, capsys):
 
 
 def test_a_matcher_of_ones_own_joins_the_methods(folder, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("phasemark.matcher.sweep_report.write_report", lambda folder: folder / "report.html")
+    monkeypatch.setattr("phasemark.matcher.sweep.report.write_report", lambda folder: folder / "report.html")
     plan = folder.parent / "plan.toml"
     options = ["--trials", "2", "--matcher", "own_matchers:off_by_3_mm", "--trust-plan", "-o", str(tmp_path / "own")]
     assert main(["sweep", "run", str(plan), *options]) == 0

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from phasemark.matcher.intervals import mean_interval, rms_interval, wilson
-from phasemark.matcher.sweep_plan import Condition
-from phasemark.matcher.sweep_tables import LEVELS, SweepTrials
+from phasemark.matcher.statistics import mean_interval, rms_interval, wilson
+from phasemark.matcher.sweep.plan import Condition
+from phasemark.matcher.sweep.result_tables import LEVELS, SweepTrials
 
 # y = A θ + e, e ~ N(0, Σ): least squares has exactly the covariance P = (Aᵀ Σ⁻¹ A)⁻¹, which is the Cramér–Rao bound
 A = np.array([[1.0, 0.2], [0.5, 1.0], [-0.3, 0.7]])

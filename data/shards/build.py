@@ -53,7 +53,8 @@ class Job(Protocol):
 
     def spec(self) -> dict[str, Any]:
         """Return what another process makes the same job from, in plain data
-        (:func:`phasemark.data.partial_outputs.job_of`)."""
+        (:func:`phasemark.data.partial_outputs.job_of`).
+        """
 
     @property
     def items(self) -> Sequence[int]:

@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-from phasemark.matcher.design.bound import RangeBound, range_bound
 from phasemark.matcher.design.confirm import Confirmation, Trial, confirm, confirm_design, ratio
 from phasemark.matcher.design.drawing import drawing_svg
 from phasemark.matcher.design.output import (
@@ -23,13 +22,14 @@ from phasemark.matcher.design.plan import (
     example_design,
     load_design_plan,
 )
+from phasemark.matcher.design.position_bound import RangeBound, range_bound
 from phasemark.matcher.design.rules import Check, Room
 from phasemark.matcher.design.run import run_design
 from phasemark.matcher.design.search import Candidate, Design, Scored
 from phasemark.matcher.design.separation import ClassDistances, most_apart, turn_distance
 
 if TYPE_CHECKING:
-    from phasemark.matcher.design.picture import bound_picture, pareto_picture
+    from phasemark.matcher.design.figures import bound_picture, pareto_picture
 
 __all__ = [
     "Candidate",
@@ -71,7 +71,7 @@ __all__ = [
 def __getattr__(name: str) -> object:
     """Import pictures when they are asked for: matplotlib takes half a second to load."""
     if name in ("bound_picture", "pareto_picture"):
-        from phasemark.matcher.design import picture
+        from phasemark.matcher.design import figures as picture
 
         return getattr(picture, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -20,12 +20,12 @@ from phasemark.data import BankPlan, build_bank, parse_grid
 from phasemark.data.progress import Progress, counter
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh
-from phasemark.matcher.bounds import Estimate, cramer_rao, efficiency, share
+from phasemark.matcher.accuracy.cramer_rao import Estimate, cramer_rao, efficiency, share
+from phasemark.matcher.accuracy.trials import Conditions, noisy_frames
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.search import Design, Scored
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.matcher import Matcher
-from phasemark.matcher.models import VIEW
-from phasemark.matcher.trials import Conditions, noisy_frames
 from phasemark.render import Renderer, Sensor, Views
 
 SIDE_STEP_DEG = 3.75

@@ -15,11 +15,11 @@ import trimesh
 from phasemark.data import write_atomically
 from phasemark.data.pages.page import figure_png
 from phasemark.landmarks import LandmarkSpec, build_mesh, export_mesh
-from phasemark.matcher.bounds import Estimate, confusion_probability
-from phasemark.matcher.design.bound import RangeBound
+from phasemark.matcher.accuracy.cramer_rao import Estimate, confusion_probability
 from phasemark.matcher.design.confirm import Confirmation, ratio
 from phasemark.matcher.design.drawing import drawing_svg
 from phasemark.matcher.design.plan import DesignPlan
+from phasemark.matcher.design.position_bound import RangeBound
 from phasemark.matcher.design.search import Design, Scored
 
 Confirmed = tuple[Confirmation, Confirmation]
@@ -251,7 +251,7 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
     OutputExistsError, StorageError
         A file cannot be written.
     """
-    from phasemark.matcher.design.picture import bound_picture, pareto_picture  # matplotlib is slow to import
+    from phasemark.matcher.design.figures import bound_picture, pareto_picture  # matplotlib is slow to import
 
     near, far = design.plan.distance_m
     notes = [f"for {Path(design.plan.sensor).stem}, {near:g} … {far:g} m"]

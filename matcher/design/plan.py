@@ -214,7 +214,7 @@ def load_design_plan(path: str | os.PathLike[str]) -> DesignPlan:
 
 def example_design() -> str:
     """Return the text of the shipped plan."""
-    return (files("phasemark.matcher") / "plans" / "design.toml").read_text(encoding="utf-8")
+    return (files("phasemark.matcher.design") / "plan.toml").read_text(encoding="utf-8")
 
 
 def default_design() -> DesignPlan:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from phasemark.landmarks import Box, LandmarkSpec
 from phasemark.landmarks.spec import Upper
-from phasemark.matcher.design.bound import RangeBound, box_alone, range_bound
 from phasemark.matcher.design.plan import DesignPlan
+from phasemark.matcher.design.position_bound import RangeBound, box_alone, range_bound
 from phasemark.matcher.design.rules import Check, Room
 from phasemark.matcher.design.separation import (
     Appearance,

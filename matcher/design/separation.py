@@ -2,8 +2,8 @@
 
 The noncentrality d is the whitened distance between two noise-free frames, over everything that could make one imitate
 the other (PHYSICS section 7): two classes are confused with probability Q(d/2), see
-:func:`~phasemark.matcher.bounds.confusion_probability`. Pixels where one returns and the other cannot, or must and does
-not, count with the matcher's own penalty.
+:func:`~phasemark.matcher.accuracy.cramer_rao.confusion_probability`. Pixels where one returns and the other cannot, or
+must and does not, count with the matcher's own penalty.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from phasemark.landmarks import Box, LandmarkSpec, build_mesh
 from phasemark.landmarks.spec import Upper
 from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts
-from phasemark.matcher.design.bound import SEARCH_TOLERANCE_M, box_alone
 from phasemark.matcher.design.plan import DesignPlan
+from phasemark.matcher.design.position_bound import SEARCH_TOLERANCE_M, box_alone
 from phasemark.render import Renderer, Sensor, Views, phasor_to_range_m, predicted_range_std, wrap_difference_m
 
 _STEP_M = 1e-4

@@ -17,7 +17,7 @@ from phasemark.matcher.drive.pose_filter import PoseFilter
 from phasemark.matcher.drive.simulate import Drive, Equipment, Stop, pose_error, run_drive
 
 if TYPE_CHECKING:
-    from phasemark.matcher.drive.picture import drive_animation, drive_picture
+    from phasemark.matcher.drive.figures import drive_animation, drive_picture
 
 __all__ = [
     "OUTPUTS",
@@ -47,7 +47,7 @@ __all__ = [
 def __getattr__(name: str) -> object:
     """Import pictures when they are asked for: matplotlib takes half a second to load."""
     if name in ("drive_animation", "drive_picture"):
-        from phasemark.matcher.drive import picture
+        from phasemark.matcher.drive import figures as picture
 
         return getattr(picture, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

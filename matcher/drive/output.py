@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from phasemark.data import write_atomically
 from phasemark.data.files.csv_cell import as_cell
-from phasemark.matcher.bounds import nees
+from phasemark.matcher.accuracy.cramer_rao import nees
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
 
 OUTPUTS = ("path.csv", "stops.csv", "summary.json", "drive.png", "drive.gif")
@@ -128,7 +128,7 @@ def write_drive(drive: Drive, folder: Path, *, force: bool = False) -> list[Path
     OutputExistsError, StorageError
         A file cannot be written.
     """
-    from phasemark.matcher.drive.picture import drive_animation, drive_picture  # matplotlib is slow to import
+    from phasemark.matcher.drive.figures import drive_animation, drive_picture  # matplotlib is slow to import
 
     picture = io.BytesIO()
     drive_picture(drive).savefig(picture, format="png", dpi=130)

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from phasemark import UsageError
 from phasemark.data.plans.bank_plan import PlanModel
 from phasemark.inputs.toml_file import read_toml
-from phasemark.matcher.landmark_map import LandmarkMap, Point, Std, load_map
+from phasemark.matcher.position.landmark_map import LandmarkMap, Point, Std, load_map
 from phasemark.render import Sensor, preset
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -236,7 +236,7 @@ def load_drive_plan(path: str | os.PathLike[str]) -> DrivePlan:
 
 def example_drive() -> str:
     """Return the text of the shipped plan: a tour of 20 m past four landmarks."""
-    return (files("phasemark.matcher") / "plans" / "drive.toml").read_text(encoding="utf-8")
+    return (files("phasemark.matcher.drive") / "plan.toml").read_text(encoding="utf-8")
 
 
 def default_drive() -> DrivePlan:

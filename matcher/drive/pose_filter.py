@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from phasemark.matcher.drive.odometry import OdometryModel, Reading, motion_jacobian, motion_noise, moved
-from phasemark.matcher.landmark_map import Placement
+from phasemark.matcher.position.landmark_map import Placement
 
 POSE = 3
 """How many numbers of the state a landmark measures: x, y and heading."""

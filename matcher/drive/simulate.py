@@ -14,15 +14,15 @@ from phasemark.data import Bank, BankPlan, build_bank
 from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
-from phasemark.matcher.bounds import cramer_rao
+from phasemark.matcher.accuracy.cramer_rao import cramer_rao
 from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
 from phasemark.matcher.drive.odometry import OdometryModel, World, moved
 from phasemark.matcher.drive.plan import DrivePlan
 from phasemark.matcher.drive.pose_filter import PoseFilter
-from phasemark.matcher.filters import kalman_filter
-from phasemark.matcher.landmark_map import MappedLandmark
+from phasemark.matcher.filters.filtered_frames import kalman_filter
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
+from phasemark.matcher.position.landmark_map import MappedLandmark
 from phasemark.render import Background, Renderer, Sensor, Views, capture
 
 FREE = ("distance_m", "delta_rad", "bearing_rad")

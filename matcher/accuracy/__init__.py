@@ -1,0 +1,1 @@
+"""Bounds, Monte-Carlo trials and the cost of a bank's grid."""

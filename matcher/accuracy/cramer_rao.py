@@ -1,0 +1,336 @@
+"""What can be known at best: Fisher information, Cramér–Rao bounds, class confusion, and tests of a covariance.
+
+All bounds are those of PHYSICS section 7, for Gaussian residuals with the variance of the noise law: say of every
+number which pixels count, whether ranges or phasors are measured, what is free, and what stands behind the landmark.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import special
+
+from phasemark import UsageError
+from phasemark.matcher.agreement import counts
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.systematic import (
+    calibrated_covariance,
+    calibrated_fields,
+    calibrated_slopes,
+    carried_covariance,
+    check_systematic,
+    declared_covariance,
+)
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, predicted_range_std
+from phasemark.render.sensor.range_noise import phase_image_variance
+
+_WALL_STEP_M = 1e-4
+NUISANCES = ("albedo", "wall_m", "wall_albedo")
+"""What may be unknown beside the view: the landmark's albedo, the wall's distance and albedo."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """What filtered frames of n views can tell.
+
+    Parameters
+    ----------
+    free : tuple of str
+        Parameters of the view, in the order of the matrices.
+    information : (n, p, p) float64
+        Fisher information in them, what the nuisances cost taken off.
+    pixels : (n, rows, cols) bool
+        Which pixels count.
+    systematic : (n, p, p) float64, optional
+        What the calibration of the sensor leaves, and what the sensor declares of a pose.
+    """
+
+    free: tuple[str, ...]
+    information: NDArray[np.float64]
+    pixels: NDArray[np.bool_]
+    systematic: NDArray[np.float64] | None = None
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Cramér–Rao bound and what is systematic, (n, p, p); NaN where a direction is not observed."""
+        noise = _inverse(self.information)
+        return noise if self.systematic is None else noise + self.systematic
+
+    def std(self, name: str) -> NDArray[np.float64]:
+        """Return the bound on the standard deviation of one parameter, metres or radians, (n,)."""
+        k = self.free.index(name)
+        return np.sqrt(self.covariance[:, k, k])
+
+
+def _inverse(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the inverses of information matrices, (n, p, p); NaN where a direction is not observed."""
+    values, vectors = np.linalg.eigh(information)
+    seen = values[:, :1] > 1e-13 * np.abs(values[:, -1:])
+    inverse = np.divide(1.0, values, out=np.full(values.shape, np.nan), where=seen)
+    return np.asarray(np.einsum("nij,nj,nkj->nik", vectors, inverse, vectors))
+
+
+def cramer_rao(
+    renderer: Renderer,
+    views: Views,
+    *,
+    free: Sequence[str] = VIEW[:2],
+    n_frames: ArrayLike = 50,
+    on: Quantity = "ranges",
+    pixels: str | NDArray[np.bool_] = "all",
+    background: Background | None = None,
+    nuisances: Sequence[str] | None = None,
+    image: PhasorImages | None = None,
+    systematic: Collection[str] = (),
+    workers: int = 1,
+) -> Bound:
+    """Return the Cramér–Rao bound at some views (PHYSICS section 7).
+
+    Pixels count where one frame measures the range to 0.1 rad or better (0.24 m at 10 MHz).
+
+    Parameters
+    ----------
+    renderer : Renderer
+        The landmark and the camera.
+    views : Views
+    free : sequence of str
+        Parameters of the view to be estimated; the others are known.
+    n_frames : array_like
+        Frames that were averaged; broadcasts against (n, rows, cols).
+    on : {"ranges", "phasors"}
+    pixels : {"all", "lower"} or (rows, cols) or (n, rows, cols) bool
+        Which pixels may count: "lower" the lower half of the rows; an array is taken as it is.
+    background : Background, optional
+    nuisances : sequence of str, optional
+        Which of :data:`NUISANCES` are unknown too; None: the albedo on phasors, nothing on ranges.
+    image : PhasorImages, optional
+        What is seen at the views, where it has been rendered already: of the same landmark, optics and background.
+    systematic : collection of {"calibration", "declared"}
+        Which errors of the sensor that all frames share are added: what its calibration leaves, and what it declares.
+    workers : int
+        Threads.
+
+    Returns
+    -------
+    Bound
+
+    Raises
+    ------
+    UsageError
+        A name is unknown, or a wall is a nuisance where there is none.
+
+    Examples
+    --------
+    >>> from phasemark.landmarks import build_mesh, catalog
+    >>> from phasemark.render import Renderer, Views, preset
+    >>> renderer = Renderer(build_mesh(catalog()["cylinder"]), preset("pmd-16x16"))
+    >>> bound = cramer_rao(renderer, Views.broadcast(1.0, 0.5), pixels="lower")
+    >>> [round(float(bound.std(name)[0]), 5) for name in bound.free]
+    [0.00036, 0.00531]
+    """
+    nuisances = (("albedo",) if on == "phasors" else ()) if nuisances is None else tuple(nuisances)
+    for name in nuisances:
+        if name not in NUISANCES:
+            raise UsageError(f"'nuisances' must be among {', '.join(NUISANCES)}, got {name!r}")
+    if not free or any(name not in VIEW for name in free) or len(set(free)) < len(free):
+        raise UsageError(f"'free' must name some of {', '.join(VIEW)} once each, got {tuple(free)!r}")
+    if (background is None or background.wall_m is None) and set(nuisances) & {"wall_m", "wall_albedo"}:
+        raise UsageError("a wall can be a nuisance only where there is one: give 'background' a wall")
+    sensor = renderer.sensor
+    if image is None:
+        image = renderer.render_views(views, background=background, workers=workers)
+    slope = renderer.jacobian(
+        *(getattr(views, name) for name in VIEW), background=background, parameters=free, workers=workers
+    )
+    columns = [slope]
+    if nuisances:
+        alone = renderer.render_views(views, workers=workers).phasor if background else image.phasor
+        for name in nuisances:
+            if name == "albedo":
+                columns.append(alone[:, None])
+            elif name == "wall_albedo":
+                assert background is not None
+                columns.append(((image.phasor - alone) / background.wall_albedo)[:, None])
+            else:
+                assert background is not None
+                assert background.wall_m is not None
+                sides = [
+                    renderer.render_views(
+                        views, background=replace(background, wall_m=background.wall_m + step), workers=workers
+                    ).phasor
+                    for step in (_WALL_STEP_M, -_WALL_STEP_M)
+                ]
+                columns.append(((sides[0] - sides[1]) / (2 * _WALL_STEP_M))[:, None])
+    use = np.broadcast_to(_chosen(pixels, sensor), image.phasor.shape) & (image.phasor != 0)
+    if isinstance(pixels, str):
+        use = use & counts(image.phasor, image.intensity, sensor)
+    frames = np.broadcast_to(np.asarray(n_frames, np.float64), image.phasor.shape)
+    rows = _whitened(image.phasor, image.intensity, np.concatenate(columns, axis=1), use, frames, on, sensor)
+    everything = rows @ rows.transpose(0, 2, 1)
+    information = eliminated(everything, len(free))
+    common = None
+    if terms := check_systematic(systematic):
+        common = np.zeros(information.shape)
+        if "declared" in terms:
+            common += declared_covariance(sensor, free)
+        if "calibration" in terms and calibrated_fields(sensor):
+            by_fields = calibrated_slopes(renderer, sensor, views, image, background, workers)
+            calibrated = _whitened(image.phasor, image.intensity, by_fields, use, frames, on, sensor)
+            known = np.nan_to_num(_inverse(everything))  # nuisances included: they take up part of an error
+            p = len(free)
+            common += carried_covariance(known, rows, calibrated, calibrated_covariance(sensor))[:, :p, :p]
+    return Bound(tuple(free), information, use, common)
+
+
+def eliminated(information: NDArray[np.float64], p: int) -> NDArray[np.float64]:
+    """Return the information in the first p parameters when the others are unknown (Schur complement).
+
+    Parameters
+    ----------
+    information : (n, q, q) float64
+    p : int
+    """
+    if information.shape[-1] == p:
+        return information
+    a, b, c = information[:, :p, :p], information[:, :p, p:], information[:, p:, p:]
+    return np.asarray(a - b @ np.linalg.pinv(c) @ b.transpose(0, 2, 1))
+
+
+def _chosen(pixels: str | NDArray[np.bool_], sensor: Sensor) -> NDArray[np.bool_]:
+    if not isinstance(pixels, str):
+        return np.asarray(pixels, np.bool_)
+    if pixels not in ("all", "lower"):
+        raise UsageError(f"'pixels' must be all, lower or an array, got {pixels!r}")
+    chosen = np.ones((sensor.rows, sensor.cols), np.bool_)
+    if pixels == "lower":
+        chosen[: sensor.rows // 2] = False
+    return chosen
+
+
+def _whitened(
+    phasor: NDArray[np.complex128],
+    intensity: NDArray[np.float64],
+    slope: NDArray[np.complex128],
+    use: NDArray[np.bool_],
+    n_frames: NDArray[np.float64],
+    on: Quantity,
+    sensor: Sensor,
+) -> NDArray[np.float64]:
+    """Return the whitened Jacobian, (n, q, residuals)."""
+    n, q = slope.shape[:2]
+    s = np.where(use, phasor, 1.0)
+    if on == "ranges":
+        std = np.where(use, predicted_range_std(np.abs(s), intensity, sensor), 1.0) / np.sqrt(n_frames)
+        change = sensor.metres_per_radian * (s.conj()[:, None] * slope).imag / (np.abs(s) ** 2)[:, None]
+        return np.asarray(np.where(use[:, None], change / std[:, None], 0.0).reshape(n, q, -1))
+    unit = sensor.contrast * sensor.signal_e
+    intensity_e = sensor.signal_e * intensity + sensor.ambient_e + sensor.dark_e
+    std = np.sqrt(phase_image_variance(intensity_e, sensor) / (2 * n_frames)) / unit
+    change = np.where(use[:, None], slope / np.where(use, std, 1.0)[:, None], 0.0)
+    return np.concatenate([change.real.reshape(n, q, -1), change.imag.reshape(n, q, -1)], axis=2)
+
+
+def confusion_probability(distance_squared: ArrayLike) -> NDArray[np.float64]:
+    """Return Σ Q(d/2) over the last axis: a bound on how often another class explains a frame better.
+
+    Parameters
+    ----------
+    distance_squared : (..., k) array_like
+        d², the whitened squared distance of the noise-free frame from the nearest image of each other class, over all
+        its views: what a matcher reports as cost on frames without noise.
+    """
+    d = np.sqrt(np.asarray(distance_squared, np.float64))
+    return np.asarray(special.ndtr(-d / 2).sum(axis=-1))
+
+
+def nees(error: ArrayLike, covariance: ArrayLike) -> NDArray[np.float64]:
+    """Return the normalised estimation error squared, eᵀ P⁻¹ e ~ χ²(p), (n,).
+
+    Parameters
+    ----------
+    error : (n, p) array_like
+        Estimate less truth, angles wrapped.
+    covariance : (n, p, p) array_like
+    """
+    e, matrix = np.asarray(error, np.float64), np.asarray(covariance, np.float64)
+    return np.asarray(np.einsum("ni,ni->n", e, np.linalg.solve(matrix, e[:, :, None])[:, :, 0]))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number from a Monte Carlo run with its 95 % interval.
+
+    Parameters
+    ----------
+    value, low, high : float
+    """
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
+
+
+def share(successes: int, n: int) -> Estimate:
+    """Return a share with its exact (Clopper–Pearson) 95 % interval.
+
+    Parameters
+    ----------
+    successes, n : int
+
+    Returns
+    -------
+    Estimate
+    """
+    if n == 0:
+        return Estimate(math.nan, 0.0, 1.0)
+    k, tail = int(successes), 0.025
+    low = float(special.betaincinv(k, n - k + 1, tail)) if k else 0.0
+    high = float(special.betaincinv(k + 1, n - k, 1 - tail)) if k < n else 1.0
+    return Estimate(k / n, low, high)
+
+
+def efficiency(error: ArrayLike, std: ArrayLike) -> Estimate:
+    """Return √mean(e² / CRLB²), 1 at the bound, with its 95 % interval from the scatter of the terms.
+
+    Parameters
+    ----------
+    error, std : (n,) array_like
+        Errors, and the bound at each truth.
+    """
+    squares = (np.asarray(error, np.float64) / np.asarray(std, np.float64)) ** 2
+    mean, half = float(squares.mean()), 1.96 * float(squares.std(ddof=1)) / math.sqrt(len(squares))
+    return Estimate(math.sqrt(mean), math.sqrt(max(mean - half, 0.0)), math.sqrt(mean + half))
+
+
+def mean_of(values: ArrayLike) -> Estimate:
+    """Return a mean with its 95 % interval."""
+    array = np.asarray(values, np.float64)
+    half = 1.96 * float(array.std(ddof=1)) / math.sqrt(len(array))
+    return Estimate(float(array.mean()), float(array.mean()) - half, float(array.mean()) + half)
+
+
+def covers(error: ArrayLike, covariance: ArrayLike, level: float = 0.95) -> NDArray[np.bool_]:
+    """Return whether each error lies inside its ellipsoid of a probability.
+
+    Parameters
+    ----------
+    error : (n, p) array_like
+        Estimate less truth, angles wrapped.
+    covariance : (n, p, p) array_like
+    level : float
+        The ellipsoid's probability.
+
+    Returns
+    -------
+    (n,) bool
+    """
+    e = np.asarray(error, np.float64)
+    return np.asarray(nees(e, covariance) <= special.chdtri(e.shape[1], 1 - level))

@@ -1,0 +1,239 @@
+"""What the spacing of a bank's grid costs: random views without noise, matched, as banks of waveforms are tested.
+
+A view between the grid's points is rendered, weighed with the noise of 50 frames but given none of it, and matched:
+what the answer is off is due to the grid alone. Over the Cramér–Rao bound of those frames (PHYSICS section 7) it says
+how much of a robot's error comes from the grid; the two add in squares.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data import Bank
+from phasemark.data.bank.build_bank import BankJob
+from phasemark.data.seeds import stream
+from phasemark.matcher.accuracy.cramer_rao import cramer_rao
+from phasemark.matcher.agreement import counts
+from phasemark.matcher.filters.filtered_frames import noise_free
+from phasemark.matcher.likelihood.images import VIEW, closing_period
+from phasemark.matcher.match import Matches
+from phasemark.matcher.matcher import Matcher
+from phasemark.render import PhasorImages, Renderer, Views
+from phasemark.render.sensor.range_noise import phase_image_variance
+
+N_FRAMES = 50
+"""Frames that are averaged before matching (PHYSICS section 6)."""
+
+_BATCH = 256
+
+
+@dataclass(frozen=True)
+class SpacingLoss:
+    """What the grid cost one method of matching.
+
+    Parameters
+    ----------
+    class_errors : int
+        Views that were taken for another class, or for none; they do not count below.
+    distance_rms_m, delta_rms_deg : float
+        Root mean square of the errors; NaN, as the next two, where every class was wrong.
+    distance_over_bound, delta_over_bound : float
+        Root mean square of the errors over the Cramér–Rao bound at each view: 1 where the grid costs as much as the
+        noise.
+    """
+
+    class_errors: int
+    distance_rms_m: float
+    delta_rms_deg: float
+    distance_over_bound: float
+    delta_over_bound: float
+
+
+@dataclass(frozen=True)
+class GridLoss:
+    """What the spacing of a bank's grid costs, and what spacing would cost as much as the noise.
+
+    Parameters
+    ----------
+    views, frames : int
+        How many views were matched; how many frames' noise they were weighed with.
+    nearest : SpacingLoss
+        For the nearest image.
+    refined : SpacingLoss or None
+        For the maximum likelihood in between; None for a bank of the planar generator, which cannot be refined.
+    mismatch_median, mismatch_99 : float
+        Median and 99th percentile of 1 − ⟨S, S_bank⟩ / (|S| |S_bank|), the share of the view's signal that the nearest
+        image leaves unexplained, in phasors whitened by the noise.
+    suggested_distance_m, suggested_delta_deg : float or None
+        Steps at which a view amid four images of the grid is one standard deviation of the noise from them, half of its
+        square due to each step: √2 over the root of the Fisher information of the ranges that the nearest image is
+        chosen by, in the median over the views. None where nothing depends on the parameter.
+    """
+
+    views: int
+    frames: int
+    nearest: SpacingLoss
+    refined: SpacingLoss | None
+    mismatch_median: float
+    mismatch_99: float
+    suggested_distance_m: float | None
+    suggested_delta_deg: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain numbers by name, ``nearest_…`` and ``refined_…`` for the methods; nothing unknown."""
+        out: dict[str, Any] = {}
+        for key, value in asdict(self).items():
+            out |= (
+                {f"{key}_{name}": inner for name, inner in value.items()} if isinstance(value, dict) else {key: value}
+            )
+        return {key: value for key, value in out.items() if value is not None and math.isfinite(value)}
+
+
+def grid_loss(bank: Bank, n: int, *, seed: int = 0, workers: int | None = None) -> GridLoss:
+    """Match random views against a bank and say what its spacing costs.
+
+    Parameters
+    ----------
+    bank : Bank
+        A bank with at least two distances and two angles.
+    n : int
+        How many views: classes in turn, distance and angle uniform over the bank's, bearing and height 0.
+    seed : int
+        Which.
+    workers : int, optional
+        Threads that render (None: one for each processor); the answer does not depend on it.
+
+    Returns
+    -------
+    GridLoss
+
+    Raises
+    ------
+    UsageError
+        `n` is not positive, or the bank's grid has no spacing.
+    """
+    if n < 1:
+        raise UsageError(f"--population must be at least 1, got {n}")
+    if len(bank.distance_m) < 2 or len(bank.delta_rad) < 2:
+        raise UsageError(f"{bank.path}: has one distance or one angle only: there is no spacing to test")
+    methods = {"nearest": Matcher(bank, "nearest")}
+    if bank.plan.model == "ray":
+        methods["refined"] = Matcher(bank, "refine", free=VIEW[:2], workers=workers)
+    job = BankJob(bank.plan, bank.mesh)
+    rng = stream(seed, "population", 0)
+    first, last = float(bank.delta_rad[0]), float(bank.delta_rad[-1])
+    period = closing_period(bank.delta_rad)
+    parts: list[_Part] = []
+    for k, (name, images_of) in enumerate(zip(bank.classes, job.whole_images(), strict=True)):
+        mesh = bank.mesh(name)
+        renderer = Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"]))
+        left = (n - k + len(bank.classes) - 1) // len(bank.classes)
+        while left > 0:
+            some = min(left, _BATCH)
+            left -= some
+            views = Views.broadcast(
+                rng.uniform(bank.distance_m[0], bank.distance_m[-1], some),
+                rng.uniform(first, last if period is None else first + period, some),
+            )
+            parts.append(_match_part(bank, methods, renderer, name, images_of(views), views))
+    return _summary(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """What some views of one class gave: errors (n, 2) by method, NaN for another class."""
+
+    error: dict[str, NDArray[np.float64]]
+    bound: dict[str, NDArray[np.float64]]
+    mismatch: NDArray[np.float64]
+    information: NDArray[np.float64]
+
+
+def _match_part(
+    bank: Bank, methods: dict[str, Matcher], renderer: Renderer, name: str, images: PhasorImages, views: Views
+) -> _Part:
+    frames = noise_free(images, N_FRAMES)
+    period = 2 * math.pi / int(bank.mesh(name).metadata["symmetry"])
+    # in a factored bank the nearest image is the lower pixels' choice; the maximum of the likelihood is that of all
+    pixels = {"nearest": "lower" if bank.lower is not None else "all", "refined": "all"}
+    error, bound, information = {}, {}, {}
+    for method, matcher in methods.items():
+        matches = matcher.match(frames)
+        error[method] = _errors(matches, name, views, period)
+        limit = cramer_rao(renderer, views, n_frames=N_FRAMES, pixels=pixels[method])
+        bound[method] = np.stack([limit.std(parameter) for parameter in limit.free], axis=1)
+        information[method] = limit.information
+        if method == "nearest":
+            mismatch = _mismatches(bank, matches, images)
+    return _Part(error, bound, mismatch, information["nearest"])
+
+
+def _errors(matches: Matches, name: str, views: Views, period: float) -> NDArray[np.float64]:
+    """Return estimate less truth in D and δ, (n, 2), NaN where another class was found."""
+    turn = matches.delta_rad - views.delta_rad
+    error = np.stack([matches.distance_m - views.distance_m, turn - period * np.round(turn / period)], axis=1)
+    error[matches.class_name != name] = np.nan
+    return error
+
+
+def _mismatches(bank: Bank, matches: Matches, images: PhasorImages) -> NDArray[np.float64]:
+    """Return the mismatch of each view with the image on the grid that it was matched to; NaN where there is none.
+
+    Pixels weigh by 1/σ² of a component of S, and count where one frame tells their phase at all.
+    """
+    sensor = bank.sensor
+    used = counts(images.phasor, images.intensity, sensor)
+    arrived_e = sensor.signal_e * images.intensity + sensor.ambient_e + sensor.dark_e
+    weight = used / np.maximum(phase_image_variance(arrived_e, sensor), 1e-30)
+    out = np.full(len(matches), np.nan)
+    for k, match in enumerate(matches):
+        if match.class_name is not None:
+            i = int(np.argmin(np.abs(bank.distance_m - match.distance_m)))
+            j = int(np.argmin(np.abs(bank.delta_rad - match.delta_rad)))
+            model, seen = bank.phasor(match.class_name, i, j).astype(np.complex128), images.phasor[k]
+            size = np.sum(weight[k] * np.abs(model) ** 2) * np.sum(weight[k] * np.abs(seen) ** 2)
+            out[k] = 1 - np.sum(weight[k] * (model * seen.conj()).real) / math.sqrt(size)
+    return out
+
+
+def _summary(parts: list[_Part]) -> GridLoss:
+    mismatch = np.concatenate([part.mismatch for part in parts])
+    matched = mismatch[np.isfinite(mismatch)]
+    losses = {}
+    for method in parts[0].error:
+        error = np.concatenate([part.error[method] for part in parts])
+        bound = np.concatenate([part.bound[method] for part in parts])
+        rms, scaled = _rms(error), _rms(error / bound)
+        losses[method] = SpacingLoss(
+            class_errors=int(np.isnan(error[:, 0]).sum()),
+            distance_rms_m=float(rms[0]),
+            delta_rms_deg=math.degrees(rms[1]),
+            distance_over_bound=float(scaled[0]),
+            delta_over_bound=float(scaled[1]),
+        )
+    information = np.median(np.concatenate([part.information for part in parts]), axis=0)
+    steps = [math.sqrt(2 / information[a, a]) if information[a, a] > 0 else None for a in range(2)]
+    return GridLoss(
+        views=len(mismatch),
+        frames=N_FRAMES,
+        nearest=losses["nearest"],
+        refined=losses.get("refined"),
+        mismatch_median=float(np.median(matched)) if len(matched) else math.nan,
+        mismatch_99=float(np.percentile(matched, 99)) if len(matched) else math.nan,
+        suggested_distance_m=steps[0],
+        suggested_delta_deg=None if steps[1] is None else math.degrees(steps[1]),
+    )
+
+
+def _rms(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the root mean square of each column, without NaN."""
+    known = np.isfinite(values)
+    total = np.sum(np.where(known, values, 0.0) ** 2, axis=0)
+    mean = np.divide(total, known.sum(axis=0), out=np.full(total.shape, np.nan), where=known.any(axis=0))
+    return np.asarray(np.sqrt(mean))

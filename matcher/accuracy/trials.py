@@ -1,0 +1,343 @@
+"""Monte Carlo of a matcher against the bound: views, frames, matches, and what follows from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from phasemark import UsageError
+from phasemark.matcher.accuracy.cramer_rao import Estimate, covers, cramer_rao, efficiency, mean_of, nees, share
+from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, phasor_mean
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.match import Matches
+from phasemark.render import Background, Renderer, Sensor, Views, capture
+
+_VIEWS_AT_ONCE = 250
+OUTLIER_SIGMA = 5.0
+"""An error of so many standard deviations in any parameter is an outlier, and counted apart."""
+
+MatchFrames = Callable[[FilteredFrames], Matches]
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What is tried.
+
+    Parameters
+    ----------
+    distance_m : (low, high)
+        True distances, uniform.
+    bearing_rad : float
+        True bearings, uniform within ± this.
+    n_frames : int
+        Frames that are filtered.
+    background : Background, optional
+    on : {"ranges", "phasors"}
+        On phasors frames are taken without a validity threshold and averaged coherently: a threshold would let only
+        the brighter ones of a weak pixel count.
+    free : tuple of str
+        What the matcher estimates, for the bound.
+    nuisances : tuple of str, optional
+        See :func:`~phasemark.matcher.accuracy.cramer_rao.cramer_rao`.
+    """
+
+    distance_m: tuple[float, float] = (0.8, 1.6)
+    bearing_rad: float = 0.0
+    n_frames: int = 50
+    background: Background | None = None
+    on: Quantity = "ranges"
+    free: tuple[str, ...] = VIEW[:2]
+    nuisances: tuple[str, ...] | None = None
+
+    def views(self, n: int, rng: np.random.Generator, delta_period_rad: float) -> Views:
+        """Draw true views, uniform, off the grid."""
+        return Views.broadcast(
+            rng.uniform(*self.distance_m, n),
+            rng.uniform(0, delta_period_rad, n),
+            rng.uniform(-1, 1, n) * self.bearing_rad,
+            0.0,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """What n frames gave.
+
+    Parameters
+    ----------
+    class_name : str
+        The true class.
+    views : Views
+        The truth.
+    free : tuple of str
+    error : (n, p) float64
+        Estimate less truth, δ wrapped by the symmetry; NaN where no landmark was found.
+    bound : (n, p, p) float64
+        Cramér–Rao bound at the truth.
+    covariance : (n, p, p) float64
+        As the matcher has it; NaN where it has none.
+    found : (n,) object
+        Class names found.
+    accepted : (n,) bool
+    p_value : (n,) float64
+    """
+
+    class_name: str
+    views: Views
+    free: tuple[str, ...]
+    error: NDArray[np.float64]
+    bound: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    found: NDArray[np.object_]
+    accepted: NDArray[np.bool_]
+    p_value: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.error)
+
+    @property
+    def scaled(self) -> NDArray[np.float64]:
+        """Errors in units of the bound, (n, p)."""
+        return np.asarray(self.error / np.sqrt(np.einsum("npp->np", self.bound)))
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Which trials found a view, and have a bound; (n,)."""
+        return np.asarray(np.isfinite(self.scaled).all(axis=1))
+
+    @property
+    def outlier(self) -> NDArray[np.bool_]:
+        """Errors beyond 5 σ of the bound, or of the matcher's own covariance in any direction, or no view, (n,)."""
+        with np.errstate(invalid="ignore"):
+            own = np.abs(self.error) > OUTLIER_SIGMA * np.sqrt(np.einsum("npp->np", self.covariance))
+            limit = special.chdtri(len(self.free), 2 * special.ndtr(-OUTLIER_SIGMA))
+            improbable = nees(self.error, self.covariance) > limit
+        return np.asarray(self.astray | own.any(axis=1) | improbable)
+
+    @property
+    def astray(self) -> NDArray[np.bool_]:
+        """Errors beyond 5 σ of the bound, or no view at all, (n,)."""
+        with np.errstate(invalid="ignore"):
+            far = np.abs(self.scaled) > OUTLIER_SIGMA
+        return np.asarray(far.any(axis=1) | ~self.usable)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Trials]) -> Trials:
+        """Put runs behind one another."""
+        first = parts[0]
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("error", "bound", "covariance", "found", "accepted", "p_value")
+        }
+        views = Views(*(np.concatenate([getattr(part.views, name) for part in parts]) for name in VIEW))
+        return replace(first, views=views, **arrays)
+
+    def summary(self) -> TrialSummary:
+        """Return the figures a matcher is judged by."""
+        inner = ~self.outlier
+        known = inner & np.isfinite(self.covariance).all(axis=(1, 2))
+        scaled = self.scaled[inner]
+        return TrialSummary(
+            n=len(self),
+            ratio={name: efficiency(scaled[:, k], np.ones(len(scaled))) for k, name in enumerate(self.free)},
+            ratio_with_outliers={
+                name: efficiency(self.scaled[self.usable, k], np.ones(self.usable.sum()))
+                for k, name in enumerate(self.free)
+            },
+            bias={name: mean_of(scaled[:, k]) for k, name in enumerate(self.free)},
+            nees=mean_of(nees(self.error[known], self.covariance[known]) / len(self.free)),
+            coverage=share(int(covers(self.error[known], self.covariance[known]).sum()), int(known.sum())),
+            outliers=share(int((~inner).sum()), len(self)),
+            astray=share(int(self.astray.sum()), len(self)),
+            class_errors=share(int((self.found != self.class_name).sum()), len(self)),
+            accepted=share(int(self.accepted.sum()), len(self)),
+        )
+
+    def bias_in_cell(self, step: tuple[float, float], bins: int = 10) -> NDArray[np.float64]:
+        """Return the mean scaled error by position in a cell of a bank's grid, in standard errors of that mean.
+
+        Parameters
+        ----------
+        step : (distance_m, delta_rad)
+            Steps of the grid.
+        bins : int
+
+        Returns
+        -------
+        (2, p, bins) float64
+            By the position along D and along δ.
+        """
+        inner = ~self.outlier
+        out = np.zeros((2, len(self.free), bins))
+        for axis, (name, width) in enumerate(zip(VIEW[:2], step, strict=True)):
+            place = (getattr(self.views, name)[inner] / width % 1 * bins).astype(int)
+            for b in range(bins):
+                values = self.scaled[inner][place == b]
+                out[axis, :, b] = values.mean(axis=0) / (values.std(axis=0, ddof=1) / math.sqrt(len(values)))
+        return out
+
+
+@dataclass(frozen=True)
+class TrialSummary:
+    """Figures of a run, each with its 95 % interval.
+
+    Parameters
+    ----------
+    n : int
+    ratio : dict of str to Estimate
+        √mean(e²/CRLB²) without outliers, by parameter.
+    ratio_with_outliers : dict of str to Estimate
+    bias : dict of str to Estimate
+        Mean error in units of the bound.
+    nees : Estimate
+        Mean eᵀP⁻¹e over the number of parameters.
+    coverage : Estimate
+        Share of errors inside the 95 % ellipsoid.
+    outliers, astray, class_errors, accepted : Estimate
+        Shares; outliers are beyond 5 σ of the bound or of the match's own covariance, astray beyond those of the bound.
+    """
+
+    n: int
+    ratio: dict[str, Estimate]
+    ratio_with_outliers: dict[str, Estimate]
+    bias: dict[str, Estimate]
+    nees: Estimate
+    coverage: Estimate
+    outliers: Estimate
+    astray: Estimate
+    class_errors: Estimate
+    accepted: Estimate
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return label and figure, for a table."""
+        return [
+            ("trials", str(self.n)),
+            *((f"ratio {name}", str(value)) for name, value in self.ratio.items()),
+            *((f"ratio {name}, outliers in", str(value)) for name, value in self.ratio_with_outliers.items()),
+            *((f"bias {name}", str(value)) for name, value in self.bias.items()),
+            ("NEES / p", str(self.nees)),
+            ("95 % coverage", str(self.coverage)),
+            ("outliers", str(self.outliers)),
+            ("beyond 5 σ of the bound", str(self.astray)),
+            ("class errors", str(self.class_errors)),
+            ("accepted", str(self.accepted)),
+        ]
+
+
+def noisy_frames(
+    renderer: Renderer,
+    sensor: Sensor,
+    views: Views,
+    conditions: Conditions,
+    rng: np.random.Generator,
+    *,
+    workers: int = 1,
+) -> FilteredFrames:
+    """Render views, take frames and filter them."""
+    image = renderer.render_views(views, background=conditions.background, workers=workers)
+    if conditions.on == "phasors":
+        free = sensor.with_(max_phase_std_rad=None)
+        return phasor_mean(capture(image, free, rng=rng, n_frames=conditions.n_frames, workers=workers))
+    return kalman_filter(capture(image, sensor, rng=rng, n_frames=conditions.n_frames, workers=workers))
+
+
+def run_trials(
+    match: MatchFrames,
+    renderer: Renderer,
+    class_name: str,
+    conditions: Conditions,
+    n: int,
+    rng: np.random.Generator,
+    *,
+    symmetry: int = 2,
+    choose: Callable[[NDArray[np.float64]], NDArray[np.bool_]] | None = None,
+    workers: int = 1,
+) -> Trials:
+    """Try a matcher on n random views of a landmark.
+
+    Parameters
+    ----------
+    match : callable
+        From filtered frames to matches, ``Matcher(...).match`` for one.
+    renderer : Renderer
+        What the frames are made with: the truth.
+    class_name : str
+        What the matcher calls it.
+    conditions : Conditions
+    n : int
+    rng : numpy.random.Generator
+    symmetry : int
+        Of the landmark.
+    choose : callable, optional
+        Which views count, from their bounds (k, p, p) to (k,) bool: a condition on what can be known.
+    workers : int
+        Threads.
+
+    Returns
+    -------
+    Trials
+
+    Raises
+    ------
+    UsageError
+        The matcher estimates other parameters than the conditions say.
+    """
+    period = 2 * math.pi / symmetry
+    sensor = renderer.sensor
+    parts: list[Trials] = []
+    done = 0
+    while done < n:
+        views = conditions.views(min(_VIEWS_AT_ONCE, n - done), rng, period)
+        bound = cramer_rao(
+            renderer,
+            views,
+            free=conditions.free,
+            n_frames=conditions.n_frames,
+            on=conditions.on,
+            background=conditions.background,
+            nuisances=conditions.nuisances,
+            workers=workers,
+        ).covariance
+        if choose is not None:
+            keep = np.flatnonzero(choose(bound))
+            views, bound = views[keep], bound[keep]
+        if not len(views):
+            continue
+        matches = match(noisy_frames(renderer, sensor, views, conditions, rng, workers=workers))
+        parts.append(_judged(matches, class_name, views, bound, conditions.free, period))
+        done += len(views)
+    return Trials.joined(parts)
+
+
+def _judged(
+    matches: Matches,
+    class_name: str,
+    views: Views,
+    bound: NDArray[np.float64],
+    free: tuple[str, ...],
+    period: float,
+) -> Trials:
+    error = np.stack([getattr(matches, name) - getattr(views, name) for name in free], axis=1)
+    k = free.index("delta_rad")
+    error[:, k] -= period * np.round(error[:, k] / period)
+    covariance = matches.covariance
+    if covariance is not None and matches.free != free:
+        raise UsageError(f"the matcher estimates {', '.join(matches.free)}, and 'free' of the conditions is {free!r}")
+    return Trials(
+        class_name=class_name,
+        views=views,
+        free=free,
+        error=error,
+        bound=bound,
+        covariance=np.full(bound.shape, np.nan) if covariance is None else covariance,
+        found=matches.class_name,
+        accepted=matches.accepted,
+        p_value=matches.p_value,
+    )

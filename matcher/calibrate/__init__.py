@@ -1,0 +1,1 @@
+"""The mounting of a camera from frames at known poses."""

@@ -1,0 +1,98 @@
+"""Where a calibration starts: the mounting under which the landmark's outlines agree with which pixels returned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.calibrate.mounting_model import ALL_NAMES, LONGEST_STEP, SCALE, CalibrationModel, clipped
+from phasemark.matcher.likelihood.residuals import Evidence
+
+OUTLINE = ("pitch", "roll", "height", "bearing", "half_angle_h", "half_angle_v")
+"""What an outline tells."""
+_OUTLINE_STD = np.array([3.0, 3.0, 3.0, 3.0, 0.7, 0.7])
+"""How far each may be from where it was thought to be, in natural units: only the registration leans on it."""
+_OUTLINE_NOISE = 0.2
+"""Of a pixel: how much of it the model says returns, against whether it did."""
+_RETURNS_FROM, _PREVAILS_FROM = 0.2, 0.6
+"""Coverage that is enough for a return, and for one from the landmark if something stands behind; below, the chance of
+it is taken to rise evenly."""
+_TRIED = np.array([-3.0, -1.5, 0.0, 1.5, 3.0])
+"""Pitches and bearings, degrees, from which the registration may start: a pixel apart."""
+_BESIDE = 0.02
+"""Share of pixels with a return from elsewhere, above which something stands behind."""
+_OUTLINE_STEPS = 6
+_OUTLINE_WIDTH = 0.2
+"""Half width of its differences, natural units: a seventh of a pixel."""
+_NEARBY_M = 0.1
+"""A return so much farther from the landmark than its own size is something else."""
+
+
+def register(
+    model: CalibrationModel, evidence: Evidence, theta: NDArray[np.float64], free: Sequence[str]
+) -> NDArray[np.float64]:
+    """Move a mounting to where the landmark's outlines agree with which pixels returned from near it.
+
+    Gauss–Newton on coverage less return, over differences of a seventh of a pixel, from the best of several pitches
+    and bearings. It needs no amplitudes, comes from two degrees away to some tenths of a pixel, and cares little what
+    stands behind.
+
+    Parameters
+    ----------
+    model : CalibrationModel
+    evidence : Evidence
+    theta : (9,) float64
+        Where the mounting is thought to be.
+    free : sequence of str
+        What may move.
+
+    Returns
+    -------
+    (9,) float64
+    """
+    if not free:
+        return theta
+    seen = evidence.seen
+    near = np.abs(seen.range_m - model.poses.distance_m[:, None]) < model.reach_m + _NEARBY_M
+    target = np.where(seen.returned & near, 1.0, 0.0)
+    known = seen.returned | seen.not_returned
+    if not (known & ~seen.returned).any() and (target[known] == 1).all():
+        known = np.ones_like(known)  # nothing was told apart: what is missing returned nothing
+    enough = _PREVAILS_FROM if (seen.returned & ~near).mean() > _BESIDE else _RETURNS_FROM
+    columns = np.array([ALL_NAMES.index(name) for name in free])
+    scale = SCALE[columns]
+    prior = np.array([_OUTLINE_STD[OUTLINE.index(name)] for name in free])
+
+    def difference(at: NDArray[np.float64]) -> NDArray[np.float64]:
+        returns = np.minimum(model.coverage(at) / enough, 1.0)
+        return np.asarray(np.where(known, target - returns, 0.0) / _OUTLINE_NOISE)
+
+    def cost(at: NDArray[np.float64]) -> float:
+        away = (at - theta)[columns] / scale / prior
+        return float((difference(at) ** 2).sum() + (away**2).sum())
+
+    tried = [theta]
+    for name in ("pitch", "bearing"):
+        if name in free:
+            steps = np.eye(len(ALL_NAMES))[ALL_NAMES.index(name)] * SCALE[ALL_NAMES.index(name)]
+            tried = [clipped(one + side * steps) for one in tried for side in _TRIED]
+    best = min(tried, key=cost)
+    for _ in range(_OUTLINE_STEPS):
+        rows = []
+        for column in columns:
+            move = np.eye(len(ALL_NAMES))[column] * SCALE[column] * _OUTLINE_WIDTH
+            rows.append((difference(best - move) - difference(best + move)).ravel() / (2 * _OUTLINE_WIDTH))
+        design = np.array(rows)
+        away = (best - theta)[columns] / scale
+        matrix = design @ design.T + np.diag(1 / prior**2)
+        step = np.linalg.solve(matrix, design @ difference(best).ravel() - away / prior**2)
+        step /= max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
+        moved = best.copy()
+        moved[columns] += scale * step
+        moved = clipped(moved)
+        if cost(moved) >= cost(best):
+            break
+        best = moved
+    return best

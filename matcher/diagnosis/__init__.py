@@ -1,0 +1,1 @@
+"""Why a frame is refused, and which change of a setting would make it fit."""

@@ -1,0 +1,550 @@
+"""Diagnosis of a refused match: the cheapest change of a setting that makes the frame fit.
+
+Every change is tried by matching: the frame as it would be read with another setting, or a matcher with another
+setting. A change is named only if its match is accepted and explains the frame far better than before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data import Bank
+from phasemark.data.bank.build_bank import rebuild_bank
+from phasemark.matcher.diagnosis.search import SIZES, Fit, Search, fitted_wall, wider
+from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
+from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
+from phasemark.matcher.match import Match
+from phasemark.matcher.matcher import Matcher
+from phasemark.render import Background, Sensor
+
+Parameter = Literal[
+    "method",
+    "free",
+    "bearing_offset_deg",
+    "background",
+    "flip_h",
+    "flip_v",
+    "rotate",
+    "quantity",
+    "unit_factor",
+    "half_angle_deg",
+    "distance_m",
+]
+VIEW = ("distance_m", "delta_rad")
+BEARING = (*VIEW, "bearing_rad")
+FEWEST_RETURNS = 3
+"""Fewer returns give no view."""
+FEWEST_DOF = 3
+"""A fit with fewer degrees of freedom says too little to recommend a change."""
+DECISIVE_RATIO = 1.5
+"""A change must lower chi2 by this factor."""
+DECISIVE_DROP = 40.0
+"""And by this much: three free parameters lower chi2 by chance by more than 40 once in a hundred million frames."""
+WORTH_A_MATCH = 60.0
+"""Cost above what noise explains up to which a rough fit is matched: two pixels that contradict it, and a little."""
+CLEARLY_ASIDE_RAD = math.radians(0.5)
+"""Before a background a rough fit knows the bearing better than that."""
+_FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
+_WINDOW_M, _WINDOW_RAD = 0.01, math.radians(1.0)
+_WINDOW_STEPS = 4
+
+
+@dataclass(frozen=True)
+class Change:
+    """One setting changed.
+
+    Parameters
+    ----------
+    parameter : str
+        "method" and "free" and "background" of :class:`~phasemark.matcher.Matcher`; "flip_h", "flip_v", "rotate" and
+        "quantity" of :func:`phasemark.data.read_frames`, applied after those given; "unit_factor", by which the ranges
+        are multiplied; "bearing_offset_deg" and "half_angle_deg" of the sensor the bank is built for; "distance_m",
+        which the bank does not reach.
+    value : object
+        Its new value; of "half_angle_deg" both angles, horizontal and vertical.
+    words : str
+        The change in words, to follow "it fits with".
+    """
+
+    parameter: Parameter
+    value: Any
+    words: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        value = self.value
+        if isinstance(value, Background):
+            value = {"wall_m": value.wall_m, "floor_m": value.floor_m}
+        elif isinstance(value, tuple):
+            value = list(value)
+        return {"parameter": self.parameter, "value": value, "words": self.words}
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """Why a frame was refused, as far as a change of settings tells.
+
+    Parameters
+    ----------
+    index : int
+        Which frame.
+    refused : Match
+        Its match as it was.
+    changes : tuple of Change
+        What makes the frame fit; empty if nothing does. One change is enough alone.
+    match : Match or None
+        The match that the changes lead to; None without a change.
+    alternatives : tuple of Change
+        Other single changes that make the frame fit too: the frame does not tell which of them is right.
+    n_returned : int
+        How many pixels returned.
+    """
+
+    index: int
+    refused: Match
+    changes: tuple[Change, ...] = ()
+    match: Match | None = None
+    alternatives: tuple[Change, ...] = ()
+    n_returned: int = 0
+
+    @property
+    def enough_alone(self) -> bool:
+        """Whether a single change makes the frame fit."""
+        return len(self.changes) == 1
+
+    def message(self, remedy: Callable[[Change], str] | None = None) -> str:
+        """Return the diagnosis in one line.
+
+        Parameters
+        ----------
+        remedy : callable, optional
+            Returns what to do for a change, in place of the library's own names: the options of a command line.
+        """
+        head = f"frame {self.index} is refused ({self._why()})"
+        if not self.changes:
+            if self.n_returned < FEWEST_RETURNS:
+                return f"{head}: {self.n_returned} of its pixels return, and {FEWEST_RETURNS} are needed"
+            return (
+                f"{head}: no change of bearing, background, orientation, unit, quantity, field of view or distance"
+                " makes it fit: it may show another landmark, or none"
+            )
+
+        told = remedy or _remedy
+        words = " and ".join(change.words for change in self.changes)
+        text = f"{head}: it fits with {words}: {', '.join(told(change) for change in self.changes)}"
+        for other in self.alternatives:
+            text += f"; it fits as well with {other.words}: {told(other)}"
+        return text
+
+    def __str__(self) -> str:
+        """Return the message with the library's names."""
+        return self.message()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, valid JSON."""
+        return {
+            "frame": self.index,
+            "changes": [change.as_dict() for change in self.changes],
+            "alternatives": [change.as_dict() for change in self.alternatives],
+            "enough_alone": self.enough_alone,
+            "match": None if self.match is None else self.match.as_dict(),
+            "message": self.message(),
+        }
+
+    def _why(self) -> str:
+        match = self.refused
+        reason = getattr(match, "reason", None) or ("no landmark" if match.class_name is None else "poor fit")
+        if math.isfinite(match.chi2) and match.dof > 0:
+            return f"{reason}, chi2/dof {match.chi2 / match.dof:.3g}"
+        return str(reason)
+
+
+def _remedy(change: Change) -> str:
+    """Return what to do, with the names of the library."""
+    value = change.value
+    if change.parameter == "method":
+        return "method='refine'"
+    if change.parameter == "free":
+        return f"free={value!r}"
+    if change.parameter == "background":
+        return f"background={value!r}"
+    if change.parameter in ("flip_h", "flip_v"):
+        return f"{change.parameter} the other way round"
+    if change.parameter == "rotate":
+        return f"rotate by {value}° more"
+    if change.parameter == "quantity":
+        return f"quantity={value!r}"
+    if change.parameter == "unit_factor":
+        return f"a unit {value:g} times as large"
+    if change.parameter == "half_angle_deg":
+        return f"a bank of a sensor with half_angle_h_deg={value[0]:.4g}, half_angle_v_deg={value[1]:.4g}"
+    if change.parameter == "bearing_offset_deg":
+        return f"a bank of a sensor with bearing_offset_deg={value:.3g}"
+    return f"a bank with distances to {value:.3g} m"
+
+
+@dataclass(frozen=True, eq=False)
+class _Setup:
+    """How a matcher was built, as far as a matcher like it needs it."""
+
+    nearest: bool
+    free: tuple[str, ...]
+    background: Background | Literal["auto"] | None
+    options: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, matcher: Matcher, background: Background | None) -> _Setup:
+        """Read the attributes of a matcher: the one place that knows them."""
+        likelihood = matcher._likelihood
+        if likelihood is None:
+            return cls(True, VIEW, background, {"false_alarm": matcher.false_alarm})
+        behind: Background | Literal["auto"] | None = "auto" if likelihood.auto else likelihood.background
+        options = {
+            "false_alarm": likelihood.false_alarm,
+            "on": likelihood.on,
+            "pixels": "all" if likelihood._used.all() else "lower",
+            "robust": likelihood._huber is not None,
+        }
+        # a bearing with a prior is looked for anew without one
+        free = VIEW[:2] if likelihood._prior_std else likelihood.free
+        return cls(False, tuple(free), behind, options)
+
+    def matcher(self, bank: Bank, free: Sequence[str], background: Background | Literal["auto"] | None) -> Matcher:
+        """Build a matcher like it by maximum likelihood."""
+        return Matcher(bank, "refine", free=free, background=background, **self.options)
+
+
+def diagnose(
+    matcher: Matcher, frames: FilteredFrames, index: int = 0, *, background: Background | None = None
+) -> Diagnosis:
+    """Find the cheapest change of settings that makes a refused frame fit.
+
+    Single changes are tried in the order of what they cost the user: a free bearing, another background, the image
+    turned or mirrored, another quantity or unit, another field of view, a distance the bank does not reach. Then
+    pairs of a bearing with one of the others. It takes 1 to 3 s of processor time, on rare views 10 s.
+
+    Parameters
+    ----------
+    matcher : Matcher
+        The one that refused.
+    frames : FilteredFrames
+    index : int
+        Which of them.
+    background : Background, optional
+        What a matcher of method "nearest" was told of the background, which it does not keep.
+
+    Returns
+    -------
+    Diagnosis
+        Without changes where nothing makes the frame fit.
+
+    Raises
+    ------
+    UsageError
+        The frame is accepted, there is no such frame, or the frames come from another camera than the bank.
+
+    Notes
+    -----
+    A change counts if its match is accepted, has at least three degrees of freedom and a chi2 that is lower than
+    before by a factor of 1.5 and by 40.
+    """
+    if not -len(frames) <= index < len(frames):
+        raise UsageError(f"'index' must be in 0 … {len(frames) - 1}, got {index}")
+    index %= len(frames)
+    frame = frames[index]
+    refused = matcher.match(frame)[0]
+    if refused.accepted:
+        raise UsageError(f"frame {index} is accepted: there is nothing to diagnose")
+    n_returned = int((frame.state == PixelState.RETURN).sum())
+    nothing = Diagnosis(index, refused, n_returned=n_returned)
+    if n_returned < FEWEST_RETURNS or matcher.bank.plan.model != "ray":
+        return nothing
+    with ExitStack() as stack:
+        trials = _Trials(matcher.bank, _Setup.of(matcher, background), frame.without_offset(), refused, stack)
+        for found in trials.in_order():
+            if found:
+                (changes, match), *others = found
+                alternatives = tuple(other[0] for other, _ in others if len(other) == 1)
+                return replace(nothing, changes=changes, match=match, alternatives=alternatives)
+    return nothing
+
+
+_Found = list[tuple[tuple[Change, ...], Match]]
+
+
+class _Trials:
+    """The changes tried on one frame."""
+
+    def __init__(self, bank: Bank, setup: _Setup, frame: FilteredFrames, refused: Match, stack: ExitStack) -> None:
+        self.bank, self.setup, self.frame, self.stack = bank, setup, frame, stack
+        self.search = Search(bank)
+        self.plain = setup.matcher(bank, setup.free, setup.background)
+        self.reference = self.plain.match(frame)[0] if setup.nearest else refused
+        self.bearing_free = "bearing_rad" in setup.free
+        self.with_bearing = setup.free if self.bearing_free else (*VIEW, "bearing_rad", *setup.free[2:])
+        self.stated = self._estimated() if setup.background == "auto" else setup.background
+        assert self.stated is None or isinstance(self.stated, Background)
+
+    def in_order(self) -> Iterator[_Found]:
+        """Try changes, the cheapest first; yield those that make the frame fit, usually none."""
+        if self.setup.nearest and self.reference.accepted:
+            yield [((_METHOD,), self.reference)]
+        rough = self._rough(self.frame, self.stated)
+        outside = rough is not None and not self._inside(rough.distance_m)
+        if not self.bearing_free and not outside:
+            yield self._bearing(rough, self.frame, self.setup.background, ())
+        yield self._other_background()
+        yield self._transformed()
+        yield self._outside(rough)
+        yield self._field_of_view()
+        if not self.bearing_free and rough is None:
+            yield self._transformed_with_bearing()
+
+    def _bearing(
+        self,
+        rough: Fit | None,
+        frame: FilteredFrames,
+        background: Background | Literal["auto"] | None,
+        before: tuple[Change, ...],
+    ) -> _Found:
+        """Match a frame with the bearing free, where a rough fit promises something."""
+        if rough is None:
+            return []
+        match = self.setup.matcher(self.bank, self.with_bearing, background).match(frame)[0]
+        if self._counts(match) and self._inside(match.distance_m):
+            return [((*before, _free_bearing(match, self.with_bearing)), match)]
+        # the matcher's own search of bearings may miss what a camera stated to look there finds
+        sensor = self._turned(rough)
+        turned = self._match_window(rough, frame, sensor, self.with_bearing, background)
+        if turned is None or not self._inside(turned.distance_m):
+            return []
+        match = self._turned_back(turned, sensor)
+        bearing_deg = math.degrees(match.bearing_rad)
+        offset_deg = self.bank.sensor.bearing_offset_deg + bearing_deg
+        words = f"a bearing of {bearing_deg:.2g}°"
+        return [((*before, Change("bearing_offset_deg", offset_deg, words)), match)]
+
+    def _other_background(self) -> _Found:
+        """Match with wall and floor estimated, or with none where some were stated."""
+        tried: list[tuple[Background | Literal["auto"] | None, Background | None]] = []
+        if isinstance(self.setup.background, Background):
+            tried.append((None, None))
+        estimated = self._estimated()
+        if self.setup.background != "auto" and estimated is not None:
+            tried.append(("auto", estimated))
+        for background, scene in tried:
+            rough = self._rough(self.frame, scene)
+            if scene is not None and scene.wall_m is not None:
+                if rough is None:  # wide pixels average over the wall, and a bearing turns it
+                    first = self.search.best(self.frame, scene, bearing=True)
+                    scene = scene if first is None else fitted_wall(self.frame, scene, first.bearing_rad)
+                    rough = self._rough(self.frame, scene)
+                scene = scene if rough is None else fitted_wall(self.frame, scene, rough.bearing_rad)
+            if rough is None:
+                continue
+            stated: list[Background | Literal["auto"] | None] = [background]
+            if scene is not None and scene.wall_m is not None:
+                stated.append(scene)
+            aside = abs(rough.bearing_rad) > CLEARLY_ASIDE_RAD and not self.bearing_free
+            for told in () if aside else stated:
+                match = self.setup.matcher(self.bank, self.setup.free, told).match(self.frame)[0]
+                if self._counts(match) and self._inside(match.distance_m):
+                    return [((_background(told, match.background),), match)]
+            for told in () if self.bearing_free else stated:
+                found = self._bearing(rough, self.frame, told, (_background(told, scene),))
+                if found:
+                    return found
+        return []
+
+    def _transformed(self) -> _Found:
+        """Match the frame as other settings would have read it."""
+        changed = list(_transforms(self.frame, self.bank))
+        matches = self.plain.match(_joined([frame for _, frame in changed]))
+        return [
+            ((change,), match)
+            for (change, _), match in zip(changed, matches, strict=True)
+            if self._counts(match) and self._inside(match.distance_m)
+        ]
+
+    def _transformed_with_bearing(self) -> _Found:
+        for change, frame in _transforms(self.frame, self.bank):
+            if change.parameter not in ("flip_v", "quantity", "unit_factor") or change.value == "range":
+                continue
+            found = self._bearing(self._rough(frame, self.stated), frame, self.setup.background, (change,))
+            if found:
+                return found
+        return []
+
+    def _outside(self, rough: Fit | None) -> _Found:
+        """Match before images at distances that the bank does not have."""
+        if rough is None or self._inside(rough.distance_m):
+            return []
+        for free in dict.fromkeys((self.setup.free, self.with_bearing)):
+            sensor = self._turned(rough) if free == self.with_bearing else self.bank.sensor
+            found = self._match_window(rough, self.frame, sensor, free, self.setup.background)
+            if found is not None and not self._inside(found.distance_m):
+                match = found
+                first, last = float(self.bank.distance_m[0]), float(self.bank.distance_m[-1])
+                where = (
+                    f"before its first, {first:.3g} m" if match.distance_m < first else f"beyond its last, {last:.3g} m"
+                )
+                change = Change(
+                    "distance_m", match.distance_m, f"a bank that reaches {match.distance_m:.3g} m, {where}"
+                )
+                if free == self.setup.free:
+                    return [((change,), match)]
+                match = self._turned_back(match, sensor)
+                return [((change, _free_bearing(match, self.with_bearing)), match)]
+        return []
+
+    def _field_of_view(self) -> _Found:
+        """Match before images of a camera with another field of view."""
+        fit = self.search.best(self.frame, self.stated, sizes=SIZES, bearing=self.bearing_free)
+        if fit is None or not _is_promising(fit):
+            return []
+        sensor = wider(self.bank.sensor, fit.size)
+        match = self._match_window(fit, self.frame, sensor, self.setup.free, self.setup.background)
+        if match is None or not self._inside(match.distance_m):
+            return []
+        angles = (sensor.half_angle_h_deg, sensor.half_angle_v_deg)
+        percent = 100 * (angles[0] / self.bank.sensor.half_angle_h_deg - 1)
+        words = f"a field of view {abs(percent):.2g} % {'wider' if percent > 0 else 'narrower'}"
+        return [((Change("half_angle_deg", angles, words),), match)]
+
+    def _rough(self, frame: FilteredFrames, scene: Background | None) -> Fit | None:
+        """Return a rough fit with the bearing free; None if it promises nothing."""
+        fit = self.search.best(frame, scene, bearing=True)
+        return None if fit is None or not _is_promising(fit) else fit
+
+    def _match_window(
+        self,
+        rough: Fit,
+        frame: FilteredFrames,
+        sensor: Sensor,
+        free: Sequence[str],
+        background: Background | Literal["auto"] | None,
+    ) -> Match | None:
+        """Match before a small bank of one class about a rough fit; None if it is refused."""
+        steps = np.arange(-_WINDOW_STEPS, _WINDOW_STEPS + 1)
+        distance_m = rough.distance_m + _WINDOW_M * steps
+        delta_deg = np.degrees(rough.delta_rad + _WINDOW_RAD * steps)
+        with suppress(UsageError):  # a lens inside the landmark, a wall before it
+            window = rebuild_bank(
+                self.bank,
+                distance_m=distance_m.tolist(),
+                delta_deg=delta_deg.tolist(),
+                classes=[rough.class_name],
+                sensor=sensor,
+            )
+            self.stack.enter_context(window)
+            match = self.setup.matcher(window, free, background).match(replace(frame, sensor=sensor))[0]
+            return match if self._counts(match) else None
+        return None
+
+    def _turned(self, rough: Fit) -> Sensor:
+        """Return the camera stated to look aside, so that a rough fit's bearing is 0."""
+        sensor = self.bank.sensor
+        return sensor.with_(bearing_offset_deg=sensor.bearing_offset_deg + math.degrees(rough.bearing_rad))
+
+    def _turned_back(self, match: Match, sensor: Sensor) -> Match:
+        """Return a match before images of a turned camera with the bearing of the bank's own."""
+        turned = math.radians(sensor.bearing_offset_deg - self.bank.sensor.bearing_offset_deg)
+        return replace(match, bearing_rad=match.bearing_rad + turned)
+
+    def _counts(self, match: Match) -> bool:
+        """Return whether a match is accepted, and far better than the refused one."""
+        if not match.accepted or match.dof < FEWEST_DOF:
+            return False
+        before = self.reference.chi2
+        if not math.isfinite(before):
+            return True
+        return match.chi2 * DECISIVE_RATIO <= before and match.chi2 + DECISIVE_DROP <= before
+
+    def _inside(self, distance_m: float) -> bool:
+        first, last = float(self.bank.distance_m[0]), float(self.bank.distance_m[-1])
+        return first - 1e-3 <= distance_m <= last + 1e-3
+
+    def _estimated(self) -> Background | None:
+        return estimate_surroundings(self.frame, bearing_known=self.bearing_free).background
+
+
+def _is_promising(fit: Fit) -> bool:
+    """Return whether a rough fit is good enough to be matched."""
+    n = fit.n_pixels
+    return fit.cost <= n + 4 * math.sqrt(2 * n) + WORTH_A_MATCH
+
+
+_METHOD = Change("method", "refine", "views between the bank's images")
+
+
+def _free_bearing(match: Match, free: tuple[str, ...]) -> Change:
+    return Change("free", free, f"the bearing free (bearing {math.degrees(match.bearing_rad):.2g}°)")
+
+
+def _background(background: Background | Literal["auto"] | None, found: Background | None) -> Change:
+    if background is None:
+        return Change("background", None, "nothing behind the landmark")
+    planes = []
+    if found is not None and found.wall_m is not None:
+        planes.append(f"wall at {found.wall_m:.3g} m")
+    if found is not None and found.floor_m is not None:
+        planes.append(f"floor {found.floor_m:.3g} m below the lens")
+    if isinstance(background, Background):
+        return Change("background", background, f"a {' and '.join(planes)}")
+    return Change("background", "auto", f"the background estimated ({', '.join(planes)})")
+
+
+def _transforms(frame: FilteredFrames, bank: Bank) -> Iterator[tuple[Change, FilteredFrames]]:
+    """Return the frame as other settings would have read it."""
+    yield Change("flip_h", True, "the image mirrored left to right"), _moved(frame, lambda a: a[..., ::-1])
+    yield Change("flip_v", True, "the image mirrored top to bottom"), _moved(frame, lambda a: a[..., ::-1, :])
+    yield Change("rotate", 180, "the image rotated by 180°"), _moved(frame, lambda a: a[..., ::-1, ::-1])
+    if frame.sensor.rows == frame.sensor.cols:
+        for angle in (90, 270):
+            words = f"the image rotated by {angle}°"
+            yield Change("rotate", angle, words), _moved(frame, lambda a, k=-angle // 90: np.rot90(a, k, (-2, -1)))
+    cosine = frame.sensor.axis_cosine()
+    yield Change("quantity", "z", "the values taken as z, along the optical axis"), _scaled(frame, 1 / cosine)
+    yield Change("quantity", "range", "the values taken as ranges, along the ray"), _scaled(frame, cosine)
+    nearest, farthest = (float(np.nanpercentile(frame.range_m, q)) for q in (5, 95))
+    first, last = float(bank.distance_m[0]), float(bank.distance_m[-1])
+    for factor in _FACTORS:
+        # the nearest surface lies before the landmark's axis, and what stands behind is not thousands of times farther
+        if first / 2 < nearest * factor < last and farthest * factor < frame.sensor.unambiguous_range_m:
+            words = f"ranges {factor:g} times as large" if factor > 1 else f"ranges {1 / factor:g} times smaller"
+            yield Change("unit_factor", factor, words), _scaled(frame, np.full(cosine.shape, factor))
+
+
+_ARRAYS = ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
+
+
+def _moved(frame: FilteredFrames, move: Any) -> FilteredFrames:
+    moved: dict[str, Any] = {
+        name: np.ascontiguousarray(move(array)) for name in _ARRAYS if (array := getattr(frame, name)) is not None
+    }
+    return replace(frame, **moved)
+
+
+def _joined(frames: Sequence[FilteredFrames]) -> FilteredFrames:
+    """Return frames of one camera as a batch."""
+    first = frames[0]
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(frame, name) for frame in frames])
+        for name in _ARRAYS
+        if getattr(first, name) is not None
+    }
+    return replace(first, time_s=None, **arrays)
+
+
+def _scaled(frame: FilteredFrames, factor: NDArray[np.float64]) -> FilteredFrames:
+    """Multiply ranges, and their standard deviations where these come from the ranges' own scatter."""
+    std_m = frame.std_m * factor if frame.std_from_scatter else frame.std_m
+    return replace(frame, range_m=frame.range_m * factor, std_m=std_m)

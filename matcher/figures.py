@@ -1,0 +1,134 @@
+"""A picture of a match: measured, best model, residual, side by side (the paper's figure 11)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from phasemark.data import Bank
+from phasemark.matcher.agreement import counts
+from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.match import Match
+from phasemark.matcher.matcher import background_image
+from phasemark.render import Background, Renderer, phasor_to_range_m, predicted_range_std, wrap_difference_m
+from phasemark.render.figures import draw_difference, draw_map, draw_range
+
+
+def model_range_m(bank: Bank, match: Match, background: Background | None) -> NDArray[np.float64]:
+    """Return the ranges of the model image a match names, (rows, cols); NaN where it returns too little to measure.
+
+    Parameters
+    ----------
+    bank : Bank
+    match : Match
+        Where it has no covariance, its view is one of the bank's grid.
+    background : Background, optional
+        What the model is composed with, as in the matcher.
+    """
+    name = match.class_name or match.alternatives[0].class_name
+    if match.covariance is not None:
+        mesh = bank.mesh(name)
+        rendered = Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"])).render(
+            match.distance_m,
+            match.delta_rad,
+            match.bearing_rad,
+            match.height_m,
+            background=match.background or background,
+        )
+        counted = counts(rendered.phasor[0], rendered.intensity[0], bank.sensor)
+        return np.where(counted, rendered.range_m[0], np.nan)
+    i = int(np.abs(bank.distance_m - match.distance_m).argmin())
+    period = 2 * math.pi / match.symmetry
+    turned = np.abs(bank.delta_rad - match.delta_rad)
+    j = int(np.minimum(turned, period - turned).argmin())
+    image = bank.image(name, i, j)
+    phasor, intensity = image.phasor[0], image.intensity[0]
+    if background is not None:
+        behind = background_image(background, bank.sensor)
+        free = 1 - image.coverage[0]
+        phasor, intensity = phasor + free * behind.phasor[0], intensity + free * behind.intensity[0]
+    noise = predicted_range_std(np.abs(phasor), intensity, bank.sensor) / bank.sensor.metres_per_radian
+    limit = bank.sensor.max_phase_std_rad or np.inf
+    return np.where(noise <= limit, phasor_to_range_m(phasor, bank.sensor), np.nan)
+
+
+def filtered_picture(frames: FilteredFrames, index: int = 0) -> Figure:
+    """Draw the range of one position beside its standard deviation.
+
+    Parameters
+    ----------
+    frames : FilteredFrames
+    index : int
+        Which position.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure = Figure(figsize=(8.4, 4.0), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.set_title("range")
+    draw_range(left, frames.range_m[index])
+    std_mm = 1e3 * np.where(np.isfinite(frames.std_m[index]), frames.std_m[index], np.nan)
+    draw_map(right, std_mm, "standard deviation", "standard deviation (mm)", cmap="viridis", vmin=0)
+    return figure
+
+
+def match_picture(
+    frames: FilteredFrames,
+    match: Match,
+    bank: Bank,
+    background: Background | None = None,
+    index: int = 0,
+    *,
+    title: bool = True,
+) -> Figure:
+    """Draw a filtered frame beside the best model image and their difference.
+
+    Parameters
+    ----------
+    frames : FilteredFrames
+    match : Match
+        The match of ``frames[index]``.
+    bank : Bank
+    background : Background, optional
+    index : int
+    title : bool
+        Whether to write above what was found.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    frames = frames.without_offset()
+    measured = frames.range_m[index]
+    model = np.full_like(measured, np.nan)
+    if math.isfinite(match.distance_m):
+        model = model_range_m(bank, match, background)
+    both = np.concatenate([measured[np.isfinite(measured)], model[np.isfinite(model)]])
+    near, far = (float(both.min()), float(both.max())) if both.size else (0.0, 1.0)
+    figure = Figure(figsize=(13.2, 4.2), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    left.set_title("measured, filtered")
+    draw_range(left, measured, near_m=near, far_m=far)
+    middle.set_title("best model image")
+    draw_range(middle, model, near_m=near, far_m=far)
+    right.set_title("measured − model")
+    draw_difference(right, wrap_difference_m(measured - model, frames.sensor))
+    if title:
+        figure.suptitle(describe(match))
+    return figure
+
+
+def describe(match: Match) -> str:
+    """Say in one line what a match found."""
+    if match.class_name is None:
+        return "no landmark"
+    verdict = "accepted" if match.accepted else "doubtful"
+    return (
+        f"{match.class_name} at D = {match.distance_m:.3f} m, δ = {math.degrees(match.delta_rad):.2f}°"
+        f" ({verdict}: χ² = {match.chi2:.0f}, {match.dof} degrees of freedom, p = {match.p_value:.2g})"
+    )

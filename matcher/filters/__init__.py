@@ -1,0 +1,1 @@
+"""Filters over the frames of one position."""

@@ -1,0 +1,1 @@
+"""Maximum likelihood: pixels compared, images modelled, views refined, background estimated."""

@@ -1,0 +1,236 @@
+"""What stands behind the landmark, estimated from the frame's own far pixels (PHYSICS section 7).
+
+The landmark stands in front, so what is clearly farther than the nearest surface is background. Its pixels are
+explained by a wall, a plane across the line of sight, and below the horizon by a floor; on amplitudes their brightness
+gives the albedo too, relative to the landmark's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.matcher.agreement import counts
+from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
+from phasemark.matcher.likelihood.images import VIEW, RenderedModel
+from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
+from phasemark.matcher.nearest.templates import Observation
+from phasemark.render import Background, Sensor
+
+CLEARLY_BEHIND_M = 0.4
+"""Farther than the nearest surface by more than a landmark is deep."""
+NEAREST_WALL_M = 0.05
+"""Nothing nearer is taken for a wall."""
+_FEWEST = 6
+_BACKGROUND_STEP_M = 1e-3
+"""Width of a difference between two places of a wall or floor."""
+_BACKGROUND_STEPS = 30
+_BACKGROUND_SETTLED = 0.1
+"""A step that promises to lower the whitened squared residual by less than this is not taken."""
+_LONGEST_STEP = 3.0
+_VIEW_SCALE = (0.01, math.radians(1), math.radians(1), 0.01)
+"""Natural units of the view; those of wall and floor are 0.1 m."""
+_USUAL_ALBEDO = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What one frame shows behind the landmark.
+
+    Parameters
+    ----------
+    background : Background or None
+        None: nothing returns from behind.
+    behind : (pixels,) bool
+        Which pixels see background alone, or may see some of it beside the landmark.
+    pure : (pixels,) bool
+        Which see background alone.
+    """
+
+    background: Background | None
+    behind: NDArray[np.bool_]
+    pure: NDArray[np.bool_]
+
+
+def estimate_surroundings(
+    frames: FilteredFrames, index: int = 0, landmark_scale: float = 1.0, *, bearing_known: bool = True
+) -> Surroundings:
+    """Estimate wall and floor behind the landmark of one frame.
+
+    Parameters
+    ----------
+    frames : FilteredFrames
+    index : int
+        Which of them.
+    landmark_scale : float
+        How much brighter the landmark is than its model: albedos count relative to it.
+    bearing_known : bool
+        Whether the mount points at the landmark. Otherwise the azimuth of what is near takes its place: the wall is
+        perpendicular to the line of sight, and a bearing of 4° ignored would move its two ends by 3 %.
+
+    Returns
+    -------
+    Surroundings
+        Without a background where no pixel is clearly behind.
+    """
+    sensor = frames.sensor
+    returned = frames.state[index] == PixelState.RETURN
+    ranges = np.where(returned, frames.range_m[index], np.nan)
+    nothing = np.zeros(ranges.size, np.bool_)
+    if returned.sum() < _FEWEST:
+        return Surroundings(None, nothing, nothing)
+    forward = sensor.axis_cosine() * ranges
+    nearest = float(np.nanpercentile(forward, 5))
+    far = returned & (forward > nearest + CLEARLY_BEHIND_M)
+    lonely = far & _inner(far)  # away from the landmark: not mixed
+    pure = lonely if lonely.sum() >= _FEWEST else far
+    if not far.any():
+        return Surroundings(None, nothing, nothing)
+    ray = _level_rays(sensor)
+    azimuth = math.radians(sensor.bearing_offset_deg)
+    if not bearing_known:
+        azimuth = float(np.arctan2(ray[1], ray[0])[returned & ~far].mean())
+    facing = math.cos(azimuth) * ray[0] + math.sin(azimuth) * ray[1]
+    forward = ranges * facing
+    down = -ray[2]
+    above = pure & (down <= 0)
+    wall_m = _weighted_middle(forward[above] if above.sum() >= 3 else forward[pure])
+    drop = down * ranges
+    short = pure & (down > 0) & (forward < wall_m - 0.1)
+    floor_m = None
+    if short.sum() >= _FEWEST:
+        height = drop[short]
+        middle = float(np.median(height))
+        if np.median(np.abs(height - middle)) < 0.02 * middle:
+            floor_m = middle
+    albedo = _USUAL_ALBEDO
+    if frames.amplitude_e is not None:
+        unit = sensor.contrast * sensor.signal_e
+        lit = pure & ~short
+        # a wall across the line of sight: |S| = ρ cos θ / r², cos θ that of the ray
+        bright = frames.amplitude_e[index] / unit * ranges**2 / facing
+        if lit.any():
+            albedo = float(np.clip(np.median(bright[lit]) / landmark_scale, 1e-3, 1.0))
+    background = Background(wall_m=wall_m, floor_m=floor_m, wall_albedo=albedo, floor_albedo=albedo)
+    return Surroundings(background, (far | ~_inner(~far) & returned).ravel(), pure.ravel())
+
+
+def fit_background(
+    model: RenderedModel,
+    evidence: Evidence,
+    class_index: int,
+    view: NDArray[np.float64],
+    free: Sequence[str],
+    background: Background,
+) -> tuple[Background, NDArray[np.float64]]:
+    """Fit wall and floor together with the view of the landmark before them, starting from guesses of both.
+
+    Levenberg–Marquardt on the residuals of matching; slopes by the background are differences of rendered images.
+
+    Parameters
+    ----------
+    model : RenderedModel
+    evidence : Evidence
+        One frame.
+    class_index : int
+    view : (4,) float64
+    free : sequence of str
+        Which parameters of the view move.
+    background : Background
+        Where to start; its albedos are kept.
+
+    Returns
+    -------
+    background : Background
+    view : (4,) float64
+    """
+    names = [name for name in ("wall_m", "floor_m") if getattr(background, name) is not None]
+    columns = [VIEW.index(name) for name in free]
+    scale = np.array([*(_VIEW_SCALE[k] for k in columns), *([0.1] * len(names))])
+    frame, which = np.zeros(1, np.int64), np.array([class_index])
+
+    def moved(place: NDArray[np.float64]) -> Background:
+        return replace(background, **dict(zip(names, place.tolist(), strict=True)))
+
+    def sums_at(at: NDArray[np.float64], place: NDArray[np.float64]) -> Sums | None:
+        views = at[None]
+        try:
+            image = model.with_background(moved(place)).images(which, views, free)
+            beside = [
+                model.with_background(moved(place + step)).images(which, views, ()).phasor
+                for step in np.eye(len(place)) * _BACKGROUND_STEP_M
+            ]
+        except UsageError:  # the landmark does not stand before this wall, or on this floor
+            return None
+        by_place = [(phasor - image.phasor) / _BACKGROUND_STEP_M for phasor in beside]
+        slope = np.concatenate([image.slope, np.stack(by_place, axis=1)], axis=1)
+        return gauss_newton_sums(
+            image.phasor, slope, evidence, frame, counts(image.phasor, image.intensity, evidence.sensor), None
+        )
+
+    at, place = view.copy(), np.array([getattr(background, name) for name in names], np.float64)
+    sums, damping = sums_at(at, place), 1e-3
+    for _ in range(_BACKGROUND_STEPS):
+        if sums is None:
+            break
+        information = sums.information[0] * np.outer(scale, scale)
+        held = information + np.diag(damping * np.diag(information) + 1e-9)
+        step = np.linalg.solve(held, sums.gradient[0] * scale)
+        step *= min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-12))
+        promise = float(sums.gradient[0] @ (step * scale))
+        if promise < _BACKGROUND_SETTLED:
+            break
+        there = at.copy()
+        there[columns] += (step * scale)[: len(columns)]
+        there[0] = np.clip(there[0], *model.limits())
+        placed = place + (step * scale)[len(columns) :]
+        tried = sums_at(there, placed) if (placed > 0).all() else None
+        if tried is not None and tried.cost[0] < sums.cost[0]:
+            at, place, sums, damping = there, placed, tried, max(damping * 0.1, 1e-9)
+        else:
+            damping *= 8
+            if damping > 1e5:
+                break
+    return moved(place), at
+
+
+def without_background(seen: Observation, surroundings: Surroundings) -> Observation:
+    """Return one frame as it would be with nothing behind: far pixels return nothing, those beside them are missing."""
+    nothing = surroundings.pure[None] & seen.returned
+    unclear = surroundings.behind[None] & ~nothing
+    keep = seen.returned & ~nothing & ~unclear
+    return Observation(
+        np.where(keep, seen.range_m, 0.0),
+        np.where(keep, seen.weight, 0.0),
+        keep,
+        (seen.not_returned & ~unclear) | nothing,
+    )
+
+
+def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which pixels have all their neighbours in a mask."""
+    padded = np.pad(mask, 1, constant_values=True)
+    rows, cols = mask.shape
+    return np.asarray(np.logical_and.reduce([padded[i : i + rows, j : j + cols] for i in range(3) for j in range(3)]))
+
+
+def _level_rays(sensor: Sensor) -> NDArray[np.float64]:
+    """Return the ray of every pixel's centre in the level camera, (3, rows, cols), unit vectors."""
+    tan_h, tan_v = sensor.tan_half_angles
+    u0, v0 = sensor.centre_px
+    v, u = np.mgrid[: sensor.rows, : sensor.cols] + 0.5
+    ray = np.stack([np.ones_like(u), tan_h * 2 * (u0 - u) / sensor.cols, tan_v * 2 * (v0 - v) / sensor.rows])
+    ray /= np.linalg.norm(ray, axis=0)
+    return np.asarray(np.einsum("jk,krc->jrc", sensor.cam2level, ray))
+
+
+def _weighted_middle(values: NDArray[np.float64]) -> float:
+    """Return the mean of what lies within 5 robust σ of the median: as good as a mean, and outliers do not matter."""
+    middle = float(np.median(values))
+    spread = 1.4826 * float(np.median(np.abs(values - middle)))
+    return float(values[np.abs(values - middle) <= 5 * spread + 1e-9].mean())

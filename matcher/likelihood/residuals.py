@@ -1,0 +1,249 @@
+"""How well model images explain filtered frames, and how that changes with the view: Gauss–Newton's sums.
+
+On *ranges*, each pixel leaves the residual y − (c/4πf) arg S, wrapped, with the variance of the filter. On *phasors*
+it leaves two, real and imaginary part of z − S, where z is the filtered amplitude · exp(iφ) in units of |S|; both have
+the variance (N₀·intensity + N_amb + N_dark + 2σ_r² + q²/6) / (2 n (K N₀)²), the law of PHYSICS section 4 before it is
+divided by the amplitude.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.matcher.agreement import DISAGREEMENT, one_frame_limit_m
+from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.nearest.templates import Observation
+from phasemark.render import Sensor
+from phasemark.render.sensor.range_noise import phase_image_variance
+
+Quantity = Literal["ranges", "phasors"]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Filtered frames as the likelihood sees them; (n, pixels) arrays.
+
+    Parameters
+    ----------
+    value : complex128
+        On ranges exp(iφ), on phasors z in units of |S|; 0 where nothing returned.
+    weight : float64
+        1/variance of the residual (m⁻² on ranges); 0 where there is none.
+    one_frame_std_m : float64
+        Noise of a single frame's range; infinite where nothing returned.
+    seen : Observation
+        The same frames as the coarse search sees them. What one frame cannot measure to 0.1 rad is no return there,
+        whether or not the camera dropped it.
+    on : {"ranges", "phasors"}
+    sensor : Sensor
+    """
+
+    value: NDArray[np.complex128]
+    weight: NDArray[np.float64]
+    one_frame_std_m: NDArray[np.float64]
+    seen: Observation
+    on: Quantity
+    sensor: Sensor
+
+    @classmethod
+    def from_frames(cls, frames: FilteredFrames, on: Quantity) -> Evidence:
+        """Take filtered frames.
+
+        Raises
+        ------
+        UsageError
+            Phasors are asked of frames without amplitude or intensity.
+        """
+        sensor = frames.sensor
+        whole = Observation.from_frames(frames, (0, sensor.rows))
+        measured = whole.returned
+        n_effective = frames.n_effective.reshape(measured.shape)
+        one_frame_m2 = np.divide(n_effective, whole.weight, out=np.full(measured.shape, np.inf), where=measured)
+        one_frame_std_m = np.sqrt(one_frame_m2)
+        strong = measured & ~(one_frame_m2 > one_frame_limit_m(sensor) ** 2)
+        seen = Observation(whole.range_m, whole.weight, strong, whole.not_returned | (measured & ~strong))
+        turn = np.asarray(np.where(measured, np.exp(1j * seen.range_m / sensor.metres_per_radian), 0.0), np.complex128)
+        if on == "ranges":
+            return cls(turn, whole.weight, one_frame_std_m, seen, on, sensor)
+        if frames.amplitude_e is None or frames.intensity_e is None:
+            raise UsageError('on="phasors" needs frames with amplitude and intensity: match on="ranges"')
+        shape = seen.range_m.shape
+        unit = sensor.contrast * sensor.signal_e
+        amplitude = np.where(measured, frames.amplitude_e.reshape(shape), 0.0) / unit
+        intensity = np.where(measured, frames.intensity_e.reshape(shape), 0.0)
+        variance = np.maximum(phase_image_variance(intensity, sensor), 1.0) / (2 * unit**2)
+        weight = np.where(measured, n_effective / variance, 0.0)
+        return cls(turn * amplitude, weight, one_frame_std_m, seen, on, sensor)
+
+    def __getitem__(self, index: NDArray[np.integer] | slice) -> Evidence:
+        seen = self.seen
+        part = Observation(seen.range_m[index], seen.weight[index], seen.returned[index], seen.not_returned[index])
+        return Evidence(self.value[index], self.weight[index], self.one_frame_std_m[index], part, self.on, self.sensor)
+
+    @property
+    def per_pixel(self) -> int:
+        """Residuals that a pixel leaves."""
+        return 1 if self.on == "ranges" else 2
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Gauss–Newton's sums of m models, each against its frame.
+
+    Parameters
+    ----------
+    cost : (m,) float64
+        Whitened squared residual; with a robust loss twice that loss.
+    capped : (m,) float64
+        The same with no residual adding more than :data:`~phasemark.matcher.nearest.templates.DISAGREEMENT`, what one
+        costs that nothing explains.
+    gradient : (m, p) float64
+        Jᵀ W r.
+    information : (m, p, p) float64
+        Jᵀ W J.
+    scatter : (m, p, p) float64
+        Jᵀ W² r² J with Huber's bounded residuals: what the middle of the sandwich is made of.
+    """
+
+    cost: NDArray[np.float64]
+    capped: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    information: NDArray[np.float64]
+    scatter: NDArray[np.float64]
+
+
+def gauss_newton_sums(
+    phasor: NDArray[np.complex128],
+    slope: NDArray[np.complex128],
+    evidence: Evidence,
+    frame: NDArray[np.int64],
+    use: NDArray[np.bool_],
+    huber: float | None,
+) -> Sums:
+    """Compare m model images with a frame each.
+
+    Parameters
+    ----------
+    phasor : (m, pixels) complex128
+    slope : (m, p, pixels) complex128
+        ∂S/∂parameter.
+    evidence : Evidence
+    frame : (m,) int64
+        Which frame each model is held against.
+    use : (m, pixels) bool
+        Which pixels count. On ranges, one of them that returns where the model has no light costs
+        :data:`~phasemark.matcher.agreement.DISAGREEMENT`.
+    huber : float, optional
+        Residual, in σ, from which the loss grows linearly, until it costs what one costs that nothing explains; from
+        there it stays, and the pixel no longer counts. None: squares throughout.
+    """
+    m, p = slope.shape[:2]
+    cost, capped, gradient = np.empty(m), np.empty(m), np.empty((m, p))
+    information, scatter = np.empty((m, p, p)), np.empty((m, p, p))
+    kernel = _sum_ranges if evidence.on == "ranges" else _sum_phasors
+    kernel(
+        phasor, slope, evidence.value, evidence.weight, frame, use, evidence.sensor.metres_per_radian,
+        np.inf if huber is None else huber, cost, capped, gradient, information, scatter,
+    )  # fmt: skip
+    return Sums(cost, capped, gradient, information, scatter)
+
+
+def robust_weight(
+    residual: NDArray[np.float64], weight: NDArray[np.float64], huber: float | None
+) -> NDArray[np.float64]:
+    """Return the weights that the information is summed with: less beyond Huber's limit, 0 for an outlier.
+
+    Parameters
+    ----------
+    residual : float64
+    weight : float64
+        Inverse variances, of a shape that broadcasts with `residual`.
+    huber : float, optional
+        As in :func:`gauss_newton_sums`.
+    """
+    weight = np.broadcast_to(weight, residual.shape)
+    if huber is None:
+        return np.asarray(weight)
+    size = np.abs(residual) * np.sqrt(weight)
+    share = np.where(size > huber, huber / np.maximum(size, huber), 1.0)
+    return np.asarray(np.where(huber * (2 * size - huber) >= DISAGREEMENT, 0.0, weight * share))
+
+
+@njit(cache=True, nogil=True)
+def _add(residual, row, weight, huber, k, cost, capped, gradient, information, scatter):  # type: ignore[no-untyped-def]
+    """Add one residual with its row of the Jacobian to the sums of model k."""
+    p = len(row)
+    size = abs(residual) * np.sqrt(weight)
+    if size > huber:
+        loss = huber * (2 * size - huber)
+        if loss >= DISAGREEMENT:
+            cost[k] += DISAGREEMENT
+            capped[k] += DISAGREEMENT
+            return
+        weight *= huber / size  # as iterated least squares has it: the sum stays positive
+    else:
+        loss = size * size
+    cost[k] += loss
+    capped[k] += min(loss, DISAGREEMENT)
+    bounded = weight * residual
+    for a in range(p):
+        gradient[k, a] += bounded * row[a]
+        for b in range(p):
+            product = row[a] * row[b]
+            information[k, a, b] += weight * product
+            scatter[k, a, b] += bounded * bounded * product
+
+
+@njit(cache=True, nogil=True)
+def _sum_ranges(  # type: ignore[no-untyped-def]
+    phasor, slope, value, weight, frame, use, metres_per_radian, huber, cost, capped, gradient, information, scatter
+):
+    m, p, pixels = slope.shape
+    row = np.empty(p)
+    cost[:], capped[:], gradient[:], information[:], scatter[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(m):
+        f = frame[k]
+        for q in range(pixels):
+            w = weight[f, q]
+            s = phasor[k, q]
+            size = s.real * s.real + s.imag * s.imag
+            if not use[k, q] or w == 0.0:
+                continue
+            if size == 0.0:
+                cost[k] += DISAGREEMENT
+                capped[k] += DISAGREEMENT
+                continue
+            ratio = value[f, q] * s.conjugate()
+            residual = metres_per_radian * np.arctan2(ratio.imag, ratio.real)
+            for a in range(p):
+                d = slope[k, a, q]
+                row[a] = metres_per_radian * (s.real * d.imag - s.imag * d.real) / size
+            _add(residual, row, w, huber, k, cost, capped, gradient, information, scatter)
+
+
+@njit(cache=True, nogil=True)
+def _sum_phasors(  # type: ignore[no-untyped-def]
+    phasor, slope, value, weight, frame, use, metres_per_radian, huber, cost, capped, gradient, information, scatter
+):
+    m, p, pixels = slope.shape
+    row = np.empty(p)
+    cost[:], capped[:], gradient[:], information[:], scatter[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(m):
+        f = frame[k]
+        for q in range(pixels):
+            w = weight[f, q]
+            if not use[k, q] or w == 0.0:
+                continue
+            difference = value[f, q] - phasor[k, q]
+            for a in range(p):
+                row[a] = slope[k, a, q].real
+            _add(difference.real, row, w, huber, k, cost, capped, gradient, information, scatter)
+            for a in range(p):
+                row[a] = slope[k, a, q].imag
+            _add(difference.imag, row, w, huber, k, cost, capped, gradient, information, scatter)

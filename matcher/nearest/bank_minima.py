@@ -1,0 +1,251 @@
+"""Where to start: the best views of a thinned bank, several modes of the likelihood, any bearing.
+
+A bearing moves the image sideways. The rays of a turned camera meet the landmark at the same ranges, so a frame shifted
+by whole columns is compared with the bank's images straight ahead; what is shifted in is missing, and a return that is
+shifted out is one that no model explains.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from phasemark.data import Bank
+from phasemark.data.bank.bank_file import BankGroup, group_rows
+from phasemark.matcher.agreement import DISAGREEMENT
+from phasemark.matcher.likelihood.images import closing_period
+from phasemark.matcher.nearest.templates import Observation, Templates
+from phasemark.render import PhasorImages
+
+_T = TypeVar("_T", bound=np.generic)
+
+_UNDECIDED, _SHARE = 300.0, 0.5
+"""Other classes start too where their cost is larger by no more than this, and this share of the best: between the
+grid's points none of them fits."""
+_GRID_STD_M = 0.01
+"""What half a step of the thinned grid changes in a range."""
+_MOST_OTHER_SIDES = 2
+_OTHER_SIDE_RAD = math.radians(30.0)
+"""Number of further sides that are tried, and the least angle between them."""
+_OTHER_SIDE_COST, _OTHER_SIDE_SHARE = 100.0, 4.0
+"""Largest cost of a further side on the grid: a constant, plus a multiple of the lowest cost."""
+
+
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """Candidates of n frames; (k,) arrays, those of a frame together, best first.
+
+    Parameters
+    ----------
+    frame, class_index : int64
+    view : (k, 4) float64
+    cost : float64
+        Whitened squared distance on the grid.
+    """
+
+    frame: NDArray[np.int64]
+    class_index: NDArray[np.int64]
+    view: NDArray[np.float64]
+    cost: NDArray[np.float64]
+
+
+class Search:
+    """A bank thinned for a first look.
+
+    Parameters
+    ----------
+    bank : Bank
+    behind : PhasorImages, optional
+        What stands behind the landmark.
+    stride : (distance, delta)
+        Every how many steps of the bank's grid an image is compared.
+    widest_rad : float
+        How far the landmark may be off to a side; at most a quarter of the image.
+    capped : bool
+        Whether no pixel costs more than a disagreement: other things may stand in view.
+    """
+
+    def __init__(
+        self,
+        bank: Bank,
+        behind: PhasorImages | None,
+        stride: tuple[int, int],
+        widest_rad: float,
+        *,
+        capped: bool = False,
+    ) -> None:
+        self._bank = bank
+        self._capped = capped
+        self._distance = bank.distance_m[:: stride[0]]
+        self._delta = bank.delta_rad[:: stride[1]]
+        self._closes = closing_period(bank.delta_rad) is not None
+        sensor = bank.sensor
+        self.column_rad = 2 * math.atan(sensor.tan_half_angles[0]) / sensor.cols
+        most = min(sensor.cols // 4, math.ceil(min(widest_rad / self.column_rad, sensor.cols)))
+        self._shifts = range(-most, most + 1)
+        thin = slice(None, None, stride[0]), slice(None, None, stride[1])
+        self._parts: list[tuple[Templates, tuple[int, int], bool]] = []
+        if bank.full is not None:
+            self._add(bank.full, (slice(None), *thin), behind)
+        else:
+            assert bank.lower is not None
+            assert bank.upper is not None
+            self._add(bank.lower, thin, behind)
+            self._add(bank.upper, (slice(None), thin[0]), behind)
+
+    def _add(self, group: BankGroup, which: tuple[slice, ...], behind: PhasorImages | None) -> None:
+        rows = group_rows(group.name, self._bank.sensor)
+        templates = Templates.build(
+            group.phasor[which], group.intensity[which], group.coverage[which], self._bank.sensor, behind, rows
+        )
+        self._parts.append((templates, rows, group.name == "upper"))
+
+    def starts(self, seen: Observation, n_modes: int, *, all_classes: bool = False) -> Starts:
+        """Return the best modes of every frame.
+
+        Parameters
+        ----------
+        seen : Observation
+            Whole frames.
+        n_modes : int
+            How many of each frame, at most.
+        all_classes : bool
+            Whether classes that are hardly worse than the best one of a mode start there too.
+        """
+        n, n_bearing = len(seen.range_m), len(self._shifts)
+        if not n:
+            return Starts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4)), np.empty(0))
+        shape = (len(self._distance), len(self._delta))
+        best = np.empty((n, n_bearing, *shape), np.float32)
+        by_class = []
+        for k, shift in enumerate(self._shifts):
+            best[:, k], above = self._costs(self._shifted(seen, shift), seen)
+            by_class.append(above)
+        frame, class_index, views, cost = [], [], [], []
+        for f in range(n):
+            found = modes(best[f], n_modes, self._closes)
+            for b, i, j in np.concatenate([found[found[:, 0] >= 0], self._other_sides(best[f], found)]):
+                least = float(best[f, b, i, j])
+                above = by_class[b][f, :, i, min(j, by_class[b].shape[-1] - 1)]
+                for c in np.argsort(above, kind="stable")[: None if all_classes else 1]:
+                    if above[c] > _UNDECIDED + _SHARE * least:
+                        break
+                    frame.append(f)
+                    class_index.append(c)
+                    views.append((self._distance[i], self._delta[j], self._bearing(b), 0.0))
+                    cost.append(least + float(above[c]))
+        return Starts(
+            np.array(frame, np.int64),
+            np.array(class_index, np.int64),
+            np.array(views, np.float64).reshape(-1, 4),
+            np.array(cost, np.float64),
+        )
+
+    def _other_sides(self, cost: NDArray[np.float32], found: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the best views from sides far from those found already, where they cost little more; (k, 3).
+
+        A thin landmark looks nearly the same from the front and from the back. Without these views the neighbours of
+        one side alone would be compared, and the answer would not know that it is ambiguous.
+        """
+        profile = cost.min(axis=(0, 1))
+        least = float(profile.min())
+        taken = found[found[:, 0] >= 0, 2]
+        period = closing_period(self._delta) or 4 * math.pi
+        others = []
+        for _ in range(_MOST_OTHER_SIDES):
+            away = np.abs(self._delta[:, None] - self._delta[None, taken])
+            away = np.minimum(away, np.abs(period - away)).min(axis=1)
+            open_ = np.where(away > _OTHER_SIDE_RAD, profile, np.inf)
+            j = int(open_.argmin())
+            if not open_[j] <= _OTHER_SIDE_COST + _OTHER_SIDE_SHARE * least:
+                break
+            b, i = np.unravel_index(int(cost[:, :, j].argmin()), cost.shape[:2])
+            others.append((b, i, j))
+            taken = np.append(taken, j)
+        return np.array(others, np.int64).reshape(-1, 3)
+
+    def _bearing(self, index: int) -> float:
+        """Return the bearing whose image is shifted by whole columns: left is positive, and a smaller column."""
+        return -self._shifts[index] * self.column_rad
+
+    def _shifted(self, seen: Observation, shift: int) -> Observation:
+        """Move frames so that what was `shift` columns right of the middle comes to the middle."""
+        if shift == 0:
+            return seen
+        rows, cols = self._bank.sensor.rows, self._bank.sensor.cols
+
+        def move(values: NDArray[_T]) -> NDArray[_T]:
+            grid = values.reshape(-1, rows, cols)
+            out = np.zeros_like(grid)
+            if shift > 0:
+                out[:, :, :-shift] = grid[:, :, shift:]
+            else:
+                out[:, :, -shift:] = grid[:, :, :shift]
+            return out.reshape(values.shape)
+
+        return Observation(move(seen.range_m), move(seen.weight), move(seen.returned), move(seen.not_returned))
+
+    def _costs(self, moved: Observation, seen: Observation) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the cost of the best class at every view of the grid, (n, D, δ), and how far above it each class is.
+
+        The latter is (n, class, D, δ), or (n, class, D, 1) where it does not depend on δ.
+        """
+        n, cols = len(moved.range_m), self._bank.sensor.cols
+        n_class, shape = len(self._bank.classes), (len(self._distance), len(self._delta))
+        out = DISAGREEMENT * (seen.returned.sum(axis=1) - moved.returned.sum(axis=1)).astype(np.float32)
+        pose: NDArray[np.float32] | None = None
+        upper: NDArray[np.float32] | None = None
+        for templates, (first, stop), is_upper in self._parts:
+            picked = slice(first * cols, stop * cols)
+            part = Observation(
+                moved.range_m[:, picked], moved.weight[:, picked],
+                moved.returned[:, picked], moved.not_returned[:, picked],
+            )  # fmt: skip
+            costs = templates.capped_costs(part, _GRID_STD_M) if self._capped else templates.costs(part)
+            if is_upper:
+                upper = costs.reshape(n, n_class, shape[0])
+            else:
+                pose = costs.reshape(n, -1, *shape)
+        assert pose is not None
+        if upper is None:
+            least = pose.min(axis=1)
+            return least + out[:, None, None], pose - least[:, None]
+        least = upper.min(axis=1)
+        return pose[:, 0] + least[:, :, None] + out[:, None, None], (upper - least[:, None])[..., None]
+
+
+@njit(cache=True, nogil=True)
+def modes(cost, n_modes, closes):  # type: ignore[no-untyped-def]
+    """Return the lowest local minima of cost (bearing, D, δ), best first; −1 behind the last."""
+    n_b, n_d, n_a = cost.shape
+    found = np.full((n_modes, 3), -1, np.int64)
+    lowest = np.full(n_modes, np.inf, cost.dtype)
+    for b in range(n_b):
+        for i in range(n_d):
+            for j in range(n_a):
+                own = cost[b, i, j]
+                if not own < lowest[-1]:
+                    continue
+                least = True
+                for bb in range(max(b - 1, 0), min(b + 2, n_b)):
+                    for ii in range(max(i - 1, 0), min(i + 2, n_d)):
+                        for jj in range(j - 1, j + 2):
+                            if closes:
+                                jj %= n_a
+                            if 0 <= jj < n_a and cost[bb, ii, jj] < own:
+                                least = False
+                if not least:
+                    continue
+                k = n_modes - 1
+                while k > 0 and lowest[k - 1] > own:
+                    lowest[k] = lowest[k - 1]
+                    found[k] = found[k - 1]
+                    k -= 1
+                lowest[k] = own
+                found[k, 0], found[k, 1], found[k, 2] = b, i, j
+    return found

@@ -1,0 +1,249 @@
+"""Whitened distance between frames and model images, over a whole bank at once (PHYSICS section 7).
+
+A pixel of a filtered frame is a return, a no return, or missing. Where the model sees the landmark (or a background
+is given) a return costs its squared range residual over its variance. A no return where the model must return
+something, and a return where the model has nothing to return, cost :data:`DISAGREEMENT`. Agreement on nothing costs
+nothing, and a missing pixel says nothing.
+
+With per-pixel weights w = 1/σ², ranges y and f about a common mean, and the model's masks M (may return) and C (must
+return), the sum over pixels is
+
+    Σ w M (y − f)² + 25 (y returns)(1 − M) + 25 (y does not return) C
+        = (w y² − 25 ret) · M  −  2 (w y) · (M f)  +  w · (M f²)  +  25 noret · C  +  25 Σ ret,
+
+one matrix product over all templates. It is formed in float32, so the mean of the bank is subtracted first, and what
+comes within its rounding error of the smallest is computed again in float64.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, disagrees
+from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState, assumed_std_m
+from phasemark.render import PhasorImages, Sensor, phasor_to_range_m, predicted_range_std, wrap_difference_m
+
+_RECHECKED = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Filtered frames as the distance sees them: (n, pixels) arrays.
+
+    Parameters
+    ----------
+    range_m : float64
+        0 where nothing returned.
+    weight : float64
+        1/σ² of a return, 0 elsewhere.
+    returned, not_returned : bool
+    """
+
+    range_m: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    returned: NDArray[np.bool_]
+    not_returned: NDArray[np.bool_]
+
+    @classmethod
+    def from_frames(cls, frames: FilteredFrames, rows: tuple[int, int]) -> Observation:
+        """Take some rows of filtered frames.
+
+        Where a frame does not know its own noise (a single frame without amplitudes), the noise law at the measured
+        range of an albedo of 0.8 facing the camera stands in.
+        """
+        picked = slice(*rows)
+        shape = (len(frames), -1)
+        state = frames.state[:, picked].reshape(shape)
+        returned = state == PixelState.RETURN
+        ranges = np.where(returned, frames.range_m[:, picked].reshape(shape), 0.0)
+        std = frames.std_m[:, picked].reshape(shape)
+        unknown = returned & ~(np.isfinite(std) & (std > 0))
+        if unknown.any():
+            law = assumed_std_m(ranges[unknown], frames.sensor)
+            std = std.copy()
+            std[unknown] = law / np.sqrt(np.maximum(frames.n_effective[:, picked].reshape(shape)[unknown], 1.0))
+        weight = np.zeros(ranges.shape)
+        weight[returned] = 1 / std[returned] ** 2
+        return cls(ranges, weight, returned, state == PixelState.NO_RETURN)
+
+    def __getitem__(self, index: slice) -> Observation:
+        return Observation(self.range_m[index], self.weight[index], self.returned[index], self.not_returned[index])
+
+
+@dataclass(frozen=True, eq=False)
+class Templates:
+    """Model images of one part of a bank, ready to be compared.
+
+    Parameters
+    ----------
+    range_m : (t, pixels) float32
+        Model ranges less `mean_m`; 0 where the model may not return.
+    may_return, must_return : (t, pixels) bool
+    mean_m : (pixels,) float64
+        Circular mean of the model ranges of each pixel.
+    sensor : Sensor
+    """
+
+    range_m: NDArray[np.float32]
+    may_return: NDArray[np.bool_]
+    must_return: NDArray[np.bool_]
+    mean_m: NDArray[np.float64]
+    sensor: Sensor
+
+    @classmethod
+    def build(
+        cls,
+        phasor: NDArray[np.complexfloating],
+        intensity: NDArray[np.floating],
+        coverage: NDArray[np.floating],
+        sensor: Sensor,
+        background: PhasorImages | None,
+        rows: tuple[int, int],
+    ) -> Templates:
+        """Turn model images into templates, composed with a background if there is one.
+
+        Parameters
+        ----------
+        phasor, intensity, coverage : (..., rows, cols)
+            What the landmark alone returns.
+        sensor : Sensor
+        background : PhasorImages, optional
+            One image of the background without the landmark; S = S_landmark + (1 − coverage) · S_background.
+        rows : (first, stop)
+            Rows of the sensor that the images hold.
+        """
+        pixels = math.prod(phasor.shape[-2:])
+        s = phasor.reshape(-1, pixels)
+        cover = np.asarray(coverage).reshape(-1, pixels)
+        may = cover >= MAY_RETURN_COVERAGE
+        must = cover > MUST_RETURN_COVERAGE
+        if background is not None:
+            picked = slice(*rows)
+            free = 1 - cover
+            behind = free * background.phasor[0, picked].reshape(1, pixels)
+            behind_intensity = free * background.intensity[0, picked].reshape(1, pixels)
+            s = s + behind.astype(np.complex64)
+            noise = predicted_range_std(np.abs(behind), behind_intensity, sensor) / sensor.metres_per_radian
+            limit = sensor.max_phase_std_rad or np.inf
+            may |= noise <= limit
+            must |= noise <= 0.5 * limit
+        may &= s != 0
+        ranges = np.where(may, phasor_to_range_m(s, sensor), 0.0)
+        # the circular mean, so that a pixel whose ranges straddle the wrap has its mean there
+        turn = np.exp(1j * ranges / sensor.metres_per_radian) * may
+        mean = phasor_to_range_m(turn.sum(axis=0), sensor)
+        mean = np.where(np.isfinite(mean), mean, 0.0)
+        about = np.where(may, wrap_difference_m(ranges - mean, sensor), 0.0).astype(np.float32)
+        return cls(about, may, must, mean, sensor)
+
+    def __len__(self) -> int:
+        return len(self.range_m)
+
+    def __getitem__(self, index: NDArray[np.integer]) -> Templates:
+        """Return some of the templates, about the same mean."""
+        return Templates(self.range_m[index], self.may_return[index], self.must_return[index], self.mean_m, self.sensor)
+
+    @cached_property
+    def matrix(self) -> NDArray[np.float32]:
+        """[M, −2 M f, M f², C], what the matrix product needs; (t, 4 · pixels)."""
+        f = self.range_m
+        may, must = self.may_return.astype(np.float32), self.must_return.astype(np.float32)
+        return np.concatenate([may, -2 * f, f**2, must], axis=1)
+
+    def costs(self, seen: Observation, subset: slice | None = None) -> NDArray[np.float32]:
+        """Return the distances of n frames from all templates (or a slice of them), (n, t), to float32's accuracy."""
+        about = self.about(seen)
+        query = np.concatenate(
+            [
+                seen.weight * about**2 - DISAGREEMENT * seen.returned,
+                seen.weight * about,
+                seen.weight,
+                DISAGREEMENT * seen.not_returned,
+            ],
+            axis=1,
+        )
+        matrix = self.matrix if subset is None else self.matrix[subset]
+        constant = DISAGREEMENT * seen.returned.sum(axis=1)
+        return np.asarray(query.astype(np.float32) @ matrix.T + constant[:, None].astype(np.float32))
+
+    def capped_costs(self, seen: Observation, grid_std_m: float) -> NDArray[np.float32]:
+        """Return the distances of n frames from all templates, (n, t), where no pixel costs more than a disagreement.
+
+        Parameters
+        ----------
+        seen : Observation
+        grid_std_m : float
+            What half a step of the grid changes in a range; added to the noise.
+        """
+        out = np.empty((len(seen.range_m), len(self)), np.float32)
+        variance = np.divide(1.0, seen.weight, out=np.zeros_like(seen.weight), where=seen.weight > 0)
+        weight = np.where(seen.returned, 1 / (variance + grid_std_m**2), 0.0)
+        period = self.sensor.unambiguous_range_m
+        _capped_costs(
+            self.range_m, self.may_return, self.must_return, self.about(seen), weight,
+            seen.returned, seen.not_returned, period, out,
+        )  # fmt: skip
+        return out
+
+    def exact_costs(self, seen: Observation, frame: int, index: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Return the distances of one frame from some templates in float64, (t,)."""
+        return np.asarray(self.costs_of_each(seen[frame : frame + 1], index[None])[0])
+
+    def costs_of_each(self, seen: Observation, index: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Return the distances of n frames from templates of their own, (n, t) as `index` is, in float64."""
+        residual = wrap_difference_m(self.about(seen)[:, None] - self.range_m[index].astype(np.float64), self.sensor)
+        fit = seen.weight[:, None] * self.may_return[index] * residual**2
+        wrong = disagrees(
+            seen.returned[:, None], seen.not_returned[:, None], self.may_return[index], self.must_return[index]
+        )
+        return np.asarray((fit + DISAGREEMENT * wrong).sum(axis=-1))
+
+    def best(self, seen: Observation, frame: int, costs: NDArray[np.float32], offset: int = 0) -> tuple[int, float]:
+        """Return the nearest template of one frame and its exact distance.
+
+        Parameters
+        ----------
+        seen : Observation
+        frame : int
+        costs : (t,) float32
+            One row of :meth:`costs`.
+        offset : int
+            Where the slice that `costs` covers begins.
+        """
+        scale = float(np.sum(seen.weight[frame] * self.about(seen[frame : frame + 1])[0] ** 2))
+        scale += float(np.abs(costs).min()) + DISAGREEMENT * seen.range_m.shape[1]
+        near = np.flatnonzero(costs <= costs.min() + 1e-5 * scale)
+        if len(near) > _RECHECKED:
+            near = near[np.argpartition(costs[near], _RECHECKED)[:_RECHECKED]]
+        exact = self.exact_costs(seen, frame, near + offset)
+        k = int(exact.argmin())
+        return int(near[k] + offset), float(exact[k])
+
+    def about(self, seen: Observation) -> NDArray[np.float64]:
+        """Return measured ranges less the bank's mean, wrapped to ± c/4f, 0 where nothing returned."""
+        return np.where(seen.returned, wrap_difference_m(seen.range_m - self.mean_m, self.sensor), 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _capped_costs(model, may, must, about, weight, returned, absent, period, out):  # type: ignore[no-untyped-def]
+    """Fill the costs of every frame at every template, no pixel above the disagreement."""
+    for f in range(out.shape[0]):
+        for t in range(out.shape[1]):
+            total = 0.0
+            for q in range(model.shape[1]):
+                if returned[f, q]:
+                    if may[t, q]:
+                        difference = abs(about[f, q] - model[t, q])
+                        difference = min(difference, abs(period - difference))
+                        total += min(weight[f, q] * difference * difference, DISAGREEMENT)
+                    else:
+                        total += DISAGREEMENT
+                elif absent[f, q] and must[t, q]:
+                    total += DISAGREEMENT
+            out[f, t] = total

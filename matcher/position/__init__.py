@@ -1,0 +1,1 @@
+"""Where the robot is: its pose from matches and a map."""

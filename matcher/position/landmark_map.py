@@ -1,0 +1,225 @@
+"""Where the landmarks stand: a map in TOML, and the robot poses that a match allows on it (PHYSICS section 8)."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import ConfigDict, Field, model_validator
+
+from phasemark import UsageError
+from phasemark.data.plans.bank_plan import PlanModel
+from phasemark.inputs.toml_file import read_toml
+from phasemark.matcher.position.robot_pose import RobotPose, ViewEstimate, robot_poses
+
+Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+Std = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Point = tuple[Coordinate, Coordinate]
+
+
+class MappedLandmark(PlanModel):
+    """One landmark of a map.
+
+    Parameters
+    ----------
+    name : str
+        Of this one landmark.
+    class_name : str
+        Its class, as the matcher's bank calls it; ``class`` in a file.
+    x_m, y_m : float
+        Where its axis stands.
+    yaw_deg : float
+        Heading of its x' axis, the box's length.
+    xy_std_m, yaw_std_deg : float
+        How well that was surveyed: standard deviations of each coordinate, and of the heading.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_by_name=True, validate_by_alias=True)
+
+    name: Annotated[str, Field(min_length=1, max_length=100)]
+    class_name: Annotated[str, Field(alias="class", min_length=1)]
+    x_m: Coordinate
+    y_m: Coordinate
+    yaw_deg: Coordinate = 0.0
+    xy_std_m: Std = 0.0
+    yaw_std_deg: Std = 0.0
+
+    @property
+    def xy_m(self) -> tuple[float, float]:
+        """(X_o, Y_o)."""
+        return self.x_m, self.y_m
+
+    @property
+    def yaw_rad(self) -> float:
+        """ψ."""
+        return math.radians(self.yaw_deg)
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Of (X_o, Y_o, ψ), (3, 3)."""
+        return np.diag(np.square([self.xy_std_m, self.xy_std_m, math.radians(self.yaw_std_deg)]))
+
+
+class LandmarkMap(PlanModel):
+    """Landmarks, and the walls of the room around them.
+
+    Parameters
+    ----------
+    landmark : sequence of MappedLandmark
+    room_m : sequence of (x, y)
+        Corners of the room in order, a simple polygon; empty: no walls.
+
+    Examples
+    --------
+    >>> LandmarkMap(landmark=[{"name": "door", "class": "cone", "x_m": 2, "y_m": 1}]).landmark[0].xy_m
+    (2.0, 1.0)
+    """
+
+    landmark: Annotated[tuple[MappedLandmark, ...], Field(min_length=1)]
+    room_m: tuple[Point, ...] = ()
+
+    @model_validator(mode="after")
+    def _is_a_map(self) -> Self:
+        names = [landmark.name for landmark in self.landmark]
+        for k, name in enumerate(names):
+            if name in names[:k]:
+                raise UsageError(f"'landmark.{k}.name' must be a name of its own, got {name!r} twice")
+        if 0 < len(self.room_m) < 3:
+            raise UsageError(f"'room_m' must have at least 3 corners, got {len(self.room_m)}")
+        for k, landmark in enumerate(self.landmark):
+            if self.room_m and not self.is_inside(landmark.xy_m):
+                raise UsageError(f"'landmark.{k}' must stand inside 'room_m', got x_m, y_m = {landmark.xy_m}")
+        return self
+
+    def is_inside(self, xy_m: Sequence[float]) -> bool:
+        """Return whether a point is inside the room; true everywhere if it has no walls."""
+        if not self.room_m:
+            return True
+        start, along = self._walls()
+        end = start + along
+        crosses = (start[:, 1] > xy_m[1]) != (end[:, 1] > xy_m[1])
+        slope = np.divide(along[:, 0], along[:, 1], out=np.zeros(len(along)), where=crosses)
+        return bool(np.count_nonzero(crosses & (start[:, 0] + slope * (xy_m[1] - start[:, 1]) > xy_m[0])) % 2)
+
+    def wall_clearance_m(self, xy_m: Sequence[float]) -> float:
+        """Return how far the nearest wall is from a point; infinite without walls."""
+        if not self.room_m:
+            return math.inf
+        start, along = self._walls()
+        to = np.asarray(xy_m, np.float64) - start
+        share = np.clip(np.sum(to * along, axis=1) / np.sum(along**2, axis=1), 0, 1)
+        return float(np.linalg.norm(to - share[:, None] * along, axis=1).min())
+
+    def wall_distance_m(self, xy_m: Sequence[float] | NDArray[np.float64], heading_rad: float) -> float | None:
+        """Return how far the room's wall is from a point in a direction; None where there is none.
+
+        Parameters
+        ----------
+        xy_m : (x, y)
+        heading_rad : float
+        """
+        if not self.room_m:
+            return None
+        start, along = self._walls()
+        ray = np.array([math.cos(heading_rad), math.sin(heading_rad)])
+        to = start - np.asarray(xy_m, np.float64)
+        across = ray[0] * along[:, 1] - ray[1] * along[:, 0]
+        parallel = across == 0
+        across = np.where(parallel, 1.0, across)
+        distance = (to[:, 0] * along[:, 1] - to[:, 1] * along[:, 0]) / across
+        place = (to[:, 0] * ray[1] - to[:, 1] * ray[0]) / across
+        met = ~parallel & (distance > 0) & (place >= 0) & (place <= 1)
+        return float(distance[met].min()) if met.any() else None
+
+    def poses(
+        self,
+        match: ViewEstimate,
+        pan_rad: float = 0.0,
+        *,
+        prior: Sequence[float] | None = None,
+        prior_covariance: ArrayLike | None = None,
+        **mounting: Any,
+    ) -> list[Placement]:
+        """Return every pose that a match allows at every landmark of its class, nearest to the prior first.
+
+        Parameters
+        ----------
+        match : Match
+            Of one frame.
+        pan_rad : float
+            β.
+        prior, prior_covariance
+            As :func:`~phasemark.matcher.robot_poses` has them; without a prior in the order of the map.
+        **mounting
+            Its further keywords: offsets, ``pan_std_rad``, ``mounting_covariance``.
+
+        Returns
+        -------
+        list of Placement
+            Empty if no landmark of the map is of that class, or there is none.
+        """
+        placements = [
+            Placement(landmark, pose)
+            for landmark in self.landmark
+            if landmark.class_name == match.class_name
+            for pose in robot_poses(
+                match,
+                landmark.xy_m,
+                landmark.yaw_rad,
+                pan_rad,
+                prior=prior,
+                prior_covariance=prior_covariance,
+                landmark_covariance=landmark.covariance,
+                **mounting,
+            )
+        ]
+        return placements if prior is None else sorted(placements, key=lambda placement: placement.pose.mahalanobis)
+
+    def _walls(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return where each wall begins, and the vector to its end; (walls, 2) both."""
+        corners = np.array(self.room_m)
+        return corners, np.roll(corners, -1, axis=0) - corners
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A pose of the robot, and the landmark that it rests on.
+
+    Parameters
+    ----------
+    landmark : MappedLandmark
+    pose : RobotPose
+    """
+
+    landmark: MappedLandmark
+    pose: RobotPose
+
+
+def load_map(path: str | os.PathLike[str]) -> LandmarkMap:
+    """Read a map of landmarks from a TOML file.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    LandmarkMap
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read or is not TOML.
+    UsageError
+        With one line that names the file, the key, the value and what would be right.
+    """
+    table = read_toml(path)
+    try:
+        return LandmarkMap(**table)
+    except UsageError as error:
+        raise UsageError(f"{os.fspath(path)}: {error}") from None

@@ -1,0 +1,1 @@
+"""Recordings in time: stamps, whether the camera stood still, and tables of estimates."""

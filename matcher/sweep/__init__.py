@@ -1,0 +1,1 @@
+"""Sweeps over conditions: plan, trials, tables, report."""

@@ -1,0 +1,209 @@
+"""The report of a sweep: one self-contained HTML page, and each figure as PNG and SVG."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+from phasemark.data import versions, write_atomically
+from phasemark.data.files.atomic_write import storage_errors
+from phasemark.data.files.folder_marker import OwnedFiles
+from phasemark.data.pages.page import embedded_png, figure_png, page_template
+from phasemark.matcher.accuracy.cramer_rao import Estimate
+from phasemark.matcher.sweep.examples import worst_examples
+from phasemark.matcher.sweep.figures.sheet import sweep_figures
+from phasemark.matcher.sweep.plan import SweepPlan
+from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, condition_axes
+from phasemark.matcher.sweep.run import read_plan_of, read_sweep, sweep_folder, write_cells
+from phasemark.render.integral.rounding import with_interval
+
+_MOST_ROWS = 80
+_READABLE_IN = 6.5
+"""Wider figures keep their size on a phone, to be moved about."""
+_MOST_EXAMPLES = 8
+_SAID = {
+    "class_name": "{}", "distance_m": "D = {:g} m", "delta_deg": "δ = {:g}°", "noise_factor": "{:g} times the noise",
+    "n_frames": "{:g} frames", "bearing_deg": "a bearing of {:g}°", "height_m": "a height of {:g} m",
+    "pitch_deg": "a pitch of {:g}°", "albedo": "an albedo of {:g}", "wall_m": "a wall at {:g} m",
+    "wiggling": "wiggling of {:g}", "unit": "unit {:g}", "dimension_error": "dimensions off by {:g}",
+}  # fmt: skip
+_ALWAYS_SAID = ("class_name", "distance_m", "delta_deg", "noise_factor", "n_frames")
+_PARAMETERS = (("distance_m", "distance", " mm", 1e3), ("delta_rad", "angle", "°", 180 / math.pi))
+
+
+def write_report(folder: str | os.PathLike[str]) -> Path:
+    """Write ``report.html``, ``figures/`` and the table of cells into a sweep's folder, over those that are there.
+
+    Parameters
+    ----------
+    folder : path-like
+        As :func:`phasemark.matcher.run_sweep` left it.
+
+    Returns
+    -------
+    Path
+        The report.
+
+    Raises
+    ------
+    InputFileError
+        The folder holds no sweep, or a damaged one.
+    OutputExistsError
+        A sweep is still writing the folder, or a file of somebody else has the name of one of ours.
+    """
+    folder = Path(folder)
+    read_plan_of(folder)
+    with sweep_folder(folder) as ours:
+        return _write_report(ours)
+
+
+def _write_report(ours: OwnedFiles) -> Path:
+    folder = ours.folder
+    plan, trials = read_sweep(folder)
+    ours.claim("cells.csv", "sweep.json", "report.html")
+    cells = write_cells(plan, trials, folder)
+    landmarks = [cell for cell in cells if not cell.stranger]
+    with storage_errors(folder):
+        (folder / "figures").mkdir(exist_ok=True)
+    shown = []
+    figures = list(sweep_figures(plan, trials, cells))
+    ours.claim(*(f"figures/{figure.name}.{kind}" for figure in figures for kind in ("png", "svg")))
+    for figure in figures:
+        png, svg = figure_png(figure.figure), io.BytesIO()
+        with matplotlib.rc_context({"svg.hashsalt": "phasemark"}):  # or the names inside would differ each time
+            figure.figure.savefig(svg, format="svg", metadata={"Date": None})
+        for kind, content in (("png", png), ("svg", svg.getvalue())):
+            write_atomically(folder / "figures" / f"{figure.name}.{kind}", content, force=True)
+        wide = figure.figure.get_figwidth() > _READABLE_IN
+        shown.append(
+            {"title": figure.title, "text": figure.text, "image": embedded_png(png, figure.title), "wide": wide}
+        )
+    axes = condition_axes([cell.condition for cell in cells])
+    page = page_template("phasemark.matcher.sweep", "page.html.j2").render(
+        plan=plan,
+        summary=summary(trials, cells),
+        figures=shown,
+        examples=_examples(plan, trials, folder),
+        header=(*axes, "method", "n", "D RMSE (mm)", "bound", "ratio", "δ RMSE (°)", "bound", "ratio", "outliers",
+                "class right", "NEES/p", "95 % coverage"),
+        rows=[_row(cell, axes) for cell in _worst_first(landmarks)[:_MOST_ROWS]],
+        n_cells=len(landmarks),
+        facts=_facts(plan, trials),
+    )  # fmt: skip
+    return write_atomically(folder / "report.html", page.encode(), force=True)
+
+
+def summary(trials: SweepTrials, cells: Sequence[Cell]) -> list[str]:
+    """Say in three sentences what was found: how accurate each method is, where it fails, which classes it finds."""
+    landmarks = [cell for cell in cells if not cell.stranger]
+    methods = trials.methods
+    accurate = "; ".join(f"{method} {_accuracy([c for c in landmarks if c.method == method])}" for method in methods)
+    sentences = [f"Root mean square errors in the median cell, and their ratios to the Cramér–Rao bound: {accurate}."]
+    worst = []
+    for method in methods:
+        mine = [cell for cell in landmarks if cell.method == method and _badness(cell) > -math.inf]
+        outliers = sum(round(c.outliers.value * c.answered.value * c.n) for c in mine if c.answered.value)
+        if mine:
+            cell = max(mine, key=_badness)
+            worst.append(
+                f"for {method}, {_badness(cell):.3g} times the bound at {_where(cell, landmarks)}"
+                + (f" ({outliers} outlier{'s' * (outliers > 1)} in all)" if outliers else "")
+            )
+    if worst:
+        sentences.append(f"The worst cells are, {'; '.join(worst)}.")
+    classes = "; ".join(_classes(trials, m) for m in range(len(methods)))
+    return [*sentences, f"{classes[:1].upper()}{classes[1:]}."]
+
+
+def _accuracy(cells: Sequence[Cell]) -> str:
+    parts = []
+    for name, label, unit, scale in _PARAMETERS:
+        rmse = [cell.rmse[name].value * scale for cell in cells if math.isfinite(cell.rmse[name].value)]
+        ratio = [cell.ratio[name].value for cell in cells if math.isfinite(cell.ratio[name].value)]
+        if rmse and ratio:
+            parts.append(f"{np.median(rmse):.2g}{unit} in {label} ({np.median(ratio):.3g} times)")
+    return " and ".join(parts) or "no answer"
+
+
+def _classes(trials: SweepTrials, m: int) -> str:
+    """Say what the confusion matrix of method m shows: right among the answers, and what was refused."""
+    refused, strange = trials.refused[:, m], trials.true_class < 0
+    answers = ~refused & ~strange
+    right = int((trials.found[answers, m] == trials.true_class[answers]).sum())
+    n, silent = int((~strange).sum()), int((refused & ~strange).sum())
+    text = f"{trials.methods[m]} named the right class in {right} of {int(answers.sum())} answers and refused"
+    text += f" {silent} of {n} trials ({100 * silent / max(n, 1):.2g} %)"
+    if strange.any():
+        text += f" and {int((refused & strange).sum())} of {int(strange.sum())} strangers"
+    return text
+
+
+def _where(cell: Cell, cells: Sequence[Cell]) -> str:
+    axes = condition_axes([one.condition for one in cells])
+    first = cells[0].condition
+    # of what may be wrong with the model, only what is wrong here
+    values = [
+        (name, getattr(cell.condition, name))
+        for name in axes
+        if name in _ALWAYS_SAID or getattr(cell.condition, name) != getattr(first, name)
+    ]
+    return ", ".join(_SAID[name].format(value) if name in _SAID else f"{name} = {value:g}" for name, value in values)
+
+
+def _badness(cell: Cell) -> float:
+    return max((ratio.value for ratio in cell.ratio.values() if math.isfinite(ratio.value)), default=-math.inf)
+
+
+def _worst_first(cells: Sequence[Cell]) -> list[Cell]:
+    return sorted(cells, key=lambda cell: -_badness(cell))
+
+
+def _with_interval(value: Estimate, scale: float = 1.0) -> str:
+    if not math.isfinite(value.value):
+        return "–"
+    return with_interval(value.value * scale, value.low * scale, value.high * scale)
+
+
+def _row(cell: Cell, axes: Sequence[str]) -> list[str]:
+    values = [getattr(cell.condition, name) for name in axes]
+    out = [f"{value:g}" if isinstance(value, int | float) else str(value) for value in values]
+    out += [cell.method, str(cell.n)]
+    for name, _, _, scale in _PARAMETERS:
+        out += [_with_interval(cell.rmse[name], scale), f"{cell.bound[name] * scale:.3g}"]
+        out.append(_with_interval(cell.ratio[name]))
+    out += [_with_interval(one) for one in (cell.outliers, cell.class_right, cell.nees, cell.coverage[0.95])]
+    return out
+
+
+def _examples(plan: SweepPlan, trials: SweepTrials, folder: Path) -> list[dict[str, Any]]:
+    where = shlex.quote(str(folder))
+    of_each = max(1, _MOST_EXAMPLES // len(plan.methods))
+    return [
+        {
+            "title": f"{example.method}: condition {example.condition}, trial {example.trial}",
+            "text": example.text,
+            "image": embedded_png(figure_png(example.figure), example.text),
+            "command": f"phasemark sweep frames {where} {example.condition} {example.trial} -o frames.npz",
+        }
+        for example in worst_examples(plan, trials, of_each)
+    ]
+
+
+def _facts(plan: SweepPlan, trials: SweepTrials) -> dict[str, Any]:
+    return {
+        "design": f"{plan.design}, {len(trials.conditions)} conditions, {len(trials)} trials of each method",
+        "truths": f"uniform within {plan.spread[0]:g} m × {plan.spread[1]:g}° about a condition, off the banks' grids",
+        "outliers": f"beyond {plan.outlier[0]:g} m or {plan.outlier[1]:g}°",
+        "bound": "Cramér–Rao of the true world at each trial's view, for each method's own pixels and parameters",
+        "sensor": plan.sensor,
+        "seed": str(plan.seed),
+        "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
+    }

@@ -1,0 +1,359 @@
+"""Tables of a sweep: one row a trial and method, and one row a cell with an interval on every number."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from phasemark.data.files.csv_cell import as_cell
+from phasemark.matcher.accuracy.cramer_rao import Estimate, nees
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.statistics import mean_interval, rms_interval, wilson
+from phasemark.matcher.sweep.plan import Condition
+
+LEVELS = (0.5, 0.9, 0.95, 0.99)
+"""Probabilities of the ellipsoids whose coverage is counted."""
+_ROWS_AT_ONCE = 5000
+_HONEST_SIGMA = 5.0
+"""An error within so many standard deviations of the bound is no outlier, however large it is."""
+_UNIT = np.array([0.01, math.pi / 180, math.pi / 180, 0.01])
+"""Lengths in centimetres and angles in degrees make a condition number that means something."""
+
+
+@dataclass(frozen=True, eq=False)
+class SweepTrials:
+    """Every trial of a sweep, ordered by condition and number; arrays have n trials × m methods.
+
+    Parameters
+    ----------
+    conditions : tuple of Condition
+    methods : tuple of str
+    free : tuple of tuple of str
+        What each method estimates.
+    classes : tuple of str
+    symmetry : tuple of int
+        Of each class.
+    outlier : (metres, degrees)
+    condition, trial : (n,) int64
+    truth : (n, 4) float64
+        distance_m, delta_rad, bearing_rad, height_m.
+    confusion : (n,) float64
+        Bound on the probability of a wrong class; NaN where it was not computed.
+    estimate : (n, m, 4) float64
+        NaN where there is none.
+    bound, covariance : (n, m, 4, 4) float64
+        NaN where a parameter is not estimated, and where a method has no covariance.
+    chi2, p_value, p_none, seconds : (n, m) float64
+    dof, found, modes : (n, m) int64
+        `found` is the class's number, −1 for none.
+    accepted : (n, m) bool
+    """
+
+    conditions: tuple[Condition, ...]
+    methods: tuple[str, ...]
+    free: tuple[tuple[str, ...], ...]
+    classes: tuple[str, ...]
+    symmetry: tuple[int, ...]
+    outlier: tuple[float, float]
+    condition: NDArray[np.int64]
+    trial: NDArray[np.int64]
+    truth: NDArray[np.float64]
+    confusion: NDArray[np.float64]
+    estimate: NDArray[np.float64]
+    bound: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    chi2: NDArray[np.float64]
+    p_value: NDArray[np.float64]
+    p_none: NDArray[np.float64]
+    seconds: NDArray[np.float64]
+    dof: NDArray[np.int64]
+    found: NDArray[np.int64]
+    modes: NDArray[np.int64]
+    accepted: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.truth)
+
+    @property
+    def true_class(self) -> NDArray[np.int64]:
+        """Number of each trial's class, −1 for a stranger, which has none; (n,)."""
+        number = {name: k for k, name in enumerate(self.classes)}
+        of_condition = np.array([number.get(condition.class_name, -1) for condition in self.conditions])
+        return np.asarray(of_condition[self.condition])
+
+    @property
+    def refused(self) -> NDArray[np.bool_]:
+        """Whether each method saw no landmark, or its fit failed its test; (n, m)."""
+        return (self.found < 0) | ~self.accepted
+
+    @property
+    def error(self) -> NDArray[np.float64]:
+        """Estimate less truth, δ wrapped by the true landmark's symmetry; (n, m, 4), NaN for strangers."""
+        return self.error_of(slice(None))
+
+    def error_of(self, rows: slice) -> NDArray[np.float64]:
+        """Return :attr:`error` of some trials."""
+        true_class = self.true_class[rows]
+        error = self.estimate[rows] - self.truth[rows, None]
+        error[true_class < 0] = np.nan
+        period = 2 * math.pi / np.array(self.symmetry, np.float64)[true_class][:, None]
+        error[:, :, 1] -= period * np.round(error[:, :, 1] / period)
+        return error
+
+    def rows_of(self, condition: int) -> slice:
+        """Return where the trials of a condition lie."""
+        return slice(*np.searchsorted(self.condition, [condition, condition + 1]))
+
+    def trial_table(self, rows: slice) -> dict[str, list[Any]]:
+        """Return what trials.csv holds of some trials: columns, trial by trial and method by method."""
+        m = len(self.methods)
+        number = self.condition[rows]
+        error = self.error_of(rows)
+        shared: dict[str, Sequence[Any]] = {
+            "condition": number.tolist(),
+            "trial": self.trial[rows].tolist(),
+            "method": self.methods * len(number),
+            "class": [self.conditions[k].class_name for k in number],
+            **{f"true_{name}": self.truth[rows, i].tolist() for i, name in enumerate(VIEW)},
+        }
+        names = (*self.classes, "none")
+        own: dict[str, NDArray[Any]] = {
+            **{name: self.estimate[rows, :, i] for i, name in enumerate(VIEW)},
+            **{f"error_{name}": error[:, :, i] for i, name in enumerate(VIEW)},
+            **{f"bound_{name}": _root(self.bound[rows, :, i, i]) for i, name in enumerate(VIEW)},
+            **{
+                f"cov_{_SHORT[i]}_{_SHORT[j]}": self.covariance[rows, :, i, j]
+                for i in range(len(VIEW))
+                for j in range(i, len(VIEW))
+            },
+            **{name: getattr(self, name)[rows] for name in ("chi2", "dof", "p_value", "p_none")},
+            "found": np.array(names, object)[self.found[rows]],
+            "modes": self.modes[rows],
+            "accepted": self.accepted[rows].astype(np.int64),
+            "seconds": self.seconds[rows],
+        }
+        return {
+            **{
+                name: list(values) if name == "method" else [value for value in values for _ in range(m)]
+                for name, values in shared.items()
+            },
+            **{name: values.reshape(-1).tolist() for name, values in own.items()},
+        }
+
+    def cells(self) -> tuple[Cell, ...]:
+        """Judge every method under every condition."""
+        error = self.error
+        return tuple(
+            self._cell(number, m, error)
+            for number in range(len(self.conditions))
+            for m in range(len(self.methods))
+            if self.rows_of(number).stop > self.rows_of(number).start
+        )
+
+    def _cell(self, number: int, m: int, all_errors: NDArray[np.float64]) -> Cell:
+        rows, condition = self.rows_of(number), self.conditions[number]
+        at = np.array([VIEW.index(name) for name in self.free[m]])
+        error = all_errors[rows, m][:, at]
+        bound = self.bound[rows, m][:, at[:, None], at]
+        covariance = self.covariance[rows, m][:, at[:, None], at]
+        n = len(error)
+        found = self.found[rows, m]
+        accepted = self.accepted[rows, m]
+        stranger = condition.class_name not in self.classes
+        right = ~accepted if stranger else found == self.classes.index(condition.class_name)
+        confusion = self.confusion[rows]
+        confusion = confusion[np.isfinite(confusion)]
+        answered = np.isfinite(error).all(axis=1) & (found >= 0)
+        limit = np.array(
+            [self.outlier[0], math.radians(self.outlier[1]), math.radians(self.outlier[1]), self.outlier[0]]
+        )
+        std = np.sqrt(np.einsum("npp->np", bound))
+        with np.errstate(invalid="ignore"):
+            gross = answered & (np.abs(error) > np.fmax(limit[at], _HONEST_SIGMA * std)).any(axis=1)
+        inner = answered & ~gross
+        bounded = np.isfinite(std).all(axis=1)
+        honest = inner & np.isfinite(covariance).all(axis=(1, 2))
+        squared = nees(error[honest], covariance[honest]) if honest.any() else np.empty(0)
+        limits = [float(special.chdtri(len(at), 1 - level)) for level in LEVELS]
+        typical = np.median(bound[bounded], axis=0) if bounded.any() else np.full(bound.shape[1:], np.nan)
+        condition_number, weak = _observability(typical, at)
+        return Cell(
+            number=number,
+            condition=condition,
+            method=self.methods[m],
+            free=self.free[m],
+            n=n,
+            answered=wilson(int(answered.sum()), n),
+            accepted=wilson(int(accepted.sum()), n),
+            outliers=wilson(int(gross.sum()), int(answered.sum())),
+            stranger=stranger,
+            class_right=wilson(int(right.sum()), n),
+            confusion_bound=float(confusion.mean()) if len(confusion) else math.nan,
+            found={
+                name: int((found == k).sum()) for k, name in [*enumerate(self.classes), (-1, "none")]
+            },
+            bias={name: mean_interval(error[inner, k]) for k, name in enumerate(self.free[m])},
+            rmse={name: rms_interval(error[inner, k]) for k, name in enumerate(self.free[m])},
+            rmse_with_outliers={name: rms_interval(error[answered, k]) for k, name in enumerate(self.free[m])},
+            bound={
+                name: float(np.sqrt(np.mean(std[bounded, k] ** 2))) if bounded.any() else math.nan
+                for k, name in enumerate(self.free[m])
+            },
+            ratio={
+                name: rms_interval(error[inner & bounded, k] / std[inner & bounded, k])
+                for k, name in enumerate(self.free[m])
+            },
+            nees=mean_interval(squared / len(at)),
+            coverage={
+                level: wilson(int((squared <= edge).sum()), len(squared))
+                for level, edge in zip(LEVELS, limits, strict=True)
+            },
+            condition_number=condition_number,
+            weak_direction=weak,
+            seconds=float(np.median(self.seconds[rows, m])) if n else math.nan,
+        )  # fmt: skip
+
+
+_SHORT = ("distance", "delta", "bearing", "height")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method under one condition; lengths in metres, angles in radians, intervals of 95 %.
+
+    Parameters
+    ----------
+    number : int
+        Of the condition in the design.
+    condition : Condition
+    method : str
+    free : tuple of str
+    n : int
+        Trials.
+    stranger : bool
+        Whether the condition shows an object that stands in no bank; it has no errors and no bound.
+    answered, accepted : Estimate
+        Shares of all trials.
+    class_right : Estimate
+        Share of all trials whose class was found; of a stranger's, those that were refused.
+    confusion_bound : float
+        Mean bound on the probability of a wrong class, for a matcher that knows the world.
+    outliers : Estimate
+        Share of the answered trials whose error is beyond the plan's limits, and beyond 5 σ of the bound.
+    found : dict of str to int
+        How often each class was found, "none" included.
+    bias, rmse : dict of str to Estimate
+        Of the answered trials that are no outliers.
+    rmse_with_outliers : dict of str to Estimate
+    bound : dict of str to float
+        Cramér–Rao bound on the standard deviation, root mean square over the true views.
+    ratio : dict of str to Estimate
+        √mean(e² / bound²), outliers left out.
+    nees : Estimate
+        Mean of eᵀP⁻¹e over the number of parameters.
+    coverage : dict of float to Estimate
+        Share of errors within the ellipsoids of :data:`LEVELS`.
+    condition_number : float
+        Of the bound, lengths in centimetres and angles in degrees.
+    weak_direction : dict of str to float
+        The direction known worst, as the standard deviation along it.
+    seconds : float
+        Median time of a match; the one number that differs from run to run.
+    """
+
+    number: int
+    condition: Condition
+    method: str
+    free: tuple[str, ...]
+    n: int
+    stranger: bool
+    answered: Estimate
+    accepted: Estimate
+    outliers: Estimate
+    class_right: Estimate
+    confusion_bound: float
+    found: dict[str, int]
+    bias: dict[str, Estimate]
+    rmse: dict[str, Estimate]
+    rmse_with_outliers: dict[str, Estimate]
+    bound: dict[str, float]
+    ratio: dict[str, Estimate]
+    nees: Estimate
+    coverage: dict[float, Estimate]
+    condition_number: float
+    weak_direction: dict[str, float]
+    seconds: float
+
+    def row(self) -> dict[str, Any]:
+        """Return the cell as one flat row of cells.csv; what a method does not estimate is NaN."""
+        out: dict[str, Any] = {"cell": self.number, **asdict(self.condition), "method": self.method, "n": self.n}
+        out |= {"stranger": int(self.stranger), "confusion_bound": self.confusion_bound}
+        for name in ("answered", "accepted", "outliers", "class_right", "nees"):
+            out |= _flat(name, getattr(self, name))
+        for name in VIEW:
+            for kind in ("bias", "rmse", "rmse_with_outliers", "ratio"):
+                out |= _flat(f"{kind}_{name}", getattr(self, kind).get(name, _UNKNOWN))
+            out[f"bound_{name}"] = self.bound.get(name, math.nan)
+            out[f"weak_{name}"] = self.weak_direction.get(name, math.nan)
+        for level, share in self.coverage.items():
+            out |= _flat(f"coverage_{round(100 * level)}", share)
+        out |= {f"found_{name}": count for name, count in self.found.items()}
+        return {**out, "condition_number": self.condition_number, "seconds": self.seconds}
+
+
+_UNKNOWN = Estimate(math.nan, math.nan, math.nan)
+
+
+def csv_bytes(table: Mapping[str, Sequence[Any]], *, header: bool = True) -> bytes:
+    """Return columns as CSV; numbers as short as they can be read back exactly, nothing for NaN."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    if header:
+        writer.writerow(table)
+    writer.writerows(zip(*(["" if v != v else as_cell(v) for v in column] for column in table.values()), strict=True))
+    return text.getvalue().encode()
+
+
+def trials_csv(trials: SweepTrials) -> Iterator[bytes]:
+    """Yield trials.csv piece by piece."""
+    for start in range(0, len(trials), _ROWS_AT_ONCE):
+        yield csv_bytes(trials.trial_table(slice(start, start + _ROWS_AT_ONCE)), header=start == 0)
+
+
+def json_rows(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows for JSON: None for what is not finite."""
+    return [{k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()} for row in rows]
+
+
+def condition_axes(conditions: Sequence[Condition]) -> tuple[str, ...]:
+    """Return the fields that differ between conditions."""
+    return tuple(field.name for field in fields(Condition) if len({getattr(one, field.name) for one in conditions}) > 1)
+
+
+def _flat(name: str, value: Estimate) -> dict[str, float]:
+    return {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
+
+
+def _root(variance: NDArray[np.float64]) -> NDArray[np.float64]:
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(variance)
+
+
+def _observability(covariance: NDArray[np.float64], at: NDArray[np.int64]) -> tuple[float, dict[str, float]]:
+    if not np.isfinite(covariance).all():
+        return math.nan, {}
+    unit = _UNIT[at]
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    if values[0] <= 0:
+        return math.inf, {}
+    weak = vectors[:, -1] * math.sqrt(values[-1]) * unit
+    weak = weak * np.sign(weak[np.argmax(np.abs(weak / unit))])  # one sign for one direction
+    return float(values[-1] / values[0]), {VIEW[i]: float(v) for i, v in zip(at, weak, strict=True)}
