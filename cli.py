@@ -324,7 +324,7 @@ def _sensor_characterise(
     from phasemark.data import summary_sentences, write_characterisation
     from phasemark.data.pages.characterisation import NAMES
     from phasemark.data.seeds import stream
-    from phasemark.render.bench import data_sheet as characterise
+    from phasemark.render import characterise
 
     sensor = _load_sensor(name_or_file)
     with _output_folder(out, "sensor characterise", NAMES, force), _Progress("measuring"):

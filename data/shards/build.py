@@ -52,9 +52,7 @@ class Job(Protocol):
     """What a file is made of: slabs of items, each item with the same few fields."""
 
     def spec(self) -> dict[str, Any]:
-        """Return what another process makes the same job from, in plain data
-        (:func:`phasemark.data.partial_outputs.job_of`).
-        """
+        """Return plain data that :func:`phasemark.data.partial_outputs.job_of` makes the same job from elsewhere."""
 
     @property
     def items(self) -> Sequence[int]:
