@@ -1125,7 +1125,7 @@ def _build(
     from phasemark.data import build_part, estimate, parse_part, planned_size
     from phasemark.data.shards.executor import processors
     from phasemark.data.shards.run import outputs_of, refuse_unwritable_output
-    from phasemark.data.size import format_size, parse_size, too_many
+    from phasemark.data.size import format_size, parse_size, refuse_too_many, too_many
 
     limit = parse_size(max_size, "--max-size")
     part, parts = (1, 1) if shard is None else parse_part(shard)
@@ -1155,6 +1155,7 @@ def _build(
             f" --max-size {format_size(size * 11 // 10).replace(' ', '')}"
         )
     if size >= _NOTED_BYTES:
+        refuse_too_many(plan)
         refuse_unwritable_output(out, force=force, resume=resume)
         threads = workers or processors()
         seconds = estimate(plan, workers=threads, trial_seconds=_TRIAL_SECONDS)["seconds"] / parts

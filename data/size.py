@@ -77,6 +77,26 @@ def too_many(counts: Mapping[str, int]) -> str | None:
     return None
 
 
+def refuse_too_many(plan: BankPlan | FramePlan) -> None:
+    """Refuse a plan whose bank or frame set cannot be one file.
+
+    Parameters
+    ----------
+    plan : BankPlan or FramePlan
+
+    Raises
+    ------
+    UsageError
+        It has too many images, views or frames; and whatever :func:`planned_size` raises.
+    """
+    many = too_many(planned_size(plan))
+    if many is None:
+        return
+    if isinstance(plan, BankPlan):
+        raise UsageError(f"{many}: thin 'distance_m' or 'delta_deg', or make several of it")
+    raise UsageError(f"{many}: take fewer, or make several sets with seeds of their own")
+
+
 def _bank_size(plan: BankPlan, sensor: Sensor) -> dict[str, int]:
     counts = {
         "landmark_class": len(plan.landmarks) + len(plan.meshes),

@@ -22,12 +22,14 @@ from pathlib import Path
 import numpy as np
 
 from phasemark import PhasemarkError
-from phasemark.data import BankPlan, FramePlan, open_bank, open_frames, read_frames, read_plan
+from phasemark.data import BankPlan, FramePlan, open_bank, open_frames, read_frames
 from phasemark.data.shards.build import _Manifest
 from phasemark.inputs import checksum_path, read_checksum
 from phasemark.landmarks import build_mesh, catalog, export_mesh, read_mesh
 from phasemark.matcher import load_map
 from phasemark.matcher.calibrate.known_poses import read_poses
+from phasemark.matcher.plan_kinds import KINDS as PLANS
+from phasemark.matcher.plan_kinds import check_plan, plan_example
 from phasemark.render import Sensor, preset
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -39,6 +41,7 @@ _TRACED = (
     "/landmarks/",
     "/inputs/",
     "/render/sensor.py",
+    "/matcher/plan_kinds.py",
     "/matcher/landmark_map.py",
     "/matcher/calibrate_poses",
 )
@@ -68,13 +71,8 @@ def mesh(path):
     read_mesh(path, unit="m")
 
 
-def toml(path):
-    for read in (lambda: read_plan(path, BankPlan), lambda: read_plan(path, FramePlan), lambda: load_map(path)):
-        try:
-            read()
-        except PhasemarkError:
-            pass
-    Sensor.from_toml(path)
+def plan(kind):
+    return lambda path: check_plan(path, kind)
 
 
 def whole_bank(path):
@@ -99,7 +97,9 @@ def checksum(path):
 
 KINDS = {
     "npy": (".npy", frames), "npz": (".npz", stated_frames), "png": (".png", stated_frames), "csv": (".csv", frames),
-    "toml": (".toml", toml), "poses": (".csv", read_poses), "manifest": (".manifest", _Manifest.read),
+    **{f"{kind}-plan": (".toml", plan(kind)) for kind in PLANS},
+    "sensor": (".toml", Sensor.from_toml), "map": (".toml", load_map),
+    "poses": (".csv", read_poses), "manifest": (".manifest", _Manifest.read),
     "checksum": (".sha256", checksum), "stl": (".stl", mesh), "ply": (".ply", mesh), "obj": (".obj", mesh),
     "off": (".off", mesh), "bag": ("", stated_frames), "h5": (".h5", stated_frames), "bank": (".h5", whole_bank),
     "frames": (".h5", whole_frames),
@@ -152,19 +152,19 @@ def _good_csv(folder):
     return ["\n".join(rows).encode(), "\n".join([",".join(named), line, line]).encode()]
 
 
-def _good_toml(folder):
-    from phasemark.render.sensor.sensor_file import sensor_toml
-
-    plans = [Path(__file__).parent.parent / "data" / "plans" / f"{name}.toml" for name in ("bank", "frames")]
-    a_map = b'[[landmark]]\nname = "door"\nclass = "cone"\nx_m = 2.0\ny_m = 1.0\nyaw_deg = 30.0\n'
-    camera = sensor_toml(preset("vl53l5cx"), {}, header=["a"], otherwise="b") if "vl53l5cx" in _presets() else ""
-    return [*(path.read_bytes() for path in plans if path.exists()), a_map, camera.encode() or b"rows = 4\n"]
+def _good_plan(kind):
+    return lambda folder: [plan_example(kind).encode()]
 
 
-def _presets():
-    from phasemark.render import preset_names
+def _good_sensor(folder):
+    fields = [preset(name).model_dump() for name in ("vl53l5cx-8x8", "pmd-16x16-wiggle")]
+    stated = [{name: value for name, value in one.items() if value not in (None, [], ())} for one in fields]
+    return ["".join(f"{name} = {json.dumps(value)}\n" for name, value in one.items()).encode() for one in stated]
 
-    return preset_names()
+
+def _good_map(folder):
+    one = b'[[landmark]]\nname = "door"\nclass = "cone"\nx_m = 2.0\ny_m = 1.0\nyaw_deg = 30.0\n'
+    return [one, one + b"xy_std_m = 0.01\nyaw_std_deg = 1\n" + one.replace(b"door", b"gate")]
 
 
 def _good_poses(folder):
@@ -227,7 +227,10 @@ def _packed(path):
 
 
 GOOD = {
-    "npy": _good_npy, "npz": _good_npz, "png": _good_png, "csv": _good_csv, "toml": _good_toml, "poses": _good_poses,
+    "npy": _good_npy, "npz": _good_npz, "png": _good_png, "csv": _good_csv,
+    **{f"{kind}-plan": _good_plan(kind) for kind in PLANS},
+    "sensor": _good_sensor, "map": _good_map,
+    "poses": _good_poses,
     "manifest": _good_manifest, "checksum": _good_checksum,
     **{kind: _good_mesh(kind) for kind in ("stl", "ply", "obj", "off")},
     "bag": _good_bag, "h5": _good_h5, "bank": _good_bank, "frames": _good_frames,

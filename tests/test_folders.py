@@ -163,6 +163,31 @@ def test_a_hidden_folder_of_somebody_else_under_our_temporary_name_stays(tmp_pat
     assert names(tmp_path) == [".out.partial", ".out.partial/photo.jpg"]
 
 
+def test_a_command_that_fails_before_it_writes_leaves_no_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    too_many = str(10**17)
+    assert main(["sensor", "characterise", "ideal", "--frames", too_many, "-o", "new/out"]) == 2
+    assert names(tmp_path) == []
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "notes.txt").write_text("mine")
+
+    def fail(folder, *written):
+        with adding_to_folder(tmp_path / folder, "test") as ours:
+            ours.claim("a", "b")
+            for name in written:
+                (tmp_path / folder / name).write_text("x")
+            raise ZeroDivisionError
+
+    for folder in ("old", "old/sub/out"):
+        with pytest.raises(ZeroDivisionError):
+            fail(folder)
+    assert names(tmp_path) == ["old", "old/notes.txt"]
+    with pytest.raises(ZeroDivisionError):
+        fail("new", "a")
+    assert read_marker(tmp_path / "new") == (True, {"a", "b"})
+    assert (tmp_path / "new" / "a").exists()
+
+
 def test_files_of_a_shared_folder_are_claimed_and_cleared_alone(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with adding_to_folder(tmp_path, "test") as ours:

@@ -1,6 +1,7 @@
 """Files from strangers: nothing outside is opened, nothing runs away, and each ends in an answer or one line."""
 
 import os
+import shutil
 import subprocess
 import sys
 import zlib
@@ -11,8 +12,10 @@ import pytest
 from mutants import COMMANDS, check_mutants
 
 from phasemark import InputFileError
+from phasemark.cli import main
 from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_bank, open_frames, read_frames
 from phasemark.data.files.guard import first_reading, refusal
+from phasemark.inputs import checksum_path
 from phasemark.render import preset
 
 SENSOR = preset("pmd-16x16")
@@ -175,3 +178,71 @@ def test_two_thousand_mutated_files_of_ours_and_of_others_end_with_an_answer_or_
     runs, refused, longest = check_mutants(tmp_path, n, 2)
     assert runs >= 2 * sum(n.values()) - n["part"]  # which has a single command
     print(f"{sum(n.values())} files, {runs} runs, {refused} refused, the longest {longest:.1f} s of processor time")
+
+
+SMALL_SWEEP = """name = "small"
+trials = 2
+classes = ["cone"]
+[axes]
+distance_m = [1.0]
+delta_deg = [45.0]
+[[methods]]
+name = "nearest"
+method = "nearest"
+bank_step = [0.1, 15.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def sweep_folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("sweep")
+    (place / "plan.toml").write_text(SMALL_SWEEP, encoding="utf-8")
+    assert main(["sweep", "run", str(place / "plan.toml"), "-o", str(place / "out"), "--workers", "1"]) == 0
+    return place / "out"
+
+
+@pytest.mark.parametrize("command", ["sensor fit", "sweep compare", "sweep report"])
+def test_fits_and_sweeps_read_hdf5_through_the_guard(command, sweep_folder, tmp_path, canary, capsys, recwarn):
+    folder = tmp_path / "sweep"
+    shutil.copytree(sweep_folder, folder)
+    (trials,) = folder.glob("*.h5")
+    arguments = {
+        "sensor fit": [trials, "--distance", "1", "--unit", "m", "--quantity", "range", "-o", tmp_path / "a.toml"],
+        "sweep compare": [sweep_folder, folder],
+        "sweep report": [folder],
+    }[command]
+    checksum_path(trials).unlink(missing_ok=True)
+    for trick in (external_link, virtual_dataset, declares_8_terabytes):
+        trials.unlink()
+        write(trick, trials, canary)
+        before = trials.read_bytes()
+        capsys.readouterr()
+        assert main([*command.split(), *map(str, arguments)]) == 3
+        (line,) = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("note: ")]
+        assert line.startswith(f"error: {trials}: ")
+        assert TRICKS[trick] in line
+        assert trials.read_bytes() == before
+
+
+def test_a_first_reading_by_a_child_precedes_fits_and_sweeps(sweep_folder, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "sweep"
+    shutil.copytree(sweep_folder, folder)
+    (trials,) = folder.glob("*.h5")
+    checksum_path(trials).unlink(missing_ok=True)
+    monkeypatch.setattr("phasemark.data.files.hdf5_reading.first_reading", lambda path: f"looked at {path.name}")
+    fit = ["sensor", "fit", trials, "--distance", "1", "--unit", "m", "--quantity", "range", "-o", tmp_path / "a.toml"]
+    for command in (fit, ["sweep", "compare", sweep_folder, folder], ["sweep", "report", folder]):
+        assert main(list(map(str, command))) == 3
+        assert f"looked at {trials.name}" in capsys.readouterr().err
+
+
+def test_trials_that_their_checksum_contradicts_are_refused(sweep_folder, tmp_path, capsys):
+    folder = tmp_path / "sweep"
+    shutil.copytree(sweep_folder, folder)
+    (trials,) = folder.glob("*.h5")
+    content = bytearray(trials.read_bytes())
+    content[-1] ^= 1
+    trials.write_bytes(content)
+    for command in (["sweep", "compare", str(sweep_folder), str(folder)], ["sweep", "report", str(folder)]):
+        assert main(command) == 3
+        assert f"{trials}: damaged" in capsys.readouterr().err

@@ -73,9 +73,33 @@ def test_a_plan_with_a_value_that_cannot_be_is_one_line(answer, text, code, word
     assert word in line
 
 
-def test_a_mesh_whose_path_holds_nul_is_one_line(answer):
-    Path("plan.toml").write_text('[[meshes]]\nname = "a"\npath = "a\\u0000.stl"\nunit = "m"\n', encoding="utf-8")
-    assert answer("bank", "build", "plan.toml", "-o", "b.h5")[0] == 3
+@pytest.mark.parametrize("symmetry", ["", "symmetry = 1\n"])
+@pytest.mark.parametrize("kind", ["bank", "frames", "sweep"])
+def test_a_mesh_whose_path_holds_nul_is_refused_in_one_line(answer, kind, symmetry):
+    Path("plan.toml").write_text(f'[[meshes]]\nname = "a"\npath = "a\\u0000.stl"\n{symmetry}', encoding="utf-8")
+    run = {"sweep": ("sweep", "run", "plan.toml", "-o", "out")}
+    for command in (
+        ("plan", "check", "--kind", kind, "plan.toml"),
+        run.get(kind, (kind, "build", "plan.toml", "-o", "out.h5")),
+    ):
+        code, line = answer(*command)
+        assert code == 2
+        said = "'path' must be the name of a file, which holds no NUL, got 'a\\x00.stl'"
+        assert line == f"error: plan.toml: meshes.0: {said}"
+    assert [str(path) for path in Path().iterdir()] == ["plan.toml"]
+
+
+def test_a_build_beyond_the_limits_is_refused_before_its_size_is_noted(answer, monkeypatch):
+    monkeypatch.setattr("phasemark.data.estimate", lambda *_, **__: pytest.fail("timed what cannot be built"))
+    Path("many.toml").write_text('views = 6000000\nclasses = ["cone"]\n', encoding="utf-8")
+    grid = ("--class", "cone", "--distance", "1:10:0.001", "--delta", "0:89.99:0.01")
+    for command, what in (
+        (("frames", "build", "many.toml", "-o", "f.h5"), "a frame set can have at most 5000000 views"),
+        (("bank", "build", *grid, "--full", "-o", "b.h5"), "a bank can have at most 20000000 images"),
+    ):
+        code, line = answer(*command, "--max-size", "999999999TB")
+        assert code == 2
+        assert line.startswith(f"error: {what}")
 
 
 @pytest.mark.parametrize("make", [

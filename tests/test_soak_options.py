@@ -3,17 +3,21 @@
 Commands and options are taken from the program itself, so that a new one is covered without a change here.
 """
 
+import math
 import os
 import resource
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 
 from phasemark.cli import app
 from phasemark.landmarks import build_mesh, catalog, export_mesh
+from phasemark.render import Renderer, Views, capture, preset
 
 pytestmark = pytest.mark.soak
 PHASEMARK = str(Path(sys.executable).with_name("phasemark"))
@@ -36,22 +40,68 @@ ODD = (
     "caf\udce9",
     "/dev/null",
 )
+VALUES = 2
+"""Odd values that each option is tried with, some 460 runs: all of them on every option would take an hour."""
 SMALL = {
     "bank build": ("--class", "cone", "--distance", "1", "--delta", "0", "-o", "out.h5"),
+    "bank info": ("bank.h5",),
+    "bank merge": ("bank1.h5", "bank2.h5", "-o", "out.h5"),
+    "bank verify": ("bank.h5", "--sample", "1"),
+    "calibrate": ("cone", "poses.npz", "--poses", "poses.csv", "-o", "out.toml"),
+    "demo": ("-o", "out"),
+    "drive": ("drive.toml", "-o", "out"),
     "frames build": ("plan.toml", "-o", "out.h5"),
+    "frames export": ("frames.h5", "--to", "npz", "-o", "out.npz"),
+    "frames import": ("board.csv", "-o", "out.npz", "--unit", "m", "--quantity", "range"),
+    "frames info": ("frames.h5",),
+    "frames merge": ("frames1.h5", "frames2.h5", "-o", "out.h5"),
+    "frames show": ("frames.h5", "-o", "out.png"),
     "frames simulate": ("--class", "cone", "--frames", "1", "-o", "out.csv"),
+    "frames verify": ("frames.h5", "--sample", "1"),
     "landmark check": ("mesh.stl", "--unit", "m"),
+    "landmark design": ("design.toml", "-o", "out"),
     "landmark export": ("cone", "-o", "out.stl"),
     "landmark list": (),
     "landmark show": ("cone", "-o", "out"),
+    "match": ("bank.h5", "frames.h5", "--no-diagnosis"),
     "plan check": ("plan.toml",),
-    "plan example": ("bank",),
-    "plan schema": ("bank",),
     "render": ("--class", "cone", "-o", "out.png"),
+    "sensor characterise": ("ideal", "--frames", "2", "-o", "out"),
+    "sensor fit": ("board.csv", "--distance", "1", "--unit", "m", "--quantity", "range", "-o", "out.toml"),
     "sensor list": (),
     "sensor show": ("ideal",),
+    "sweep compare": ("sweep", "sweep"),
+    "sweep frames": ("sweep", "0", "0", "-o", "out.npz"),
+    "sweep report": ("sweep",),
+    "sweep run": ("sweep.toml", "-o", "out"),
 }
-"""Arguments with which a command does little; others get the option alone, and mostly say what is missing."""
+"""Arguments with which a command does little."""
+LONG = {"demo": 60, "landmark design": 40, "drive": 30, "sweep run": 30, "sweep report": 30, "calibrate": 30}
+"""Seconds of commands that cannot do little, while another test runs beside them."""
+PLAN = 'views = 1\nclasses = ["cone"]\n'
+DESIGN = "n_classes = 2\n[sampling]\ndistances = 2\ndelta_step_deg = 15\n[search]\nboxes = 4\nuppers = 8\nstep_mm = 3\n"
+DRIVE = """[map]
+room_m = [[0, 0], [4, 0], [4, 3], [0, 3]]
+[[map.landmark]]
+name = "a"
+class = "cone"
+x_m = 2
+y_m = 2
+yaw_deg = 30
+[path]
+waypoints_m = [[1, 1], [1.5, 1]]
+"""
+SWEEP = """name = "small"
+trials = 2
+classes = ["cone"]
+[axes]
+distance_m = [1.0]
+delta_deg = [45.0]
+[[methods]]
+name = "nearest"
+method = "nearest"
+bank_step = [0.1, 15.0]
+"""
 
 
 def commands(group, path=()):
@@ -70,44 +120,97 @@ CASES = [
 ]
 
 
+def odd_values(case):
+    """Return those values of a case that its option is tried with; over all cases each value has its turn."""
+    return [ODD[(case * VALUES + k) % len(ODD)] for k in range(VALUES)]
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """A folder of small inputs of every command, made by commands, which fill Numba's cache as well."""
+    folder = tmp_path_factory.mktemp("inputs")
+    for name, text in (("plan", PLAN), ("design", DESIGN), ("drive", DRIVE), ("sweep", SWEEP)):
+        (folder / f"{name}.toml").write_text(text, encoding="utf-8")
+    (folder / "mesh.stl").write_bytes(export_mesh(build_mesh(catalog()["cone"]), "stl"))
+    rng = np.random.default_rng(0)
+    np.savetxt(folder / "board.csv", 1 + 0.01 * rng.standard_normal((10, 256)), delimiter=",", fmt="%.4f")
+    poses = [(0.8 + 0.1 * k, 45.0 * k) for k in range(8)]
+    rows = [f"{distance_m:.1f},{delta_deg:g},5" for distance_m, delta_deg in poses]
+    (folder / "poses.csv").write_text("\n".join(["distance_m,delta_deg,frames", *rows]), encoding="utf-8")
+    sensor = preset("pmd-16x16")
+    views = Views.broadcast([d for d, _ in poses], [math.radians(delta) for _, delta in poses])
+    image = Renderer(build_mesh(catalog()["cone"]), sensor).render_views(views)
+    taken = capture(image, sensor, rng=rng, n_frames=5)
+    shape = (-1, sensor.rows, sensor.cols)
+    arrays = {"range": taken.range_m, "amplitude": taken.amplitude_e, "intensity": taken.intensity_e}
+    arrays = {name: values.reshape(shape) for name, values in arrays.items()}
+    np.savez(folder / "poses.npz", unit="m", quantity="range", **arrays)
+    grid = "--class cone --distance 1 --delta 0:80:10"
+    for command in (
+        f"bank build {grid} -o bank.h5",
+        f"bank build {grid} --shard 1/2 -o bank1.h5",
+        f"bank build {grid} --shard 2/2 -o bank2.h5",
+        "frames build plan.toml -o frames.h5",
+        "frames build plan.toml --views 2 --shard 1/2 -o frames1.h5",
+        "frames build plan.toml --views 2 --shard 2/2 -o frames2.h5",
+        "sweep run sweep.toml -o sweep",
+    ):
+        subprocess.run([PHASEMARK, *command.split()], cwd=folder, check=True, capture_output=True)
+    return folder
+
+
 def limited():
     resource.setrlimit(resource.RLIMIT_DATA, (BYTES, BYTES))
 
 
-def outcome(arguments, folder):
-    """Run one command; return what is wrong with how it ended, or None."""
-    before = set(os.listdir(folder))
+def files(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def outcome(arguments, place, seconds):
+    """Run one command in the inmost folder of a place; return what is wrong with how it ended, or None."""
+    before = files(place)
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     try:
         done = subprocess.run(
-            [PHASEMARK, *arguments], cwd=folder, env=environment, preexec_fn=limited, timeout=SECONDS,
+            [PHASEMARK, *arguments], cwd=place / "in" / "here", env=environment, preexec_fn=limited, timeout=seconds,
             stdin=subprocess.DEVNULL, capture_output=True,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        return f"took more than {SECONDS} s"
+        return f"took more than {seconds} s"
     lines = [line for line in done.stderr.decode("utf-8", "replace").splitlines() if not line.startswith("note: ")]
     if done.returncode not in CODES:
         return f"exit code {done.returncode}: {lines[-1:]}"
     if done.returncode and (len(lines) != 1 or not lines[0].startswith("error: ")):
         return f"{len(lines)} lines of error: {lines[-1:]}"
-    left = set(os.listdir(folder)) - before
+    left = files(place) - before
     if done.returncode and left:
         return f"left {sorted(left)} behind"
     return None
 
 
-@pytest.mark.parametrize(
-    ("path", "option", "count"), CASES, ids=[f"{' '.join(path)} {name}" for path, name, _ in CASES]
-)
-def test_an_odd_value_is_answered_or_refused_in_one_line(path, option, count, tmp_path):
-    wrong = {}
-    for k, value in enumerate(ODD if count else ("",)):
-        folder = tmp_path / str(k)
-        folder.mkdir()
-        (folder / "plan.toml").write_text('views = 1\nclasses = ["cone"]\n', encoding="utf-8")
-        (folder / "mesh.stl").write_bytes(export_mesh(build_mesh(catalog()["cone"]), "stl"))
+def test_every_command_with_an_option_is_given_its_arguments(inputs):
+    assert {" ".join(path) for path, _, _ in CASES} <= set(SMALL)
+    for words in ("bank info", "frames info", "match", "sweep compare", "sweep frames", "sensor fit", "calibrate"):
+        place = inputs / "place" / words
+        shutil.copytree(inputs, place / "in" / "here", ignore=shutil.ignore_patterns("place"))
+        command = [PHASEMARK, *words.split(), *SMALL[words]]
+        done = subprocess.run(command, cwd=place / "in" / "here", capture_output=True, text=True, check=False)
+        assert done.returncode == 0 or words in ("sensor fit", "calibrate"), (words, done.stderr)
+        print(words, done.returncode, done.stderr[-300:])
+    assert {value for case in range(len(CASES)) for value in odd_values(case)} == set(ODD)
+
+
+@pytest.mark.parametrize("case", range(len(CASES)), ids=[f"{' '.join(path)} {name}" for path, name, _ in CASES])
+def test_an_odd_value_is_answered_or_refused_in_one_line(case, inputs, tmp_path):
+    path, option, count = CASES[case]
+    words, wrong = " ".join(path), {}
+    for k, value in enumerate(odd_values(case) if count else ("",)):
+        place = tmp_path / str(k)  # two folders deeper the command runs, for values that lead out of its folder
+        shutil.copytree(inputs, place / "in" / "here", ignore=shutil.ignore_patterns("place"))
         given = [f"{option}={value}"] if count == 1 else [option, *[value] * count]
-        found = outcome([*path, *SMALL.get(" ".join(path), ()), *given], folder)
+        found = outcome([*path, *SMALL[words], *given], place, LONG.get(words, SECONDS))
+        shutil.rmtree(place)
         if found is not None:
             wrong[value[:20]] = found
     assert not wrong

@@ -38,7 +38,7 @@ from phasemark.data.plans.bank_plan import BankPlan, MeshPlan, factored_refusal
 from phasemark.data.progress import Progress
 from phasemark.data.shards.build import Place
 from phasemark.data.shards.run import produce, refuse_unwritable_output
-from phasemark.data.size import planned_size, too_many
+from phasemark.data.size import refuse_too_many
 from phasemark.landmarks import (
     LandmarkSpec,
     MeshWarning,
@@ -303,9 +303,7 @@ def _slabs(plan: BankPlan, sensor: Sensor, landmarks: list[Landmark]) -> Iterato
 
 
 def _refuse_impossible(plan: BankPlan) -> None:
-    many = too_many(planned_size(plan))
-    if many is not None:
-        raise UsageError(f"{many}: thin 'distance_m' or 'delta_deg', or make several of it")
+    refuse_too_many(plan)
     reason = factored_refusal(plan) if plan.layout == "factored" else None
     if reason is not None:
         raise UsageError(f"no factored bank: {reason}; build a full one (--full, layout = 'full')")

@@ -11,7 +11,8 @@ import json
 import os
 import stat
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import takewhile
 from pathlib import Path
 
 from phasemark import OutputExistsError, StorageError, UsageError
@@ -157,6 +158,8 @@ class OwnedFiles:
 def adding_to_folder(folder: Path, content: str, adopted: Iterable[str] = ()) -> Iterator[OwnedFiles]:
     """Hold a folder against other runs while the block adds files to it.
 
+    A block that fails before it has added one leaves nothing: no marker, and no folder that was made for it.
+
     Parameters
     ----------
     folder : Path
@@ -175,16 +178,30 @@ def adding_to_folder(folder: Path, content: str, adopted: Iterable[str] = ()) ->
     StorageError
         It cannot be written.
     """
+    made = list(takewhile(lambda path: not os.path.lexists(path), (folder, *folder.parents)))
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise UsageError(f"{folder}: is not a folder, or lies in a file") from None
     except OSError as error:
         raise StorageError(f"{folder}: cannot be made ({error.strerror or error})") from error
-    with storage_errors(folder), exclusive(folder / LOCK, folder):
-        for name in filter(is_marker_part, os.listdir(folder)):  # of a run that was killed
-            (folder / name).unlink(missing_ok=True)
-        yield OwnedFiles(folder, content, set(adopted))
+    try:
+        with storage_errors(folder), exclusive(folder / LOCK, folder):
+            for name in filter(is_marker_part, os.listdir(folder)):  # of a run that was killed
+                (folder / name).unlink(missing_ok=True)
+            marked = os.path.lexists(folder / MARKER)
+            ours = OwnedFiles(folder, content, set(adopted))
+            try:
+                yield ours
+            except BaseException:
+                if not marked and not any(os.path.lexists(folder / name) for name in ours.names):
+                    (folder / MARKER).unlink(missing_ok=True)
+                raise
+    except BaseException:
+        with suppress(OSError):  # one that holds something stays, and so do those it lies in
+            for path in made:
+                path.rmdir()
+        raise
 
 
 def _fail(error: OSError) -> None:

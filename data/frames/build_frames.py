@@ -32,7 +32,7 @@ from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
 from phasemark.data.shards.run import produce, refuse_unwritable_output
-from phasemark.data.size import frame_set_fields, planned_size, too_many
+from phasemark.data.size import frame_set_fields, refuse_too_many
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture
 
 _KEYS = ("class_index", "albedo", "wall_m", "floor_m")
@@ -114,9 +114,7 @@ class FrameJob:
 
     def __init__(self, plan: FramePlan, stored_mesh: StoredMesh | None = None) -> None:
         self.plan = plan.resolve()
-        many = too_many(planned_size(self.plan))
-        if many is not None:
-            raise UsageError(f"{many}: take fewer, or make several sets with seeds of their own")
+        refuse_too_many(self.plan)
         self.sensor = self.plan.build_sensor()
         self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
         self._renderers = [Renderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks]

@@ -84,6 +84,12 @@ _Grid = Annotated[
 ]
 
 
+def _without_nul(path: str, info: ValidationInfo) -> str:
+    if "\0" in path:
+        raise UsageError(f"'{info.field_name}' must be the name of a file, which holds no NUL, got {path!r}")
+    return path
+
+
 class PlanModel(BaseModel):
     """A frozen table of a plan; what is wrong with it is a UsageError of one line."""
 
@@ -125,7 +131,7 @@ class MeshPlan(PlanModel):
     """
 
     name: _Name
-    path: str
+    path: Annotated[str, AfterValidator(_without_nul)]
     unit: Literal["m", "cm", "mm", "inch"] | None = None
     up: Literal["z", "-z", "y", "-y", "x", "-x"] = "z"
     origin: Literal["file", "base", "center"] = "file"
