@@ -12,7 +12,8 @@ import warnings
 
 from distributed import LocalCluster
 
-from phasemark.data import FramePlan, build_frames, remote
+from phasemark.data import FramePlan, build_frames
+from phasemark.data.shards import remote
 
 
 def worker(address):

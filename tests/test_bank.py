@@ -15,7 +15,7 @@ import trimesh
 import xarray
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
-from phasemark.data import BankPlan, build, build_bank, mesh_sha256, open_bank, verify_checksum, versions
+from phasemark.data import BankPlan, build_bank, mesh_sha256, open_bank, verify_checksum, versions
 from phasemark.data.files.hdf5_layout import Layout, SparseMemory
 from phasemark.inputs import checksum_path
 from phasemark.landmarks import build_mesh, catalog
@@ -60,7 +60,7 @@ def paint(distance_m, delta_rad, row, col, mark):
 
 @pytest.fixture
 def painted(monkeypatch):
-    monkeypatch.setattr(build, "Renderer", Painter)
+    monkeypatch.setattr("phasemark.data.bank.build_bank.Renderer", Painter)
 
 
 @pytest.fixture
@@ -300,10 +300,10 @@ def test_progress_counts_images(painted, tmp_path):
 
 def test_an_existing_bank_needs_force_and_is_asked_about_before_rendering(bank_file, monkeypatch):
     before = bank_file.read_bytes()
-    monkeypatch.setattr(build, "Renderer", None)
+    monkeypatch.setattr("phasemark.data.bank.build_bank.Renderer", None)
     with pytest.raises(OutputExistsError, match="--force"):
         build_bank(PLAN, bank_file)
-    monkeypatch.setattr(build, "Renderer", Painter)
+    monkeypatch.setattr("phasemark.data.bank.build_bank.Renderer", Painter)
     build_bank(FULL, bank_file, force=True).close()
     assert bank_file.read_bytes() != before
     verify_checksum(bank_file)

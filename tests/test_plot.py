@@ -58,7 +58,7 @@ def test_a_surface_half_way_is_blue_too_and_every_caption_says_so():
     root = Path(__file__).resolve().parent.parent
     readme = " ".join((root / "README.md").read_text(encoding="utf-8").split())
     assert RANGE_COLOURS in readme
-    for page in (root / "README.md", *root.glob("docs/*.md"), *root.glob("matcher/*.j2")):
+    for page in (root / "README.md", *root.glob("docs/*.md"), *root.glob("*/**/*.j2")):
         text = " ".join(page.read_text(encoding="utf-8").replace(RANGE_COLOURS, "").split())
         assert "blue is a pixel" not in text, page.name
         assert "lies blue" not in text, page.name

@@ -112,7 +112,7 @@ def test_every_term_is_neutral_by_default():
 
 @pytest.mark.parametrize("name", [name for name in preset_names() if name != "ideal"])
 def test_every_number_of_a_preset_says_where_it_comes_from(name):
-    text = resources.files("phasemark.render").joinpath(f"{name}.toml").read_text(encoding="utf-8")
+    text = resources.files("phasemark.render.sensor").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if line and not line.startswith("#")]
     assert len(lines) == len(tomllib.loads(text))
     for line in lines:

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
-from phasemark.data import read_checksum, renames, verify_checksum, write_atomically, write_checksum
+from phasemark.data import read_checksum, verify_checksum, write_atomically, write_checksum
+from phasemark.data.files import renames
 
 HERE = Path(__file__).parent
 
