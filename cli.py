@@ -1123,9 +1123,9 @@ def _build(
 ) -> None:
     """Build a bank or frame set, whole or in part; or say what that would take."""
     from phasemark.data import build_part, estimate, parse_part, planned_size
+    from phasemark.data.plans.size import format_size, parse_size, refuse_too_many, too_many
     from phasemark.data.shards.executor import processors
     from phasemark.data.shards.run import outputs_of, refuse_unwritable_output
-    from phasemark.data.size import format_size, parse_size, refuse_too_many, too_many
 
     limit = parse_size(max_size, "--max-size")
     part, parts = (1, 1) if shard is None else parse_part(shard)
@@ -1778,8 +1778,8 @@ def _demo(
 ) -> None:
     """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°."""
     from phasemark.data.shards.run import outputs_of
-    from phasemark.matcher.demo.report import summary_rows
-    from phasemark.matcher.demo.run import cell_rows, run_demo, write_demo
+    from phasemark.matcher.demo.report import summary_rows, write_demo
+    from phasemark.matcher.demo.run import cell_rows, run_demo
 
     bank = out / "bank.h5"
     _refuse_existing([bank], force)

@@ -14,7 +14,7 @@ from phasemark.data.partial_outputs import build_part, estimate, merge_parts, pa
 from phasemark.data.plans.bank_plan import BankPlan, MeshPlan, load_plan, read_plan
 from phasemark.data.plans.frame_plan import Distribution, FramePlan
 from phasemark.data.plans.grid_axis import format_grid, parse_grid
-from phasemark.data.size import planned_size
+from phasemark.data.plans.size import planned_size
 from phasemark.data.verify import verify_bank, verify_frames
 from phasemark.inputs import read_checksum, unverified, verify_checksum
 

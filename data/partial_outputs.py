@@ -24,10 +24,10 @@ from phasemark.data.frames.build_frames import FrameJob
 from phasemark.data.plans.bank_plan import BankPlan
 from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.data.plans.grid_axis import as_count
+from phasemark.data.plans.size import planned_size
 from phasemark.data.progress import Progress
 from phasemark.data.shards.build import Job, Place, difference, make_shard, pieces
 from phasemark.data.shards.run import produce, refuse_unwritable_output
-from phasemark.data.size import planned_size
 from phasemark.inputs import verify_checksum
 
 FORMAT = "phasemark-part"
@@ -101,6 +101,11 @@ class PartJob:
         if self.start == self.stop:
             raise UsageError(f"--shard {part}/{parts} would be empty: there are only {self._total} items to share")
         self._pieces = list(pieces(job.items, self.start, self.stop))
+
+    @property
+    def maker(self) -> str:
+        """What makes this job in another process."""
+        return "phasemark.data.partial_outputs:job_of"
 
     def spec(self) -> dict[str, Any]:
         """Return what another process makes the same job from."""
@@ -281,6 +286,11 @@ class MergeJob:
             raise OutputExistsError(
                 f"{first.path}: was built elsewhere with something else ({'; '.join(changes[:4])}): merge it there"
             )
+
+    @property
+    def maker(self) -> str:
+        """What makes this job in another process."""
+        return "phasemark.data.partial_outputs:job_of"
 
     def spec(self) -> dict[str, Any]:
         """Return what the parts were made from."""

@@ -33,7 +33,7 @@ from scipy.optimize import least_squares
 from phasemark import PhasemarkError
 from phasemark.data import BankPlan, MeshPlan, build_bank, read_frames
 from phasemark.matcher import Matcher, Matches, kalman_filter
-from phasemark.matcher.recordings.stamps import spread_stamps
+from phasemark.matcher.filters.stamps import spread_stamps
 from phasemark.render import Frames, Sensor, preset
 
 THICKNESS_M = 0.01

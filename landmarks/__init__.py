@@ -38,6 +38,15 @@ __all__ = [
 ]
 
 
+def _picture(spec: LandmarkSpec) -> bytes:
+    from phasemark.landmarks.figures import mesh_picture
+
+    return mesh_picture(build_mesh(spec))
+
+
+LandmarkSpec.picture = staticmethod(_picture)
+
+
 def __getattr__(name: str) -> object:
     """Import pictures when they are asked for: matplotlib takes half a second to load."""
     if name in ("mesh_html", "mesh_picture"):

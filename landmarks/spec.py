@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from collections.abc import Callable
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,6 +203,9 @@ class LandmarkSpec(_Spec):
     2
     """
 
+    picture: ClassVar[Callable[..., bytes]]
+    """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
+
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
     box: Box
     upper: Upper | None = None
@@ -226,7 +230,4 @@ class LandmarkSpec(_Spec):
 
     def _repr_png_(self) -> bytes:
         """Show the landmark in a notebook."""
-        from phasemark.landmarks.figures import mesh_picture
-        from phasemark.landmarks.mesh import build_mesh
-
-        return mesh_picture(build_mesh(self))
+        return type(self).picture(self)

@@ -1,5 +1,7 @@
 """What the robot concludes: filters, matching, and its own position."""
 
+from typing import TYPE_CHECKING
+
 from phasemark.matcher.accuracy.cramer_rao import (
     Bound,
     Estimate,
@@ -37,6 +39,9 @@ from phasemark.matcher.sweep.examples import sweep_frames
 from phasemark.matcher.sweep.plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, load_sweep
 from phasemark.matcher.sweep.result_tables import Cell, SweepTrials
 from phasemark.matcher.sweep.run import read_sweep, run_sweep
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = [
     "PRIOR_STD",
@@ -103,3 +108,12 @@ __all__ = [
     "share",
     "sweep_frames",
 ]
+
+
+def _figure_of_filtered(frames: FilteredFrames) -> "Figure":
+    from phasemark.matcher.figures import filtered_picture  # matplotlib takes half a second to load
+
+    return filtered_picture(frames)
+
+
+FilteredFrames.figure = staticmethod(_figure_of_filtered)

@@ -20,6 +20,8 @@ from phasemark.render.sensor.sensor import Sensor, preset, preset_names
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from phasemark.render.figures import PAPER_CMAP, range_picture, terminal_picture
 
 __all__ = [
@@ -63,6 +65,22 @@ __all__ = [
 ]
 
 _PICTURES = ("PAPER_CMAP", "range_picture", "terminal_picture")
+
+
+def _figure_of_frame(frames: Frames, index: int, frame: int) -> "Figure":
+    from phasemark.render.figures import plot_frame
+
+    return plot_frame(frames, index, frame)
+
+
+def _figure_of_image(images: PhasorImages, index: int) -> "Figure":
+    from phasemark.render.figures import plot_phasor_image
+
+    return plot_phasor_image(images, index)
+
+
+Frames.figure = staticmethod(_figure_of_frame)
+PhasorImages.figure = staticmethod(_figure_of_image)
 
 
 def __getattr__(name: str) -> object:

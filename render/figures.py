@@ -5,7 +5,6 @@ Figures are built without pyplot, so that nothing here needs a display or touche
 
 from __future__ import annotations
 
-import io
 import math
 from typing import TYPE_CHECKING
 
@@ -127,24 +126,6 @@ def draw_difference(axes: Axes, difference_m: NDArray[np.float64], *, span_mm: f
     image = _draw_pixels(axes, 1e3 * difference_m, cmap="RdBu", vmin=-span, vmax=span)
     _colour_bar(axes, image, "difference (mm)")
     return image
-
-
-def figure_png(figure: Figure, *, dpi: float = 90) -> bytes:
-    """Return a figure as a PNG.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-    dpi : float
-        Pixels an inch.
-
-    Returns
-    -------
-    bytes
-    """
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
-    return buffer.getvalue()
 
 
 def plot_phasor_image(images: PhasorImages, index: int = 0) -> Figure:

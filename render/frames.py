@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntFlag
-from typing import TYPE_CHECKING, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
+from phasemark.render.png import figure_png
 from phasemark.render.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
@@ -65,6 +67,9 @@ class Frames:
         The shapes do not agree with each other or with the sensor, a valid pixel's amplitude or intensity cannot be, or
         a time stamp is not finite.
     """
+
+    figure: ClassVar[Callable[..., Figure]]
+    """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
 
     def __init__(
         self,
@@ -190,12 +195,8 @@ class Frames:
 
     def plot(self, index: int = 0, frame: int = 0) -> Figure:
         """Draw range, amplitude and flags of one frame for a first look."""
-        from phasemark.render.figures import plot_frame
-
-        return plot_frame(self, index, frame)
+        return type(self).figure(self, index, frame)
 
     def _repr_png_(self) -> bytes | None:
         """Show the first frame in a notebook; nothing where there is none."""
-        from phasemark.render.figures import figure_png
-
         return figure_png(self.plot()) if self.range_m.size else None

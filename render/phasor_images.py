@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
+from phasemark.render.png import figure_png
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
@@ -97,6 +98,9 @@ class PhasorImages:
     harmonics : mapping of int to (n, rows, cols) complex128
         S_k for the orders k > 1 that were asked for.
     """
+
+    figure: ClassVar[Callable[..., Figure]]
+    """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
 
     phasor: NDArray[np.complex128]
     intensity: NDArray[np.float64]
@@ -188,12 +192,8 @@ class PhasorImages:
 
     def plot(self, index: int = 0) -> Figure:
         """Draw range, amplitude and coverage of one view for a first look."""
-        from phasemark.render.figures import plot_phasor_image
-
-        return plot_phasor_image(self, index)
+        return type(self).figure(self, index)
 
     def _repr_png_(self) -> bytes | None:
         """Show the first view in a notebook; nothing where there is none."""
-        from phasemark.render.figures import figure_png
-
         return figure_png(self.plot()) if len(self) else None

@@ -29,8 +29,8 @@ from phasemark.matcher.calibrate.mounting_fit import Fit
 from phasemark.matcher.calibrate.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel
 from phasemark.matcher.calibrate.pose_track import PoseTrack
 from phasemark.matcher.calibrate.report import calibration_toml
+from phasemark.matcher.filters.stamps import stamp_jitter
 from phasemark.matcher.likelihood.residuals import Evidence
-from phasemark.matcher.recordings.stamps import stamp_jitter
 from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, preset
 
 PMD = preset("pmd-16x16")

@@ -10,8 +10,8 @@ import pytest
 
 from phasemark import OutputExistsError, UsageError
 from phasemark.data.seeds import stream
-from phasemark.matcher.demo.report import summary_rows
-from phasemark.matcher.demo.run import LANDMARK_XY_M, cells_csv, run_demo, trials_csv, write_demo
+from phasemark.matcher.demo.report import summary_rows, write_demo
+from phasemark.matcher.demo.run import LANDMARK_XY_M, cells_csv, run_demo, trials_csv
 
 SMALL = {
     "classes": ("cone", "post"),

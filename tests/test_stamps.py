@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from phasemark.matcher.recordings.stamps import spread_stamps, stamp_jitter
+from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
 
 
 @pytest.mark.parametrize(

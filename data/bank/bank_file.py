@@ -6,7 +6,7 @@ import os
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -25,30 +25,15 @@ from phasemark.data.files.hdf5_reading import (
     whole_numbers,
 )
 from phasemark.data.pages.notebook import facts_html
+from phasemark.data.plans.arrays import IMAGE_DIMS, LAYOUT_GROUPS, PHASOR_DIMS, VIEW_DIMS, GroupName, group_rows
 from phasemark.data.plans.bank_plan import BankPlan
 from phasemark.data.plans.grid_axis import format_grid
 from phasemark.render import PhasorImages, Sensor, Views
 
 FORMAT = "phasemark-bank"
 SCHEMA_VERSION = 1
-
-GroupName = Literal["lower", "upper", "full"]
-VIEW_DIMS: dict[GroupName, tuple[str, ...]] = {
-    "lower": ("distance", "delta"),
-    "upper": ("landmark_class", "distance"),
-    "full": ("landmark_class", "distance", "delta"),
-}
-PHASOR_DIMS = ("frequency", "row", "col", "iq")
-IMAGE_DIMS = ("row", "col")
 _COVERAGE_SLACK = 0.01
 """How far a coverage may lie outside 0 … 1: more than any error of the integral, less than damage."""
-LAYOUT_GROUPS: dict[str, tuple[GroupName, ...]] = {"factored": ("lower", "upper"), "full": ("full",)}
-
-
-def group_rows(group: GroupName, sensor: Sensor) -> tuple[int, int]:
-    """Return first and stop of the image rows that a group holds."""
-    half = sensor.rows // 2
-    return {"lower": (half, sensor.rows), "upper": (0, half), "full": (0, sensor.rows)}[group]
 
 
 class BankGroup:

@@ -17,28 +17,18 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.data.bank.bank_file import (
-    FORMAT,
-    IMAGE_DIMS,
-    LAYOUT_GROUPS,
-    PHASOR_DIMS,
-    SCHEMA_VERSION,
-    VIEW_DIMS,
-    Bank,
-    GroupName,
-    group_rows,
-    open_bank,
-)
+from phasemark.data.bank.bank_file import FORMAT, SCHEMA_VERSION, Bank, open_bank
 from phasemark.data.files.hdf5_layout import Layout
 from phasemark.data.files.json_text import json_text
 from phasemark.data.files.narrow import narrowed
 from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.files.same_file import named_files
+from phasemark.data.plans.arrays import IMAGE_DIMS, LAYOUT_GROUPS, PHASOR_DIMS, VIEW_DIMS, GroupName, group_rows
 from phasemark.data.plans.bank_plan import BankPlan, MeshPlan, factored_refusal
+from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
 from phasemark.data.shards.build import Place
 from phasemark.data.shards.run import produce, refuse_unwritable_output
-from phasemark.data.size import refuse_too_many
 from phasemark.landmarks import (
     LandmarkSpec,
     MeshWarning,
@@ -217,6 +207,11 @@ class BankJob:
         self.sensor = self.plan.build_sensor()
         self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
         self._slabs = list(_slabs(self.plan, self.sensor, self.landmarks))
+
+    @property
+    def maker(self) -> str:
+        """What makes this job in another process."""
+        return "phasemark.data.partial_outputs:job_of"
 
     def spec(self) -> dict[str, Any]:
         """Return what another process makes the same job from."""

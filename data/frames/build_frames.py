@@ -19,20 +19,14 @@ from phasemark.data.files.hdf5_layout import Layout
 from phasemark.data.files.json_text import json_text
 from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.files.same_file import named_files
-from phasemark.data.frames.frame_set_file import (
-    FORMAT,
-    FRAME_FIELDS,
-    SCHEMA_VERSION,
-    VIEW_FIELDS,
-    FrameSet,
-    open_frames,
-)
+from phasemark.data.frames.frame_set_file import FORMAT, SCHEMA_VERSION, FrameSet, open_frames
+from phasemark.data.plans.arrays import FRAME_FIELDS, VIEW_FIELDS, frame_set_fields
 from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
 from phasemark.data.shards.run import produce, refuse_unwritable_output
-from phasemark.data.size import frame_set_fields, refuse_too_many
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture
 
 _KEYS = ("class_index", "albedo", "wall_m", "floor_m")
@@ -119,6 +113,11 @@ class FrameJob:
         self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
         self._renderers = [Renderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks]
         self._shot_sensor = self.sensor.without_errors(shot_noise=True) if "shot" in self.plan.variants else None
+
+    @property
+    def maker(self) -> str:
+        """What makes this job in another process."""
+        return "phasemark.data.partial_outputs:job_of"
 
     def spec(self) -> dict[str, Any]:
         """Return what another process makes the same job from."""

@@ -28,25 +28,13 @@ from phasemark.data.files.hdf5_reading import (
     whole_numbers,
 )
 from phasemark.data.pages.notebook import facts_html
+from phasemark.data.plans.arrays import FRAME_FIELDS, VIEW_FIELDS
 from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.render import Frames, Sensor
 
 FORMAT = "phasemark-frames"
 SCHEMA_VERSION = 1
 
-FRAME_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
-    "range": (("frame", "row", "col"), "<f4", "m", "range along the ray, NaN where invalid"),
-    "amplitude": (("frame", "row", "col"), "<f4", "e-", "amplitude per phase image"),
-    "intensity": (("frame", "row", "col"), "<f4", "e-", "intensity per phase image"),
-    "flags": (("frame", "row", "col"), "|u1", "1", "why a pixel is not valid, 0 where it is"),
-    "taps": (("frame", "phase", "tap", "row", "col"), "<f4", "e-", "what each tap reported"),
-    "range_shot": (("frame", "row", "col"), "<f4", "m", "range with shot noise alone, NaN where invalid"),
-}
-VIEW_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
-    "coverage": (("view", "row", "col"), "<f4", "1", "share of the pixel that sees the landmark"),
-    "range_hard": (("view", "row", "col"), "<f4", "m", "range that the centre ray sees, without noise"),
-    "range_mixed": (("view", "row", "col"), "<f4", "m", "range mixed over the pixel, without noise"),
-}
 """Dimensions, type, units and long name of the large datasets."""
 
 _MOST = 1e12

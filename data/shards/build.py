@@ -49,10 +49,17 @@ class Place:
 
 
 class Job(Protocol):
-    """What a file is made of: slabs of items, each item with the same few fields."""
+    """What a file is made of: slabs of items, each item with the same few fields.
+
+    `maker` is ``module:callable``, the function that makes the same job from its `spec` in another process.
+    """
+
+    @property
+    def maker(self) -> str:
+        """Where another process finds the function that takes the spec."""
 
     def spec(self) -> dict[str, Any]:
-        """Return plain data that :func:`phasemark.data.partial_outputs.job_of` makes the same job from elsewhere."""
+        """Return plain data that the maker makes the same job from."""
 
     @property
     def items(self) -> Sequence[int]:

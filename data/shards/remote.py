@@ -76,14 +76,9 @@ def open_maker(scheduler: str, job: Job) -> Maker | None:
 @functools.lru_cache(maxsize=4)
 def _job(spec: str, identity: str) -> Job:
     """Return the job that was sent, if this process would make the same bytes of it."""
-    described = json.loads(spec)
-    module, separator, name = described["kind"].partition(":")
-    if separator:  # a kind that another package brings; what is sent comes from the program that asks, not from a file
-        job: Job = getattr(importlib.import_module(module), name)(described)
-    else:
-        from phasemark.data.partial_outputs import job_of
-
-        job = job_of(described)
+    maker, described = json.loads(spec)
+    module, _, name = maker.partition(":")  # what is sent comes from the program that asks, not from a file
+    job: Job = getattr(importlib.import_module(module), name)(described)
     changes = difference(json.loads(identity), json.loads(json.dumps(job.identity())))
     if changes:
         raise UsageError(f"a worker would make other bytes ({'; '.join(changes[:4])}): install the same everywhere")
@@ -96,7 +91,7 @@ def make_bytes(spec: str, identity: str, start: int, stop: int) -> list[bytes]:
 
 
 def _described(job: Job) -> tuple[str, str]:
-    return json.dumps(job.spec()), json.dumps(job.identity())
+    return json.dumps([job.maker, job.spec()]), json.dumps(job.identity())
 
 
 class ProcessMaker:

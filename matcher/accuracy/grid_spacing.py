@@ -21,9 +21,10 @@ from phasemark.data.seeds import stream
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import noise_free
-from phasemark.matcher.likelihood.images import VIEW, closing_period
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
+from phasemark.matcher.nearest.grid import closing_period
 from phasemark.render import PhasorImages, Renderer, Views
 from phasemark.render.sensor.range_noise import phase_image_variance
 

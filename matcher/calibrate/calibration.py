@@ -34,9 +34,9 @@ from phasemark.matcher.filters.filtered_frames import (
     kalman_filter,
     phasor_mean,
 )
+from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
 from phasemark.matcher.likelihood.estimator import MIN_RETURNS, p_values_of
 from phasemark.matcher.likelihood.residuals import Evidence, Quantity
-from phasemark.matcher.recordings.stamps import spread_stamps, stamp_jitter
 from phasemark.render import Background, Frames, Sensor, wrap_difference_m, wrap_range_m
 from phasemark.render.sensor.sensor_file import rounded
 

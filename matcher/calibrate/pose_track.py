@@ -16,7 +16,7 @@ from scipy import interpolate
 
 from phasemark import UsageError
 from phasemark.matcher.calibrate.known_poses import KnownPoses
-from phasemark.matcher.recordings.stamps import stamp_jitter
+from phasemark.matcher.filters.stamps import stamp_jitter
 
 LONGEST_GAP_S = 0.25
 """Longest time between two poses that is bridged."""

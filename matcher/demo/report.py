@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,37 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from phasemark.data import versions
+from phasemark.data import versions, write_atomically
 from phasemark.data.pages.page import embedded_png, figure_png, page_template, short_number
 from phasemark.landmarks import mesh_picture
-from phasemark.matcher.demo.run import LANDMARK_XY_M, SHIFT_STEPS, WALL_M, CellResult, DemoResult, cell_rows
+from phasemark.matcher.demo.run import (
+    LANDMARK_XY_M,
+    SHIFT_STEPS,
+    WALL_M,
+    CellResult,
+    DemoResult,
+    cell_rows,
+    cells_csv,
+    trials_csv,
+)
 from phasemark.matcher.figures import describe, match_picture
 from phasemark.render.figures import RANGE_COLOURS, draw_range
 
 _ANGLE_STYLES = (("#0072B2", "o", "-"), ("#D55E00", "s", "--"), ("#009E73", "^", ":"), ("#CC79A7", "D", "-."))
 """Colours that differ for the colour-blind, with marks and strokes that differ without colour."""
+
+
+def write_demo(result: DemoResult, folder: Path, *, force: bool = False) -> Path:
+    """Write ``report.html``, ``cells.csv`` and ``trials.csv`` into a folder; returns the report's path.
+
+    Raises
+    ------
+    OutputExistsError, StorageError
+        As in :func:`phasemark.data.write_atomically`.
+    """
+    write_atomically(folder / "cells.csv", cells_csv(result.cells).encode(), force=force)
+    write_atomically(folder / "trials.csv", trials_csv(result.cells).encode(), force=force)
+    return write_atomically(folder / "report.html", demo_report(result).encode(), force=force)
 
 
 def demo_report(result: DemoResult) -> str:

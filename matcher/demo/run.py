@@ -10,7 +10,6 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 from threading import Lock
 from typing import Any
 
@@ -350,19 +349,3 @@ def _csv(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     writer.writerow(header)
     writer.writerows(rows)
     return buffer.getvalue()
-
-
-def write_demo(result: DemoResult, folder: Path, *, force: bool = False) -> Path:
-    """Write ``report.html``, ``cells.csv`` and ``trials.csv`` into a folder; returns the report's path.
-
-    Raises
-    ------
-    OutputExistsError, StorageError
-        As in :func:`phasemark.data.write_atomically`.
-    """
-    from phasemark.data import write_atomically
-    from phasemark.matcher.demo.report import demo_report
-
-    write_atomically(folder / "cells.csv", cells_csv(result.cells).encode(), force=force)
-    write_atomically(folder / "trials.csv", trials_csv(result.cells).encode(), force=force)
-    return write_atomically(folder / "report.html", demo_report(result).encode(), force=force)

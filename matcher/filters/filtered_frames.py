@@ -7,9 +7,10 @@ deviation. Neither removes mixing at edges: averaging converges to the mixed ran
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,8 +19,12 @@ from scipy import special
 from phasemark import UsageError
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
+from phasemark.render.png import figure_png
 from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
 from phasemark.render.sensor.sensor import Sensor
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _LEAST_POOLED = 1e-4
 """Least variance over that of the law; frames without any scatter are simulated, or frozen."""
@@ -67,6 +72,9 @@ class FilteredFrames:
     UsageError
         The shapes do not agree with each other or with the sensor.
     """
+
+    figure: ClassVar[Callable[..., Figure]]
+    """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
 
     range_m: NDArray[np.float64]
     std_m: NDArray[np.float64]
@@ -134,10 +142,7 @@ class FilteredFrames:
 
     def _repr_png_(self) -> bytes | None:
         """Show range and standard deviation of the first position in a notebook; nothing where there is none."""
-        from phasemark.matcher.figures import filtered_picture
-        from phasemark.render.figures import figure_png
-
-        return figure_png(filtered_picture(self)) if len(self) else None
+        return figure_png(type(self).figure(self)) if len(self) else None
 
 
 def assumed_std_m(range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:

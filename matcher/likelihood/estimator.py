@@ -17,6 +17,7 @@ from phasemark.data import Bank
 from phasemark.landmarks.symmetry import mesh_symmetry
 from phasemark.matcher.agreement import DISAGREEMENT, counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.filters.stamps import spread_stamps
 from phasemark.matcher.likelihood.background_estimate import (
     NEAREST_WALL_M,
     estimate_surroundings,
@@ -38,7 +39,6 @@ from phasemark.matcher.likelihood.systematic import (
 from phasemark.matcher.match import Candidate, Match, Reason
 from phasemark.matcher.nearest.bank_minima import Search, Starts
 from phasemark.matcher.nearest.templates import Observation
-from phasemark.matcher.recordings.stamps import spread_stamps
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, phasor_to_range_m, wrap_difference_m
 
 Pixels = Literal["all", "lower"]

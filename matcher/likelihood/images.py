@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
+from phasemark.matcher.nearest.grid import closing_period
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 
 VIEW = ("distance_m", "delta_rad", "bearing_rad", "height_m")
@@ -212,15 +213,6 @@ def _behind_arrays(behind: PhasorImages | None) -> tuple[NDArray[np.complex128],
     if behind is None:
         return np.empty(0, np.complex128), np.empty(0)
     return behind.phasor.reshape(-1), behind.intensity.reshape(-1)
-
-
-def closing_period(delta_rad: NDArray[np.float64]) -> float | None:
-    """Return the period over which a regular grid of angles closes: 2π / n, one step beyond its end; None if none."""
-    if len(delta_rad) < 2:
-        return None
-    step = float(delta_rad[1] - delta_rad[0])
-    turns = 2 * np.pi / (delta_rad[-1] - delta_rad[0] + step)
-    return float(2 * np.pi / round(turns)) if round(turns) >= 1 and abs(turns - round(turns)) < 1e-6 else None
 
 
 class RenderedModel:

@@ -16,9 +16,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark.data import Bank
-from phasemark.data.bank.bank_file import BankGroup, group_rows
+from phasemark.data.bank.bank_file import BankGroup
+from phasemark.data.plans.arrays import group_rows
 from phasemark.matcher.agreement import DISAGREEMENT
-from phasemark.matcher.likelihood.images import closing_period
+from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.render import PhasorImages
 

@@ -16,8 +16,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark.matcher.agreement import DISAGREEMENT
-from phasemark.matcher.likelihood.images import closing_period
 from phasemark.matcher.nearest.bank_minima import modes
+from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Observation, Templates
 
 _THIN_M, _THIN_RAD = 0.06, math.radians(6)

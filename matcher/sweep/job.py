@@ -114,10 +114,14 @@ class SweepJob:
         self._renderers: dict[tuple[Any, ...], Renderer] = {}
         self._guard = threading.Lock()
 
+    @property
+    def maker(self) -> str:
+        """What makes this job in another process."""
+        return "phasemark.matcher.sweep.job:job_of"
+
     def spec(self) -> dict[str, Any]:
         """Return what another process makes the same job from."""
         return {
-            "kind": "phasemark.matcher.sweep.job:job_of",
             "plan": self.plan.model_dump(mode="json"),
             "round": [self.of.number, list(self.of.conditions), self.of.first, self.of.trials],
         }

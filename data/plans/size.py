@@ -9,8 +9,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from phasemark import UsageError
-from phasemark.data.bank.bank_file import LAYOUT_GROUPS, VIEW_DIMS, group_rows
-from phasemark.data.frames.frame_set_file import FRAME_FIELDS, VIEW_FIELDS
+from phasemark.data.plans.arrays import (
+    FRAME_FIELDS,
+    LAYOUT_GROUPS,
+    VIEW_DIMS,
+    VIEW_FIELDS,
+    frame_set_fields,
+    group_rows,
+)
 from phasemark.data.plans.bank_plan import BankPlan
 from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.render import Sensor
@@ -123,16 +129,6 @@ def _frames_size(plan: FramePlan, sensor: Sensor) -> dict[str, int]:
         dims, kind, _, _ = {**FRAME_FIELDS, **VIEW_FIELDS}[name]
         size += math.prod(counts[dim] for dim in dims) * np.dtype(kind).itemsize
     return {"views": plan.views, "frames": counts["frame"], "bytes": size}
-
-
-def frame_set_fields(plan: FramePlan, sensor: Sensor) -> list[str]:
-    """Return the names of the large datasets of a frame set, in their order in the file."""
-    per_frame = ["range", "flags"] if sensor.kind == "direct" else ["range", "amplitude", "intensity", "flags"]
-    if plan.keep_taps:
-        per_frame.append("taps")
-    if "shot" in plan.variants:
-        per_frame.append("range_shot")
-    return [*per_frame, "coverage", *(f"range_{name}" for name in ("hard", "mixed") if name in plan.variants)]
 
 
 def parse_size(text: str, name: str) -> int:

@@ -1,0 +1,49 @@
+"""Which arrays a bank and a frame set hold: their dimensions, types and units, before any file is made."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.render import Sensor
+
+GroupName = Literal["lower", "upper", "full"]
+VIEW_DIMS: dict[GroupName, tuple[str, ...]] = {
+    "lower": ("distance", "delta"),
+    "upper": ("landmark_class", "distance"),
+    "full": ("landmark_class", "distance", "delta"),
+}
+PHASOR_DIMS = ("frequency", "row", "col", "iq")
+IMAGE_DIMS = ("row", "col")
+LAYOUT_GROUPS: dict[str, tuple[GroupName, ...]] = {"factored": ("lower", "upper"), "full": ("full",)}
+
+
+def group_rows(group: GroupName, sensor: Sensor) -> tuple[int, int]:
+    """Return first and stop of the image rows that a group holds."""
+    half = sensor.rows // 2
+    return {"lower": (half, sensor.rows), "upper": (0, half), "full": (0, sensor.rows)}[group]
+
+
+FRAME_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+    "range": (("frame", "row", "col"), "<f4", "m", "range along the ray, NaN where invalid"),
+    "amplitude": (("frame", "row", "col"), "<f4", "e-", "amplitude per phase image"),
+    "intensity": (("frame", "row", "col"), "<f4", "e-", "intensity per phase image"),
+    "flags": (("frame", "row", "col"), "|u1", "1", "why a pixel is not valid, 0 where it is"),
+    "taps": (("frame", "phase", "tap", "row", "col"), "<f4", "e-", "what each tap reported"),
+    "range_shot": (("frame", "row", "col"), "<f4", "m", "range with shot noise alone, NaN where invalid"),
+}
+VIEW_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+    "coverage": (("view", "row", "col"), "<f4", "1", "share of the pixel that sees the landmark"),
+    "range_hard": (("view", "row", "col"), "<f4", "m", "range that the centre ray sees, without noise"),
+    "range_mixed": (("view", "row", "col"), "<f4", "m", "range mixed over the pixel, without noise"),
+}
+
+
+def frame_set_fields(plan: FramePlan, sensor: Sensor) -> list[str]:
+    """Return the names of the large datasets of a frame set, in their order in the file."""
+    per_frame = ["range", "flags"] if sensor.kind == "direct" else ["range", "amplitude", "intensity", "flags"]
+    if plan.keep_taps:
+        per_frame.append("taps")
+    if "shot" in plan.variants:
+        per_frame.append("range_shot")
+    return [*per_frame, "coverage", *(f"range_{name}" for name in ("hard", "mixed") if name in plan.variants)]
