@@ -1,4 +1,3 @@
-import importlib
 import itertools
 import math
 from dataclasses import replace
@@ -19,11 +18,9 @@ from phasemark.render import (
     predicted_range_std,
     preset,
 )
+from phasemark.render.exposure import capture as chain
 from phasemark.render.exposure.taps import demodulate, tap_means
 from phasemark.render.sensor.camera_unit import camera_unit
-
-# The chain's module; its function of the same name hides it from `import phasemark.render.capture as ...`.
-chain = importlib.import_module("phasemark.render.capture")
 
 FALSE_ALARM = 1e-3  # of a whole test, whatever the number of cells
 

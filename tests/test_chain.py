@@ -1,6 +1,5 @@
 """The errors of the chain from light to frames, each against a closed form or a stated interval."""
 
-import importlib
 import itertools
 import math
 
@@ -21,13 +20,13 @@ from phasemark.render import (
     pulse_harmonics,
     square_harmonics,
 )
+from phasemark.render.exposure import capture as chain
 from phasemark.render.exposure import photoelectrons as read_out
 from phasemark.render.exposure.random_streams import fill_normal, fill_uniform, philox, uniform_pair
 from phasemark.render.exposure.stray_light import spread_light
 from phasemark.render.sensor.correlation import correlation_curve, correlation_peak
 from phasemark.render.sensor.sensor import PATTERN_BOUND
 
-chain = importlib.import_module("phasemark.render.capture")  # hidden by its function of the same name
 PMD = preset("pmd-16x16")
 
 
