@@ -157,6 +157,16 @@ def test_trials_of_a_matcher_that_estimates_something_else_are_refused(bank, ren
         run_trials(Matcher(bank, "refine").match, renderers["cone"], "cone", Conditions(), 1, np.random.default_rng(1))
 
 
+@pytest.mark.parametrize("background", [None, Background(wall_m=2.5), Background(floor_m=0.3)])
+def test_a_model_given_a_background_has_the_limits_of_one_built_with_it(bank, background):
+    built = RenderedModel(bank, background).limits()
+    for before in (None, Background(wall_m=3.0)):
+        assert RenderedModel(bank, before).with_background(background).limits() == built
+    if background is not None and background.wall_m is not None:
+        radius = max(np.hypot(*bank.mesh(name).vertices[:, :2].T).max() for name in bank.classes)
+        assert built[1] + radius < background.wall_m  # the landmark stands before the wall, whichever side it shows
+
+
 @pytest.mark.parametrize("huber", [None, 2.0])
 @pytest.mark.parametrize("on", ["ranges", "phasors"])
 def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, renderers, on, huber):

@@ -215,6 +215,12 @@ def _behind_arrays(behind: PhasorImages | None) -> tuple[NDArray[np.complex128],
     return behind.phasor.reshape(-1), behind.intensity.reshape(-1)
 
 
+_BEFORE_LENS_M, _BEFORE_WALL_M = 5e-3, 1e-3
+"""Smallest gaps between the circle around a landmark and the lens, and the wall."""
+_BEYOND_BANK = 1.25
+"""Without a wall a view may be this many times as far as the bank's last distance."""
+
+
 class RenderedModel:
     """Model images rendered where they are needed, from the meshes of a bank.
 
@@ -235,15 +241,19 @@ class RenderedModel:
         self.workers = workers
         self._renderers = []
         self._factored = bank.lower is not None
-        near = 0.0
+        self._radius_m = 0.0
         for name in bank.classes:
             mesh = bank.mesh(name)
             self._renderers.append(Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"])))
-            near = max(near, float(np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max()))
+            self._radius_m = max(self._radius_m, float(np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max()))
+        self._bank_end_m = float(bank.distance_m[-1])
+        self._limits = self._limits_before(background)
+
+    def _limits_before(self, background: Background | None) -> tuple[float, float]:
+        """Return the limits of distance: the lens outside the landmark, and the landmark before the wall."""
         wall = None if background is None else background.wall_m
-        far = float(bank.distance_m[-1]) * 1.25 if wall is None else wall - near - 1e-3
-        self._limits = (near + 5e-3, far)
-        """The lens outside the landmark, and the landmark before the wall."""
+        far = _BEYOND_BANK * self._bank_end_m if wall is None else wall - self._radius_m - _BEFORE_WALL_M
+        return self._radius_m + _BEFORE_LENS_M, far
 
     def renderer(self, class_index: int) -> Renderer:
         """Return what renders one class of the bank."""
@@ -254,10 +264,7 @@ class RenderedModel:
         other = object.__new__(RenderedModel)
         other.__dict__.update(self.__dict__)
         other.background = background
-        near = self._limits[0]
-        wall = None if background is None else background.wall_m
-        if wall is not None:
-            other._limits = (near, wall - near)
+        other._limits = self._limits_before(background)
         return other
 
     def limits(self) -> tuple[float, float]:
