@@ -1,4 +1,4 @@
-"""TOML files that a user wrote: sensors, plans and maps."""
+"""TOML files: sensors, plans and maps that are read, and values that are written."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import os
 import tomllib
 from pathlib import Path
 from typing import Any
+
+import tomlkit
 
 from phasemark import InputFileError
 from phasemark.inputs.reading import MOST_TOML_BYTES, read_text
@@ -35,3 +37,22 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise InputFileError(f"{path}: not a TOML file ({error})") from None
     except ValueError:  # Python converts no number of more than 4300 digits
         raise InputFileError(f"{path}: not a TOML file that can be used (a number has thousands of digits)") from None
+
+
+def toml_value(value: Any) -> str:
+    """Return a value as it stands behind the equals sign of a TOML file.
+
+    Parameters
+    ----------
+    value : str, bool, int, float, or list of them
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> print(toml_value("😀"), toml_value([0.5, 2]))
+    "😀" [0.5, 2]
+    """
+    return str(tomlkit.item(value).as_string())

@@ -11,6 +11,7 @@ from chain_cells import FALSE_ALARM, pure_image
 from scipy import stats
 
 from phasemark import UsageError
+from phasemark.inputs.toml_file import toml_value
 from phasemark.matcher import kalman_filter
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.nearest.templates import assumed_std_m
@@ -286,3 +287,9 @@ def test_the_variants_of_a_frame_add_one_error_after_another():
     # fixed patterns stay when noise is averaged: 0.02 rad are 5 cm
     seen = variants.full.valid.all(axis=1)
     assert np.std(variants.full.range_m.mean(axis=1)[seen]) > 0.03
+
+
+def test_a_sensor_file_holds_any_character():
+    # beyond the basic plane of Unicode, where JSON has surrogates that TOML refuses, and what must be escaped
+    odd = '😀 é \x7f " \\'
+    assert tomllib.loads("a = " + toml_value(odd))["a"] == odd

@@ -14,6 +14,7 @@ import trimesh
 
 from phasemark.data import write_atomically
 from phasemark.data.pages.page import figure_png
+from phasemark.inputs.toml_file import toml_value
 from phasemark.landmarks import LandmarkSpec, build_mesh, export_mesh
 from phasemark.matcher.accuracy.cramer_rao import Estimate, confusion_probability
 from phasemark.matcher.design.confirm import Confirmation, ratio
@@ -38,16 +39,16 @@ def landmarks_toml(design: Design) -> str:
     """Return the set as the plan of a bank: ``phasemark bank build landmarks.toml`` takes it."""
     lines = ["# Landmarks found by `phasemark landmark design`; the plan of a bank of them.", ""]
     plan = design.plan
-    lines.append(f"sensor = {json.dumps(_sensor_reference(plan))}")
-    lines += [f"distance_m = {json.dumps(f'{0.9 * plan.distance_m[0]:.3g}:{1.1 * plan.distance_m[1]:.3g}:0.01')}", ""]
+    lines.append(f"sensor = {toml_value(_sensor_reference(plan))}")
+    lines += [f"distance_m = {toml_value(f'{0.9 * plan.distance_m[0]:.3g}:{1.1 * plan.distance_m[1]:.3g}:0.01')}", ""]
     overrides = _sensor_overrides(design)
     if overrides:
-        lines += ["[sensor_overrides]", *(f"{key} = {json.dumps(value)}" for key, value in overrides.items()), ""]
+        lines += ["[sensor_overrides]", *(f"{key} = {toml_value(value)}" for key, value in overrides.items()), ""]
     for spec in design.result.specs:
         table = spec.model_dump(mode="json", exclude_none=True)
-        lines += ["[[landmarks]]", f"name = {json.dumps(spec.name)}", f"albedo = {spec.albedo!r}"]
+        lines += ["[[landmarks]]", f"name = {toml_value(spec.name)}", f"albedo = {spec.albedo!r}"]
         for part in ("box", "upper"):
-            lines += [f"[landmarks.{part}]", *(f"{key} = {json.dumps(value)}" for key, value in table[part].items())]
+            lines += [f"[landmarks.{part}]", *(f"{key} = {toml_value(value)}" for key, value in table[part].items())]
         lines.append("")
     return "\n".join(lines)
 

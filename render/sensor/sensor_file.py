@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from phasemark.inputs.toml_file import toml_value
 from phasemark.render.sensor.sensor import Sensor
 
 _DIGITS = 7  # of a number in a sensor file
@@ -36,7 +36,7 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
         ]
         if own:
             lines += ["", f"# {title}"]
-        lines += [f"{name} = {json.dumps(fields[name])}  # {comments.get(name, otherwise)}" for name in own]
+        lines += [f"{name} = {toml_value(fields[name])}  # {comments.get(name, otherwise)}" for name in own]
     return "\n".join(lines) + "\n"
 
 
