@@ -85,7 +85,7 @@ def test_the_root_module_imports_nothing() -> None:
 def test_imports_point_one_way() -> None:
     done = subprocess.run([BIN / "lint-imports", "--no-cache"], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
-    assert "1 kept, 0 broken" in done.stdout
+    assert re.search(r"Contracts: \d+ kept, 0 broken", done.stdout)
 
 
 @pytest.mark.parametrize("name", [*ROOMS, "cli"])
