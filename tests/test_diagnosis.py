@@ -14,7 +14,7 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, diagnose, kalman_filter
 from phasemark.matcher.diagnosis.search import _Seen
-from phasemark.render import Background, Renderer, capture, preset
+from phasemark.render import Background, Frames, Renderer, capture, preset
 
 PRESETS = ("vl53l5cx-8x8", "pmd-16x16")
 WALL = Background(wall_m=3.0)
@@ -138,6 +138,16 @@ def test_nothing_is_recommended_for_a_scene_without_a_landmark(banks, background
     image = Renderer(None, sensor).render(1.0, background=background)
     frames = kalman_filter(capture(image, sensor, rng=np.random.default_rng(1), n_frames=50))
     assert diagnosis_of(banks["pmd-16x16"], frames).changes == ()
+
+
+def test_a_diagnosis_stops_when_time_is_up_and_its_message_tells(banks):
+    bank = banks["vl53l5cx-8x8"]
+    ranges = np.full((1, 1, 8, 8), 0.6)
+    ranges[..., ::2] = 1.3
+    found = diagnose(Matcher(bank, "refine"), kalman_filter(Frames(ranges, sensor=bank.sensor)), seconds=0.0)
+    assert found.stopped
+    assert "time was up" in str(found)
+    assert found.as_dict()["stopped"]
 
 
 def test_an_accepted_frame_has_nothing_to_diagnose(banks):

@@ -7,6 +7,7 @@ setting. A change is named only if its match is accepted and explains the frame 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
@@ -106,6 +107,8 @@ class Diagnosis:
         Other single changes that make the frame fit too: the frame does not tell which of them is right.
     n_returned : int
         How many pixels returned.
+    stopped : bool
+        Whether time was up before every change was tried.
     """
 
     index: int
@@ -114,6 +117,7 @@ class Diagnosis:
     match: Match | None = None
     alternatives: tuple[Change, ...] = ()
     n_returned: int = 0
+    stopped: bool = False
 
     @property
     def enough_alone(self) -> bool:
@@ -132,6 +136,8 @@ class Diagnosis:
         if not self.changes:
             if self.n_returned < FEWEST_RETURNS:
                 return f"{head}: {self.n_returned} of its pixels return, and {FEWEST_RETURNS} are needed"
+            if self.stopped:
+                return f"{head}: none of the changes tried makes it fit, and time was up before all were tried"
             return (
                 f"{head}: no change of bearing, background, orientation, unit, quantity, field of view or distance"
                 " makes it fit: it may show another landmark, or none"
@@ -155,6 +161,7 @@ class Diagnosis:
             "changes": [change.as_dict() for change in self.changes],
             "alternatives": [change.as_dict() for change in self.alternatives],
             "enough_alone": self.enough_alone,
+            "stopped": self.stopped,
             "match": None if self.match is None else self.match.as_dict(),
             "message": self.message(),
         }
@@ -223,13 +230,18 @@ class _Setup:
 
 
 def diagnose(
-    matcher: Matcher, frames: FilteredFrames, index: int = 0, *, background: Background | None = None
+    matcher: Matcher,
+    frames: FilteredFrames,
+    index: int = 0,
+    *,
+    background: Background | None = None,
+    seconds: float = 10.0,
 ) -> Diagnosis:
     """Find the cheapest change of settings that makes a refused frame fit.
 
     Single changes are tried in the order of what they cost the user: a free bearing, another background, the image
     turned or mirrored, another quantity or unit, another field of view, a distance the bank does not reach. Then
-    pairs of a bearing with one of the others. It takes 1 to 3 s of processor time, on rare views 10 s.
+    pairs of a bearing with one of the others. It takes 1 to 3 s of processor time on usual views.
 
     Parameters
     ----------
@@ -240,6 +252,8 @@ def diagnose(
         Which of them.
     background : Background, optional
         What a matcher of method "nearest" was told of the background, which it does not keep.
+    seconds : float
+        No further change is tried when this much time has passed; the change that is being tried is finished.
 
     Returns
     -------
@@ -265,6 +279,7 @@ def diagnose(
         raise UsageError(f"frame {index} is accepted: there is nothing to diagnose")
     n_returned = int((frame.state == PixelState.RETURN).sum())
     nothing = Diagnosis(index, refused, n_returned=n_returned)
+    end = time.monotonic() + seconds
     if n_returned < FEWEST_RETURNS or matcher.bank.plan.model != "ray":
         return nothing
     with ExitStack() as stack:
@@ -274,6 +289,8 @@ def diagnose(
                 (changes, match), *others = found
                 alternatives = tuple(other[0] for other, _ in others if len(other) == 1)
                 return replace(nothing, changes=changes, match=match, alternatives=alternatives)
+            if time.monotonic() > end:
+                return replace(nothing, stopped=True)
     return nothing
 
 
