@@ -23,7 +23,7 @@ from phasemark.render.exposure.taps import demodulate, tap_means
 from phasemark.render.sensor.camera_unit import camera_unit
 
 # The chain's module; its function of the same name hides it from `import phasemark.render.capture as ...`.
-chain = importlib.import_module("phasemark.render.capture")
+chain = importlib.import_module("phasemark.render.exposure.capture")
 
 FALSE_ALARM = 1e-3  # of a whole test, whatever the number of cells
 

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from chain_cells import FALSE_ALARM, exact_over_law, images_of, noise_law_m, noise_table, one_pixel, pure_image, wrapped
+from builders import images_of, one_pixel, pure_image, wrapped
+from oracles.noise_law import FALSE_ALARM, exact_over_law, noise_law_m, noise_table
 from scipy import special, stats
 
 from phasemark import UsageError
@@ -27,7 +28,7 @@ from phasemark.render.exposure.stray_light import spread_light
 from phasemark.render.sensor.correlation import correlation_curve, correlation_peak
 from phasemark.render.sensor.sensor import PATTERN_BOUND
 
-chain = importlib.import_module("phasemark.render.capture")  # hidden by its function of the same name
+chain = importlib.import_module("phasemark.render.exposure.capture")  # hidden by its function of the same name
 PMD = preset("pmd-16x16")
 
 

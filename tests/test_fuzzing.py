@@ -5,8 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import fuzzing
 import pytest
+from programs import fuzzing
 
 SOAK = {
     "npy": 20_000, "npz": 12_000, "png": 12_000, "csv": 15_000, "poses": 12_000, "manifest": 2_000,

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders import strangers
+from damaged_frames import DAMAGE, check_damaged
 from hypothesis import HealthCheck, given, settings
-from open_set import DAMAGE, check_damaged, strangers
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank

@@ -1,6 +1,6 @@
 """Kill or fail a sweep at its k-th call to the system, and resume it; a program, run by the tests.
 
-usage: sweep_crash_points.py FOLDER kill|ENOSPC|EIO
+usage: python -m programs.sweep_crash_points FOLDER kill|ENOSPC|EIO
 
 A file of the user lies in the folder and stays. A second run with --force at every seventh call finds the lock. Each
 run is a fork of this process. The trials are as in an uninterrupted sweep. Prints how many points there were.
@@ -12,8 +12,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from crash_points import in_fork
-from system_calls import Trap
+from programs.system_calls import Trap, in_fork
 
 from phasemark import OutputExistsError, PhasemarkError, StorageError
 from phasemark.matcher.sweep.plan import Method, SweepPlan

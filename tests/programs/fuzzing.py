@@ -1,6 +1,6 @@
 """Damaged and hostile files for every reader, found by mutation that follows what code they reach.
 
-``python fuzzing.py KIND COUNT SEED FOLDER`` reads COUNT mutants in a process of its own and prints how it went; a crash
+``python tests/programs/fuzzing.py KIND COUNT SEED FOLDER`` reads COUNT mutants and prints how it went; a crash
 of that process is a finding as well. An input that reaches lines which no other has reached is mutated further. An
 input that ends in anything but an answer or a :class:`phasemark.PhasemarkError` is kept in FOLDER, and belongs into
 ``tests/corpus/KIND`` once it is mended: the ordinary tests read all that is there, and mutation begins with it.
@@ -32,7 +32,7 @@ from phasemark.matcher.plan_kinds import KINDS as PLANS
 from phasemark.matcher.plan_kinds import check_plan, plan_example
 from phasemark.render import Sensor, preset
 
-CORPUS = Path(__file__).parent / "corpus"
+CORPUS = Path(__file__).resolve().parent.parent / "corpus"
 SENSOR = preset("pmd-16x16").model_copy(update={"rows": 4, "cols": 4})
 MOST_SECONDS = 10
 MOST_BYTES = 2 << 30
