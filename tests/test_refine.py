@@ -366,6 +366,6 @@ def matchers(bank):
 
 
 @given(**DAMAGE)
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damaged_frames_get_an_answer_and_never_a_view_that_is_not_a_number(matchers, renderers, **damage):
     check_damaged(matchers, renderers["post"], **damage)

@@ -324,10 +324,10 @@ def test_frames_of_a_trial_do_not_replace_a_file_of_the_sweep(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "action", ["kill", pytest.param("ENOSPC", marks=pytest.mark.soak), pytest.param("EIO", marks=pytest.mark.soak)]
+    ("action", "step"),
+    [("kill", 5), *(pytest.param(action, 1, marks=pytest.mark.soak) for action in ("kill", "ENOSPC", "EIO"))],
 )
-def test_a_sweep_ended_at_any_call_to_the_system_goes_on_or_starts_over(action):
+def test_a_sweep_ended_at_any_call_to_the_system_goes_on_or_starts_over(action, step):
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=memory) as folder:
-        printed = run_program("sweep_crash_points", folder, action)
-    assert int(printed) > 10
+        assert int(run_program("sweep_crash_points", folder, action, step)) > 10
