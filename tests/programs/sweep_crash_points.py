@@ -3,8 +3,8 @@
 usage: python -m programs.sweep_crash_points FOLDER kill|ENOSPC|EIO STEP
 
 k runs in steps of STEP, and of three times STEP with --force. A file of the user lies in the folder and stays. A second
-run with --force, at every call that 7 times STEP divides, finds the lock. Each run is a fork of this process. The trials
-are as in an uninterrupted sweep. Prints how many points there were.
+run with --force, at every call that 7 times STEP divides, finds the lock. Each run is a fork of this process. The
+trials are those of an uninterrupted sweep. Prints how many points there were.
 """
 
 import shutil
