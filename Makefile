@@ -18,7 +18,7 @@ demo: $(VENV)/.installed
 	$(BIN)/phasemark demo --out out/demo --force
 
 test: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n 2 -m "not soak" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not soak" $(ARGS)
 
 soak: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m soak $(ARGS)

@@ -1,5 +1,8 @@
 """Read the fenced blocks of a Markdown page and run them as printed, in order, in one folder.
 
+A process of its own takes three seconds to load the program. So commands and Python blocks run in this process, with
+what they print redirected where ``>`` says; a command that asks the shell for more is given to a shell.
+
 HTML comments directly above a block change how it is run:
 
 ``<!-- test: given FILE -->``
@@ -14,14 +17,20 @@ HTML comments directly above a block change how it is run:
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import re
 import shlex
 import subprocess
 import sys
+import traceback
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+from phasemark.cli import main
 
 RUN = ("phasemark", "sha256sum")
 SET_UP = (".", "cd", "git", "make", "pip", "python", "python3")
@@ -117,13 +126,13 @@ def run_page(page: Path, folder: Path) -> Iterator[str]:
             if not (folder / name).exists():
                 GIVEN[name](folder / name)
         if block.language == "python":
-            _run([sys.executable, "-W", "error", "-c", block.text], folder, f"{page.name}:{block.line}")
+            _run_here(lambda text=block.text: _execute(text), folder, f"{page.name}:{block.line}", warn="error")
             yield block.text
         elif block.language in _SHELL_LANGUAGES:
             for command in shell_commands(block):
                 program = shlex.split(command, comments=True)[0]
                 if program in RUN:
-                    _run(["bash", "-euo", "pipefail", "-c", command], folder, f"{page.name}:{block.line}: {command}")
+                    _run_command(command, folder, f"{page.name}:{block.line}: {command}")
                     yield command
                 elif program not in SET_UP:
                     raise AssertionError(f"{page.name}:{block.line}: no rule for '{command}'")
@@ -142,12 +151,59 @@ def _check_twin(block: Block, page: Path) -> None:
         assert shlex.split(command, comments=True) in run, f"{what}\nis not run in {block.twin}"
 
 
-def _run(command: list[str], folder: Path, what: str) -> None:
+def _run_command(command: str, folder: Path, what: str) -> None:
+    lexer = shlex.shlex(command, posix=True, punctuation_chars=True)
+    lexer.whitespace_split = True
+    words = list(lexer)
+    printed_to = None
+    if words[-2:-1] == [">"]:
+        *words, _, printed_to = words
+    if words[0] == "phasemark" and not any(set(word) & set("|&;<>()$`*?~") for word in words):
+        _run_here(lambda: main(words[1:]), folder, what, printed_to=printed_to)
+    else:
+        _run_in_shell(command, folder, what)
+
+
+def _run_here(
+    function: Callable[[], int | None], folder: Path, what: str, *, warn: str = "default", printed_to: str | None = None
+) -> None:
+    """Call what a process of its own would run; the folder is the current one, and modules are looked for in it."""
+    path, modules = list(sys.path), set(sys.modules)
+    printed = io.StringIO()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(contextlib.chdir(folder))
+        stack.enter_context(warnings.catch_warnings())
+        warnings.simplefilter(warn)  # type: ignore[arg-type]
+        stack.enter_context(contextlib.redirect_stderr(printed))
+        out = stack.enter_context(open(printed_to, "w", encoding="utf-8")) if printed_to else printed
+        stack.enter_context(contextlib.redirect_stdout(out))
+        try:
+            code = function()
+        except SystemExit as end:
+            code = end.code
+        except Exception:
+            code = 1
+            traceback.print_exc()
+        finally:
+            sys.path[:] = path
+            for name in set(sys.modules) - modules:
+                if str(getattr(sys.modules[name], "__file__", None)).startswith(str(folder)):
+                    del sys.modules[name]  # another page may have another module of the name
+    assert not code, f"{what}\nexit code {code}\n{printed.getvalue()}"
+
+
+def _execute(text: str) -> None:
+    sys.path.insert(0, "")
+    exec(compile(text, "<block>", "exec"), {"__name__": "__main__"})
+
+
+def _run_in_shell(command: str, folder: Path, what: str) -> None:
     bin_folder = str(Path(sys.executable).parent)
-    environment = {**os.environ, "PATH": os.pathsep.join([bin_folder, os.environ["PATH"]]), "MPLBACKEND": "agg"}
+    environment = {**os.environ, "PATH": os.pathsep.join([bin_folder, os.environ["PATH"]])}
     done = subprocess.run(
-        command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
-    )
+        ["bash", "-euo", "pipefail", "-c", command],
+        cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True,
+    )  # fmt: skip
     assert done.returncode == 0, f"{what}\nexit code {done.returncode}\n{done.stdout}{done.stderr}"
 
 

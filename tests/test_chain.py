@@ -5,7 +5,8 @@ import math
 
 import numpy as np
 import pytest
-from chain_cells import FALSE_ALARM, exact_over_law, images_of, noise_law_m, noise_table, one_pixel, pure_image, wrapped
+from builders import images_of, one_pixel, pure_image, wrapped
+from oracles.noise_law import FALSE_ALARM, exact_over_law, noise_law_m, noise_table
 from scipy import special, stats
 
 from phasemark import UsageError

@@ -9,7 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chain_cells import FALSE_ALARM, exact_over_law, noise_law_m, one_pixel, pure_image, wrapped
+from builders import one_pixel, pure_image, wrapped
+from oracles.noise_law import FALSE_ALARM, exact_over_law, noise_law_m
 from scipy import stats
 
 from phasemark import UsageError

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from oracles import mean_of_blocks, sphere_pixels
+from oracles.images import mean_of_blocks, sphere_pixels
 
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog

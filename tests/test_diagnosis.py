@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from open_set import strangers
+from builders import strangers
 
 from phasemark import UsageError
 from phasemark.cli import main

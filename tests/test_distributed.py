@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from builders import run_program
 
 from phasemark import OutputExistsError, UsageError
 from phasemark.data import FramePlan, build_frames
@@ -16,7 +17,6 @@ from phasemark.data.frames.build_frames import FrameJob
 from phasemark.data.shards.build import build, manifest_path, partial_path
 from phasemark.data.shards.remote import ProcessMaker
 
-HERE = Path(__file__).parent
 PROGRAM = [sys.executable, "-c", "import sys; from phasemark.cli import main; sys.exit(main())"]
 PLAN = FramePlan(classes=["cone", "post"], views=40, frames_per_view=2, seed=7, wall_m=4.0)
 
@@ -28,16 +28,8 @@ def reference(tmp_path_factory):
     return path.read_bytes()
 
 
-def program(name, *arguments):
-    """Run one of the tests' programs and return what it prints."""
-    command = [sys.executable, HERE / name, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
-
-
 def dask_build(out, views, seconds):
-    return int(program("dask_build.py", out, views, seconds).split()[-1])
+    return int(run_program("dask_build", out, views, seconds).split()[-1])
 
 
 def test_a_dask_cluster_makes_the_same_bytes(reference, tmp_path):
@@ -165,7 +157,7 @@ def test_no_worker_process_outlives_the_command(tmp_path, number):
 
 @pytest.mark.parametrize(("views", "n"), [(40, 2), pytest.param(1500, 200, marks=pytest.mark.soak)])
 def test_a_build_killed_at_a_random_moment_resumes_to_the_same_bytes(tmp_path, views, n):
-    done = program("random_kills.py", tmp_path, views, n, 11)
+    done = run_program("random_kills", tmp_path, views, n, 11)
     assert sum(map(int, done.split()[-3:])) == n
     print(f"before, during and after the file was made: {done.split()[-3:]}")
 
@@ -173,7 +165,7 @@ def test_a_build_killed_at_a_random_moment_resumes_to_the_same_bytes(tmp_path, v
 @pytest.mark.soak
 def test_threads_processes_and_dask_make_one_file_whatever_the_workers_and_shards(tmp_path):
     pytest.importorskip("distributed")
-    lines = program("every_way.py", tmp_path).splitlines()
+    lines = run_program("build_on_every_scheduler", tmp_path).splitlines()
     made = [line.split() for line in lines if line.split()[0] in ("threads", "processes", "dask", "twice")]
     assert len(made) == 3 * 4 * 3 + 3
     assert len({line[-1] for line in made}) == 1

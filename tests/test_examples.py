@@ -5,9 +5,11 @@ import csv
 import importlib
 import io
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -236,8 +238,15 @@ EXAMPLES = sorted(EXAMPLE.parent.glob("*.py"))
 
 
 def run_example(name, *arguments, folder):
-    program = [sys.executable, "-W", "error", EXAMPLE.with_name(name), *map(str, arguments)]
-    return subprocess.run(program, capture_output=True, text=True, cwd=folder)
+    """Run an example as a script in this process, which has loaded what it imports."""
+    out, err, path = io.StringIO(), io.StringIO(), str(EXAMPLE.with_name(name))
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        patch.chdir(folder)
+        patch.syspath_prepend(EXAMPLE.parent)
+        patch.setattr(sys, "argv", [path, *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(path, run_name="__main__")
+    return SimpleNamespace(returncode=end.value.code or 0, stdout=out.getvalue(), stderr=err.getvalue())
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)

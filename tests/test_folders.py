@@ -3,20 +3,16 @@
 import errno
 import json
 import os
-import subprocess
-import sys
 import tempfile
-from pathlib import Path
 
 import pytest
+from builders import run_program
 
 from phasemark import OutputExistsError, StorageError, UsageError
 from phasemark.cli import main
 from phasemark.data.files import renames
 from phasemark.data.files.folder_marker import LOCK, MARKER, adding_to_folder, read_marker
 from phasemark.data.files.replaced_folder import replacing_folder
-
-HERE = Path(__file__).parent
 
 
 def names(folder):
@@ -213,12 +209,8 @@ def test_files_of_a_shared_folder_are_claimed_and_cleared_alone(tmp_path):
 def test_a_folder_ended_at_any_call_to_the_system_is_the_old_or_the_new_one(action, in_one_step):
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=memory) as folder:
-        done = subprocess.run(
-            [sys.executable, HERE / "folder_crash_points.py", folder, action, in_one_step],
-            env={**os.environ, "PYTHONPATH": str(HERE)}, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout) > 30
+        printed = run_program("folder_crash_points", folder, action, in_one_step)
+    assert int(printed) > 30
 
 
 @pytest.mark.parametrize(

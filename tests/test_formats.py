@@ -11,7 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from regenerate_golden import BANK, BANK_PLAN, FRAMES, FRAMES_PLAN
+from programs.regenerate_golden import BANK, BANK_PLAN, FRAMES, FRAMES_PLAN
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main

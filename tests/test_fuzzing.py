@@ -5,8 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import fuzzing
 import pytest
+from programs import fuzzing
 
 SOAK = {
     "npy": 20_000, "npz": 12_000, "png": 12_000, "csv": 15_000, "poses": 12_000, "manifest": 2_000,
@@ -20,11 +20,21 @@ TOML = [kind for kind, (suffix, _) in fuzzing.KINDS.items() if suffix == ".toml"
 SEED = 20261
 
 
-def run(kind, count, folder):
-    command = [sys.executable, fuzzing.__file__, kind, str(count), str(SEED), str(folder)]
+SHORT = ["npy", "npz", "png", "csv", *TOML, "stl", "ply", "obj", "off"]
+
+
+def run(kinds, count, folder):
+    """Run the program; return what it found by kind, and what it said of readers that crashed."""
+    command = [sys.executable, fuzzing.__file__, ",".join(kinds), str(count), str(SEED), str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f"the reader of {kind} ended with {done.returncode}: {done.stderr[-2000:]}"
-    found = json.loads(done.stdout.splitlines()[-1])
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    return {found["kind"]: found for found in lines}, done.stderr[-2000:]
+
+
+def check(kind, count, folder, ran):
+    by_kind, said = ran
+    assert kind in by_kind, said
+    found = by_kind[kind]
     print(found)
     assert found["inputs"] == count
     assert not found["found"], f"{found['n_found']} findings, kept in {folder}: {found['found']}"
@@ -33,9 +43,22 @@ def run(kind, count, folder):
     assert found["refused"] < count  # some are sound still
 
 
-@pytest.mark.parametrize("kind", ["npy", "npz", "png", "csv", *TOML, "stl", "ply", "obj", "off"])
-def test_two_hundred_mutants_of_each_kind_end_with_an_answer_or_one_line(kind, tmp_path):
-    run(kind, 200, tmp_path)
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """The folder of a run of all kinds, which loads the program once, and what it found."""
+    folder = tmp_path_factory.mktemp("mutants")
+    return folder, run(SHORT, 200, folder)
+
+
+@pytest.mark.parametrize("kind", SHORT)
+def test_two_hundred_mutants_of_each_kind_end_with_an_answer_or_one_line(kind, short):
+    check(kind, 200, *short)
+
+
+def test_a_reader_that_crashes_is_told(tmp_path):
+    found, said = run(["npy", "unknown"], 3, tmp_path)
+    assert list(found) == ["npy"]
+    assert "the reader of unknown ended with" in said
 
 
 @pytest.mark.soak
@@ -43,7 +66,7 @@ def test_two_hundred_mutants_of_each_kind_end_with_an_answer_or_one_line(kind, t
 def test_a_hundred_thousand_mutants_end_with_an_answer_or_one_line(kind, tmp_path):
     if kind == "bag":
         pytest.importorskip("rosbags")
-    run(kind, SOAK[kind], tmp_path)
+    check(kind, SOAK[kind], tmp_path, run([kind], SOAK[kind], tmp_path))
 
 
 def test_the_soak_reads_a_hundred_thousand_inputs():
@@ -54,6 +77,11 @@ def test_the_soak_reads_a_hundred_thousand_inputs():
 @pytest.mark.parametrize("path", sorted(fuzzing.CORPUS.glob("*/*")), ids=lambda path: f"{path.parent.name}-{path.name}")
 def test_what_was_found_once_stays_mended(path, tmp_path):
     fuzzing.read_one(path.parent.name, path.read_bytes(), tmp_path)
+
+
+def test_the_readers_whose_lines_are_followed_exist():
+    root = Path(__file__).resolve().parent.parent
+    assert [part for part in fuzzing.OWN_READERS if not (root / part.strip("/")).exists()] == []
 
 
 def test_the_corpus_is_small():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from regenerate_golden import CATALOGUE, render_catalogue
+from programs.regenerate_golden import CATALOGUE, render_catalogue
 
 from phasemark.landmarks import catalog
 

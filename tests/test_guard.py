@@ -9,7 +9,7 @@ import zlib
 import h5py
 import numpy as np
 import pytest
-from mutants import COMMANDS, check_mutants
+from damaged_files import COMMANDS, check_mutants
 
 from phasemark import InputFileError
 from phasemark.cli import main

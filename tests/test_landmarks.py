@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from shadow import coverage_of_hull, coverage_of_mesh, project
+from oracles.outline_coverage import coverage_of_hull, coverage_of_mesh, project
 
 from phasemark import UsageError
 from phasemark.landmarks import (

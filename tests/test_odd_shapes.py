@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from odd_meshes import ODD, lump
-from oracles import adaptive_images
-from smoothness import random_views
+from builders import ODD, lump
+from oracles.images import adaptive_images
+from oracles.smoothness import random_views
 
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog

@@ -80,6 +80,14 @@ def test_a_failing_block_fails_with_its_line(language: str, tmp_path: Path) -> N
         list(run_page(tmp_path / "page.md", tmp_path))
 
 
+def test_what_a_command_prints_goes_where_it_says(tmp_path: Path) -> None:
+    text = "```bash\nphasemark sensor show pmd-16x16 > a.toml  # words\nphasemark sensor list | wc -l > b.txt\n```\n"
+    (tmp_path / "page.md").write_text(text, encoding="utf-8")
+    assert len(list(run_page(tmp_path / "page.md", tmp_path))) == 2
+    assert "modulation_hz" in (tmp_path / "a.toml").read_text(encoding="utf-8")
+    assert int((tmp_path / "b.txt").read_text(encoding="utf-8")) > 3
+
+
 def test_an_unknown_program_is_not_passed_over(tmp_path: Path) -> None:
     (tmp_path / "page.md").write_text("```bash\nphasemrk sensor list\n```\n", encoding="utf-8")
     with pytest.raises(AssertionError, match="no rule"):

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders import strangers
+from damaged_frames import DAMAGE, check_damaged
 from hypothesis import HealthCheck, given, settings
-from open_set import DAMAGE, check_damaged, strangers
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
@@ -375,6 +376,6 @@ def matchers(bank):
 
 
 @given(**DAMAGE)
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damaged_frames_get_an_answer_and_never_a_view_that_is_not_a_number(matchers, renderers, **damage):
     check_damaged(matchers, renderers["post"], **damage)

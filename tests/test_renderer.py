@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from builders import ODD, l_bracket, star_prism
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from odd_meshes import ODD, l_bracket, star_prism
-from oracles import (
+from oracles.images import (
     brute_force,
     image_points,
     integrate_pixels,

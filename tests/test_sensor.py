@@ -7,7 +7,8 @@ from importlib import resources
 
 import numpy as np
 import pytest
-from chain_cells import FALSE_ALARM, pure_image
+from builders import pure_image
+from oracles.noise_law import FALSE_ALARM
 from scipy import stats
 
 from phasemark import UsageError

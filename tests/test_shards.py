@@ -7,27 +7,24 @@ import sys
 import tempfile
 import threading
 import time
-from pathlib import Path
 
 import pytest
-from toy_job import ToyJob, check_toy_file
+from builders import HELPERS_IN_PATH, run_program
+from programs.toy_job import ToyJob, check_toy_file
 
 from phasemark import OutputExistsError, StorageError, UsageError
 from phasemark.data import verify_checksum
 from phasemark.data.shards.build import build, difference, manifest_path, partial_path
 from phasemark.data.shards.remote import open_maker
 
-HERE = Path(__file__).parent
-
 
 def names(folder):
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def run_program(text, **options):
+def start_text(text, **options):
     """Start a Python program that can import the tests' helpers."""
-    environment = {**os.environ, "PYTHONPATH": str(HERE)}
-    return subprocess.Popen([sys.executable, "-c", text], env=environment, text=True, **options)
+    return subprocess.Popen([sys.executable, "-c", text], env=HELPERS_IN_PATH, text=True, **options)
 
 
 class Stop(Exception):
@@ -189,13 +186,9 @@ def test_readers_see_the_old_file_or_the_new_one(tmp_path):
 def test_a_build_ended_at_any_call_to_the_system_leaves_old_or_new_and_resumes(action):
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # hundreds of fsyncs take a minute on a disk
     with tempfile.TemporaryDirectory(dir=memory) as folder:
-        done = subprocess.run(
-            [sys.executable, HERE / "crash_points.py", folder, action],
-            env={**os.environ, "PYTHONPATH": str(HERE)}, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+        printed = run_program("build_crash_points", folder, action)
     # two rounds, without and with an old file: layout, manifest, three shards, commit, hash, publication
-    assert int(done.stdout) > 30
+    assert int(printed) > 30
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -205,7 +198,7 @@ def test_an_interrupted_command_exits_with_its_code_and_can_be_resumed(tmp_path,
 import sys
 from phasemark import cli
 from phasemark.data.shards.build import build
-from toy_job import ToyJob
+from programs.toy_job import ToyJob
 
 def run(arguments):
     build(ToyJob(items=(400, 3), seconds=0.02), {str(path)!r}, workers=2, shard_items=1)
@@ -213,7 +206,7 @@ def run(arguments):
 cli._run = run
 sys.exit(cli.main([]))
 """
-    with run_program(program, stderr=subprocess.PIPE) as child:
+    with start_text(program, stderr=subprocess.PIPE) as child:
         wait_for(lambda: manifest_path(path).exists() and manifest_path(path).read_bytes().count(b"\n") > 1)
         child.send_signal(number)
         child.communicate(timeout=20)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from smoothness import (
+from oracles.smoothness import (
     PARAMETERS,
     Outline,
     difference_quotients,

@@ -7,11 +7,11 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_job import ToyJob, check_toy_file
+from builders import HELPERS_IN_PATH, run_program
+from programs.toy_job import ToyJob, check_toy_file
 
 from phasemark import InputFileError, StorageError
 from phasemark.data.shards.build import build, manifest_path, partial_path
@@ -19,12 +19,11 @@ from phasemark.landmarks import build_mesh, catalog, export_mesh, read_mesh
 from phasemark.render import Renderer, preset
 
 pytestmark = pytest.mark.soak
-HERE = Path(__file__).parent
 PROGRAM = """
 import sys
 from phasemark import cli
 from phasemark.data.shards.build import build
-from toy_job import ToyJob
+from programs.toy_job import ToyJob
 cli._run = lambda arguments: build(ToyJob(items=(400, 3), seconds=0.02), arguments[0], workers=2, shard_items=1)
 sys.exit(cli.main(sys.argv[1:]))
 """
@@ -41,9 +40,7 @@ def test_fifty_interruptions_exit_with_their_code_and_can_be_resumed(tmp_path):
         folder.mkdir()
         path = folder / "toy"
         number, code = ((signal.SIGINT, 130), (signal.SIGTERM, 143))[k % 2]
-        child = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, path], env={**os.environ, "PYTHONPATH": str(HERE)}, stderr=subprocess.PIPE
-        )
+        child = subprocess.Popen([sys.executable, "-c", PROGRAM, path], env=HELPERS_IN_PATH, stderr=subprocess.PIPE)
         end = time.monotonic() + 30
         while not manifest_path(path).exists() and time.monotonic() < end:
             time.sleep(0.01)
@@ -82,11 +79,7 @@ def test_every_command_that_writes_survives_disks_of_ten_sizes(tmp_path):
     if subprocess.run(mount, capture_output=True, check=False).returncode:
         pytest.skip("mounting a small disk needs privileges")
     try:
-        done = subprocess.run(
-            [sys.executable, HERE / "full_disks.py", tmp_path], capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr[-3000:]
-        print(done.stdout)
+        print(run_program("full_disks", tmp_path))
     finally:
         subprocess.run(["umount", tmp_path / "disk"], check=True)
 
@@ -146,7 +139,7 @@ def test_two_builders_on_one_output_end_with_one_winner(tmp_path):
     command = [sys.executable, "-c", PROGRAM]
     for k in range(5):
         path = tmp_path / f"toy{k}"
-        environment = {**os.environ, "PYTHONPATH": str(HERE)}
+        environment = HELPERS_IN_PATH
         both = [subprocess.Popen([*command, path], env=environment, stderr=subprocess.PIPE) for _ in range(2)]
         codes = sorted((child.communicate(timeout=60), child.returncode)[1] for child in both)
         assert codes == [0, 4]

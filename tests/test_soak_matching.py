@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders import strangers
+from damaged_frames import DAMAGE, check_damaged
 from hypothesis import HealthCheck, given, settings
-from open_set import DAMAGE, check_damaged, strangers
-from oracles import adaptive_images
+from oracles.images import adaptive_images
 
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
@@ -117,7 +118,7 @@ def inliers_rms(scaled):
 
 @pytest.mark.parametrize("name", list(catalog()))
 def test_frames_of_another_renderer_are_matched_as_well(bank, renderers, name):
-    """The quadtree of tests/oracles.py knows nothing of edges. The same views and the same noise, 40 × 20 frames."""
+    """The quadtree of oracles/images.py knows nothing of edges. The same views and the same noise, 40 × 20 frames."""
     rng, n = np.random.default_rng(17), 40
     views = Views.broadcast(rng.uniform(0.8, 1.6, n), rng.uniform(0, math.pi, n))
     images = [adaptive_images(renderers[name], views[k : k + 1], tolerance=1e-4, last=8) for k in range(n)]

@@ -5,16 +5,8 @@ import math
 
 import numpy as np
 import pytest
-from chain_cells import (
-    FALSE_ALARM,
-    exact_over_law,
-    images_of,
-    noise_table,
-    one_pixel,
-    phase_density,
-    pure_image,
-    wrapped,
-)
+from builders import images_of, one_pixel, pure_image, wrapped
+from oracles.noise_law import FALSE_ALARM, exact_over_law, noise_table, phase_density
 from scipy import integrate, stats
 
 from phasemark.render import capture

@@ -4,16 +4,14 @@ import errno
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from builders import run_program
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data import read_checksum, verify_checksum, write_atomically, write_checksum
 from phasemark.data.files import renames
-
-HERE = Path(__file__).parent
 
 
 def names(folder: Path) -> list[str]:
@@ -279,9 +277,5 @@ def test_a_rename_that_replaces_nothing_refuses_an_existing_name(tmp_path, monke
 
 @pytest.mark.parametrize("action", ["kill", "ENOSPC", "EIO", "other"])
 def test_a_file_ended_at_any_call_to_the_system_is_the_old_or_the_new_one(tmp_path, action):
-    done = subprocess.run(
-        [sys.executable, HERE / "file_crash_points.py", tmp_path, action],
-        env={**os.environ, "PYTHONPATH": str(HERE)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout) > 15
+    printed = run_program("file_crash_points", tmp_path, action)
+    assert int(printed) > 15

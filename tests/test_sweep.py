@@ -1,13 +1,13 @@
 """Sweeps as they are run: same numbers for any number of workers, resumed, refused, kept."""
 
 import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+from builders import run_program
 from own_matchers import Fails
 
 from phasemark import OutputExistsError, UsageError, cli
@@ -17,8 +17,6 @@ from phasemark.matcher.plan_kinds import plan_schema
 from phasemark.matcher.sweep.plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
 from phasemark.matcher.sweep.report import write_report
 from phasemark.matcher.sweep.run import read_sweep, run_sweep, sweep_folder
-
-HERE = Path(__file__).parent
 
 EXACT = ("condition", "trial", "truth", "estimate", "bound", "covariance", "chi2", "p_value", "found", "accepted")
 
@@ -326,14 +324,10 @@ def test_frames_of_a_trial_do_not_replace_a_file_of_the_sweep(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "action", ["kill", pytest.param("ENOSPC", marks=pytest.mark.soak), pytest.param("EIO", marks=pytest.mark.soak)]
+    ("action", "step"),
+    [("kill", 5), *(pytest.param(action, 1, marks=pytest.mark.soak) for action in ("kill", "ENOSPC", "EIO"))],
 )
-def test_a_sweep_ended_at_any_call_to_the_system_goes_on_or_starts_over(action):
+def test_a_sweep_ended_at_any_call_to_the_system_goes_on_or_starts_over(action, step):
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=memory) as folder:
-        done = subprocess.run(
-            [sys.executable, HERE / "sweep_crash_points.py", folder, action],
-            env={**os.environ, "PYTHONPATH": str(HERE)}, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert int(done.stdout) > 10
+        assert int(run_program("sweep_crash_points", folder, action, step)) > 10

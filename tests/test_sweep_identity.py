@@ -1,26 +1,12 @@
 """One sweep, whatever runs it: threads, worker processes, a cluster, or several lives of a program that is killed."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
-from sweep_ways import plan, tables
+from builders import run_program
+from programs.sweep_random_kills import plan, tables
 
 from phasemark.matcher.sweep.run import run_sweep
 
-HERE = Path(__file__).parent
 TRIALS = 60
-
-
-def program(*arguments):
-    """Run the tests' program and return what it prints."""
-    command = [sys.executable, HERE / "sweep_ways.py", *map(str, arguments)]
-    quiet = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=quiet)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +28,7 @@ def test_threads_and_processes_give_the_tables_of_one_worker(reference, tmp_path
 def ways(tmp_path_factory):
     """A folder in which the program was run, killed twice, and what it printed."""
     folder = tmp_path_factory.mktemp("program")
-    return folder, program(folder, TRIALS, 2, 17)
+    return folder, run_program("sweep_random_kills", folder, TRIALS, 2, 17)
 
 
 def test_a_sweep_killed_at_a_random_moment_and_resumed_gives_the_tables_of_one_that_was_not(ways, reference):
@@ -58,7 +44,7 @@ def test_a_dask_cluster_gives_the_tables_of_one_worker(ways, reference):
 
 @pytest.mark.soak
 def test_a_sweep_killed_at_20_random_moments_and_resumed_gives_the_same_tables(tmp_path):
-    counts = list(map(int, program(tmp_path, 300, 20, 18).split()))
+    counts = list(map(int, run_program("sweep_random_kills", tmp_path, 300, 20, 18).split()))
     assert sum(counts) == 20
     assert sum(count > 0 for count in counts) > 1, "the kills all came at one stage"
     print(f"killed before a trial was safe, in the first round, after it, at the end: {counts}")

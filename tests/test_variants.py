@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from smoothness import random_views
-from solids import first_hit
+from oracles.smoothness import random_views
+from oracles.solids import first_hit
 
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog

@@ -1,35 +1,22 @@
 """Kill or fail a build at its k-th call to the system, for every k, and resume it; a program, run by test_shards.py.
 
-usage: crash_points.py FOLDER kill|ENOSPC|EIO
+usage: python -m programs.build_crash_points FOLDER kill|ENOSPC|EIO
 
 Prints how many points there were. Each run is a fork of this process, which has a single thread.
 """
 
-import os
 import signal
 import sys
 from pathlib import Path
 
-from system_calls import Trap
-from toy_job import ToyJob, check_toy_file
+from programs.system_calls import Trap, in_fork
+from programs.toy_job import ToyJob, check_toy_file
 
 from phasemark import StorageError
 from phasemark.data.shards.build import build, manifest_path, partial_path
 from phasemark.inputs import checksum_path, verify_checksum
 
 CALLS = ("pwrite", "write", "fsync", "replace", "posix_fallocate", "ftruncate")
-
-
-def in_fork(function, *arguments):
-    """Run a function in a child; return its exit code, −signal if it was killed."""
-    child = os.fork()
-    if child == 0:
-        code = 99
-        try:
-            code = function(*arguments)
-        finally:
-            os._exit(code)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 def fail_at(path, at, action, force):

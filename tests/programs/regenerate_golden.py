@@ -1,4 +1,4 @@
-"""Write the golden files that our own code makes: ``python tests/regenerate_golden.py`` from the repository's root."""
+"""Write the golden files of our own: ``python tests/programs/regenerate_golden.py`` from the root of the repository."""
 
 from pathlib import Path
 
@@ -8,16 +8,17 @@ from phasemark.data import BankPlan, FramePlan, build_bank, build_frames
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, preset
 
-CATALOGUE = Path(__file__).parent / "golden" / "catalogue.npz"
+GOLDEN = Path(__file__).resolve().parent.parent / "golden"
+CATALOGUE = GOLDEN / "catalogue.npz"
 VIEW = {"distance_m": 0.9, "delta_rad": 0.5, "bearing_rad": 0.02, "height_m": -0.01}
 BACKGROUND = Background(wall_m=3.0, floor_m=0.3)
 
 TINY_CAMERA = {"rows": 4, "cols": 4}
-BANK = Path(__file__).parent / "golden" / "bank-v1.h5"
+BANK = GOLDEN / "bank-v1.h5"
 BANK_PLAN = BankPlan(
     classes=["cone"], sensor_overrides=TINY_CAMERA, distance_m="0.9,1", delta_deg="0,45", model="planar"
 )
-FRAMES = Path(__file__).parent / "golden" / "frames-v1.h5"
+FRAMES = GOLDEN / "frames-v1.h5"
 FRAMES_PLAN = FramePlan(
     landmarks=[{"name": "block", "box": {"length_m": 0.2, "width_m": 0.1, "height_m": 0.1}, "upper": None}],
     sensor_overrides=TINY_CAMERA,

@@ -1,6 +1,6 @@
 """Kill `phasemark frames build` at random moments and resume it; a program, run by the tests.
 
-usage: random_kills.py FOLDER VIEWS RUNS SEED
+usage: python -m programs.random_kills FOLDER VIEWS RUNS SEED
 
 Each run is a fork of this process, which has all of the program loaded, and no threads left.
 Prints in how many runs the kill came before, during and after the file was made.

@@ -1,9 +1,10 @@
 """Kill or fail a sweep at its k-th call to the system, and resume it; a program, run by the tests.
 
-usage: sweep_crash_points.py FOLDER kill|ENOSPC|EIO
+usage: python -m programs.sweep_crash_points FOLDER kill|ENOSPC|EIO STEP
 
-A file of the user lies in the folder and stays. A second run with --force at every seventh call finds the lock. Each
-run is a fork of this process. The trials are as in an uninterrupted sweep. Prints how many points there were.
+k runs in steps of STEP, and of three times STEP with --force. A file of the user lies in the folder and stays. A second
+run with --force, at every call that 7 times STEP divides, finds the lock. Each run is a fork of this process. The
+trials are those of an uninterrupted sweep. Prints how many points there were.
 """
 
 import shutil
@@ -12,8 +13,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from crash_points import in_fork
-from system_calls import Trap
+from programs.system_calls import Trap, in_fork
 
 from phasemark import OutputExistsError, PhasemarkError, StorageError
 from phasemark.matcher.sweep.plan import Method, SweepPlan
@@ -45,14 +45,13 @@ def finish(folder, options):
     return 0
 
 
-def main(folder, action):
-    folder = Path(folder)
+def main(folder, action, step):
+    folder, step = Path(folder), int(step)
     run_sweep(PLAN, folder / "reference", workers=1)
     expected = read_sweep(folder / "reference")[1].estimate
     points = 0
     for options in ({}, {"force": True}):
-        step = 1 if action == "kill" and not options else 3
-        for at in range(1, 1000, step):
+        for at in range(1, 1000, 3 * step if options else step):
             path = folder / "sweep"
             path.mkdir()
             (path / MINE).write_text("mine")
@@ -69,13 +68,13 @@ def main(folder, action):
             shutil.rmtree(path)
             if code == 0:
                 break
-    second_runs(folder / "sweep")
+    second_runs(folder / "sweep", 7 * step)
     sys.stdout.write(f"{points}\n")
 
 
-def second_runs(path):
-    """Have a second run with --force start at every seventh call of a first one, which ends as if it were alone."""
-    for at in range(7, 1000, 7):
+def second_runs(path, step):
+    """Have a second run with --force start during a first one, every few calls; the first ends as if it were alone."""
+    for at in range(step, 1000, step):
         codes = []
 
         def second(codes=codes):

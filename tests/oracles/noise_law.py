@@ -1,40 +1,12 @@
-"""One-pixel cameras and scenes of given phasors, for the tests of the chain from light to frames."""
+"""The noise of a range written out a second time: the law, and the exact density of which it is the limit."""
 
 import math
 
 import numpy as np
+from builders import one_pixel
 from scipy import special
 
-from phasemark.render import PhasorImages, Sensor, Views
-
 FALSE_ALARM = 1e-3  # of a whole test, whatever the number of cells
-
-
-def one_pixel(**fields):
-    return Sensor(**{"rows": 1, "cols": 1, "half_angle_h_deg": 1, "half_angle_v_deg": 1, **fields})
-
-
-def images_of(phasor, intensity, sensor, harmonics=None):
-    """PhasorImages of given pixels, (n, rows, cols)."""
-    phasor = np.asarray(phasor, complex)
-    views = Views.broadcast(np.ones(len(phasor)))
-    return PhasorImages(
-        phasor, np.asarray(intensity, float), np.ones(phasor.shape), sensor, views, harmonics=harmonics or {}
-    )
-
-
-def pure_image(range_m, sensor, amplitude=1.0, intensity=None):
-    """PhasorImages (n, rows, cols) of unmixed pixels at given ranges, every harmonic that the sensor needs included."""
-    phase = np.asarray(range_m, float) / sensor.metres_per_radian
-    phase = np.broadcast_to(phase.reshape(-1, 1, 1), (phase.size, sensor.rows, sensor.cols))
-    light = np.full(phase.shape, amplitude if intensity is None else intensity, float)
-    harmonics = {k: amplitude * np.exp(1j * k * phase) for k in sensor.harmonic_orders}
-    return images_of(amplitude * np.exp(1j * phase), light, sensor, harmonics)
-
-
-def wrapped(difference_m, sensor):
-    period = sensor.unambiguous_range_m
-    return (difference_m + period / 2) % period - period / 2
 
 
 def noise_law_m(sensor, amplitude, intensity):

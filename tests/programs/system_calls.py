@@ -51,3 +51,15 @@ class Trap:
             return call(*arguments, **options)
 
         return trapped
+
+
+def in_fork(function, *arguments):
+    """Run a function in a child; return its exit code, −signal if it was killed."""
+    child = os.fork()
+    if child == 0:
+        code = 99
+        try:
+            code = function(*arguments)
+        finally:
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])

@@ -1,6 +1,6 @@
 """Kill or fail the writing of a folder at its k-th call to the system, for every k; a program, run by the tests.
 
-usage: folder_crash_points.py FOLDER kill|ENOSPC|EIO|other exchange|two-renames
+usage: python -m programs.folder_crash_points FOLDER kill|ENOSPC|EIO|other exchange|two-renames
 
 "other" has a second run write the same folder at that call. Afterwards the folder is the old or the new one, whole,
 and another run leaves nothing but its own. Without an exchange in one step, and only when killed, the name may be
@@ -12,8 +12,7 @@ import signal
 import sys
 from pathlib import Path
 
-from crash_points import in_fork
-from system_calls import Trap
+from programs.system_calls import Trap, in_fork
 
 from phasemark import OutputExistsError, StorageError
 from phasemark.data.files import renames

@@ -1,13 +1,15 @@
 """Damaged and hostile files for every reader, found by mutation that follows what code they reach.
 
-``python fuzzing.py KIND COUNT SEED FOLDER`` reads COUNT mutants in a process of its own and prints how it went; a crash
-of that process is a finding as well. An input that reaches lines which no other has reached is mutated further. An
-input that ends in anything but an answer or a :class:`phasemark.PhasemarkError` is kept in FOLDER, and belongs into
-``tests/corpus/KIND`` once it is mended: the ordinary tests read all that is there, and mutation begins with it.
+``python tests/programs/fuzzing.py KIND,... COUNT SEED FOLDER`` reads COUNT mutants of each kind in a process of its own
+and prints how it went; a crash of that process is a finding as well. An input that reaches lines which no other has
+reached is mutated further. An input that ends in anything but an answer or a :class:`phasemark.PhasemarkError` is kept
+in FOLDER, and belongs into ``tests/corpus/KIND`` once it is mended: the ordinary tests read all that is there, and
+mutation begins with it.
 """
 
 import io
 import json
+import os
 import random
 import resource
 import shutil
@@ -32,20 +34,20 @@ from phasemark.matcher.plan_kinds import KINDS as PLANS
 from phasemark.matcher.plan_kinds import check_plan, plan_example
 from phasemark.render import Sensor, preset
 
-CORPUS = Path(__file__).parent / "corpus"
+CORPUS = Path(__file__).resolve().parent.parent / "corpus"
 SENSOR = preset("pmd-16x16").model_copy(update={"rows": 4, "cols": 4})
 MOST_SECONDS = 10
 MOST_BYTES = 2 << 30
-_TRACED = (
+OWN_READERS = (
     "/data/",
     "/landmarks/",
     "/inputs/",
-    "/render/sensor.py",
+    "/render/sensor/",
     "/matcher/plan_kinds.py",
-    "/matcher/landmark_map.py",
-    "/matcher/calibrate_poses",
+    "/matcher/position/landmark_map.py",
+    "/matcher/calibrate/known_poses.py",
 )
-_TRACED += ("numpy/lib/", "/zipfile", "/PIL/Png", "trimesh/exchange", "/tomllib/")
+_TRACED = (*OWN_READERS, "numpy/lib/", "/zipfile", "/PIL/Png", "trimesh/exchange", "/tomllib/")
 _TRACE_SHARE = 0.1
 """Share of the mutants whose lines are followed, which takes ten times as long."""
 _MOST_SEEDS = 400
@@ -426,5 +428,19 @@ def _mutated_bag(content, rng):
     return b"".join(b"%s\n%d\n" % (name, len(body)) + body for name, body in files)
 
 
+def main(kinds, count, seed, folder):
+    """Read mutants of each kind in a fork of this process, and print a line each; return 1 if a reader crashed."""
+    codes = []
+    for kind in kinds.split(","):
+        child = os.fork()
+        if child == 0:
+            print(json.dumps(fuzz(kind, int(count), int(seed), Path(folder))), flush=True)
+            os._exit(0)
+        codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+        if codes[-1]:
+            print(f"the reader of {kind} ended with {codes[-1]}", file=sys.stderr)
+    return int(any(codes))
+
+
 if __name__ == "__main__":
-    print(json.dumps(fuzz(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4]))))
+    sys.exit(main(*sys.argv[1:]))

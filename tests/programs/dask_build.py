@@ -1,6 +1,6 @@
 """Build a frame set on a Dask cluster whose workers are killed every so often; a program, run by the tests.
 
-usage: dask_build.py OUT VIEWS SECONDS   (SECONDS between kills; 0: none)
+usage: python -m programs.dask_build OUT VIEWS SECONDS   (SECONDS between kills; 0: none)
 
 Two workers come when the build says that it waits for one, and another for each that is killed. Prints how many were.
 """

@@ -1,6 +1,6 @@
 """Run every command that writes on disks of ten sizes that are too small for it; a program, run by the tests.
 
-usage: full_disks.py FOLDER
+usage: python -m programs.full_disks FOLDER
 
 FOLDER/disk must be a tmpfs that this process may remount. Each command runs once in this process, and then in forks of
 it, which have nothing to load and end as a program does. Prints for each command how many runs found the disk full.
@@ -12,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from random_kills import code_of, fork, warm
+from programs.random_kills import code_of, fork, warm
 
 PLAN = 'views = 60\nframes_per_view = 2\nseed = 7\nwall_m = 4.0\nclasses = ["cone", "post"]\n'
 SHARES = (0.005, 0.02, 0.1, 0.25, 0.4, 0.55, 0.7, 0.85, 0.95, 0.99)

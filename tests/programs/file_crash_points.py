@@ -1,6 +1,6 @@
 """Kill or fail the writing of a picture, table or plan at its k-th call to the system; a program, run by the tests.
 
-usage: file_crash_points.py FOLDER kill|ENOSPC|EIO|other
+usage: python -m programs.file_crash_points FOLDER kill|ENOSPC|EIO|other
 
 "other" has a second run write the same file at that call, without --force where the first has none. The file is old or
 new, and never has the checksum of another content. Prints how many points there were.
@@ -10,8 +10,7 @@ import signal
 import sys
 from pathlib import Path
 
-from crash_points import in_fork
-from system_calls import Trap
+from programs.system_calls import Trap, in_fork
 
 from phasemark import OutputExistsError, StorageError
 from phasemark.data import verify_checksum, write_atomically

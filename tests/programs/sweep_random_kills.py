@@ -1,6 +1,6 @@
 """Kill a small sweep at random moments and resume it, and run it on a Dask cluster; a program, run by the tests.
 
-usage: sweep_ways.py FOLDER TRIALS RUNS SEED
+usage: python -m programs.sweep_random_kills FOLDER TRIALS RUNS SEED
 
 A killed run is a fork of this process, which has all of the program loaded, and no threads left. Prints in how many
 runs the kill came before any trial was safe, in the first round, after it, and after the end. The sweep on the cluster,
@@ -15,7 +15,7 @@ import threading
 import time
 from pathlib import Path
 
-from random_kills import code_of
+from programs.random_kills import code_of
 
 from phasemark.matcher.sweep.plan import Method, SweepPlan
 from phasemark.matcher.sweep.run import run_sweep

@@ -1,6 +1,6 @@
 """Build one frame set in every way there is; a program, run by the tests.
 
-usage: every_way.py FOLDER
+usage: python -m programs.build_on_every_scheduler FOLDER
 
 Prints, for each build, the way and the file's SHA-256.
 """

@@ -1,7 +1,73 @@
-"""Meshes that are not landmarks: open, concave, star shaped, disjoint, bumpy."""
+"""What several tests build or start: cameras of one pixel, images of given phasors, odd meshes, the programs."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import trimesh
+
+from phasemark.render import PhasorImages, Sensor, Views
+
+TESTS = Path(__file__).parent
+HELPERS_IN_PATH = {**os.environ, "PYTHONPATH": str(TESTS)}
+"""The environment of a process that imports the tests' helpers."""
+
+
+def run_program(name, *arguments):
+    """Run a program of tests/programs in a process of its own; return what it prints."""
+    command = [sys.executable, "-m", f"programs.{name}", *map(str, arguments)]
+    done = subprocess.run(command, env=HELPERS_IN_PATH, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{name} ended with {done.returncode}: {done.stderr[-3000:]}"
+    return done.stdout
+
+
+def one_pixel(**fields):
+    return Sensor(**{"rows": 1, "cols": 1, "half_angle_h_deg": 1, "half_angle_v_deg": 1, **fields})
+
+
+def images_of(phasor, intensity, sensor, harmonics=None):
+    """PhasorImages of given pixels, (n, rows, cols)."""
+    phasor = np.asarray(phasor, complex)
+    views = Views.broadcast(np.ones(len(phasor)))
+    return PhasorImages(
+        phasor, np.asarray(intensity, float), np.ones(phasor.shape), sensor, views, harmonics=harmonics or {}
+    )
+
+
+def pure_image(range_m, sensor, amplitude=1.0, intensity=None):
+    """PhasorImages (n, rows, cols) of unmixed pixels at given ranges, every harmonic that the sensor needs included."""
+    phase = np.asarray(range_m, float) / sensor.metres_per_radian
+    phase = np.broadcast_to(phase.reshape(-1, 1, 1), (phase.size, sensor.rows, sensor.cols))
+    light = np.full(phase.shape, amplitude if intensity is None else intensity, float)
+    harmonics = {k: amplitude * np.exp(1j * k * phase) for k in sensor.harmonic_orders}
+    return images_of(amplitude * np.exp(1j * phase), light, sensor, harmonics)
+
+
+def wrapped(difference_m, sensor):
+    period = sensor.unambiguous_range_m
+    return (difference_m + period / 2) % period - period / 2
+
+
+def strangers():
+    """Return meshes of upper parts that are in no catalogue, on the catalogue's box."""
+    box = trimesh.creation.box((0.24, 0.16, 0.15))
+    box.apply_translation((0, 0, -0.075))
+
+    def block(x, y, bottom, top):
+        mesh = trimesh.creation.box((x, y, top - bottom))
+        mesh.apply_translation((0, 0, (top + bottom) / 2))
+        return mesh
+
+    corners = [[x * 0.075, y * 0.075, 0] for x in (-1, 1) for y in (-1, 1)]
+    uppers = {
+        "cube": block(0.13, 0.13, 0, 0.15),
+        "slab": block(0.05, 0.14, 0, 0.15),
+        "table": trimesh.boolean.union([block(0.06, 0.06, 0, 0.1), block(0.14, 0.14, 0.1, 0.15)], engine="manifold"),
+        "pyramid": trimesh.convex.convex_hull(np.array([*corners, [0, 0, 0.15]])),
+    }
+    return {name: trimesh.boolean.union([box, upper], engine="manifold") for name, upper in uppers.items()}
 
 
 def bowl(rings=128):
