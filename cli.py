@@ -1609,8 +1609,8 @@ def _calibrate(
     from phasemark.data import read_frames, write_atomically
     from phasemark.data.shards.executor import processors
     from phasemark.matcher import PoseStd, calibrate, filter_poses, frames_of_poses, kalman_filter, read_poses
-    from phasemark.matcher.calibrate.mounting_model import Mounting
-    from phasemark.matcher.calibrate.report import calibration_dict, calibration_toml, residual_picture
+    from phasemark.matcher.calibration.mounting_model import Mounting
+    from phasemark.matcher.calibration.report import calibration_dict, calibration_toml, residual_picture
 
     if out.suffix.lower() != ".toml":
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")
@@ -1737,8 +1737,8 @@ def _calibration_target(landmark: str, class_name: str | None, sensor: str | Non
 
 def _echo_calibration(found: Calibration) -> None:
     """Print every number with its standard deviation and use, their correlations, the test of the fit and notes."""
-    from phasemark.matcher.calibrate.mounting_model import PARAMETERS
-    from phasemark.matcher.calibrate.report import USES, shown, shown_names, shown_std
+    from phasemark.matcher.calibration.mounting_model import PARAMETERS
+    from phasemark.matcher.calibration.report import USES, shown, shown_names, shown_std
 
     rows = []
     for name in shown_names(found):

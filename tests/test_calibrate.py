@@ -25,10 +25,10 @@ from phasemark.matcher import (
     kalman_filter,
     read_poses,
 )
-from phasemark.matcher.calibrate.mounting_fit import Fit
-from phasemark.matcher.calibrate.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel
-from phasemark.matcher.calibrate.pose_track import PoseTrack
-from phasemark.matcher.calibrate.report import calibration_toml
+from phasemark.matcher.calibration.mounting_fit import Fit
+from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel
+from phasemark.matcher.calibration.pose_track import PoseTrack
+from phasemark.matcher.calibration.report import calibration_toml
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.recordings.stamps import stamp_jitter
 from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, preset
@@ -741,7 +741,7 @@ def test_the_command_refuses_to_write_what_cannot_be_trusted(folder, tmp_path, c
             found.append(calibrate(*given, **options))
         return found[0]
 
-    monkeypatch.setattr("phasemark.matcher.calibrate", calibrated)  # both commands calibrate alike
+    monkeypatch.setattr("phasemark.matcher.calibration", calibrated)  # both commands calibrate alike
     free = ("--free", "pitch,half_angle_h,range_offset", "--on", "ranges")
     assert command(folder[0], tmp_path, *free, landmark="cone") == 3
     error = capsys.readouterr().err.splitlines()[-1]
