@@ -203,7 +203,10 @@ def _run(arguments: list[str]) -> None:
     except typer.TyperException as error:
         failed_in: typer.Context | None = getattr(error, "ctx", None)
         path = "phasemark" if failed_in is None else failed_in.command_path
-        raise UsageError(f"{error.format_message().rstrip('.')}: see '{path} --help'") from None
+        message = (
+            error.format_message().rstrip(".").replace("Value error, ", "", 1)
+        )  # the words of a validator of typer's
+        raise UsageError(f"{message}: see '{path} --help'") from None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

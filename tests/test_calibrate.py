@@ -475,7 +475,7 @@ def test_what_is_stated_and_fixed_is_in_the_sensor_too():
         ({}, ["--free", "pitch,tilt"], 2, "'free' must be among pitch, roll"),
         ({}, ["--free", "pitch", "--fix", "pitch"], 2, "nothing is free"),
         ({}, ["--on", "ranges", "--free", "albedo"], 2, "takes amplitudes"),
-        ({}, ["--on", "sound"], 2, "'on' must be auto, ranges or phasors"),
+        ({}, ["--on", "sound"], 2, "'sound' is not one of 'auto', 'ranges', 'phasors'"),
         ({}, ["--position-std", "-1"], 2, "'position_m' must be a standard deviation"),
         ({}, ["--albedo", "2"], 2, "--albedo must be in (0, 1]"),
         ({}, ["--class", "cone"], 2, "--class belongs to a bank"),

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -15,28 +15,22 @@ from phasemark.data.commands.build import build_or_estimate, merge_shards
 from phasemark.data.commands.console import echo_facts, echo_json, tell
 from phasemark.data.commands.inputs import name_and_file, open_any_bank
 from phasemark.data.commands.options import (
-    DryRun,
+    Building,
     Force,
     Json,
-    MaxSize,
-    MeshUnit,
-    Origin,
+    MeshReading,
+    MeshUnitWord,
     Resume,
-    Scheduler,
-    Shard,
-    ShardItems,
-    Up,
-    Workers,
     a_class,
     a_preset,
-    one_of,
 )
 
 if TYPE_CHECKING:
-    from phasemark.data import MeshPlan
+    from phasemark.data import BankPlan, MeshPlan
 
 
 def bank_build(
+    *,
     out: Annotated[Path, typer.Option("-o", "--out", help="The bank to write; its checksum goes beside it.")],
     plan_file: Annotated[
         Path | None, typer.Argument(metavar="[PLAN]", help="A plan (.toml); options override it.")
@@ -45,9 +39,7 @@ def bank_build(
         list[str] | None, typer.Option("--class", help="A class of the catalogue; repeatable.", autocompletion=a_class)
     ] = None,
     meshes: Annotated[list[str] | None, typer.Option("--mesh", metavar="NAME=FILE", help="Repeatable.")] = None,
-    unit: MeshUnit = None,
-    up: Up = "z",
-    origin: Origin = "file",
+    mesh_reading: MeshReading,
     symmetry: Annotated[
         int | None,
         typer.Option("--symmetry", help="Turns that leave the mesh as it is; found from the mesh if not given."),
@@ -59,67 +51,58 @@ def bank_build(
     distance: Annotated[str | None, typer.Option("--distance", metavar="START:STOP:STEP", help="Metres.")] = None,
     delta: Annotated[str | None, typer.Option("--delta", metavar="START:STOP:STEP", help="Degrees.")] = None,
     model: Annotated[
-        str | None,
+        Literal["ray", "hard", "planar"] | None,
         typer.Option(
             "--model",
             help="ray; hard: centre rays, nothing mixed; or planar: the paper's own generator.",
-            autocompletion=one_of("ray", "hard", "planar"),
         ),
     ] = None,
     albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmarks, in place of their own.")] = None,
     full: Annotated[
         bool, typer.Option("--full", help="Every class at every D and δ; taken where nothing less will do.")
     ] = False,
-    workers: Workers = None,
-    resume: Resume = False,
-    dry_run: DryRun = False,
-    max_size: MaxSize = "2GB",
-    shard: Shard = None,
-    shard_size: ShardItems = None,
-    scheduler: Scheduler = "threads",
-    as_json: Json = False,
-    force: Force = False,
+    building: Building,
 ) -> None:
     """Build a bank of noise-free model images."""
-    from phasemark.data import BankPlan, MeshPlan, build_bank, load_plan
-    from phasemark.data.plans.bank_plan import factored_refusal
+    from phasemark.data import BankPlan, build_bank, load_plan
     from phasemark.landmarks import catalog
 
     if plan_file is not None and str(plan_file) in catalog():
         raise UsageError(f"'{plan_file}' is a class of the catalogue, not a plan: give --class {plan_file}")
     plan = BankPlan() if plan_file is None else load_plan(plan_file)
-    layout_stated = "layout" in plan.model_fields_set or full
-    changes: dict[str, Any] = {}
+    layout_stated = full or "layout" in plan.model_fields_set
+    options: dict[str, Any] = {
+        "sensor": sensor, "distance_m": distance, "delta_deg": delta, "model": model, "albedo": albedo,
+        "layout": "full" if full else None,
+    }  # fmt: skip
+    changes = {key: value for key, value in options.items() if value is not None}
     if classes or meshes:
-        changes["classes"] = tuple(classes or ())
-        changes["landmarks"] = ()
-        changes["meshes"] = tuple(
-            MeshPlan(
-                name=name,
-                path=path,
-                unit=_stated_unit(path, unit),
-                up=up,  # type: ignore[arg-type]  # MeshPlan says what is right
-                origin=origin,  # type: ignore[arg-type]
-                symmetry=symmetry,
-            )
-            for name, path in map(name_and_file, meshes or ())
-        )
-    options = (
-        ("sensor", sensor), ("distance_m", distance), ("delta_deg", delta), ("model", model), ("albedo", albedo)
-    )  # fmt: skip
-    changes |= {key: value for key, value in options if value is not None}
-    if full:
-        changes["layout"] = "full"
-    plan = BankPlan(**{**plan.model_dump(), **changes})
+        stated = tuple(_mesh_plan(one, mesh_reading, symmetry) for one in meshes or ())
+        changes |= {"classes": tuple(classes or ()), "landmarks": (), "meshes": stated}
+    plan = _completed(BankPlan(**{**plan.model_dump(), **changes}), layout_stated)
+    build_or_estimate(build_bank, plan, out, building)
+
+
+def _mesh_plan(name_and_path: str, reading: MeshReading, symmetry: int | None) -> MeshPlan:
+    """Return what a plan says of a mesh that an option names."""
+    from phasemark.data import MeshPlan
+
+    name, path = name_and_file(name_and_path)
+    unit = _stated_unit(path, reading.unit)
+    return MeshPlan(name=name, path=path, unit=unit, up=reading.up, origin=reading.origin, symmetry=symmetry)
+
+
+def _completed(plan: BankPlan, layout_stated: bool) -> BankPlan:
+    """Return a plan with the symmetry found for its meshes, and a full layout where nothing less will do."""
+    from phasemark.data.plans.bank_plan import factored_refusal
+
     resolved = plan.resolve()
     plan = plan.model_copy(update={"meshes": _with_symmetry(plan.meshes, resolved.meshes)})
     if not layout_stated and (reason := factored_refusal(resolved)) is not None:
         plan = plan.model_copy(update={"layout": "full"})
         if not plan.meshes:
             tell(f"note: a full bank, every class at every D and δ: {reason}")
-    build_or_estimate(
-        build_bank, plan, out, shard, dry_run, max_size, as_json, workers, resume, force, shard_size, scheduler
-    )
+    return plan
 
 
 def bank_info(
@@ -165,7 +148,7 @@ def _with_symmetry(meshes: Sequence[MeshPlan], found: Sequence[MeshPlan]) -> tup
     return tuple(one.model_copy(update={"symmetry": other.symmetry}) for one, other in zip(meshes, found, strict=True))
 
 
-def _stated_unit(path: str, unit: str | None) -> Any:
+def _stated_unit(path: str, unit: MeshUnitWord | None) -> MeshUnitWord | None:
     """Return the unit, or let the mesh reader say what the extents would be in each."""
     if unit is None:
         from phasemark.landmarks import read_mesh

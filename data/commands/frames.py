@@ -6,64 +6,50 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from phasemark import UsageError
 from phasemark.data.commands.build import build_or_estimate, merge_shards
+from phasemark.data.commands.command import Without
 from phasemark.data.commands.console import LongWork, echo_facts, echo_json, readable
-from phasemark.data.commands.inputs import background_of, load_landmark, load_sensor, name_and_file
+from phasemark.data.commands.inputs import background_of, load_class_or_mesh, load_sensor, refuse_unless_one
 from phasemark.data.commands.options import (
-    DryRun,
-    FlipH,
-    FlipV,
+    Building,
     Floor,
     Force,
-    FramesUnit,
-    InvalidMeans,
+    FrameReading,
     Json,
-    MaxSize,
-    MeshUnit,
-    Origin,
-    Quantity,
+    MeshReading,
+    QuantityWord,
     Resume,
-    Rotate,
     Sample,
-    Scheduler,
     Seed,
     SensorName,
-    Shard,
-    ShardItems,
-    Up,
-    ValidStatus,
     Wall,
-    Workers,
     a_class,
-    one_of,
 )
 from phasemark.data.commands.outputs import refuse_existing, refuse_input_files, refuse_unwritable_files
+
+if TYPE_CHECKING:
+    from phasemark.render import Sensor
+
+ExportFormat = Literal["npz", "csv", "png16", "ply", "bop", "rosbag"]
 
 _RECORDED_PIXELS = 5_000_000
 """Most pixels of a simulated recording, all frames together: some hundred bytes of memory each."""
 
 
 def frames_build(
+    *,
     plan_file: Annotated[Path, typer.Argument(metavar="PLAN", help="A plan (.toml); options override it.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The frame set to write; its checksum goes beside it.")],
     seed: Annotated[
         int | None, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")
     ] = None,
     views: Annotated[int | None, typer.Option("--views", min=1, help="How many views.")] = None,
-    workers: Workers = None,
-    resume: Resume = False,
-    dry_run: DryRun = False,
-    max_size: MaxSize = "2GB",
-    shard: Shard = None,
-    shard_size: ShardItems = None,
-    scheduler: Scheduler = "threads",
-    as_json: Json = False,
-    force: Force = False,
+    building: Building,
 ) -> None:
     """Build a set of noisy frames with their truth."""
     from phasemark.data import FramePlan, build_frames, read_plan
@@ -71,9 +57,7 @@ def frames_build(
     plan = read_plan(plan_file, FramePlan)
     changes = {key: value for key, value in (("seed", seed), ("views", views)) if value is not None}
     plan = plan.model_copy(update=changes)
-    build_or_estimate(
-        build_frames, plan, out, shard, dry_run, max_size, as_json, workers, resume, force, shard_size, scheduler
-    )
+    build_or_estimate(build_frames, plan, out, building)
 
 
 def frames_info(
@@ -115,22 +99,13 @@ def frames_merge(
 def frames_export(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
     to: Annotated[
-        str,
-        typer.Option(
-            "--to",
-            metavar="FORMAT",
-            help="npz, csv, png16, ply, bop or rosbag.",
-            autocompletion=one_of("npz", "csv", "png16", "ply", "bop", "rosbag"),
-        ),
+        ExportFormat,
+        typer.Option("--to", metavar="FORMAT", help="npz, csv, png16, ply, bop or rosbag."),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="The file (npz, csv) or folder to write.")],
     quantity: Annotated[
-        str | None,
-        typer.Option(
-            "--quantity",
-            help="range or z, in npz, csv and png16; BOP and ROS have z.",
-            autocompletion=one_of("range", "z"),
-        ),
+        QuantityWord | None,
+        typer.Option("--quantity", help="range or z, in npz, csv and png16; BOP and ROS have z."),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -139,54 +114,36 @@ def frames_export(
 
     refuse_input_files([out])
     with open_frames(frames, untrusted=True) as opened:
-        typer.echo(export_frames(opened, out, to, quantity=quantity, force=force))  # type: ignore[arg-type]
+        typer.echo(export_frames(opened, out, to, quantity=quantity, force=force))
 
 
 def frames_import(
+    *,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV, NPY, NPZ, HDF5, PNG; a folder of PNG, a bag.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The measured frames as .npz, range along the ray, metres.")],
     sensor: SensorName = "pmd-16x16",
-    unit: FramesUnit = None,
-    quantity: Quantity = None,
-    invalid_means: InvalidMeans = "missing",
-    valid_status: ValidStatus = None,
-    flip_h: FlipH = False,
-    flip_v: FlipV = False,
-    rotate: Rotate = 0,
+    reading: FrameReading,
     topic: Annotated[str | None, typer.Option("--topic", help="Which images of a ROS bag.")] = None,
     force: Force = False,
 ) -> None:
     """Bring measured frames into one form: range along the ray, in metres, upright."""
-    from phasemark.data import read_frames, write_measured
+    from phasemark.data import write_measured
 
     if out.suffix.lower() != ".npz":
         raise UsageError(f"the output must be a .npz file, got '{out}'")
     refuse_existing([out], force)
-    frames = read_frames(
-        file,
-        sensor=load_sensor(sensor),
-        unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
-        quantity=quantity,  # type: ignore[arg-type]
-        invalid_means=invalid_means,  # type: ignore[arg-type]
-        valid_status=valid_status,
-        flip_h=flip_h,
-        flip_v=flip_v,
-        rotate=rotate,
-        untrusted=True,
-        topic=topic,
-    )
+    frames = reading.read(file, load_sensor(sensor), topic=topic)
     typer.echo(write_measured(frames, out, force=force))
 
 
 def frames_simulate(
+    *,
     out: Annotated[Path, typer.Option("-o", "--out", help="The recording to write: .csv, .npz or .h5.")],
     class_name: Annotated[
         str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=a_class)
     ] = None,
     mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
-    unit: MeshUnit = None,
-    up: Up = "z",
-    origin: Origin = "file",
+    mesh_reading: MeshReading,
     sensor: SensorName = "pmd-16x16",
     distance: Annotated[
         float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis, in the first frame.")
@@ -223,28 +180,15 @@ def frames_simulate(
     from phasemark.data.measured.simulated import recording_format
     from phasemark.render import Views
 
-    if (class_name is None) == (mesh_file is None):
-        raise UsageError("say what to record: either --class NAME or --mesh NAME=FILE")
-    if class_name is not None and unit is not None:
-        raise UsageError("--unit belongs to --mesh: the catalogue is in metres")
+    refuse_unless_one(class_name, mesh_file, mesh_reading, "record")
     for option, value in (("--to-distance", to_distance), ("--to-delta", to_delta)):
         if value is not None and not moving:
             raise UsageError(f"{option} goes with --moving: a camera at rest keeps its view")
     recording_format(out)
     camera = load_sensor(sensor)
-    if n_frames * camera.rows * camera.cols > _RECORDED_PIXELS:
-        most = _RECORDED_PIXELS // (camera.rows * camera.cols)
-        raise UsageError(
-            f"--frames must be at most {most} for {camera.rows} × {camera.cols} pixels: a recording is"
-            " made in memory; phasemark frames build makes large sets"
-        )
+    _refuse_many_frames(n_frames, camera)
     refuse_unwritable_files([out], force)
-    if class_name is not None:
-        name, mesh = load_landmark(class_name, None, "z", "file", from_catalog=True)
-    else:
-        assert mesh_file is not None
-        name, path = name_and_file(mesh_file)
-        _, mesh = load_landmark(path, unit, up, origin)
+    name, mesh = load_class_or_mesh(class_name, mesh_file, mesh_reading)
     way = np.linspace(0.0, 1.0, n_frames) if moving else np.zeros(n_frames)
     last_distance = 0.8 * distance if to_distance is None else to_distance
     last_delta = delta + 40.0 if to_delta is None else to_delta
@@ -268,20 +212,29 @@ def frames_simulate(
     typer.echo(write_recording(recording, out, description=description, force=force))
 
 
+def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
+    """Refuse a recording that is too large to be made in memory."""
+    if n_frames * camera.rows * camera.cols > _RECORDED_PIXELS:
+        most = _RECORDED_PIXELS // (camera.rows * camera.cols)
+        raise UsageError(
+            f"--frames must be at most {most} for {camera.rows} × {camera.cols} pixels: a recording is"
+            " made in memory; phasemark frames build makes large sets"
+        )
+
+
 def frames_show(
+    *,
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, or measured frames.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png.")],
     index: Annotated[int, typer.Option("--index", min=0, help="Number of the frame.")] = 0,
     sensor: SensorName = "pmd-16x16",
-    unit: FramesUnit = None,
-    quantity: Quantity = None,
-    valid_status: ValidStatus = None,
+    reading: Annotated[FrameReading, Without("invalid_means", "flip_h", "flip_v", "rotate")],
     force: Force = False,
 ) -> None:
     """Draw one frame."""
     import io as bytes_io
 
-    from phasemark.data import is_frame_set, open_frames, read_frames, write_atomically
+    from phasemark.data import is_frame_set, open_frames, write_atomically
 
     if out.suffix.lower() != ".png":
         raise UsageError(f"the picture must be a .png file, got '{out}'")
@@ -291,14 +244,7 @@ def frames_show(
             _refuse_index(index, len(opened))
             figure = opened.frames([index]).plot()
     else:
-        measured = read_frames(
-            frames,
-            sensor=load_sensor(sensor),
-            unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
-            quantity=quantity,  # type: ignore[arg-type]
-            valid_status=valid_status,
-            untrusted=True,
-        )
+        measured = reading.read(frames, load_sensor(sensor))
         _refuse_index(index, len(measured) * measured.n_frames)
         figure = measured.plot(*divmod(index, measured.n_frames))
     picture = bytes_io.BytesIO()

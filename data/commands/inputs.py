@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.console import tell
+from phasemark.data.commands.options import MeshReading
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -33,19 +34,40 @@ def open_any_bank(path: Path) -> Bank:
     return open_bank(path, untrusted=True)
 
 
-def load_landmark(
-    name_or_file: str, unit: str | None, up: str, origin: str, *, from_catalog: bool = False
-) -> tuple[str, Trimesh]:
+def load_landmark(name_or_file: str, reading: MeshReading) -> tuple[str, Trimesh]:
     """Return the name and mesh of a class of the catalogue, or of a mesh file."""
-    from phasemark.landmarks import build_mesh, catalog, read_mesh
+    from phasemark.landmarks import catalog, read_mesh
+
+    path = Path(name_or_file)
+    if name_or_file in catalog() or not (path.suffix or path.exists()):
+        return name_or_file, load_class(name_or_file)
+    return path.stem, read_mesh(path, unit=reading.unit, up=reading.up, origin=reading.origin)
+
+
+def load_class(name: str) -> Trimesh:
+    """Return the mesh of a class of the catalogue."""
+    from phasemark.landmarks import build_mesh, catalog
 
     specs = catalog()
-    if name_or_file in specs:
-        return name_or_file, build_mesh(specs[name_or_file])
-    path = Path(name_or_file)
-    if from_catalog or not (path.suffix or path.exists()):
-        raise UsageError(f"unknown class '{name_or_file}': the catalogue has {', '.join(specs)}")
-    return path.stem, read_mesh(path, unit=unit, up=up, origin=origin)
+    if name not in specs:
+        raise UsageError(f"unknown class '{name}': the catalogue has {', '.join(specs)}")
+    return build_mesh(specs[name])
+
+
+def load_class_or_mesh(class_name: str | None, mesh: str | None, reading: MeshReading) -> tuple[str, Trimesh]:
+    """Return the name and mesh that one of --class and --mesh names."""
+    if class_name is not None:
+        return class_name, load_class(class_name)
+    name, path = name_and_file(mesh or "")
+    return name, load_landmark(path, reading)[1]
+
+
+def refuse_unless_one(class_name: str | None, mesh: str | None, reading: MeshReading, doing: str) -> None:
+    """Refuse both or none of --class and --mesh, and a unit without a mesh."""
+    if (class_name is None) == (mesh is None):
+        raise UsageError(f"say what to {doing}: either --class NAME or --mesh NAME=FILE")
+    if class_name is not None and reading.unit is not None:
+        raise UsageError("--unit belongs to --mesh: the catalogue is in metres")
 
 
 def name_and_file(text: str) -> tuple[str, str]:

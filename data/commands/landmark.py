@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from phasemark.data.commands.console import echo_facts, echo_json, echo_table, readable
-from phasemark.data.commands.inputs import load_landmark
-from phasemark.data.commands.options import Force, Json, MeshUnit, Origin, Up, a_class
+from phasemark.data.commands.inputs import load_class, load_landmark
+from phasemark.data.commands.options import Force, Json, MeshReading, a_class
 from phasemark.data.commands.outputs import make_folder, refuse_existing, refuse_input_files
 
 if TYPE_CHECKING:
@@ -42,21 +42,20 @@ def landmark_list(as_json: Json = False) -> None:
 
 
 def landmark_show(
+    *,
     name_or_file: Annotated[
         str,
         typer.Argument(metavar="NAME|FILE", help="A class, or an STL, PLY, OBJ or OFF file.", autocompletion=a_class),
     ],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for NAME.png and NAME.html.")] = None,
-    unit: MeshUnit = None,
-    up: Up = "z",
-    origin: Origin = "file",
+    mesh_reading: MeshReading,
     force: Force = False,
 ) -> None:
     """Draw a landmark: a shaded picture, and a page to turn it in 3D."""
     from phasemark.data import write_atomically
     from phasemark.landmarks import mesh_html, mesh_picture
 
-    name, mesh = load_landmark(name_or_file, unit, up, origin)
+    name, mesh = load_landmark(name_or_file, mesh_reading)
     folder = out or Path()
     picture, page = folder / f"{name}.png", folder / f"{name}.html"
     refuse_existing([picture, page], force)
@@ -77,15 +76,14 @@ def landmark_export(
     from phasemark.landmarks import export_mesh
 
     refuse_input_files([out])
-    _, mesh = load_landmark(name, None, "z", "file", from_catalog=True)
+    mesh = load_class(name)
     typer.echo(write_atomically(out, export_mesh(mesh, out.suffix.removeprefix(".")), force=force))
 
 
 def landmark_check(
+    *,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="An STL, PLY, OBJ or OFF file.")],
-    unit: MeshUnit = None,
-    up: Up = "z",
-    origin: Origin = "file",
+    mesh_reading: MeshReading,
     as_json: Json = False,
 ) -> None:
     """Check a mesh file and say what it holds."""
@@ -93,7 +91,7 @@ def landmark_check(
 
     from phasemark.landmarks import MAX_SYMMETRY, check_mesh
 
-    _, mesh = load_landmark(str(file), unit, up, origin)
+    _, mesh = load_landmark(str(file), mesh_reading)
     report = dataclasses.asdict(check_mesh(mesh))
     if as_json:
         echo_json({"file": str(file), **report})

@@ -7,17 +7,24 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from phasemark import UsageError
-from phasemark.data.commands.inputs import background_of, load_landmark, load_sensor, name_and_file, note_too_far
-from phasemark.data.commands.options import Floor, Force, MeshUnit, Origin, SensorName, Up, Wall, a_class, one_of
+from phasemark.data.commands.inputs import (
+    background_of,
+    load_class_or_mesh,
+    load_sensor,
+    note_too_far,
+    refuse_unless_one,
+)
+from phasemark.data.commands.options import Floor, Force, MeshReading, SensorName, Wall, a_class
 from phasemark.data.commands.outputs import refuse_existing
 
 
 def render_frame(
+    *,
     out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png; the data go beside it as .npz.")],
     distance: Annotated[
         float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")
@@ -29,18 +36,15 @@ def render_frame(
         str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=a_class)
     ] = None,
     mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
-    unit: MeshUnit = None,
-    up: Up = "z",
-    origin: Origin = "file",
+    mesh_reading: MeshReading,
     sensor: SensorName = "pmd-16x16",
     wall: Wall = None,
     floor: Floor = None,
     variant: Annotated[
-        str,
+        Literal["exact", "hard"],
         typer.Option(
             "--variant",
             help="exact, or hard: what the centre ray of each pixel sees, nothing mixed.",
-            autocompletion=one_of("exact", "hard"),
         ),
     ] = "exact",
     force: Force = False,
@@ -53,22 +57,12 @@ def render_frame(
     from phasemark.data import write_atomically
     from phasemark.render import Renderer, terminal_picture
 
-    if (class_name is None) == (mesh_file is None):
-        raise UsageError("say what to render: either --class NAME or --mesh NAME=FILE")
+    refuse_unless_one(class_name, mesh_file, mesh_reading, "render")
     if out.suffix.lower() != ".png":
         raise UsageError(f"the picture must be a .png file, got '{out}'")
-    if class_name is not None and unit is not None:
-        raise UsageError("--unit belongs to --mesh: the catalogue is in metres")
     data = out.with_suffix(".npz")
     refuse_existing([out, data], force)
-    if class_name is not None:
-        _, mesh = load_landmark(class_name, None, "z", "file", from_catalog=True)
-    else:
-        assert mesh_file is not None
-        _, path = name_and_file(mesh_file)
-        _, mesh = load_landmark(path, unit, up, origin)
-    if variant not in ("exact", "hard"):
-        raise UsageError(f"--variant must be exact or hard, got '{variant}'")
+    _, mesh = load_class_or_mesh(class_name, mesh_file, mesh_reading)
     camera = load_sensor(sensor)
     note_too_far(camera, {"--distance": distance, "--wall": wall})
     image = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8)).render(
@@ -77,7 +71,7 @@ def render_frame(
         math.radians(bearing),
         height,
         background=background_of(wall, floor),
-        variant="hard" if variant == "hard" else "exact",
+        variant=variant,
     )
     arrays = {
         "phasor": image.phasor[0],

@@ -6,26 +6,21 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from phasemark import UsageError
+from phasemark.data.commands.command import Without
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
 from phasemark.data.commands.inputs import load_sensor, note_too_far
 from phasemark.data.commands.options import (
-    FlipH,
-    FlipV,
     Force,
-    FramesUnit,
+    FrameReading,
     Json,
-    Quantity,
-    Rotate,
     Seed,
     SensorName,
-    ValidStatus,
     a_preset,
-    one_of,
 )
 from phasemark.data.commands.outputs import output_folder, refuse_existing
 
@@ -113,6 +108,7 @@ def sensor_characterise(
 
 
 def sensor_fit(
+    *,
     frames: Annotated[
         list[Path], typer.Argument(metavar="FRAMES...", help="Frames of a flat board: CSV, NPY, NPZ or HDF5.")
     ],
@@ -135,19 +131,10 @@ def sensor_fit(
     ] = None,
     sensor: SensorName = "pmd-16x16",
     amplitude_unit: Annotated[
-        str,
-        typer.Option(
-            "--amplitude-unit",
-            help="Unit of amplitude and intensity: electrons or arbitrary.",
-            autocompletion=one_of("electrons", "arbitrary"),
-        ),
+        Literal["electrons", "arbitrary"],
+        typer.Option("--amplitude-unit", help="Unit of amplitude and intensity: electrons or arbitrary."),
     ] = "electrons",
-    unit: FramesUnit = None,
-    quantity: Quantity = None,
-    valid_status: ValidStatus = None,
-    flip_h: FlipH = False,
-    flip_v: FlipV = False,
-    rotate: Rotate = 0,
+    reading: Annotated[FrameReading, Without("invalid_means")],
     as_json: Json = False,
     force: Force = False,
 ) -> None:
@@ -156,34 +143,21 @@ def sensor_fit(
     Give the board's distance for each file, in order: FRAMES FRAMES --distance 1.0 --distance 2.0. Geometry and
     whatever the frames do not tell come from --sensor; the file says of each number whether it is measured or assumed.
     """
-    from phasemark.data import read_frames, write_atomically
+    from phasemark.data import write_atomically
     from phasemark.render import fit_sensor
 
     if out.suffix.lower() != ".toml":
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")
     refuse_existing([out], force)
     base = load_sensor(sensor)
-    measured = [
-        read_frames(
-            path,
-            sensor=base,
-            unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
-            quantity=quantity,  # type: ignore[arg-type]
-            valid_status=valid_status,
-            flip_h=flip_h,
-            flip_v=flip_v,
-            rotate=rotate,
-            untrusted=True,
-        )
-        for path in frames
-    ]
+    measured = [reading.read(path, base) for path in frames]
     note_too_far(base, {"--distance": max(distance)})
     fit = fit_sensor(
         [one[k : k + 1] for one in measured for k in range(len(one))],  # every position of a file has its distance
         distance,
         base=base,
         albedo=albedo or None,
-        amplitude_unit=amplitude_unit,  # type: ignore[arg-type]  # fit_sensor says what is right
+        amplitude_unit=amplitude_unit,
         distance_std_m=distance_std or None,
     )
     write_atomically(out, fit.to_toml(base_name=readable(sensor)).encode(), force=force)

@@ -4,45 +4,39 @@
 
 from __future__ import annotations
 
+import io
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
-from phasemark.data.commands.inputs import background_of, load_landmark, load_sensor, note_too_far, open_any_bank
+from phasemark.data.commands.inputs import background_of, load_class, load_sensor, note_too_far, open_any_bank
 from phasemark.data.commands.options import (
-    FlipH,
-    FlipV,
     Floor,
     Force,
-    FramesUnit,
-    InvalidMeans,
+    FrameReading,
     Json,
-    Quantity,
-    Rotate,
-    ValidStatus,
     Wall,
     Workers,
     a_class,
     a_preset,
-    one_of,
 )
 from phasemark.data.commands.outputs import refuse_existing
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-    from phasemark.matcher import (
-        Calibration,
-    )
-    from phasemark.render import Sensor
+    from phasemark.matcher import Calibration, FilteredFrames, KnownPoses, Mounting, PoseStd
+    from phasemark.render import Frames, Sensor
 
 
 def calibrate_camera(
+    *,
     landmark: Annotated[
         str, typer.Argument(metavar="BANK|CLASS", help="A bank, or a class of the catalogue.", autocompletion=a_class)
     ],
@@ -111,22 +105,12 @@ def calibrate_camera(
     ] = (0.0, 0.0),
     landmark_yaw: Annotated[float, typer.Option("--landmark-yaw", metavar="DEG", help="Heading of its x' axis.")] = 0.0,
     on: Annotated[
-        str,
-        typer.Option(
-            "--on",
-            help="auto, ranges, or phasors: amplitudes too.",
-            autocompletion=one_of("auto", "ranges", "phasors"),
-        ),
+        Literal["auto", "ranges", "phasors"],
+        typer.Option("--on", help="auto, ranges, or phasors: amplitudes too."),
     ] = "auto",
     wall: Wall = None,
     floor: Floor = None,
-    unit: FramesUnit = None,
-    quantity: Quantity = None,
-    invalid_means: InvalidMeans = "missing",
-    valid_status: ValidStatus = None,
-    flip_h: FlipH = False,
-    flip_v: FlipV = False,
-    rotate: Rotate = 0,
+    reading: FrameReading,
     plot: Annotated[
         Path | None,
         typer.Option("--plot", help="The picture of the residuals, .png; beside the sensor file otherwise."),
@@ -141,67 +125,25 @@ def calibrate_camera(
     the delay of the stamps: --free and --fix take pitch, roll, height, bearing, half_angle_h, half_angle_v (both: fov),
     range_offset, albedo and delay. A result that cannot be trusted is not written without --force (exit code 3).
     """
-    import io as bytes_io
-
-    from phasemark.data import read_frames, write_atomically
     from phasemark.data.shards.executor import processors
-    from phasemark.matcher import PoseStd, calibrate, filter_poses, frames_of_poses, kalman_filter, read_poses
-    from phasemark.matcher.calibration.mounting_model import Mounting
-    from phasemark.matcher.calibration.report import calibration_dict, calibration_toml, residual_picture
+    from phasemark.matcher import calibrate, read_poses
+    from phasemark.matcher.calibration.report import calibration_dict
 
-    if out.suffix.lower() != ".toml":
-        raise UsageError(f"the sensor must be a .toml file, got '{out}'")
-    picture = plot or out.with_suffix(".png")
-    if picture.suffix.lower() != ".png":
-        raise UsageError(f"the picture must be a .png file, got '{picture}'")
+    picture = _picture_beside(out, plot)
     refuse_existing([out, picture], force)
     background = background_of(wall, floor)
     mesh, base, base_name = _calibration_target(landmark, class_name, sensor)
-    stds = None
-    if (position_std, heading_std, delta_std) != (None, None, None):
-        stds = PoseStd(position_std or 0.0, math.radians(heading_std or 0.0), math.radians(delta_std or 0.0))
     known = read_poses(poses, landmark_xy_m=landmark_xy, landmark_yaw_rad=math.radians(landmark_yaw))
     furthest_m = float(known.distance_m.max()) if len(known.distance_m) else None
     note_too_far(base, {f"{poses}: the landmark": furthest_m, "--wall": wall})
-    measured = [
-        read_frames(
-            path,
-            sensor=base,
-            unit=unit,  # type: ignore[arg-type]  # read_frames says what is right
-            quantity=quantity,  # type: ignore[arg-type]
-            invalid_means=invalid_means,  # type: ignore[arg-type]
-            valid_status=valid_status,
-            flip_h=flip_h,
-            flip_v=flip_v,
-            rotate=rotate,
-            untrusted=True,
-        )
-        for path in frames
-    ]
-    if moving:
-        if len(measured) != 1:
-            raise UsageError(f"--moving takes one recording, got {len(measured)} files")
-        filtered = kalman_filter(measured[0].each_a_position())
-    else:
-        filtered = filter_poses(
-            frames_of_poses(measured, known),
-            on,  # type: ignore[arg-type]  # calibrate says what is right
-        )
+    filtered = _filtered([reading.read(path, base) for path in frames], known, on, moving)
     fixed = [] if fix is None else _names(fix)
     if delay_ms is not None:
         if not moving:
             raise UsageError("--delay-ms takes --moving: still poses have no delay")
         fixed.append("delay")
     bright = float(mesh.metadata.get("albedo", 0.8)) if albedo is None else albedo
-    if not 0 < bright <= 1:
-        raise UsageError(f"--albedo must be in (0, 1], got {bright:g}")
-    start = Mounting.of_sensor(base, bright)
-    if height is not None:
-        start = replace(start, height_m=height)
-    if bearing is not None:
-        start = replace(start, bearing_rad=math.radians(bearing))
-    if delay_ms is not None:
-        start = replace(start, delay_s=delay_ms / 1e3)
+    start = _start(base, bright, height, bearing, delay_ms)
     with LongWork("rendering poses") as progress:
         found = calibrate(
             mesh,
@@ -210,30 +152,86 @@ def calibrate_camera(
             free=None if free is None else _names(free),
             fixed=fixed,
             start=start,
-            on=on,  # type: ignore[arg-type]  # calibrate says what is right
+            on=on,
             background=background,
-            pose_std=stds,
-            reports_z=quantity == "z" or None,
+            pose_std=_pose_std(position_std, heading_std, delta_std),
+            reports_z=reading.quantity == "z" or None,
             moving=moving,
             zones=zones,
             workers=workers or min(processors(), 4),
             progress=progress,
         )
-    if found.doubts and not force:
-        raise InputFileError(
-            f"nothing was written, for the calibration cannot be trusted: {'; '.join(found.doubts)}. Likely cause:"
-            f" {found.cause} (--force writes it all the same)"
-        )
-    buffer = bytes_io.BytesIO()
-    residual_picture(found).savefig(buffer, format="png", dpi=100)
-    write_atomically(picture, buffer.getvalue(), force=force)
-    write_atomically(out, calibration_toml(found, base_name=readable(base_name)).encode(), force=force)
+    _write_calibration(found, out, picture, base_name, force)
     if as_json:
         echo_json({"file": str(out), "picture": str(picture), **calibration_dict(found)})
         return
     _echo_calibration(found)
     typer.echo(out)
     typer.echo(picture)
+
+
+def _picture_beside(out: Path, plot: Path | None) -> Path:
+    """Return where the picture of the residuals goes; refuse names of a wrong kind."""
+    if out.suffix.lower() != ".toml":
+        raise UsageError(f"the sensor must be a .toml file, got '{out}'")
+    picture = plot or out.with_suffix(".png")
+    if picture.suffix.lower() != ".png":
+        raise UsageError(f"the picture must be a .png file, got '{picture}'")
+    return picture
+
+
+def _pose_std(position: float | None, heading_deg: float | None, delta_deg: float | None) -> PoseStd | None:
+    """Return how well the poses are known; None if nothing is said of it."""
+    from phasemark.matcher import PoseStd
+
+    if (position, heading_deg, delta_deg) == (None, None, None):
+        return None
+    return PoseStd(position or 0.0, math.radians(heading_deg or 0.0), math.radians(delta_deg or 0.0))
+
+
+def _filtered(
+    measured: Sequence[Frames], known: KnownPoses, on: Literal["auto", "ranges", "phasors"], moving: bool
+) -> FilteredFrames:
+    """Return the frames of a moving camera one by one, and those of a still one averaged at each pose."""
+    from phasemark.matcher import filter_poses, frames_of_poses, kalman_filter
+
+    if not moving:
+        return filter_poses(frames_of_poses(measured, known), on)
+    if len(measured) != 1:
+        raise UsageError(f"--moving takes one recording, got {len(measured)} files")
+    return kalman_filter(measured[0].each_a_position())
+
+
+def _start(
+    base: Sensor, albedo: float, height: float | None, bearing_deg: float | None, delay_ms: float | None
+) -> Mounting:
+    """Return the mounting as it is thought to be."""
+    from phasemark.matcher.calibration.mounting_model import Mounting
+
+    if not 0 < albedo <= 1:
+        raise UsageError(f"--albedo must be in (0, 1], got {albedo:g}")
+    start = Mounting.of_sensor(base, albedo)
+    if height is not None:
+        start = replace(start, height_m=height)
+    if bearing_deg is not None:
+        start = replace(start, bearing_rad=math.radians(bearing_deg))
+    return start if delay_ms is None else replace(start, delay_s=delay_ms / 1e3)
+
+
+def _write_calibration(found: Calibration, out: Path, picture: Path, base_name: str, force: bool) -> None:
+    """Write the sensor file and the picture of the residuals, unless the calibration cannot be trusted."""
+    from phasemark.data import write_atomically
+    from phasemark.matcher.calibration.report import calibration_toml, residual_picture
+
+    if found.doubts and not force:
+        raise InputFileError(
+            f"nothing was written, for the calibration cannot be trusted: {'; '.join(found.doubts)}. Likely cause:"
+            f" {found.cause} (--force writes it all the same)"
+        )
+    buffer = io.BytesIO()
+    residual_picture(found).savefig(buffer, format="png", dpi=100)
+    write_atomically(picture, buffer.getvalue(), force=force)
+    write_atomically(out, calibration_toml(found, base_name=readable(base_name)).encode(), force=force)
 
 
 def _names(text: str) -> list[str]:
@@ -250,7 +248,7 @@ def _calibration_target(landmark: str, class_name: str | None, sensor: str | Non
         if class_name is not None:
             raise UsageError("--class belongs to a bank: give the class in its place")
         name = sensor or "pmd-16x16"
-        return load_landmark(landmark, None, "z", "file", from_catalog=True)[1], load_sensor(name), name
+        return load_class(landmark), load_sensor(name), name
     with open_any_bank(path) as bank:
         if class_name is None and len(bank.classes) > 1:
             raise UsageError(f"{landmark} has {', '.join(bank.classes)}: say with --class which one was recorded")

@@ -8,6 +8,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from phasemark.data.commands.options import FrameReading
+
 if TYPE_CHECKING:
     from phasemark.matcher import (
         Change,
@@ -19,10 +21,7 @@ if TYPE_CHECKING:
 class Given:
     """How a command was told to read frames and match them, as far as a diagnosis depends on it."""
 
-    unit: str | None
-    flip_h: bool
-    flip_v: bool
-    rotate: int
+    reading: FrameReading
     nearest: bool
     bearing_fixed: bool
 
@@ -38,7 +37,7 @@ def _flags(change: Change, given: Given) -> str:
 
     value = change.value
     refine = "--method refine " if given.nearest else ""
-    turned = given.rotate in (90, 270)  # mirrored before it is turned: left and right become top and bottom
+    turned = given.reading.rotate in (90, 270)  # mirrored before it is turned: left and right become top and bottom
     if change.parameter == "method":
         return refine.strip()
     if change.parameter == "free":
@@ -53,14 +52,14 @@ def _flags(change: Change, given: Given) -> str:
     if change.parameter in ("flip_h", "flip_v"):
         horizontal = (change.parameter == "flip_h") != turned
         option = "--flip-h" if horizontal else "--flip-v"
-        return f"without {option}" if (given.flip_h if horizontal else given.flip_v) else option
+        return f"without {option}" if (given.reading.flip_h if horizontal else given.reading.flip_v) else option
     if change.parameter == "rotate":
-        angle = (given.rotate + value) % 360
+        angle = (given.reading.rotate + value) % 360
         return f"--rotate {angle}" if angle else "without --rotate"
     if change.parameter == "quantity":
         return f"--quantity {value}"
     if change.parameter == "unit_factor":
-        scale = None if given.unit is None else METRES_PER_UNIT[given.unit] * value
+        scale = None if given.reading.unit is None else METRES_PER_UNIT[given.reading.unit] * value
         right = next((name for name, metres in METRES_PER_UNIT.items() if scale and math.isclose(metres, scale)), None)
         return f"a unit {value:g} times as large as the file states" if right is None else f"--unit {right}"
     if change.parameter == "half_angle_deg":

@@ -5,21 +5,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from phasemark.data.commands.console import echo_json
 from phasemark.data.commands.inputs import note_plan_too_far
-from phasemark.data.commands.options import Json, one_of
+from phasemark.data.commands.options import Json
 
-_a_plan_kind = one_of("bank", "frames", "sweep", "drive", "design")
+PlanKind = Literal["bank", "frames", "sweep", "drive", "design"]
 
 
 def plan_example(
-    kind: Annotated[
-        str, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.", autocompletion=_a_plan_kind)
-    ],
+    kind: Annotated[PlanKind, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.")],
 ) -> None:
     """Print a plan with comments; it can be used as it is."""
     from phasemark.matcher.plan_kinds import plan_example
@@ -28,9 +26,7 @@ def plan_example(
 
 
 def plan_schema(
-    kind: Annotated[
-        str, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.", autocompletion=_a_plan_kind)
-    ],
+    kind: Annotated[PlanKind, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.")],
 ) -> None:
     """Print the JSON Schema of a kind of plan, for editors and other programs."""
     from phasemark.matcher.plan_kinds import plan_schema
@@ -41,11 +37,10 @@ def plan_schema(
 def plan_check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A plan (.toml).")],
     kind: Annotated[
-        str | None,
+        PlanKind | None,
         typer.Option(
             "--kind",
             help="bank, frames, sweep, drive or design, if the plan leaves it open.",
-            autocompletion=_a_plan_kind,
         ),
     ] = None,
     as_json: Json = False,
