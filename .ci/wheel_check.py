@@ -18,7 +18,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOT_FILES = {"__init__.py", "__main__.py", "cli.py", "py.typed"}
-ROOMS = {"data", "landmarks", "matcher", "render"}
+ROOMS = {"data", "inputs", "landmarks", "matcher", "render"}
 
 IMPORT_ALL = """
 import importlib, pkgutil, sys

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args, get_origin
 
 import typer
 
@@ -39,9 +39,19 @@ def cell(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
 
 
+def choices(annotation: Any) -> list[str]:
+    """Return the words that an option chooses among, of ``Literal[...]``, ``list`` of it, or it and None."""
+    if get_origin(annotation) is Literal:
+        return [str(word) for word in get_args(annotation)]
+    return next(filter(None, map(choices, get_args(annotation))), [])
+
+
 def kind(option: Any) -> str:
     """Return what an option takes, a repeatable one what it takes each time."""
     annotation = option.type_descriptor.annotation
+    words = choices(annotation)
+    if words:
+        return "|".join(words)
     return TYPES[next(iter(get_args(annotation)), annotation)]
 
 

@@ -21,8 +21,8 @@ from real_recording import THICKNESS_M, Recording, read_recording
 
 from phasemark import PhasemarkError
 from phasemark.matcher import KnownPoses, calibrate, kalman_filter
-from phasemark.matcher.calibrate.mounting_model import PARAMETERS
-from phasemark.matcher.calibrate.report import calibration_toml, residual_picture, shown, shown_std
+from phasemark.matcher.calibration.mounting_model import PARAMETERS
+from phasemark.matcher.calibration.report import calibration_toml, residual_picture, shown, shown_std
 from phasemark.render import preset
 
 SENSOR = "vl53l5cx-8x8"

@@ -2,46 +2,48 @@
 
 from typing import TYPE_CHECKING
 
-from phasemark.matcher.accuracy.cramer_rao import (
-    Bound,
-    Estimate,
-    confusion_probability,
-    covers,
-    cramer_rao,
-    efficiency,
-    nees,
-    share,
-)
-from phasemark.matcher.accuracy.grid_spacing import GridLoss, SpacingLoss, grid_loss
-from phasemark.matcher.accuracy.trials import Conditions, Trials, TrialSummary, run_trials
-from phasemark.matcher.calibrate.calibration import Calibration, calibrate, filter_poses
-from phasemark.matcher.calibrate.known_poses import KnownPoses, PoseStd, frames_of_poses, read_poses
-from phasemark.matcher.calibrate.mounting_model import Mounting
-from phasemark.matcher.diagnosis.diagnose import Change, Diagnosis, diagnose
-from phasemark.matcher.filters.filtered_frames import (
-    FilteredFrames,
-    PixelKalman,
-    PixelState,
-    kalman,
-    kalman_filter,
-    kalman_step,
-    noise_free,
-    phasor_mean,
-)
-from phasemark.matcher.likelihood.background_estimate import Surroundings, estimate_surroundings
-from phasemark.matcher.match import Candidate, Match, Matches
-from phasemark.matcher.matcher import Matcher, background_image
-from phasemark.matcher.position.landmark_map import LandmarkMap, MappedLandmark, Placement, load_map
-from phasemark.matcher.position.robot_pose import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
-from phasemark.matcher.recordings.stillness import MotionTest, motion_test
-from phasemark.matcher.sweep.compare import Difference, compare_cells
-from phasemark.matcher.sweep.examples import sweep_frames
-from phasemark.matcher.sweep.plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, load_sweep
-from phasemark.matcher.sweep.result_tables import Cell, SweepTrials
-from phasemark.matcher.sweep.run import read_sweep, run_sweep
+from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from phasemark.matcher.accuracy.cramer_rao import (
+        Bound,
+        Estimate,
+        confusion_probability,
+        covers,
+        cramer_rao,
+        efficiency,
+        nees,
+        share,
+    )
+    from phasemark.matcher.accuracy.grid_spacing import GridLoss, SpacingLoss, grid_loss
+    from phasemark.matcher.accuracy.trials import Conditions, Trials, TrialSummary, run_trials
+    from phasemark.matcher.calibration.calibration import Calibration, calibrate, filter_poses
+    from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd, frames_of_poses, read_poses
+    from phasemark.matcher.calibration.mounting_model import Mounting
+    from phasemark.matcher.diagnosis.diagnose import Change, Diagnosis, diagnose
+    from phasemark.matcher.filters.filtered_frames import (
+        FilteredFrames,
+        PixelKalman,
+        PixelState,
+        kalman,
+        kalman_filter,
+        kalman_step,
+        noise_free,
+        phasor_mean,
+    )
+    from phasemark.matcher.likelihood.background_estimate import Surroundings, estimate_surroundings
+    from phasemark.matcher.match import Candidate, Match, Matches
+    from phasemark.matcher.matcher import Matcher, background_image
+    from phasemark.matcher.position.landmark_map import LandmarkMap, MappedLandmark, Placement, load_map
+    from phasemark.matcher.position.robot_pose import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
+    from phasemark.matcher.recordings.stillness import MotionTest, motion_test
+    from phasemark.matcher.sweep.compare import Difference, compare_cells
+    from phasemark.matcher.sweep.examples import sweep_frames
+    from phasemark.matcher.sweep.plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, load_sweep
+    from phasemark.matcher.sweep.result_tables import Cell, SweepTrials
+    from phasemark.matcher.sweep.run import read_sweep, run_sweep
+else:
+    __getattr__, __dir__ = on_use.imported_on_use(__name__)
 
 __all__ = [
     "PRIOR_STD",
@@ -108,12 +110,3 @@ __all__ = [
     "share",
     "sweep_frames",
 ]
-
-
-def _figure_of_filtered(frames: FilteredFrames) -> "Figure":
-    from phasemark.matcher.figures import filtered_picture  # matplotlib takes half a second to load
-
-    return filtered_picture(frames)
-
-
-FilteredFrames.figure = staticmethod(_figure_of_filtered)

@@ -14,7 +14,7 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import background_image
 from phasemark.render import Background, Renderer, phasor_to_range_m, predicted_range_std, wrap_difference_m
-from phasemark.render.figures import draw_difference, draw_map, draw_range
+from phasemark.render.figures import draw_difference, draw_range
 
 
 def model_range_m(bank: Bank, match: Match, background: Background | None) -> NDArray[np.float64]:
@@ -53,28 +53,6 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
     noise = predicted_range_std(np.abs(phasor), intensity, bank.sensor) / bank.sensor.metres_per_radian
     limit = bank.sensor.max_phase_std_rad or np.inf
     return np.where(noise <= limit, phasor_to_range_m(phasor, bank.sensor), np.nan)
-
-
-def filtered_picture(frames: FilteredFrames, index: int = 0) -> Figure:
-    """Draw the range of one position beside its standard deviation.
-
-    Parameters
-    ----------
-    frames : FilteredFrames
-    index : int
-        Which position.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
-    figure = Figure(figsize=(8.4, 4.0), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    left.set_title("range")
-    draw_range(left, frames.range_m[index])
-    std_mm = 1e3 * np.where(np.isfinite(frames.std_m[index]), frames.std_m[index], np.nan)
-    draw_map(right, std_mm, "standard deviation", "standard deviation (mm)", cmap="viridis", vmin=0)
-    return figure
 
 
 def match_picture(

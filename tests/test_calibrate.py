@@ -25,10 +25,10 @@ from phasemark.matcher import (
     kalman_filter,
     read_poses,
 )
-from phasemark.matcher.calibrate.mounting_fit import Fit
-from phasemark.matcher.calibrate.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel
-from phasemark.matcher.calibrate.pose_track import PoseTrack
-from phasemark.matcher.calibrate.report import calibration_toml
+from phasemark.matcher.calibration.mounting_fit import Fit
+from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel
+from phasemark.matcher.calibration.pose_track import PoseTrack
+from phasemark.matcher.calibration.report import calibration_toml
 from phasemark.matcher.filters.stamps import stamp_jitter
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, preset
@@ -476,7 +476,7 @@ def test_what_is_stated_and_fixed_is_in_the_sensor_too():
         ({}, ["--free", "pitch,tilt"], 2, "'free' must be among pitch, roll"),
         ({}, ["--free", "pitch", "--fix", "pitch"], 2, "nothing is free"),
         ({}, ["--on", "ranges", "--free", "albedo"], 2, "takes amplitudes"),
-        ({}, ["--on", "sound"], 2, "'on' must be auto, ranges or phasors"),
+        ({}, ["--on", "sound"], 2, "'sound' is not one of 'auto', 'ranges', 'phasors'"),
         ({}, ["--position-std", "-1"], 2, "'position_m' must be a standard deviation"),
         ({}, ["--albedo", "2"], 2, "--albedo must be in (0, 1]"),
         ({}, ["--class", "cone"], 2, "--class belongs to a bank"),
@@ -742,7 +742,7 @@ def test_the_command_refuses_to_write_what_cannot_be_trusted(folder, tmp_path, c
             found.append(calibrate(*given, **options))
         return found[0]
 
-    monkeypatch.setattr("phasemark.matcher.calibrate", calibrated)  # both commands calibrate alike
+    monkeypatch.setattr("phasemark.matcher.calibration", calibrated)  # both commands calibrate alike
     free = ("--free", "pitch,half_angle_h,range_offset", "--on", "ranges")
     assert command(folder[0], tmp_path, *free, landmark="cone") == 3
     error = capsys.readouterr().err.splitlines()[-1]

@@ -14,6 +14,7 @@ from typing import NamedTuple, NoReturn
 import pytest
 
 from phasemark import PhasemarkError, StorageError, __version__, cli
+from phasemark.data.commands import console
 from phasemark.render import Sensor, preset, preset_names
 
 PHASEMARK = str(Path(sys.executable).with_name("phasemark"))
@@ -127,13 +128,14 @@ def _fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     def fail(name_or_file: str) -> Sensor:
         raise error
 
-    monkeypatch.setattr(cli, "_load_sensor", fail)
+    monkeypatch.setattr("phasemark.data.commands.sensor.load_sensor", fail)
 
 
 def test_termination_unwinds_and_exits_with_143() -> None:
     program = """
         import sys, time
         from phasemark import cli
+        from phasemark.data.commands import sensor
 
         def wait(name_or_file):
             try:
@@ -142,7 +144,7 @@ def test_termination_unwinds_and_exits_with_143() -> None:
             finally:
                 print("cleaned up")
 
-        cli._load_sensor = wait
+        sensor.load_sensor = wait
         sys.exit(cli.main(["sensor", "show", "ideal"]))
     """
     command = [sys.executable, "-c", textwrap.dedent(program)]
@@ -196,7 +198,7 @@ class Clock:
 
 def test_a_line_of_progress_says_what_how_far_and_for_how_long(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
-    progress = cli._Progress("rendering", clock)
+    progress = console.LongWork("rendering", clock)
     with progress as report:
         clock.seconds = 10.0
         assert progress._line() == "rendering: 10 s elapsed"
@@ -225,7 +227,7 @@ def test_long_work_writes_lines_where_stderr_is_no_terminal(
 ) -> None:
     # The work itself is replaced by waiting for two lines.
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "_PROGRESS_SECONDS", 1e-3)
+    monkeypatch.setattr(console, "PROGRESS_SECONDS", 1e-3)
     (tmp_path / "frames.toml").write_text("views = 1\n", encoding="utf-8")
     lines: list[str] = []
     two = threading.Event()

@@ -206,7 +206,7 @@ def test_a_dry_run_states_a_size_that_would_be_refused(run, tmp_path):
 
 
 def test_a_large_file_that_is_allowed_is_announced(run, tmp_path, monkeypatch):
-    monkeypatch.setattr("phasemark.cli._NOTED_BYTES", 100_000)
+    monkeypatch.setattr("phasemark.data.commands.build.NOTED_BYTES", 100_000)
     command = ["bank", "build", "--class", "cone", *SMALL, "-o", tmp_path / "b.h5", "--max-size"]
     assert run(*command, "0.19MB")[0] == 2
     code, _, err = run(*command, "0.2 MB")
@@ -396,7 +396,7 @@ MISTAKES = [
     _case(2, "landmark", "export", "cone", "-o", "x.step", contains="stl"),
     _case(2, "landmark", "check", "box.stl", contains="inch"),
     _case(2, "landmark", "check", "box.stl", "--unit", "mile", contains="mile"),
-    _case(2, "landmark", "check", "box.stl", "--unit", "m", "--up", "w", contains="'up'"),
+    _case(2, "landmark", "check", "box.stl", "--unit", "m", "--up", "w", contains="'--up': 'w' is not one of 'x', 'y'"),
     _case(3, "landmark", "check", "cut.stl", "--unit", "m", contains="cut off"),
     _case(3, "landmark", "check", "none.stl", "--unit", "m", contains="none.stl"),
     _case(3, "landmark", "check", "frames.csv", "--unit", "m", contains="csv"),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from phasemark.cli import _OUTPUTS
+from phasemark.data.commands.command import OUTPUTS
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -55,7 +55,7 @@ def test_every_command_that_writes_has_its_promises(commands):
 
 
 def writes(command):
-    return {parameter.name for parameter in command.params} & set(_OUTPUTS)
+    return {parameter.name for parameter in command.params} & set(OUTPUTS)
 
 
 def test_no_page_or_message_installs_extras_from_an_index():

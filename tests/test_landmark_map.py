@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from phasemark import InputFileError, UsageError
-from phasemark.cli import _plain_pose, _pose_text, main
+from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank
 from phasemark.matcher import LandmarkMap, Match, load_map, robot_poses
+from phasemark.matcher.commands.match_table import plain_pose, pose_text
 from phasemark.render import Renderer, capture
 
 DOOR = {"name": "door", "class": "cone", "x_m": 2.0, "y_m": 1.0, "yaw_deg": 30.0}
@@ -170,6 +171,6 @@ def test_options_that_make_no_sense_are_one_line(capsys, bank_and_frames, option
 def test_a_pose_with_covariance_is_printed_with_its_standard_deviations():
     match = Match("cone", True, 1.2, 0.4, covariance=np.diag([1e-6, 1e-4]), symmetry=1)
     (placement,) = LandmarkMap(landmark=[DOOR]).poses(match)
-    pose = _plain_pose(placement.pose)
+    pose = plain_pose(placement.pose)
     assert pose["std"]["heading_deg"] == pytest.approx(math.degrees(0.01))
-    assert f"heading {pose['heading_deg']:.2f} ± 0.57°" in _pose_text(pose)
+    assert f"heading {pose['heading_deg']:.2f} ± 0.57°" in pose_text(pose)

@@ -64,7 +64,7 @@ caching.CacheImpl._locator_classes = [caching.UserProvidedCacheLocator]  # as in
 caching.CompileResultCacheImpl._locator_classes = caching.CacheImpl._locator_classes
 with warnings.catch_warnings(record=True) as noted:
     warnings.simplefilter("always")
-    import phasemark.matcher
+    from phasemark.matcher import Matcher
 from phasemark.render import compile_cache
 import pathlib
 assert len([one for one in noted if "compiled code" in str(one.message)]) == 1

@@ -110,6 +110,26 @@ def test_public_names_are_listed_and_exist(name: str) -> None:
     assert [key for key in module.__all__ if not hasattr(module, key)] == []
 
 
+@pytest.mark.parametrize("name", ["data", "matcher"])
+def test_a_room_is_imported_without_its_modules(name: str) -> None:
+    program = f"""
+import sys
+import phasemark.{name} as room
+print("numpy" in sys.modules, set(room.__all__) <= set(dir(room)))
+from phasemark.{name} import {{}}
+print("numpy" in sys.modules)
+"""
+    first = importlib.import_module(f"phasemark.{name}").__all__[0]
+    command = [sys.executable, "-c", program.format(first)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.split()) == (0, ["False", "True", "True"]), done.stderr
+
+
+def test_an_unknown_name_of_a_room_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match=r"module 'phasemark.data' has no attribute 'open_banks'"):
+        importlib.import_module("phasemark.data").open_banks  # noqa: B018
+
+
 @pytest.mark.parametrize("name", MODULES)
 def test_every_module_says_what_lives_there(name: str) -> None:
     assert (importlib.import_module(name).__doc__ or "").strip()

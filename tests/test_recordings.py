@@ -108,7 +108,7 @@ def test_the_note_names_the_first_position_that_moved(run, folder, tmp_path):
 
 
 def test_rows_are_printed_as_batches_finish(folder, capsys, monkeypatch):
-    monkeypatch.setattr("phasemark.cli._NEAREST_AT_ONCE", 4)
+    monkeypatch.setattr("phasemark.matcher.commands.match.NEAREST_AT_ONCE", 4)
     printed, match = [], Matcher.match
 
     def watched(self, frames):

@@ -6,8 +6,9 @@ import pytest
 import typer
 
 from phasemark import UsageError
-from phasemark.cli import _OUTPUTS, app, main
+from phasemark.cli import app, main
 from phasemark.data import BankPlan, MeshPlan, build_bank
+from phasemark.data.commands.command import OUTPUTS
 from phasemark.data.files.same_file import refuse_inputs
 from phasemark.landmarks import build_mesh, catalog, export_mesh
 
@@ -80,7 +81,7 @@ def test_every_command_with_an_output_has_a_case():
         if not hasattr(command, "commands"):
             yield " ".join(path), {parameter.name for parameter in command.params}
 
-    found = {name for name, names in commands(typer.main.get_command(app), []) if names & set(_OUTPUTS)}
+    found = {name for name, names in commands(typer.main.get_command(app), []) if names & set(OUTPUTS)}
     assert found == {*CASES, *ELSEWHERE}
 
 

@@ -10,8 +10,9 @@ import pytest
 from builders import run_program
 from own_matchers import Fails
 
-from phasemark import OutputExistsError, UsageError, cli
+from phasemark import OutputExistsError, UsageError
 from phasemark.cli import main
+from phasemark.data.commands import console
 from phasemark.data.files.folder_marker import MARKER
 from phasemark.matcher.plan_kinds import plan_schema
 from phasemark.matcher.sweep.plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
@@ -180,7 +181,7 @@ def test_what_a_matcher_raises_is_shown_with_its_own_traceback(
         f'methods = [{{ name = "mine", method = "own_matchers:{matcher}" }}]\n',
         encoding="utf-8",
     )
-    monkeypatch.setattr(cli, "_PROGRESS_SECONDS", 1e6)  # no line of progress among those of the error
+    monkeypatch.setattr(console, "PROGRESS_SECONDS", 1e6)  # no line of progress among those of the error
     options = ["--scheduler", scheduler, "--trust-plan", "-o", str(tmp_path / "out")]
     assert main(["sweep", "run", str(tmp_path / "plan.toml"), *options]) == 2
     *traceback, error = capsys.readouterr().err.splitlines()

@@ -7,10 +7,10 @@ deviation. Neither removes mixing at edges: averaging converges to the mixed ran
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ from phasemark.render.sensor.range_noise import measured_range_std, predicted_ra
 from phasemark.render.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 _LEAST_POOLED = 1e-4
 """Least variance over that of the law; frames without any scatter are simulated, or frozen."""
@@ -72,9 +72,6 @@ class FilteredFrames:
     UsageError
         The shapes do not agree with each other or with the sensor.
     """
-
-    figure: ClassVar[Callable[..., Figure]]
-    """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
 
     range_m: NDArray[np.float64]
     std_m: NDArray[np.float64]
@@ -142,7 +139,9 @@ class FilteredFrames:
 
     def _repr_png_(self) -> bytes | None:
         """Show range and standard deviation of the first position in a notebook; nothing where there is none."""
-        return figure_png(type(self).figure(self)) if len(self) else None
+        from phasemark.matcher.filters.figures import filtered_figure  # matplotlib takes half a second to load
+
+        return figure_png(filtered_figure(self.range_m[0], self.std_m[0])) if len(self) else None
 
 
 def assumed_std_m(range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:

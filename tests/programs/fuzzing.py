@@ -29,7 +29,7 @@ from phasemark.data.shards.build import _Manifest
 from phasemark.inputs import checksum_path, read_checksum
 from phasemark.landmarks import build_mesh, catalog, export_mesh, read_mesh
 from phasemark.matcher import load_map
-from phasemark.matcher.calibrate.known_poses import read_poses
+from phasemark.matcher.calibration.known_poses import read_poses
 from phasemark.matcher.plan_kinds import KINDS as PLANS
 from phasemark.matcher.plan_kinds import check_plan, plan_example
 from phasemark.render import Sensor, preset

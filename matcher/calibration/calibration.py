@@ -19,14 +19,14 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.data.progress import Progress, counter
-from phasemark.matcher.calibrate.judgement import doubts_about, likely_cause
-from phasemark.matcher.calibrate.known_poses import KnownPoses, PoseStd
-from phasemark.matcher.calibrate.mounting_fit import Fit, Knowledge, Place, inverse
-from phasemark.matcher.calibrate.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel, Mounting
-from phasemark.matcher.calibrate.notes import advice, named, observability_notes, odd_pose_notes
-from phasemark.matcher.calibrate.pose_errors import estimate_pose_std
-from phasemark.matcher.calibrate.pose_track import LONGEST_GAP_S, PoseTrack
-from phasemark.matcher.calibrate.recording_fit import Recorded, Recording, prior_std
+from phasemark.matcher.calibration.judgement import doubts_about, likely_cause
+from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
+from phasemark.matcher.calibration.mounting_fit import Fit, Knowledge, Place, inverse
+from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel, Mounting
+from phasemark.matcher.calibration.notes import advice, named, observability_notes, odd_pose_notes
+from phasemark.matcher.calibration.pose_errors import estimate_pose_std
+from phasemark.matcher.calibration.pose_track import LONGEST_GAP_S, PoseTrack
+from phasemark.matcher.calibration.recording_fit import Recorded, Recording, prior_std
 from phasemark.matcher.filters.filtered_frames import (
     FilteredFrames,
     PixelState,

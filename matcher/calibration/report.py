@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from phasemark.matcher.calibrate.calibration import Calibration
-from phasemark.matcher.calibrate.known_poses import POSE_UNITS
-from phasemark.matcher.calibrate.mounting_model import ALL_NAMES, NAMES, PARAMETERS
+from phasemark.matcher.calibration.calibration import Calibration
+from phasemark.matcher.calibration.known_poses import POSE_UNITS
+from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS
 from phasemark.render.figures import draw_difference
 from phasemark.render.integral.rounding import error_text, value_and_error
 from phasemark.render.sensor.sensor_file import sensor_toml

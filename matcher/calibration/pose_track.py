@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import interpolate
 
 from phasemark import UsageError
-from phasemark.matcher.calibrate.known_poses import KnownPoses
+from phasemark.matcher.calibration.known_poses import KnownPoses
 from phasemark.matcher.filters.stamps import stamp_jitter
 
 LONGEST_GAP_S = 0.25

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from phasemark.matcher.calibrate.known_poses import PoseStd
-from phasemark.matcher.calibrate.mounting_fit import Blocks
+from phasemark.matcher.calibration.known_poses import PoseStd
+from phasemark.matcher.calibration.mounting_fit import Blocks
 
 _START = (2e-4, math.radians(0.02), math.radians(0.02))
 """Where one of three descents begins; the others from 7 and 55 times as much."""

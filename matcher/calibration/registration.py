@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.calibrate.mounting_model import ALL_NAMES, LONGEST_STEP, SCALE, CalibrationModel, clipped
+from phasemark.matcher.calibration.mounting_model import ALL_NAMES, LONGEST_STEP, SCALE, CalibrationModel, clipped
 from phasemark.matcher.likelihood.residuals import Evidence
 
 OUTLINE = ("pitch", "roll", "height", "bearing", "half_angle_h", "half_angle_v")

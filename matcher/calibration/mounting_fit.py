@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phasemark.matcher.agreement import DISAGREEMENT, one_frame_limit_m
-from phasemark.matcher.calibrate.mounting_model import (
+from phasemark.matcher.calibration.mounting_model import (
     ALL_NAMES,
     LONGEST_STEP,
     SCALE,
@@ -32,7 +32,7 @@ from phasemark.matcher.calibrate.mounting_model import (
     Images,
     clipped,
 )
-from phasemark.matcher.calibrate.registration import OUTLINE, register
+from phasemark.matcher.calibration.registration import OUTLINE, register
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.render import predicted_range_std
 
@@ -69,11 +69,11 @@ class Place:
     Parameters
     ----------
     theta : (9,) float64
-        Mounting, in the order of :data:`~phasemark.matcher.calibrate.mounting_model.ALL_NAMES`.
+        Mounting, in the order of :data:`~phasemark.matcher.calibration.mounting_model.ALL_NAMES`.
     u : (K, q) float64
         Errors of the poses, of unit variance each.
     shift : (K, 3) float64
-        What they come to, :data:`~phasemark.matcher.calibrate.mounting_model.POSE`.
+        What they come to, :data:`~phasemark.matcher.calibration.mounting_model.POSE`.
     images : Images
         The model there.
     use : (K, pixels) bool

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.calibrate.known_poses import KnownPoses
-from phasemark.matcher.calibrate.mounting_model import PARAMETERS
+from phasemark.matcher.calibration.known_poses import KnownPoses
+from phasemark.matcher.calibration.mounting_model import PARAMETERS
 from phasemark.render.integral.rounding import error_text
 
 TITLES = {

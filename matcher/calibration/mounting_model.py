@@ -16,8 +16,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from phasemark.matcher.calibrate.known_poses import KnownPoses
-from phasemark.matcher.calibrate.pose_track import PoseTrack
+from phasemark.matcher.calibration.known_poses import KnownPoses
+from phasemark.matcher.calibration.pose_track import PoseTrack
 from phasemark.matcher.likelihood.residuals import Quantity
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 

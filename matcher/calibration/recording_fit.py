@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
-from phasemark.matcher.calibrate.mounting_model import ALL_NAMES, SCALE, STEP, CalibrationModel, Images, clipped
+from phasemark.matcher.calibration.mounting_model import ALL_NAMES, SCALE, STEP, CalibrationModel, Images, clipped
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.render import Sensor
 from phasemark.render.sensor.range_noise import direct_range_std

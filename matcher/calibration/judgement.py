@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.calibrate.mounting_model import ALL_NAMES, PARAMETERS, clipped
-from phasemark.matcher.calibrate.notes import TITLES
-from phasemark.matcher.calibrate.recording_fit import prior_std
+from phasemark.matcher.calibration.mounting_model import ALL_NAMES, PARAMETERS, clipped
+from phasemark.matcher.calibration.notes import TITLES
+from phasemark.matcher.calibration.recording_fit import prior_std
 
 TRUSTED = 3.0
 """Prior standard deviations beyond which a result is not trusted."""

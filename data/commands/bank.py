@@ -1,0 +1,157 @@
+"""Commands of ``phasemark bank`` that build, describe and merge."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from phasemark import UsageError
+from phasemark.data.commands.build import build_or_estimate, merge_shards
+from phasemark.data.commands.console import echo_facts, echo_json, tell
+from phasemark.data.commands.inputs import name_and_file, open_any_bank
+from phasemark.data.commands.options import (
+    Building,
+    Force,
+    Json,
+    MeshReading,
+    MeshUnitWord,
+    Resume,
+    a_class,
+    a_preset,
+)
+
+if TYPE_CHECKING:
+    from phasemark.data import BankPlan, MeshPlan
+
+
+def bank_build(
+    *,
+    out: Annotated[Path, typer.Option("-o", "--out", help="The bank to write; its checksum goes beside it.")],
+    plan_file: Annotated[
+        Path | None, typer.Argument(metavar="[PLAN]", help="A plan (.toml); options override it.")
+    ] = None,
+    classes: Annotated[
+        list[str] | None, typer.Option("--class", help="A class of the catalogue; repeatable.", autocompletion=a_class)
+    ] = None,
+    meshes: Annotated[list[str] | None, typer.Option("--mesh", metavar="NAME=FILE", help="Repeatable.")] = None,
+    mesh_reading: MeshReading,
+    symmetry: Annotated[
+        int | None,
+        typer.Option("--symmetry", help="Turns that leave the mesh as it is; found from the mesh if not given."),
+    ] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option("--sensor", metavar="NAME|FILE", help="A preset or sensor file.", autocompletion=a_preset),
+    ] = None,
+    distance: Annotated[str | None, typer.Option("--distance", metavar="START:STOP:STEP", help="Metres.")] = None,
+    delta: Annotated[str | None, typer.Option("--delta", metavar="START:STOP:STEP", help="Degrees.")] = None,
+    model: Annotated[
+        Literal["ray", "hard", "planar"] | None,
+        typer.Option(
+            "--model",
+            help="ray; hard: centre rays, nothing mixed; or planar: the paper's own generator.",
+        ),
+    ] = None,
+    albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmarks, in place of their own.")] = None,
+    full: Annotated[
+        bool, typer.Option("--full", help="Every class at every D and δ; taken where nothing less will do.")
+    ] = False,
+    building: Building,
+) -> None:
+    """Build a bank of noise-free model images."""
+    from phasemark.data import BankPlan, build_bank, load_plan
+    from phasemark.landmarks import catalog
+
+    if plan_file is not None and str(plan_file) in catalog():
+        raise UsageError(f"'{plan_file}' is a class of the catalogue, not a plan: give --class {plan_file}")
+    plan = BankPlan() if plan_file is None else load_plan(plan_file)
+    layout_stated = full or "layout" in plan.model_fields_set
+    options: dict[str, Any] = {
+        "sensor": sensor, "distance_m": distance, "delta_deg": delta, "model": model, "albedo": albedo,
+        "layout": "full" if full else None,
+    }  # fmt: skip
+    changes = {key: value for key, value in options.items() if value is not None}
+    if classes or meshes:
+        stated = tuple(_mesh_plan(one, mesh_reading, symmetry) for one in meshes or ())
+        changes |= {"classes": tuple(classes or ()), "landmarks": (), "meshes": stated}
+    plan = _completed(BankPlan(**{**plan.model_dump(), **changes}), layout_stated)
+    build_or_estimate(build_bank, plan, out, building)
+
+
+def _mesh_plan(name_and_path: str, reading: MeshReading, symmetry: int | None) -> MeshPlan:
+    """Return what a plan says of a mesh that an option names."""
+    from phasemark.data import MeshPlan
+
+    name, path = name_and_file(name_and_path)
+    unit = _stated_unit(path, reading.unit)
+    return MeshPlan(name=name, path=path, unit=unit, up=reading.up, origin=reading.origin, symmetry=symmetry)
+
+
+def _completed(plan: BankPlan, layout_stated: bool) -> BankPlan:
+    """Return a plan with the symmetry found for its meshes, and a full layout where nothing less will do."""
+    from phasemark.data.plans.bank_plan import factored_refusal
+
+    resolved = plan.resolve()
+    plan = plan.model_copy(update={"meshes": _with_symmetry(plan.meshes, resolved.meshes)})
+    if not layout_stated and (reason := factored_refusal(resolved)) is not None:
+        plan = plan.model_copy(update={"layout": "full"})
+        if not plan.meshes:
+            tell(f"note: a full bank, every class at every D and δ: {reason}")
+    return plan
+
+
+def bank_info(
+    bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank.")],
+    as_json: Json = False,
+) -> None:
+    """Say what a bank holds."""
+    with open_any_bank(bank) as opened:
+        info = opened.info()
+    if as_json:
+        echo_json(info)
+    else:
+        echo_facts(info)
+
+
+def bank_merge(
+    shards: Annotated[list[Path], typer.Argument(metavar="SHARD...", help="All parts that --shard has built.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The bank to write.")],
+    resume: Resume = False,
+    force: Force = False,
+) -> None:
+    """Put the parts of a bank together."""
+    merge_shards(shards, out, resume, force)
+
+
+def _with_symmetry(meshes: Sequence[MeshPlan], found: Sequence[MeshPlan]) -> tuple[MeshPlan, ...]:
+    """Return the meshes of a plan with the symmetry found for each, and say it where none was stated."""
+    from phasemark.landmarks import MAX_SYMMETRY
+
+    for before, after in zip(meshes, found, strict=True):
+        if before.symmetry is not None or after.symmetry is None:
+            continue
+        if after.symmetry == MAX_SYMMETRY:
+            what = "is a body of revolution: no side of it can be told from another, and one δ is enough"
+        elif after.symmetry > 1:
+            what = f"looks the same every {360 / after.symmetry:g}° (symmetry {after.symmetry}): δ is known modulo that"
+        else:
+            what = (
+                "has no symmetry about its axis z' (if it has one about another, --origin base brings z' into the"
+                " middle of its bounding box)"
+            )
+        tell(f"note: '{after.name}' {what}; --symmetry N, or 'symmetry' in a plan, overrides this")
+    return tuple(one.model_copy(update={"symmetry": other.symmetry}) for one, other in zip(meshes, found, strict=True))
+
+
+def _stated_unit(path: str, unit: MeshUnitWord | None) -> MeshUnitWord | None:
+    """Return the unit, or let the mesh reader say what the extents would be in each."""
+    if unit is None:
+        from phasemark.landmarks import read_mesh
+
+        read_mesh(path, unit=None)
+    return unit

@@ -1,0 +1,257 @@
+"""Commands of ``phasemark frames``: frame sets, recordings and measured frames."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from phasemark import UsageError
+from phasemark.data.commands.build import build_or_estimate, merge_shards
+from phasemark.data.commands.command import Without
+from phasemark.data.commands.console import LongWork, echo_facts, echo_json, readable
+from phasemark.data.commands.inputs import background_of, load_class_or_mesh, load_sensor, refuse_unless_one
+from phasemark.data.commands.options import (
+    Building,
+    Floor,
+    Force,
+    FrameReading,
+    Json,
+    MeshReading,
+    QuantityWord,
+    Resume,
+    Sample,
+    Seed,
+    SensorName,
+    Wall,
+    a_class,
+)
+from phasemark.data.commands.outputs import refuse_existing, refuse_input_files, refuse_unwritable_files
+
+if TYPE_CHECKING:
+    from phasemark.render import Sensor
+
+ExportFormat = Literal["npz", "csv", "png16", "ply", "bop", "rosbag"]
+
+_RECORDED_PIXELS = 5_000_000
+"""Most pixels of a simulated recording, all frames together: some hundred bytes of memory each."""
+
+
+def frames_build(
+    *,
+    plan_file: Annotated[Path, typer.Argument(metavar="PLAN", help="A plan (.toml); options override it.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The frame set to write; its checksum goes beside it.")],
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")
+    ] = None,
+    views: Annotated[int | None, typer.Option("--views", min=1, help="How many views.")] = None,
+    building: Building,
+) -> None:
+    """Build a set of noisy frames with their truth."""
+    from phasemark.data import FramePlan, build_frames, read_plan
+
+    plan = read_plan(plan_file, FramePlan)
+    changes = {key: value for key, value in (("seed", seed), ("views", views)) if value is not None}
+    plan = plan.model_copy(update=changes)
+    build_or_estimate(build_frames, plan, out, building)
+
+
+def frames_info(
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
+    as_json: Json = False,
+) -> None:
+    """Say what a frame set holds."""
+    from phasemark.data import open_frames
+
+    with open_frames(frames, untrusted=True) as opened:
+        info = opened.info()
+    echo_json(info) if as_json else echo_facts(info)
+
+
+def frames_verify(
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, its checksum beside it.")],
+    sample: Sample = 16,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Check a frame set: checksum, schema, values, and random views rendered and captured again."""
+    from phasemark.data import verify_frames
+
+    with LongWork("verifying"):
+        report = verify_frames(frames, sample=sample, seed=seed)
+    echo_json(report) if as_json else echo_facts(report)
+
+
+def frames_merge(
+    shards: Annotated[list[Path], typer.Argument(metavar="SHARD...", help="All parts that --shard has built.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The frame set to write.")],
+    resume: Resume = False,
+    force: Force = False,
+) -> None:
+    """Put the parts of a frame set together; the bytes are those of a single run."""
+    merge_shards(shards, out, resume, force)
+
+
+def frames_export(
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
+    to: Annotated[
+        ExportFormat,
+        typer.Option("--to", metavar="FORMAT", help="npz, csv, png16, ply, bop or rosbag."),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The file (npz, csv) or folder to write.")],
+    quantity: Annotated[
+        QuantityWord | None,
+        typer.Option("--quantity", help="range or z, in npz, csv and png16; BOP and ROS have z."),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write a frame set for other programs."""
+    from phasemark.data import export_frames, open_frames
+
+    refuse_input_files([out])
+    with open_frames(frames, untrusted=True) as opened:
+        typer.echo(export_frames(opened, out, to, quantity=quantity, force=force))
+
+
+def frames_import(
+    *,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV, NPY, NPZ, HDF5, PNG; a folder of PNG, a bag.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The measured frames as .npz, range along the ray, metres.")],
+    sensor: SensorName = "pmd-16x16",
+    reading: FrameReading,
+    topic: Annotated[str | None, typer.Option("--topic", help="Which images of a ROS bag.")] = None,
+    force: Force = False,
+) -> None:
+    """Bring measured frames into one form: range along the ray, in metres, upright."""
+    from phasemark.data import write_measured
+
+    if out.suffix.lower() != ".npz":
+        raise UsageError(f"the output must be a .npz file, got '{out}'")
+    refuse_existing([out], force)
+    frames = reading.read(file, load_sensor(sensor), topic=topic)
+    typer.echo(write_measured(frames, out, force=force))
+
+
+def frames_simulate(
+    *,
+    out: Annotated[Path, typer.Option("-o", "--out", help="The recording to write: .csv, .npz or .h5.")],
+    class_name: Annotated[
+        str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=a_class)
+    ] = None,
+    mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
+    mesh_reading: MeshReading,
+    sensor: SensorName = "pmd-16x16",
+    distance: Annotated[
+        float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis, in the first frame.")
+    ] = 1.0,
+    delta: Annotated[
+        float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen, in the first frame.")
+    ] = 0.0,
+    bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
+    height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the optical axis.")] = 0.0,
+    wall: Wall = None,
+    floor: Floor = None,
+    moving: Annotated[
+        bool, typer.Option("--moving/--still", help="Whether D and δ change evenly until the last frame.")
+    ] = False,
+    to_distance: Annotated[
+        float | None,
+        typer.Option("--to-distance", metavar="M", help="With --moving, D in the last frame; 0.8 of the first."),
+    ] = None,
+    to_delta: Annotated[
+        float | None, typer.Option("--to-delta", metavar="DEG", help="With --moving, δ in the last frame; 40 more.")
+    ] = None,
+    n_frames: Annotated[int, typer.Option("--frames", min=1, help="How many frames.")] = 20,
+    seed: Seed = 0,
+    force: Force = False,
+) -> None:
+    """Simulate a recording in the form that sensors write, with time stamps and the truth, to try match with.
+
+    The file says that it is simulated. A direct sensor writes z in millimetres and status codes (5: valid), another one
+    ranges in metres with amplitudes. The truth of each frame stands in columns truth_..., which other commands ignore.
+    """
+    import numpy as np
+
+    from phasemark.data import simulate_recording, write_recording
+    from phasemark.data.measured.simulated import recording_format
+    from phasemark.render import Views
+
+    refuse_unless_one(class_name, mesh_file, mesh_reading, "record")
+    for option, value in (("--to-distance", to_distance), ("--to-delta", to_delta)):
+        if value is not None and not moving:
+            raise UsageError(f"{option} goes with --moving: a camera at rest keeps its view")
+    recording_format(out)
+    camera = load_sensor(sensor)
+    _refuse_many_frames(n_frames, camera)
+    refuse_unwritable_files([out], force)
+    name, mesh = load_class_or_mesh(class_name, mesh_file, mesh_reading)
+    way = np.linspace(0.0, 1.0, n_frames) if moving else np.zeros(n_frames)
+    last_distance = 0.8 * distance if to_distance is None else to_distance
+    last_delta = delta + 40.0 if to_delta is None else to_delta
+    views = Views.broadcast(
+        distance + way * (last_distance - distance),
+        np.radians(delta + way * (last_delta - delta)),
+        math.radians(bearing),
+        height,
+    )
+    recording = simulate_recording(
+        mesh,
+        readable(name),
+        camera,
+        views,
+        seed=seed,
+        albedo=mesh.metadata.get("albedo", 0.8),
+        background=background_of(wall, floor),
+    )
+    described = readable(f"landmark={name} sensor={Path(sensor).name}")
+    description = f"{described} seed={seed} {'moving' if moving else 'still'}"
+    typer.echo(write_recording(recording, out, description=description, force=force))
+
+
+def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
+    """Refuse a recording that is too large to be made in memory."""
+    if n_frames * camera.rows * camera.cols > _RECORDED_PIXELS:
+        most = _RECORDED_PIXELS // (camera.rows * camera.cols)
+        raise UsageError(
+            f"--frames must be at most {most} for {camera.rows} × {camera.cols} pixels: a recording is"
+            " made in memory; phasemark frames build makes large sets"
+        )
+
+
+def frames_show(
+    *,
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, or measured frames.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png.")],
+    index: Annotated[int, typer.Option("--index", min=0, help="Number of the frame.")] = 0,
+    sensor: SensorName = "pmd-16x16",
+    reading: Annotated[FrameReading, Without("invalid_means", "flip_h", "flip_v", "rotate")],
+    force: Force = False,
+) -> None:
+    """Draw one frame."""
+    import io as bytes_io
+
+    from phasemark.data import is_frame_set, open_frames, write_atomically
+
+    if out.suffix.lower() != ".png":
+        raise UsageError(f"the picture must be a .png file, got '{out}'")
+    refuse_existing([out], force)
+    if is_frame_set(frames):
+        with open_frames(frames, untrusted=True) as opened:
+            _refuse_index(index, len(opened))
+            figure = opened.frames([index]).plot()
+    else:
+        measured = reading.read(frames, load_sensor(sensor))
+        _refuse_index(index, len(measured) * measured.n_frames)
+        figure = measured.plot(*divmod(index, measured.n_frames))
+    picture = bytes_io.BytesIO()
+    figure.savefig(picture, format="png", dpi=120)
+    typer.echo(write_atomically(out, picture.getvalue(), force=force))
+
+
+def _refuse_index(index: int, n: int) -> None:
+    if index >= n:
+        raise UsageError(f"--index must be below {n}, the number of frames, got {index}")

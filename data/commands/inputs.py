@@ -1,0 +1,121 @@
+"""What arguments name: sensors, landmarks, banks, and what stands behind a landmark."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from phasemark import InputFileError, UsageError
+from phasemark.data.commands.console import tell
+from phasemark.data.commands.options import MeshReading
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+    from phasemark.data import Bank
+    from phasemark.render import Background, Sensor
+
+
+def open_any_bank(path: Path) -> Bank:
+    """Open a bank from anywhere; say of a mesh how a bank is made of it."""
+    from phasemark.data import open_bank
+    from phasemark.landmarks.mesh_files import FORMATS
+
+    if path.exists() and path.suffix.lower().removeprefix(".") in FORMATS:
+        mesh, out = shlex.quote(f"part={path}"), shlex.quote(f"{path.stem}.h5")
+        raise InputFileError(
+            f"{path}: a mesh, not a bank; if it is in millimetres, one is made of it by: phasemark bank build"
+            f" --mesh {mesh} --unit mm --out {out}"
+        )
+    return open_bank(path, untrusted=True)
+
+
+def load_landmark(name_or_file: str, reading: MeshReading) -> tuple[str, Trimesh]:
+    """Return the name and mesh of a class of the catalogue, or of a mesh file."""
+    from phasemark.landmarks import catalog, read_mesh
+
+    path = Path(name_or_file)
+    if name_or_file in catalog() or not (path.suffix or path.exists()):
+        return name_or_file, load_class(name_or_file)
+    return path.stem, read_mesh(path, unit=reading.unit, up=reading.up, origin=reading.origin)
+
+
+def load_class(name: str) -> Trimesh:
+    """Return the mesh of a class of the catalogue."""
+    from phasemark.landmarks import build_mesh, catalog
+
+    specs = catalog()
+    if name not in specs:
+        raise UsageError(f"unknown class '{name}': the catalogue has {', '.join(specs)}")
+    return build_mesh(specs[name])
+
+
+def load_class_or_mesh(class_name: str | None, mesh: str | None, reading: MeshReading) -> tuple[str, Trimesh]:
+    """Return the name and mesh that one of --class and --mesh names."""
+    if class_name is not None:
+        return class_name, load_class(class_name)
+    name, path = name_and_file(mesh or "")
+    return name, load_landmark(path, reading)[1]
+
+
+def refuse_unless_one(class_name: str | None, mesh: str | None, reading: MeshReading, doing: str) -> None:
+    """Refuse both or none of --class and --mesh, and a unit without a mesh."""
+    if (class_name is None) == (mesh is None):
+        raise UsageError(f"say what to {doing}: either --class NAME or --mesh NAME=FILE")
+    if class_name is not None and reading.unit is not None:
+        raise UsageError("--unit belongs to --mesh: the catalogue is in metres")
+
+
+def name_and_file(text: str) -> tuple[str, str]:
+    """Split NAME=FILE."""
+    name, separator, path = text.partition("=")
+    if not (name and separator and path):
+        raise UsageError(f"--mesh must be NAME=FILE, got '{text}'")
+    return name, path
+
+
+def background_of(wall: float | None, floor: float | None) -> Background | None:
+    """Return what the options say of wall and floor."""
+    from phasemark.render import Background
+
+    return None if wall is None and floor is None else Background(wall_m=wall, floor_m=floor)
+
+
+def note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None]) -> None:
+    """Write a note for each distance that the sensor shows wrapped, or not at all."""
+    for name, distance_m in distances_m.items():
+        described = None if distance_m is None else sensor.describe_beyond_range(name, distance_m)
+        if described is not None:
+            tell(f"note: {described}")
+
+
+def note_plan_too_far(plan: PlanWithDistances) -> None:
+    """Write a note for each key of a plan with distances that the sensor shows wrapped, or not at all."""
+    distances_m = {f"'{name}'": distance_m for name, distance_m in plan.greatest_distances_m().items()}
+    note_too_far(plan.build_sensor(), distances_m)
+
+
+class PlanWithDistances(Protocol):
+    """A plan that knows its sensor and how far away it puts things."""
+
+    def build_sensor(self) -> Sensor:
+        """Return the sensor."""
+
+    def greatest_distances_m(self) -> Mapping[str, float | None]:
+        """Return the greatest distance of each key that has one."""
+
+
+def load_sensor(name_or_file: str) -> Sensor:
+    """Return a preset, or the sensor of a file; a preset's name wins over a file of that name."""
+    from phasemark.render import Sensor, preset, preset_names
+
+    if name_or_file in preset_names():
+        return preset(name_or_file)
+    path = Path(name_or_file)
+    if path.suffix == ".toml" or path.exists():
+        return Sensor.from_toml(path)
+    raise UsageError(f"unknown sensor '{name_or_file}': give {', '.join(preset_names())}, or a .toml file")

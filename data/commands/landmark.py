@@ -1,0 +1,111 @@
+"""Commands of ``phasemark landmark``: the catalogue and mesh files."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from phasemark.data.commands.console import echo_facts, echo_json, echo_table, readable
+from phasemark.data.commands.inputs import load_class, load_landmark
+from phasemark.data.commands.options import Force, Json, MeshReading, a_class
+from phasemark.data.commands.outputs import make_folder, refuse_existing, refuse_input_files
+
+if TYPE_CHECKING:
+    from phasemark.landmarks import LandmarkSpec
+
+
+def landmark_list(as_json: Json = False) -> None:
+    """List the landmarks of the catalogue."""
+    from phasemark.landmarks import catalog
+
+    specs = catalog()
+    if as_json:
+        echo_json([spec.model_dump(mode="json") for spec in specs.values()])
+        return
+    echo_table(
+        ("class", "box (m)", "upper part", "albedo", "repeats every"),
+        (
+            (
+                name,
+                f"{spec.box.length_m:g} × {spec.box.width_m:g} × {spec.box.height_m:g}",
+                _describe_upper(spec),
+                f"{spec.albedo:g}",
+                f"{360 / spec.symmetry:g}°",
+            )
+            for name, spec in specs.items()
+        ),
+    )
+
+
+def landmark_show(
+    *,
+    name_or_file: Annotated[
+        str,
+        typer.Argument(metavar="NAME|FILE", help="A class, or an STL, PLY, OBJ or OFF file.", autocompletion=a_class),
+    ],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for NAME.png and NAME.html.")] = None,
+    mesh_reading: MeshReading,
+    force: Force = False,
+) -> None:
+    """Draw a landmark: a shaded picture, and a page to turn it in 3D."""
+    from phasemark.data import write_atomically
+    from phasemark.landmarks import mesh_html, mesh_picture
+
+    name, mesh = load_landmark(name_or_file, mesh_reading)
+    folder = out or Path()
+    picture, page = folder / f"{name}.png", folder / f"{name}.html"
+    refuse_existing([picture, page], force)
+    make_folder(folder)
+    write_atomically(picture, mesh_picture(mesh), force=force)
+    write_atomically(page, mesh_html(mesh, readable(name)).encode(), force=force)
+    typer.echo(picture)
+    typer.echo(page)
+
+
+def landmark_export(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A class of the catalogue.", autocompletion=a_class)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The file; .stl, .ply, .obj or .off.")],
+    force: Force = False,
+) -> None:
+    """Write a landmark of the catalogue as a mesh, in metres."""
+    from phasemark.data import write_atomically
+    from phasemark.landmarks import export_mesh
+
+    refuse_input_files([out])
+    mesh = load_class(name)
+    typer.echo(write_atomically(out, export_mesh(mesh, out.suffix.removeprefix(".")), force=force))
+
+
+def landmark_check(
+    *,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="An STL, PLY, OBJ or OFF file.")],
+    mesh_reading: MeshReading,
+    as_json: Json = False,
+) -> None:
+    """Check a mesh file and say what it holds."""
+    import dataclasses
+
+    from phasemark.landmarks import MAX_SYMMETRY, check_mesh
+
+    _, mesh = load_landmark(str(file), mesh_reading)
+    report = dataclasses.asdict(check_mesh(mesh))
+    if as_json:
+        echo_json({"file": str(file), **report})
+        return
+    del report["warnings"]  # reading the file has put them on stderr
+    n = report["symmetry"]
+    report["symmetry"] = {1: "1 (none)", MAX_SYMMETRY: f"{n} (a body of revolution)"}.get(
+        n, f"{n} (looks the same every {360 / n:g}° about z')"
+    )
+    echo_facts({"file": file, **report})
+
+
+def _describe_upper(spec: LandmarkSpec) -> str:
+    if spec.upper is None:
+        return "none"
+    fields = spec.upper.model_dump(exclude={"kind", "profile_m"})
+    return " ".join([spec.upper.kind, *(f"{key.removesuffix('_m')} {value:g}" for key, value in fields.items())])

@@ -1,0 +1,73 @@
+"""What a command checks of the files and folders that it is about to write."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from phasemark import OutputExistsError, UsageError
+from phasemark.data.commands.command import inputs_given
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder for outputs, and those above it; one that is there already will do."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise UsageError(f"{path}: is no folder, or lies in something that is none") from None
+
+
+def refuse_input_files(outputs: Iterable[Path], plan: BaseModel | None = None) -> None:
+    """Refuse outputs that are the same file as an argument of the running command, or as one that a plan names."""
+    from phasemark.data.files.same_file import named_files, refuse_inputs
+
+    of_plan = () if plan is None else named_files(plan.model_dump())
+    refuse_inputs(outputs, [*inputs_given.get(), *of_plan])
+
+
+@contextmanager
+def output_folder(
+    folder: Path,
+    command: str,
+    names: Sequence[str],
+    force: bool,
+    plan: BaseModel | None = None,
+    *,
+    also: Sequence[str] = (),
+) -> Iterator[None]:
+    """Hold a folder while a command writes files into it; a file that another program wrote is not replaced.
+
+    `names` must not exist unless they are ours and `force` is set; `also` are ours too, and looked at by their writer.
+    """
+    from phasemark.data.files.folder_marker import adding_to_folder
+
+    refuse_existing([folder / name for name in names], force, plan)
+    with adding_to_folder(folder, command) as ours:
+        ours.claim(*names, *also)
+        yield
+
+
+def refuse_existing(paths: Sequence[Path], force: bool, plan: BaseModel | None = None) -> None:
+    """Refuse outputs that are inputs, or exist, before any work is done."""
+    refuse_input_files(paths, plan)
+    for path in paths:
+        if path.is_dir():
+            raise UsageError(f"{path}: is a folder, give the name of a file")
+        if path.exists() and not force:
+            raise OutputExistsError(f"{path}: exists already; --force replaces it")
+
+
+def refuse_unwritable_files(paths: Iterable[Path], force: bool) -> None:
+    """Refuse outputs that exist or cannot be written, before any work is done."""
+    from phasemark.data.files.atomic_write import refuse_unwritable
+
+    refuse_existing(paths := list(paths), force)
+    for path in paths:
+        refuse_unwritable(path, force=force)

@@ -1,0 +1,94 @@
+"""The command ``phasemark render``: one noise-free frame."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from phasemark import UsageError
+from phasemark.data.commands.inputs import (
+    background_of,
+    load_class_or_mesh,
+    load_sensor,
+    note_too_far,
+    refuse_unless_one,
+)
+from phasemark.data.commands.options import Floor, Force, MeshReading, SensorName, Wall, a_class
+from phasemark.data.commands.outputs import refuse_existing
+
+
+def render_frame(
+    *,
+    out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png; the data go beside it as .npz.")],
+    distance: Annotated[
+        float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")
+    ] = 1.0,
+    delta: Annotated[float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen.")] = 0.0,
+    bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
+    height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the optical axis.")] = 0.0,
+    class_name: Annotated[
+        str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=a_class)
+    ] = None,
+    mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
+    mesh_reading: MeshReading,
+    sensor: SensorName = "pmd-16x16",
+    wall: Wall = None,
+    floor: Floor = None,
+    variant: Annotated[
+        Literal["exact", "hard"],
+        typer.Option(
+            "--variant",
+            help="exact, or hard: what the centre ray of each pixel sees, nothing mixed.",
+        ),
+    ] = "exact",
+    force: Force = False,
+) -> None:
+    """Render one noise-free frame: a picture, the phasors, and a sketch in the terminal."""
+    import io as bytes_io
+
+    import numpy as np
+
+    from phasemark.data import write_atomically
+    from phasemark.render import Renderer, terminal_picture
+
+    refuse_unless_one(class_name, mesh_file, mesh_reading, "render")
+    if out.suffix.lower() != ".png":
+        raise UsageError(f"the picture must be a .png file, got '{out}'")
+    data = out.with_suffix(".npz")
+    refuse_existing([out, data], force)
+    _, mesh = load_class_or_mesh(class_name, mesh_file, mesh_reading)
+    camera = load_sensor(sensor)
+    note_too_far(camera, {"--distance": distance, "--wall": wall})
+    image = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8)).render(
+        distance,
+        math.radians(delta),
+        math.radians(bearing),
+        height,
+        background=background_of(wall, floor),
+        variant=variant,
+    )
+    arrays = {
+        "phasor": image.phasor[0],
+        "intensity": image.intensity[0],
+        "coverage": image.coverage[0],
+        "range": image.range_m[0],
+        "unit": "m",
+        "quantity": "range",
+    }
+    buffer, picture = bytes_io.BytesIO(), bytes_io.BytesIO()
+    np.savez(buffer, **arrays)
+    image.plot().savefig(picture, format="png", dpi=120)
+    write_atomically(data, buffer.getvalue(), force=force)
+    write_atomically(out, picture.getvalue(), force=force)
+    if sys.stdout.isatty():
+        from rich.console import Console
+
+        Console().print(terminal_picture(image.range_m[0], width=48))
+    typer.echo(out)
+    typer.echo(data)

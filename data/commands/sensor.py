@@ -1,0 +1,195 @@
+"""Commands of ``phasemark sensor``: presets, sensor files, their data sheet and their fit."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from phasemark import UsageError
+from phasemark.data.commands.command import Without
+from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
+from phasemark.data.commands.inputs import load_sensor, note_too_far
+from phasemark.data.commands.options import (
+    Force,
+    FrameReading,
+    Json,
+    Seed,
+    SensorName,
+    a_preset,
+)
+from phasemark.data.commands.outputs import output_folder, refuse_existing
+
+if TYPE_CHECKING:
+    from phasemark.render import Estimate, Sensor
+
+
+def sensor_list(as_json: Json = False) -> None:
+    """List the shipped presets."""
+    from phasemark.render import preset, preset_names
+
+    sensors = {name: preset(name) for name in preset_names()}
+    if as_json:
+        echo_json([{"name": name, **_sensor_facts(sensor)} for name, sensor in sensors.items()])
+        return
+    echo_table(
+        ("preset", "pixels", "field of view", "modulation", "unambiguous range"),
+        (
+            (
+                name,
+                f"{sensor.rows} × {sensor.cols}",
+                f"{2 * sensor.half_angle_v_deg:g}° × {2 * sensor.half_angle_h_deg:g}°",
+                "direct" if sensor.kind == "direct" else f"{sensor.modulation_hz / 1e6:g} MHz",
+                "" if sensor.kind == "direct" else f"{sensor.unambiguous_range_m:.3f} m",
+            )
+            for name, sensor in sensors.items()
+        ),
+    )
+
+
+def sensor_show(
+    name_or_file: Annotated[
+        str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=a_preset)
+    ],
+    as_json: Json = False,
+) -> None:
+    """Print every field of a sensor; the text is a sensor file again."""
+    sensor = load_sensor(name_or_file)
+    if as_json:
+        echo_json({"name": name_or_file, **_sensor_facts(sensor)})
+        return
+    if sensor.kind == "direct":
+        typer.echo("# direct time of flight: no taps, no phasors; its own quantity is z, along the optical axis")
+    else:
+        typer.echo(
+            f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {sensor.metres_per_radian:.6f} m per radian"
+        )
+    fields = sensor.model_dump(mode="json")
+    for title, names in sensor.field_groups().items():
+        typer.echo(f"\n# {title}")
+        for name in names:
+            value = fields[name]
+            typer.echo(f"# {name} is not set" if value is None else f"{name} = {json.dumps(value)}")
+
+
+def sensor_characterise(
+    name_or_file: Annotated[
+        str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=a_preset)
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, its pictures and numbers.")],
+    n_frames: Annotated[
+        int | None, typer.Option("--frames", min=2, help="Frames at each point; by default 51200 readings a point.")
+    ] = None,
+    seed: Seed = 2005,
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Measure a sensor before flat fields, as EMVA 1288 would, and compare it with what its numbers predict."""
+    from phasemark.data import summary_sentences, write_characterisation
+    from phasemark.data.pages.characterisation import NAMES
+    from phasemark.data.seeds import stream
+    from phasemark.render import characterise
+
+    sensor = load_sensor(name_or_file)
+    with output_folder(out, "sensor characterise", NAMES, force), LongWork("measuring"):
+        found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
+        report = write_characterisation(found, readable(name_or_file), out, seed=seed, force=force)[0]
+    if as_json:
+        facts = found.as_dict()
+        echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
+        return
+    for sentence in (*summary_sentences(found, name_or_file), *found.notes):
+        typer.echo(sentence)
+    typer.echo(report)
+
+
+def sensor_fit(
+    *,
+    frames: Annotated[
+        list[Path], typer.Argument(metavar="FRAMES...", help="Frames of a flat board: CSV, NPY, NPZ or HDF5.")
+    ],
+    distance: Annotated[
+        list[float],
+        typer.Option("--distance", metavar="M", help="Distance of the board; once for each FRAMES, in order."),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
+    albedo: Annotated[
+        list[float] | None,
+        typer.Option("--albedo", help="Albedo of the board, one for all or one for each; 0.8 is assumed."),
+    ] = None,
+    distance_std: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--distance-std",
+            metavar="M",
+            help="Standard deviation of the distances, one for all or one for each; 0.001 is assumed.",
+        ),
+    ] = None,
+    sensor: SensorName = "pmd-16x16",
+    amplitude_unit: Annotated[
+        Literal["electrons", "arbitrary"],
+        typer.Option("--amplitude-unit", help="Unit of amplitude and intensity: electrons or arbitrary."),
+    ] = "electrons",
+    reading: Annotated[FrameReading, Without("invalid_means")],
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Fit a sensor to measured frames of a flat board that fills the image, square to the camera.
+
+    Give the board's distance for each file, in order: FRAMES FRAMES --distance 1.0 --distance 2.0. Geometry and
+    whatever the frames do not tell come from --sensor; the file says of each number whether it is measured or assumed.
+    """
+    from phasemark.data import write_atomically
+    from phasemark.render import fit_sensor
+
+    if out.suffix.lower() != ".toml":
+        raise UsageError(f"the sensor must be a .toml file, got '{out}'")
+    refuse_existing([out], force)
+    base = load_sensor(sensor)
+    measured = [reading.read(path, base) for path in frames]
+    note_too_far(base, {"--distance": max(distance)})
+    fit = fit_sensor(
+        [one[k : k + 1] for one in measured for k in range(len(one))],  # every position of a file has its distance
+        distance,
+        base=base,
+        albedo=albedo or None,
+        amplitude_unit=amplitude_unit,
+        distance_std_m=distance_std or None,
+    )
+    write_atomically(out, fit.to_toml(base_name=readable(sensor)).encode(), force=force)
+    if as_json:
+        echo_json({"file": str(out), **fit.as_dict()})
+        return
+    fields = fit.sensor.model_dump(mode="json")
+    echo_table(
+        ("field", "value", "std error", "from"),
+        ((name, *value_and_error_of(fields[name], one), one.note) for name, one in fit.estimates.items()),
+    )
+    for note in fit.notes:
+        typer.echo(note)
+    typer.echo(out)
+
+
+def _sensor_facts(sensor: Sensor) -> dict[str, Any]:
+    return {**sensor.model_dump(mode="json"), "unambiguous_range_m": sensor.unambiguous_range_m}
+
+
+def value_and_error_of(value: object, estimate: Estimate) -> tuple[str, str]:
+    """Write a fitted field and its standard error, rounded alike; pixels are counted and have no error."""
+    from phasemark.render.integral.rounding import value_and_error
+
+    if estimate.std_error is None:
+        return _short(value), "assumed"
+    text, error = value_and_error(value if isinstance(value, float) else estimate.value, estimate.std_error)
+    return (text if isinstance(value, float) and error else _short(value)), error
+
+
+def _short(value: object) -> str:
+    """Write a field's value for a table; a list of pixels as their number."""
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    return f"{len(value)} in all" if isinstance(value, list) else str(value)

@@ -1,0 +1,287 @@
+"""The command ``phasemark calibrate``: how a camera is mounted."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from phasemark import InputFileError, UsageError
+from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
+from phasemark.data.commands.inputs import background_of, load_class, load_sensor, note_too_far, open_any_bank
+from phasemark.data.commands.options import (
+    Floor,
+    Force,
+    FrameReading,
+    Json,
+    Wall,
+    Workers,
+    a_class,
+    a_preset,
+)
+from phasemark.data.commands.outputs import refuse_existing
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+    from phasemark.matcher import Calibration, FilteredFrames, KnownPoses, Mounting, PoseStd
+    from phasemark.render import Frames, Sensor
+
+
+def calibrate_camera(
+    *,
+    landmark: Annotated[
+        str, typer.Argument(metavar="BANK|CLASS", help="A bank, or a class of the catalogue.", autocompletion=a_class)
+    ],
+    frames: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FRAMES...", help="Measured frames: a file for each pose, or one of them all, in order."
+        ),
+    ],
+    poses: Annotated[
+        Path,
+        typer.Option(
+            "--poses", metavar="CSV", help="Columns distance_m,delta_deg[,bearing_deg] or x_m,y_m,heading_deg [,t_ms]."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
+    class_name: Annotated[
+        str | None, typer.Option("--class", help="Which class of a bank that has several.", autocompletion=a_class)
+    ] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            "--sensor",
+            metavar="NAME|FILE",
+            help="The camera as it is thought to be; a bank has its own.",
+            autocompletion=a_preset,
+        ),
+    ] = None,
+    free: Annotated[
+        str | None, typer.Option("--free", metavar="NAMES", help="Estimate these alone, e.g. pitch,roll,height.")
+    ] = None,
+    fix: Annotated[
+        str | None, typer.Option("--fix", metavar="NAMES", help="Leave these as they are, e.g. fov.")
+    ] = None,
+    height: Annotated[
+        float | None,
+        typer.Option("--height", metavar="M", help="Landmark's origin above the lens, as it is thought to be."),
+    ] = None,
+    bearing: Annotated[
+        float | None,
+        typer.Option("--bearing", metavar="DEG", help="Where the camera sees it if 0 is stated, likewise."),
+    ] = None,
+    albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmark, likewise.")] = None,
+    moving: Annotated[
+        bool, typer.Option("--moving", help="A moving camera: each frame has a pose of its own, by time stamps.")
+    ] = False,
+    delay_ms: Annotated[
+        float | None,
+        typer.Option("--delay-ms", metavar="MS", help="Fixed delay: added to the stamp of a frame to get its time."),
+    ] = None,
+    zones: Annotated[
+        bool | None,
+        typer.Option("--zones/--no-zones", help="Offsets of zones and noise law of a direct sensor; with --moving."),
+    ] = None,
+    position_std: Annotated[
+        float | None, typer.Option("--position-std", metavar="M", help="How well the places of the lens are known.")
+    ] = None,
+    heading_std: Annotated[
+        float | None, typer.Option("--heading-std", metavar="DEG", help="How well the camera's headings are known.")
+    ] = None,
+    delta_std: Annotated[
+        float | None, typer.Option("--delta-std", metavar="DEG", help="How well the landmark is turned to its side.")
+    ] = None,
+    landmark_xy: Annotated[
+        tuple[float, float], typer.Option("--landmark-xy", metavar="X Y", help="Where it stands, for x_m,y_m.")
+    ] = (0.0, 0.0),
+    landmark_yaw: Annotated[float, typer.Option("--landmark-yaw", metavar="DEG", help="Heading of its x' axis.")] = 0.0,
+    on: Annotated[
+        Literal["auto", "ranges", "phasors"],
+        typer.Option("--on", help="auto, ranges, or phasors: amplitudes too."),
+    ] = "auto",
+    wall: Wall = None,
+    floor: Floor = None,
+    reading: FrameReading,
+    plot: Annotated[
+        Path | None,
+        typer.Option("--plot", help="The picture of the residuals, .png; beside the sensor file otherwise."),
+    ] = None,
+    workers: Workers = None,
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Find how a camera is mounted from frames of a landmark taken at known positions.
+
+    Pitch, roll, height, bearing, field of view, range offset, from amplitudes the landmark's albedo, and with --moving
+    the delay of the stamps: --free and --fix take pitch, roll, height, bearing, half_angle_h, half_angle_v (both: fov),
+    range_offset, albedo and delay. A result that cannot be trusted is not written without --force (exit code 3).
+    """
+    from phasemark.data.shards.executor import processors
+    from phasemark.matcher import calibrate, read_poses
+    from phasemark.matcher.calibration.report import calibration_dict
+
+    picture = _picture_beside(out, plot)
+    refuse_existing([out, picture], force)
+    background = background_of(wall, floor)
+    mesh, base, base_name = _calibration_target(landmark, class_name, sensor)
+    known = read_poses(poses, landmark_xy_m=landmark_xy, landmark_yaw_rad=math.radians(landmark_yaw))
+    furthest_m = float(known.distance_m.max()) if len(known.distance_m) else None
+    note_too_far(base, {f"{poses}: the landmark": furthest_m, "--wall": wall})
+    filtered = _filtered([reading.read(path, base) for path in frames], known, on, moving)
+    fixed = [] if fix is None else _names(fix)
+    if delay_ms is not None:
+        if not moving:
+            raise UsageError("--delay-ms takes --moving: still poses have no delay")
+        fixed.append("delay")
+    bright = float(mesh.metadata.get("albedo", 0.8)) if albedo is None else albedo
+    start = _start(base, bright, height, bearing, delay_ms)
+    with LongWork("rendering poses") as progress:
+        found = calibrate(
+            mesh,
+            filtered,
+            known,
+            free=None if free is None else _names(free),
+            fixed=fixed,
+            start=start,
+            on=on,
+            background=background,
+            pose_std=_pose_std(position_std, heading_std, delta_std),
+            reports_z=reading.quantity == "z" or None,
+            moving=moving,
+            zones=zones,
+            workers=workers or min(processors(), 4),
+            progress=progress,
+        )
+    _write_calibration(found, out, picture, base_name, force)
+    if as_json:
+        echo_json({"file": str(out), "picture": str(picture), **calibration_dict(found)})
+        return
+    _echo_calibration(found)
+    typer.echo(out)
+    typer.echo(picture)
+
+
+def _picture_beside(out: Path, plot: Path | None) -> Path:
+    """Return where the picture of the residuals goes; refuse names of a wrong kind."""
+    if out.suffix.lower() != ".toml":
+        raise UsageError(f"the sensor must be a .toml file, got '{out}'")
+    picture = plot or out.with_suffix(".png")
+    if picture.suffix.lower() != ".png":
+        raise UsageError(f"the picture must be a .png file, got '{picture}'")
+    return picture
+
+
+def _pose_std(position: float | None, heading_deg: float | None, delta_deg: float | None) -> PoseStd | None:
+    """Return how well the poses are known; None if nothing is said of it."""
+    from phasemark.matcher import PoseStd
+
+    if (position, heading_deg, delta_deg) == (None, None, None):
+        return None
+    return PoseStd(position or 0.0, math.radians(heading_deg or 0.0), math.radians(delta_deg or 0.0))
+
+
+def _filtered(
+    measured: Sequence[Frames], known: KnownPoses, on: Literal["auto", "ranges", "phasors"], moving: bool
+) -> FilteredFrames:
+    """Return the frames of a moving camera one by one, and those of a still one averaged at each pose."""
+    from phasemark.matcher import filter_poses, frames_of_poses, kalman_filter
+
+    if not moving:
+        return filter_poses(frames_of_poses(measured, known), on)
+    if len(measured) != 1:
+        raise UsageError(f"--moving takes one recording, got {len(measured)} files")
+    return kalman_filter(measured[0].each_a_position())
+
+
+def _start(
+    base: Sensor, albedo: float, height: float | None, bearing_deg: float | None, delay_ms: float | None
+) -> Mounting:
+    """Return the mounting as it is thought to be."""
+    from phasemark.matcher.calibration.mounting_model import Mounting
+
+    if not 0 < albedo <= 1:
+        raise UsageError(f"--albedo must be in (0, 1], got {albedo:g}")
+    start = Mounting.of_sensor(base, albedo)
+    if height is not None:
+        start = replace(start, height_m=height)
+    if bearing_deg is not None:
+        start = replace(start, bearing_rad=math.radians(bearing_deg))
+    return start if delay_ms is None else replace(start, delay_s=delay_ms / 1e3)
+
+
+def _write_calibration(found: Calibration, out: Path, picture: Path, base_name: str, force: bool) -> None:
+    """Write the sensor file and the picture of the residuals, unless the calibration cannot be trusted."""
+    from phasemark.data import write_atomically
+    from phasemark.matcher.calibration.report import calibration_toml, residual_picture
+
+    if found.doubts and not force:
+        raise InputFileError(
+            f"nothing was written, for the calibration cannot be trusted: {'; '.join(found.doubts)}. Likely cause:"
+            f" {found.cause} (--force writes it all the same)"
+        )
+    buffer = io.BytesIO()
+    residual_picture(found).savefig(buffer, format="png", dpi=100)
+    write_atomically(picture, buffer.getvalue(), force=force)
+    write_atomically(out, calibration_toml(found, base_name=readable(base_name)).encode(), force=force)
+
+
+def _names(text: str) -> list[str]:
+    """Split names at commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _calibration_target(landmark: str, class_name: str | None, sensor: str | None) -> tuple[Trimesh, Sensor, str]:
+    """Return the mesh of a landmark, and the camera as it is thought to be with its name."""
+    from phasemark.landmarks import catalog
+
+    path = Path(landmark)
+    if landmark in catalog() or not (path.suffix or path.exists()):
+        if class_name is not None:
+            raise UsageError("--class belongs to a bank: give the class in its place")
+        name = sensor or "pmd-16x16"
+        return load_class(landmark), load_sensor(name), name
+    with open_any_bank(path) as bank:
+        if class_name is None and len(bank.classes) > 1:
+            raise UsageError(f"{landmark} has {', '.join(bank.classes)}: say with --class which one was recorded")
+        mesh = bank.mesh(class_name or bank.classes[0])
+        return (mesh, bank.sensor, landmark) if sensor is None else (mesh, load_sensor(sensor), sensor)
+
+
+def _echo_calibration(found: Calibration) -> None:
+    """Print every number with its standard deviation and use, their correlations, the test of the fit and notes."""
+    from phasemark.matcher.calibration.mounting_model import PARAMETERS
+    from phasemark.matcher.calibration.report import USES, shown, shown_names, shown_std
+
+    rows = []
+    for name in shown_names(found):
+        parameter = PARAMETERS[name]
+        use = USES.get(name) or f"{parameter.field} of the sensor"
+        rows.append((name, shown(found, name), shown_std(found, name), parameter.unit, use))
+    echo_table(("", "value", "±", "", "where it goes"), rows)
+    if len(found.free) > 1:
+        typer.echo("\ncorrelation")
+        echo_table(
+            ("", *found.free),
+            (
+                (name, *(f"{value:.2f}" for value in row))
+                for name, row in zip(found.free, found.correlation, strict=True)
+            ),
+        )
+    typer.echo(f"\nχ² = {found.chi2:.6g}, {found.dof} degrees of freedom, p = {found.p_value:.3g}")
+    typer.echo(f"standard deviations from {found.covariance_from}")
+    before, after = found.held_out_m
+    if math.isfinite(after):
+        typer.echo(f"residuals of held-out frames, r.m.s.: {1e3 * before:.3g} mm before, {1e3 * after:.3g} mm after")
+    for note in found.notes:
+        typer.echo(f"note: {note}")
+    for doubt in found.doubts:
+        typer.echo(f"not to be trusted: {doubt}; likely cause: {found.cause}")

@@ -1,0 +1,48 @@
+"""The command ``phasemark demo``: the paper's experiment."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from phasemark.data.commands.console import LongWork, echo_json, echo_table, finite_or_none
+from phasemark.data.commands.options import Force, Json, Seed, Workers
+from phasemark.data.commands.outputs import output_folder, refuse_existing
+
+
+def demo_report(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, the tables and the bank.")] = Path(
+        "out/demo"
+    ),
+    seed: Seed = 2005,
+    workers: Workers = None,
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°."""
+    from phasemark.data.shards.run import outputs_of
+    from phasemark.matcher.demo.report import summary_rows, write_demo
+    from phasemark.matcher.demo.run import cell_rows, run_demo
+
+    bank = out / "bank.h5"
+    refuse_existing([bank], force)
+    names = ("report.html", "cells.csv", "trials.csv")
+    with output_folder(out, "demo", names, force, also=[path.name for path in outputs_of(bank)]):
+        with LongWork("matching") as progress:
+            result = run_demo(bank, seed=seed, workers=workers, force=force, progress=progress)
+        with LongWork("writing the report"):
+            report = write_demo(result, out, force=force)
+    if as_json:
+        cells = [{key: finite_or_none(value) for key, value in row.items()} for row in cell_rows(result.cells)]
+        echo_json({"report": str(report), "seconds": result.seconds, "cells": cells})
+        return
+    header = ("D (cm)", "δ (°)", "class right", "|ΔD| mm", "worst", "|Δδ| °", "worst", "position mm", "worst")
+    for title, shifted in (("on the bank's grid", False), ("between grid points", True)):
+        typer.echo(f"{title}: medians and worst over the classes")
+        echo_table(header, summary_rows(result.select(shifted=shifted)))
+        typer.echo("")
+    typer.echo(report)

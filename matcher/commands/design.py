@@ -1,0 +1,109 @@
+"""The command ``phasemark landmark design``: a set of landmarks for a camera and a working range."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from phasemark.data.commands.console import LongWork, echo_json, echo_table
+from phasemark.data.commands.options import Force, Json, Workers
+from phasemark.data.commands.outputs import output_folder
+
+
+def landmark_design(
+    plan_file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[PLAN]", help="A plan (.toml); without it four landmarks for the PMD camera."),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder for landmarks, tables, pictures and drawings.")
+    ] = Path("out/design"),
+    confirm_frames: Annotated[
+        int,
+        typer.Option("--confirm", metavar="N", min=0, help="Simulated frame sets to match from every side; 0: none."),
+    ] = 100,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, max=2**64 - 1, help="Replaces the plan's root of all random numbers.")
+    ] = None,
+    example: Annotated[bool, typer.Option("--example", help="Print the default plan, and do nothing else.")] = False,
+    workers: Workers = None,
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Design a set of landmarks for a camera and a working range, and confirm what it gains by simulated frames."""
+    from phasemark.matcher.design import (
+        confirm_design,
+        default_design,
+        example_design,
+        load_design_plan,
+        output_names,
+        run_design,
+        summary,
+        write_design,
+    )
+
+    if example:
+        typer.echo(example_design(), nl=False)
+        return
+    plan = default_design() if plan_file is None else load_design_plan(plan_file)
+    if seed is not None:
+        plan = plan.model_copy(update={"seed": seed})
+    with output_folder(out, "landmark design", output_names(plan), force, plan):
+        with LongWork("searching") as progress:
+            design = run_design(plan, workers=workers, progress=progress)
+        confirmed = None
+        if confirm_frames:
+            with LongWork("matching simulated frames") as progress:
+                confirmed = confirm_design(design, confirm_frames, workers=workers, progress=progress)
+        with LongWork("writing the design"):
+            files = write_design(design, confirmed, out, force=force)
+    facts = summary(design, confirmed)
+    if as_json:
+        echo_json({"files": [str(path) for path in files], **facts})
+        return
+    _echo_design(facts)
+    for path in files:
+        typer.echo(path)
+
+
+def _echo_design(facts: Mapping[str, Any]) -> None:
+    """Print a design beside the catalogue."""
+    from phasemark.render.integral.rounding import with_interval
+
+    def within(interval: Mapping[str, float | None], scale: float) -> str:
+        value, low, high = (
+            math.nan if number is None else scale * number for number in map(interval.get, ("value", "low", "high"))
+        )
+        return with_interval(value, low, high) if math.isfinite(value) else "nothing found"
+
+    sets = [facts["result"], facts["catalogue"]]
+    rows = [
+        ("box (mm)", *(" × ".join(f"{1000 * side:g}" for side in one["landmarks"][0]["box"].values()) for one in sets)),
+        ("looks the same every", *(f"{360 / one['symmetry']:g}°" for one in sets)),
+        ("worst position bound (mm)", *(f"{1000 * one['worst_position_bound_m']:.1f}" for one in sets)),
+        ("median position bound (mm)", *(f"{1000 * one['median_position_bound_m']:.1f}" for one in sets)),
+        ("least d between classes", *(_number(one["least_class_distance"]) for one in sets)),
+        ("least d from itself turned", *(_number(one["turn_distance"]) for one in sets)),
+    ]
+    confirmation = facts["confirmation"]
+    if confirmation:
+        tried = [confirmation["result"], confirmation["catalogue"]]
+        for title, key in (("worst side", "worst"), ("anywhere", "anywhere")):
+            found = (f"{within(one[key]['rmse_m'], 1000)}, N = {one[key]['n']}" for one in tried)
+            rows.append((f"r.m.s. error, {title} (mm)", *found))
+        rows.append(("r.m.s. error / bound, all sides", *(within(one["rmse_over_bound"], 1) for one in tried)))
+        rows.append(("class errors, all sides (%)", *(within(one["class_errors"], 100) for one in tried)))
+    echo_table(("", "new set", "catalogue"), rows)
+    typer.echo(f"worst position bound {facts['bound_factor']:.2f} times lower than the catalogue's")
+    if confirmation:
+        typer.echo(f"worst r.m.s. error {within(confirmation['worst_rmse_factor'], 1)} times lower, 95 % interval")
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.1f}"

@@ -1,0 +1,72 @@
+"""A diagnosis of a refused frame in the words of the command line."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from phasemark.data.commands.options import FrameReading
+
+if TYPE_CHECKING:
+    from phasemark.matcher import (
+        Change,
+        Diagnosis,
+    )
+
+
+@dataclass(frozen=True)
+class Given:
+    """How a command was told to read frames and match them, as far as a diagnosis depends on it."""
+
+    reading: FrameReading
+    nearest: bool
+    bearing_fixed: bool
+
+
+def diagnosis_text(diagnosis: Diagnosis, given: Given) -> str:
+    """Return a diagnosis in one line that names options."""
+    return diagnosis.message(lambda change: _flags(change, given))
+
+
+def _flags(change: Change, given: Given) -> str:
+    """Return the options that make one change."""
+    from phasemark.data.measured.reading import METRES_PER_UNIT
+
+    value = change.value
+    refine = "--method refine " if given.nearest else ""
+    turned = given.reading.rotate in (90, 270)  # mirrored before it is turned: left and right become top and bottom
+    if change.parameter == "method":
+        return refine.strip()
+    if change.parameter == "free":
+        return f"{refine}--free bearing" + (" instead of --fix bearing" if given.bearing_fixed else "")
+    if change.parameter == "background":
+        if value == "auto":
+            return f"{refine}--auto-background"
+        if value is None:
+            return f"{refine}without --wall and --floor".strip()
+        planes = ((f"--{name}", getattr(value, f"{name}_m")) for name in ("wall", "floor"))
+        return refine + " ".join(f"{option} {metres:.4f}" for option, metres in planes if metres is not None)
+    if change.parameter in ("flip_h", "flip_v"):
+        horizontal = (change.parameter == "flip_h") != turned
+        option = "--flip-h" if horizontal else "--flip-v"
+        return f"without {option}" if (given.reading.flip_h if horizontal else given.reading.flip_v) else option
+    if change.parameter == "rotate":
+        angle = (given.reading.rotate + value) % 360
+        return f"--rotate {angle}" if angle else "without --rotate"
+    if change.parameter == "quantity":
+        return f"--quantity {value}"
+    if change.parameter == "unit_factor":
+        scale = None if given.reading.unit is None else METRES_PER_UNIT[given.reading.unit] * value
+        right = next((name for name, metres in METRES_PER_UNIT.items() if scale and math.isclose(metres, scale)), None)
+        return f"a unit {value:g} times as large as the file states" if right is None else f"--unit {right}"
+    if change.parameter == "half_angle_deg":
+        return (
+            "a bank of a sensor file with"
+            f" half_angle_h_deg = {value[0]:.4g}, half_angle_v_deg = {value[1]:.4g} (phasemark calibrate makes one)"
+        )
+    if change.parameter == "bearing_offset_deg":
+        return f"a bank of a sensor file with bearing_offset_deg = {value:.3g}, or the camera turned"
+    return f"phasemark bank build --distance with a grid that has {value:.2f} m"

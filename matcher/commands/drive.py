@@ -1,0 +1,73 @@
+"""The command ``phasemark drive``: a robot from landmark to landmark."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from phasemark.data.commands.console import LongWork, echo_json, echo_table
+from phasemark.data.commands.inputs import note_plan_too_far
+from phasemark.data.commands.options import Force, Json, Workers
+from phasemark.data.commands.outputs import output_folder
+
+
+def drive_robot(
+    plan_file: Annotated[
+        Path | None, typer.Argument(metavar="[PLAN]", help="A plan (.toml); without it a tour of 20 m.")
+    ] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for tables, summary, picture and animation.")] = Path(
+        "out/drive"
+    ),
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")] = 2005,
+    example: Annotated[
+        bool, typer.Option("--example", help="Print the plan of that tour, and do nothing else.")
+    ] = False,
+    workers: Workers = None,
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Drive a robot from landmark to landmark, its odometry corrected on the way."""
+    from phasemark.matcher.drive import (
+        OUTPUTS,
+        default_drive,
+        example_drive,
+        load_drive_plan,
+        run_drive,
+        summary,
+        write_drive,
+    )
+
+    if example:
+        typer.echo(example_drive(), nl=False)
+        return
+    plan = default_drive() if plan_file is None else load_drive_plan(plan_file)
+    note_plan_too_far(plan)
+    with output_folder(out, "drive", OUTPUTS, force, plan):
+        with LongWork("driving, cm") as progress:
+            drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
+        with LongWork("drawing"):
+            files = write_drive(drive, out, force=force)
+    facts = summary(drive)
+    if as_json:
+        echo_json({"files": [str(path) for path in files], **facts})
+        return
+    echo_table(
+        ("error", "at the end", "largest", "heading at the end", "largest"),
+        (
+            (
+                title,
+                f"{facts[f'{key}_final_position_error_m']:.3f} m",
+                f"{facts[f'{key}_largest_position_error_m']:.3f} m",
+                f"{facts[f'{key}_final_heading_error_deg']:.2f}°",
+                f"{facts[f'{key}_largest_heading_error_deg']:.2f}°",
+            )
+            for title, key in (("dead reckoning", "dead_reckoned"), ("corrected", "corrected"))
+        ),
+    )
+    typer.echo(f"{facts['way_m']:.1f} m, {facts['corrections']} corrections at {facts['stops']} stops")
+    for path in files:
+        typer.echo(path)

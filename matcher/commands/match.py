@@ -1,0 +1,205 @@
+"""The command ``phasemark match``: measured frames against a bank."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from phasemark.data.commands.console import LongWork, Table, echo_json, tell
+from phasemark.data.commands.inputs import note_too_far, open_any_bank
+from phasemark.data.commands.options import (
+    FrameReading,
+)
+from phasemark.data.commands.outputs import refuse_unwritable_files
+from phasemark.matcher.commands.diagnosis_flags import Given, diagnosis_text
+from phasemark.matcher.commands.match_options import Place, Results, Search
+from phasemark.matcher.commands.match_table import match_rows
+
+if TYPE_CHECKING:
+    from phasemark.data import Bank
+    from phasemark.matcher import (
+        FilteredFrames,
+        LandmarkMap,
+        Match,
+        Matcher,
+    )
+    from phasemark.matcher.recordings.estimates_table import MatchedBatch
+    from phasemark.render import Background, Frames
+
+
+NEAREST_AT_ONCE, REFINED_AT_ONCE = 256, 64
+"""Positions matched before their answers are printed; refinement takes up to 50 ms each."""
+
+
+def match_frames(
+    *,
+    bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank.")],
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Measured frames: CSV, NPY, NPZ or HDF5.")],
+    reading: FrameReading,
+    search: Search,
+    place: Place,
+    moving: Annotated[
+        bool, typer.Option("--moving", help="The camera moves: match every frame by itself instead of their mean.")
+    ] = False,
+    results: Results,
+) -> None:
+    """Match measured frames against a bank, and place the robot.
+
+    All frames of a file are averaged: the camera stands still. A file of shape (n, frames, rows, cols) has n positions.
+    With --moving every frame is a position of its own. A CSV file may have a header that names its columns: t_ms or
+    t_s, mm_0 ... (or range_0 ..., z_0 ...), status_0 ...; for a VL53L5CX or VL53L8CX give --valid-status 5.
+    """
+    from phasemark.data import write_atomically
+
+    place.check()
+    landmarks = place.landmarks()
+    results.check()
+    search.check()
+    with open_any_bank(bank) as opened:
+        measured = reading.read(frames, opened.sensor)
+        note_too_far(opened.sensor, {"--wall": search.wall})
+        positions = measured.each_a_position() if moving else measured
+        plots = results.plots(len(positions))
+        refuse_unwritable_files(results.files(plots), results.force)
+        matcher = search.matcher(opened)
+        if not moving:
+            _note_motion(measured, frames)
+        printed = _Answers(search, place, results, landmarks, plots, moving)
+        printed.match_all(matcher, positions)
+        printed.diagnose(matcher, reading)
+        if results.as_json:
+            echo_json({"bank": str(bank), "frames": str(frames), "matches": printed.answers})
+        if results.estimates is not None:
+            write_atomically(results.estimates, printed.estimated.to_csv().encode(), force=results.force)
+        for k, path in plots.items():
+            _save_match_picture(path, *printed.drawn[k], opened, search.background, results.force)
+    if not (results.as_json or results.as_jsonl):
+        for path in results.files(plots):
+            typer.echo(path)
+        _note_plots(plots, results.plot_index, len(positions))
+
+
+class _Answers:
+    """Matches that are printed batch by batch, and what of them is needed at the end."""
+
+    def __init__(
+        self,
+        search: Search,
+        place: Place,
+        results: Results,
+        landmarks: LandmarkMap | None,
+        plots: Mapping[int, Path],
+        moving: bool,
+    ) -> None:
+        from phasemark.matcher.recordings.estimates_table import EstimateTable
+
+        self._search, self._place, self._results, self._landmarks = search, place, results, landmarks
+        self._plots, self._moving = plots, moving
+        self._table, self.estimated = Table(), EstimateTable(search.parameters)
+        self.answers: list[dict[str, Any]] = []  # all of them only for --json, whose answers are one list
+        self.drawn: dict[int, tuple[FilteredFrames, Match]] = {}
+        self._refused: tuple[int, FilteredFrames] | None = None
+        self._n_accepted = 0
+
+    def match_all(self, matcher: Matcher, positions: Frames) -> None:
+        """Match all positions, and print each batch as soon as it is known."""
+        from phasemark.matcher.recordings.estimates_table import match_in_batches
+
+        n, averaged = len(positions), self._search.filter()
+        at_once = NEAREST_AT_ONCE if self._search.method == "nearest" else REFINED_AT_ONCE
+        with LongWork("matching") if n > at_once else nullcontext() as progress:
+            for batch in match_in_batches(matcher, positions, averaged, at_once=at_once):
+                self._print([self._answer(batch, k) for k in range(len(batch.matches))], batch.start)
+                if self._results.estimates is not None:
+                    self.estimated.add(batch)
+                sys.stdout.flush()
+                if progress is not None:
+                    progress(batch.start + len(batch.matches), n)
+
+    def _answer(self, batch: MatchedBatch, k: int) -> dict[str, Any]:
+        """Return a match of a batch as plain numbers, and note what is needed of it later."""
+        match, index = batch.matches[k], batch.start + k
+        answer = match.as_dict()
+        if batch.filtered.time_s is not None:
+            answer["time_s"] = float(batch.filtered.time_s[k])
+        if self._landmarks is not None:
+            answer["poses"] = self._place.poses(match, self._landmarks)
+        if index in self._plots:
+            self.drawn[index] = batch.filtered[k : k + 1], match
+        self._n_accepted += match.accepted
+        if self._refused is None and not match.accepted:
+            self._refused = index, batch.filtered[k : k + 1]
+        return answer
+
+    def _print(self, answers: Sequence[dict[str, Any]], start: int) -> None:
+        if self._results.as_json:
+            self.answers += answers
+        elif self._results.as_jsonl:
+            for k, answer in enumerate(answers, start):
+                typer.echo(json.dumps({"index": k, **answer}, ensure_ascii=False, allow_nan=False))
+        else:
+            self._table.echo(match_rows(answers, start, self._moving))
+
+    def diagnose(self, matcher: Matcher, reading: FrameReading) -> None:
+        """Say which setting would make the first refused position fit."""
+        from phasemark.matcher import diagnose
+
+        search = self._search
+        # among the frames of a moving camera some do not show the landmark: that needs no diagnosis
+        some_right = self._moving and self._n_accepted
+        if self._refused is None or self._results.no_diagnosis or search.unknown_background or some_right:
+            return
+        index, filtered = self._refused
+        diagnosis = replace(diagnose(matcher, filtered, 0, background=search.background), index=index)
+        message = diagnosis_text(diagnosis, Given(reading, search.method == "nearest", search.fix == "bearing"))
+        tell(f"note: {message}")
+        if self._results.as_json:
+            self.answers[index]["diagnosis"] = {**diagnosis.as_dict(), "message": message}
+
+
+def _note_plots(plots: Mapping[int, Path], chosen: str | None, n: int) -> None:
+    """Say how to have more positions drawn than the first."""
+    if plots and chosen is None and len(plots) < n:
+        tell(
+            f"note: drew the first of {n} positions; --plot-index 0,{n // 2}:{min(n // 2 + 9, n - 1)} draws others"
+            " (some seconds each)"
+        )
+
+
+def _note_motion(measured: Frames, file: Path) -> None:
+    """Say that frames which are about to be averaged were not taken at rest."""
+    import numpy as np
+
+    from phasemark.matcher import motion_test
+
+    moved = np.flatnonzero(motion_test(measured).moved())
+    if moved.size:
+        n = len(measured)
+        where = "the file" if n == 1 else f"{len(moved)} of {n} positions, the first being {moved[0]}"
+        tell(
+            f"note: {file}: the camera or the scene moved during {where}, so that the mean of the frames is no single"
+            " view; --moving matches every frame by itself"
+        )
+
+
+def _save_match_picture(
+    path: Path, filtered: FilteredFrames, match: Match, bank: Bank, background: Background | None, force: bool
+) -> None:
+    """Draw one position."""
+    import io as bytes_io
+
+    from phasemark.data import write_atomically
+    from phasemark.matcher.figures import match_picture
+
+    buffer = bytes_io.BytesIO()
+    match_picture(filtered, match, bank, background).savefig(buffer, format="png", dpi=120)
+    write_atomically(path, buffer.getvalue(), force=force)

@@ -1,0 +1,274 @@
+"""What ``phasemark match`` is told: how to match, where the landmark stands, and what to print and write."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from phasemark import UsageError
+from phasemark.data.commands.inputs import background_of
+from phasemark.data.commands.options import Floor, Force, Json, Wall, one_of
+from phasemark.matcher.commands.match_table import pose_facts
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from phasemark.data import Bank
+    from phasemark.matcher import FilteredFrames, LandmarkMap, Match, Matcher
+    from phasemark.render import Background, Frames
+
+_DRAWN_ALL = 4
+"""Most positions that are drawn unless the user says which; a picture takes two seconds."""
+
+_FREE = {"bearing": "bearing_rad", "height": "height_m"}
+
+
+@dataclass(frozen=True)
+class Search:
+    """How frames are averaged and matched."""
+
+    filter_name: Annotated[
+        Literal["kalman", "phasor-mean"], typer.Option("--filter", help="kalman or phasor-mean.")
+    ] = "kalman"
+    method: Annotated[
+        Literal["nearest", "refine"],
+        typer.Option(
+            "--method",
+            help="nearest: the paper's minimum-distance classifier. refine: maximum likelihood, with covariance.",
+        ),
+    ] = "nearest"
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--free",
+            help="With refine, estimate this with nothing known of it: bearing or height; repeatable.",
+            autocompletion=one_of("bearing", "height"),
+        ),
+    ] = None
+    fix: Annotated[
+        Literal["bearing"] | None,
+        typer.Option("--fix", help="With refine, leave this at 0: bearing.", metavar="NAME"),
+    ] = None
+    bearing_std: Annotated[
+        float | None,
+        typer.Option(
+            "--bearing-std",
+            metavar="DEG",
+            help="With refine, how well the camera points at the landmark (1.5 unless --free or --fix is given).",
+        ),
+    ] = None
+    on: Annotated[
+        Literal["ranges", "phasors"],
+        typer.Option(
+            "--on",
+            help="With refine: ranges, or phasors with the albedo free.",
+        ),
+    ] = "ranges"
+    pixels: Annotated[
+        Literal["all", "lower"],
+        typer.Option("--pixels", help="With refine, what gives the view: all or lower."),
+    ] = "all"
+    robust: Annotated[bool, typer.Option("--robust", help="With refine, count residuals beyond 3 σ less.")] = False
+    false_alarm: Annotated[
+        float, typer.Option("--false-alarm", help="Share of good frames that the test of the fit may refuse.")
+    ] = 0.01
+    auto_background: Annotated[
+        bool, typer.Option("--auto-background", help="With refine, estimate wall and floor from each frame.")
+    ] = False
+    unknown_background: Annotated[
+        bool,
+        typer.Option("--unknown-background", help="With refine: other things may stand before, beside and behind it."),
+    ] = False
+    wall: Wall = None
+    floor: Floor = None
+
+    @property
+    def background(self) -> Background | None:
+        """What stands behind the landmark, as far as it is stated."""
+        return background_of(self.wall, self.floor)
+
+    @property
+    def near_the_axis(self) -> bool:
+        """Whether the bearing is estimated with what is known of it, as nothing else is asked for."""
+        return self.method == "refine" and not self.free and not self.fix
+
+    @property
+    def parameters(self) -> list[str]:
+        """What is estimated."""
+        free = ["bearing"] if self.near_the_axis else self.free or ()
+        return ["distance_m", "delta_rad", *(_FREE[name] for name in free)]
+
+    def filter(self) -> Callable[[Frames], FilteredFrames]:
+        """Return what averages the frames of a position."""
+        from phasemark.matcher import kalman_filter, phasor_mean
+
+        return kalman_filter if self.filter_name == "kalman" else phasor_mean
+
+    def check(self) -> None:
+        """Refuse options that contradict each other."""
+        stated = self.background is not None
+        if self.auto_background and stated:
+            raise UsageError("--auto-background estimates wall and floor: leave --wall and --floor out")
+        if self.unknown_background and (self.auto_background or stated):
+            raise UsageError(
+                "--unknown-background takes nothing for known: leave --auto-background, --wall and --floor out"
+            )
+        if self.bearing_std is not None and (self.free or self.fix):
+            raise UsageError("--bearing-std says how well the bearing is known: leave --free and --fix out")
+        if self.fix and "bearing" in (self.free or ()):
+            raise UsageError("--free and --fix both name bearing: give one of them")
+        for name in self.free or ():
+            if name not in _FREE:
+                raise UsageError(f"--free must be {' or '.join(_FREE)}, got '{name}'")
+        refined = (
+            ("--free", bool(self.free)), ("--on", self.on != "ranges"), ("--pixels", self.pixels != "all"),
+            ("--robust", self.robust), ("--auto-background", self.auto_background),
+            ("--unknown-background", self.unknown_background), ("--fix", self.fix is not None),
+            ("--bearing-std", self.bearing_std is not None),
+        )  # fmt: skip
+        for option, used in refined:
+            if used and self.method == "nearest":
+                raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
+
+    def matcher(self, bank: Bank) -> Matcher:
+        """Return the matcher."""
+        from phasemark.matcher import Matcher
+        from phasemark.matcher.likelihood.estimator import BEARING_STD_RAD
+
+        return Matcher(
+            bank,
+            self.method,
+            free=None if self.near_the_axis else self.parameters,
+            background="auto" if self.auto_background else "unknown" if self.unknown_background else self.background,
+            bearing_std_rad=BEARING_STD_RAD if self.bearing_std is None else math.radians(self.bearing_std),
+            false_alarm=self.false_alarm,
+            on=self.on,
+            pixels=self.pixels,
+            robust=self.robust,
+        )
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where landmarks stand, and where the robot is thought to be."""
+
+    landmark_xy: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--landmark-xy", metavar="X Y", help="Where the landmark stands, metres."),
+    ] = None
+    landmark_yaw: Annotated[float, typer.Option("--landmark-yaw", metavar="DEG", help="Heading of its x' axis.")] = 0.0
+    pan: Annotated[float, typer.Option("--pan", metavar="DEG", help="Pan angle of the camera on the robot.")] = 0.0
+    prior: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--prior", metavar="X Y DEG", help="Where the robot is thought to be; orders the solutions."),
+    ] = None
+    prior_std: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--prior-std", metavar="M DEG", help="How well: standard deviations of x and y, and of heading."),
+    ] = None
+    map_file: Annotated[
+        Path | None,
+        typer.Option("--map", metavar="MAP", help="Where the landmarks stand (.toml), instead of --landmark-xy."),
+    ] = None
+
+    def check(self) -> None:
+        """Refuse options that contradict each other, or lack what they belong to."""
+        if self.map_file is not None and self.landmark_xy is not None:
+            raise UsageError("--map and --landmark-xy both say where the landmark stands: give one of them")
+        if self.prior is not None and self.landmark_xy is None and self.map_file is None:
+            raise UsageError("--prior needs --landmark-xy or --map: without it there is no robot position")
+        if self.prior_std is not None and self.prior is None:
+            raise UsageError("--prior-std needs --prior, which it belongs to")
+        if self.prior_std is not None and not min(self.prior_std) > 0:
+            x, heading = self.prior_std
+            raise UsageError(f"--prior-std must be two positive numbers, got {x:g} {heading:g}")
+
+    def landmarks(self) -> LandmarkMap | None:
+        """Return where landmarks stand; None if nothing is said of it."""
+        from phasemark.matcher import load_map
+
+        if self.map_file is not None:
+            return load_map(self.map_file)
+        return None if self.landmark_xy is None else _one_landmark(self.landmark_xy, self.landmark_yaw)
+
+    def poses(self, match: Match, landmarks: LandmarkMap) -> list[dict[str, Any]]:
+        """Return the robot poses of a match as plain numbers, best first; none if there is no landmark."""
+        any_class = self.map_file is None
+        return pose_facts(match, landmarks, any_class, math.radians(self.pan), self.prior, self.prior_std)
+
+
+def _one_landmark(xy: tuple[float, float], yaw_deg: float) -> LandmarkMap:
+    """Return the map of a landmark of any class."""
+    from phasemark.matcher import LandmarkMap, MappedLandmark
+
+    if not all(map(math.isfinite, (*xy, yaw_deg))):
+        raise UsageError(
+            f"--landmark-xy and --landmark-yaw must be finite numbers, got {xy[0]:g} {xy[1]:g} and {yaw_deg:g}"
+        )
+    only = MappedLandmark(name="landmark", class_name="any", x_m=xy[0], y_m=xy[1], yaw_deg=yaw_deg)
+    return LandmarkMap(landmark=(only,))
+
+
+@dataclass(frozen=True)
+class Results:
+    """What is printed and written."""
+
+    estimates: Annotated[
+        Path | None,
+        typer.Option("--estimates", metavar="FILE", help="Write a line for each position into this .csv."),
+    ] = None
+    plot: Annotated[
+        Path | None,
+        typer.Option(
+            "--plot", help="Draw measured, model and residual into this .png; of several positions, number K into -K."
+        ),
+    ] = None
+    plot_index: Annotated[
+        str | None,
+        typer.Option(
+            "--plot-index",
+            metavar="LIST",
+            help=f"Positions to draw, such as 0,17,200:210. By default all, or the first of more than {_DRAWN_ALL}.",
+        ),
+    ] = None
+    no_diagnosis: Annotated[
+        bool, typer.Option("--no-diagnosis", help="Do not look for the setting that makes a refused frame fit.")
+    ] = False
+    as_json: Json = False
+    as_jsonl: Annotated[
+        bool, typer.Option("--jsonl", help="Print each match as a line of JSON as soon as it is known.")
+    ] = False
+    force: Force = False
+
+    def check(self) -> None:
+        """Refuse names of a wrong kind, and options that contradict each other."""
+        if self.plot is not None and self.plot.suffix.lower() != ".png":
+            raise UsageError(f"the picture must be a .png file, got '{self.plot}'")
+        if self.plot is None and self.plot_index is not None:
+            raise UsageError("--plot-index needs --plot, the file to draw into")
+        if self.estimates is not None and self.estimates.suffix.lower() != ".csv":
+            raise UsageError(f"the estimates must be a .csv file, got '{self.estimates}'")
+        if self.as_json and self.as_jsonl:
+            raise UsageError("--json and --jsonl are two forms of the same output: give one of them")
+
+    def plots(self, n: int) -> dict[int, Path]:
+        """Return which of n positions to draw, and into which files; of several, with a number before the suffix."""
+        from phasemark.data.plans.grid_axis import parse_indices
+
+        if self.plot is None:
+            return {}
+        if self.plot_index is not None:
+            indices = parse_indices(self.plot_index, n, "--plot-index")
+        else:
+            indices = list(range(n if n <= _DRAWN_ALL else 1))
+        return {k: self.plot if n == 1 else self.plot.with_stem(f"{self.plot.stem}-{k}") for k in indices}
+
+    def files(self, plots: dict[int, Path]) -> list[Path]:
+        """Return all files that are written."""
+        return [*([] if self.estimates is None else [self.estimates]), *plots.values()]

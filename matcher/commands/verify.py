@@ -1,0 +1,37 @@
+"""The command ``phasemark bank verify``, which matches random views against the bank if it is asked to."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from phasemark.data.commands.console import LongWork, echo_facts, echo_json
+from phasemark.data.commands.inputs import open_any_bank
+from phasemark.data.commands.options import Json, Sample, Seed
+
+
+def bank_verify(
+    bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank, its checksum beside it.")],
+    population: Annotated[
+        int | None, typer.Option("--population", min=1, help="Match so many random views against the bank.")
+    ] = None,
+    sample: Sample = 16,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Check a bank: checksum, schema, values, random images rendered again; and what its grid's spacing costs."""
+    from phasemark.data import verify_bank
+
+    with LongWork("verifying"):
+        report = verify_bank(bank, sample=sample, seed=seed)
+    if population is not None:
+        from phasemark.matcher import grid_loss
+
+        with open_any_bank(bank) as opened, LongWork("matching random views"):
+            loss = grid_loss(opened, population, seed=seed).as_dict()
+        report |= {key: float(f"{value:.3g}") if isinstance(value, float) else value for key, value in loss.items()}
+    echo_json(report) if as_json else echo_facts(report)
