@@ -39,6 +39,7 @@ __all__ = [
 
 
 def _picture(spec: LandmarkSpec) -> bytes:
+    """Draw a landmark as a PNG."""
     from phasemark.landmarks.figures import mesh_picture
 
     return mesh_picture(build_mesh(spec))

@@ -68,12 +68,14 @@ _PICTURES = ("PAPER_CMAP", "range_picture", "terminal_picture")
 
 
 def _figure_of_frame(frames: Frames, index: int, frame: int) -> "Figure":
+    """Draw range, amplitude and flags of one frame."""
     from phasemark.render.figures import plot_frame
 
     return plot_frame(frames, index, frame)
 
 
 def _figure_of_image(images: PhasorImages, index: int) -> "Figure":
+    """Draw range, amplitude and coverage of one view."""
     from phasemark.render.figures import plot_phasor_image
 
     return plot_phasor_image(images, index)

@@ -371,7 +371,11 @@ def test_positions_of_one_file_take_their_distances_in_order(folder, tmp_path):
         (["empty.csv", "--distance", "1"], 2, "no pixel is valid"),
         (["missing.npz", "--distance", "1"], 3, "cannot be read"),
         (["1.npz", "--distance", "1", "--sensor", "nothing"], 2, "unknown sensor 'nothing'"),
-        (["1.npz", "--distance", "1", "--amplitude-unit", "volts"], 2, "'electrons' or 'arbitrary'"),
+        (
+            ["1.npz", "--distance", "1", "--amplitude-unit", "volts"],
+            2,
+            "'volts' is not one of 'electrons', 'arbitrary'",
+        ),
     ],
 )
 def test_the_command_says_in_one_line_what_is_wrong(folder, tmp_path, capsys, monkeypatch, arguments, code, part):

@@ -128,7 +128,7 @@ def test_plan_commands_print_and_check(tmp_path, capsys):
     assert main(["plan", "check", str(path)]) == 2
     assert re.search(r"plan\.toml: 'views' must be .* got -1", capsys.readouterr().err)
     assert main(["plan", "schema", "tour"]) == 2
-    assert "unknown kind of plan 'tour': there are bank, frames, sweep, drive" in capsys.readouterr().err
+    assert "'tour' is not one of 'bank', 'frames', 'sweep', 'drive'" in capsys.readouterr().err
     with pytest.raises(UsageError, match="unknown kind of plan 'tour'"):
         plan_schema("tour")
 

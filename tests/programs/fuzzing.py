@@ -45,7 +45,7 @@ OWN_READERS = (
     "/render/sensor/",
     "/matcher/plan_kinds.py",
     "/matcher/position/landmark_map.py",
-    "/matcher/calibrate/known_poses.py",
+    "/matcher/calibration/known_poses.py",
 )
 _TRACED = (*OWN_READERS, "numpy/lib/", "/zipfile", "/PIL/Png", "trimesh/exchange", "/tomllib/")
 _TRACE_SHARE = 0.1
