@@ -208,7 +208,7 @@ def _good_bank(folder):
 
 
 def _good_frames(folder):
-    from phasemark.data.frames import build_frames
+    from phasemark.data import build_frames
 
     build_frames(FramePlan(classes=["cone"], views=2), folder / "f.h5").close()
     return [(folder / "f.h5").read_bytes()]
