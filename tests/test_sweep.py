@@ -332,3 +332,9 @@ def test_a_sweep_ended_at_any_call_to_the_system_goes_on_or_starts_over(action, 
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=memory) as folder:
         assert int(run_program("sweep_crash_points", folder, action, step)) > 10
+
+
+@pytest.mark.parametrize("scheduler", ["local:0", "somewhere"])
+def test_a_scheduler_that_cannot_be_is_refused_before_a_folder_is_made(tmp_path, scheduler):
+    assert main(["sweep", "run", "paper", "--trials", "1", "--scheduler", scheduler, "-o", str(tmp_path / "x")]) == 2
+    assert not (tmp_path / "x").exists()

@@ -42,6 +42,29 @@ MOST_PROCESSES = 1024
 _LENGTH = struct.Struct("<q")
 
 
+def check_scheduler(scheduler: str) -> int | None:
+    """Return the number of processes that ``local:N`` asks for, None for anything else that can be a scheduler.
+
+    Raises
+    ------
+    UsageError
+        It is neither ``threads``, ``local:N`` nor an address.
+    """
+    kind, _, count = scheduler.partition(":")
+    if kind == "local":
+        n = as_count(count)
+        if n is None or not 1 <= n <= MOST_PROCESSES:
+            raise UsageError(
+                f"--scheduler local:N needs a number of processes, 1 to {MOST_PROCESSES}, got '{scheduler[:40]}'"
+            )
+        return n
+    if scheduler != "threads" and "://" not in scheduler:
+        raise UsageError(
+            f"--scheduler must be threads, local:N or an address such as tcp://HOST:8786, got '{scheduler}'"
+        )
+    return None
+
+
 def open_maker(scheduler: str, job: Job) -> Maker | None:
     """Return what makes a job's shards: None for threads of this process.
 
@@ -56,21 +79,10 @@ def open_maker(scheduler: str, job: Job) -> Maker | None:
     UsageError
         It is none of these, Dask is not installed, or its scheduler cannot be reached.
     """
+    processes = check_scheduler(scheduler)
     if scheduler == "threads":
         return None
-    kind, _, count = scheduler.partition(":")
-    if kind == "local":
-        n = as_count(count)
-        if n is None or not 1 <= n <= MOST_PROCESSES:
-            raise UsageError(
-                f"--scheduler local:N needs a number of processes, 1 to {MOST_PROCESSES}, got '{scheduler[:40]}'"
-            )
-        return ProcessMaker(job, n)
-    if "://" not in scheduler:
-        raise UsageError(
-            f"--scheduler must be threads, local:N or an address such as tcp://HOST:8786, got '{scheduler}'"
-        )
-    return DaskMaker(job, scheduler)
+    return DaskMaker(job, scheduler) if processes is None else ProcessMaker(job, processes)
 
 
 @functools.lru_cache(maxsize=4)

@@ -22,6 +22,7 @@ from phasemark.data.files.json_text import json_text
 from phasemark.data.files.same_file import named_files, refuse_inputs
 from phasemark.data.progress import Progress
 from phasemark.data.shards.build import difference
+from phasemark.data.shards.remote import check_scheduler
 from phasemark.data.shards.run import outputs_of, produce
 from phasemark.inputs import MOST_TOML_BYTES, read_text
 from phasemark.matcher.sweep.job import FORMAT, SCHEMA_VERSION, Round, SweepJob, check_matcher
@@ -84,6 +85,7 @@ def run_sweep(
     for method in plan.methods:
         if method.is_program:
             check_matcher(method.method)
+    check_scheduler(scheduler)
     folder = Path(folder)
     refuse_inputs(sweep_outputs(folder), named_files(plan.model_dump()))
     with sweep_folder(folder) as ours:
