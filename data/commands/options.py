@@ -62,7 +62,9 @@ FramesUnit = Annotated[
 ]
 Quantity = Annotated[
     QuantityWord | None,
-    typer.Option("--quantity", help="range (along the ray) or z (along the optical axis); likewise."),
+    typer.Option(
+        "--quantity", help="range (along the ray) or z (along the optical axis); needed where the file does not say it."
+    ),
 ]
 InvalidMeans = Annotated[
     InvalidMeansWord, typer.Option("--invalid-means", help="What an invalid pixel stands for: missing or no-return.")

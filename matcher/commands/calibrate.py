@@ -61,7 +61,7 @@ def calibrate_camera(
         typer.Option(
             "--sensor",
             metavar="NAME|FILE",
-            help="The camera as it is thought to be; a bank has its own.",
+            help="The assumed camera; a bank has its own.",
             autocompletion=a_preset,
         ),
     ] = None,
@@ -73,7 +73,7 @@ def calibrate_camera(
     ] = None,
     height: Annotated[
         float | None,
-        typer.Option("--height", metavar="M", help="Landmark's origin above the lens, as it is thought to be."),
+        typer.Option("--height", metavar="M", help="Assumed height of the landmark's origin above the lens."),
     ] = None,
     bearing: Annotated[
         float | None,
