@@ -338,9 +338,11 @@ def calibrate(
     names = tuple(name for name in names if name not in kept)
     assumed = start or Mounting.of_sensor(sensor, albedo)
     z = sensor.quantity == "z" if reports_z is None else reports_z
+    rendered = counter(progress, _USUAL_RENDERINGS)
     if recorded:
-        whole = _Job(mesh, background, assumed, names, z, zones is not False and sensor.kind == "direct", workers)
-        return _from_recording(whole, frames, poses, moving, counter(progress, _USUAL_RENDERINGS))
+        with_zones = zones is not False and sensor.kind == "direct"
+        whole = _Job(mesh, background, assumed, names, z, with_zones, workers, rendered)
+        return _from_recording(whole, frames, poses, moving)
     frames = _without_zones(frames)
     _check(frames, poses, names, lit)
     evidence = Evidence.from_frames(frames, quantity)
@@ -352,7 +354,7 @@ def calibrate(
         background=background,
         reports_z=z,
         workers=workers,
-        rendered=counter(progress, _USUAL_RENDERINGS),
+        rendered=rendered,
     )
     _check_view(model, evidence, assumed)
     edges = model.has_background or not _returns_beside(model, evidence, assumed)
@@ -381,7 +383,7 @@ def calibrate(
     doubts = doubts_about(place.theta, assumed.vector, names, held_out)
     cause = ""
     if doubts:
-        job = _Job(mesh, background, assumed, tuple(n for n in names if n != "albedo"), z, False, workers)
+        job = _Job(mesh, background, assumed, tuple(n for n in names if n != "albedo"), z, False, workers, rendered)
         cause = _cause(job, frames, poses, edges)
     return replace(found, doubts=tuple(doubts), cause=cause, held_out_m=held_out)
 
@@ -420,6 +422,8 @@ class _Job:
     reports_z: bool
     zones: bool
     workers: int
+    rendered: Callable[[], None]
+    """Called each time all poses have been rendered."""
 
 
 def _without_zones(frames: FilteredFrames) -> FilteredFrames:
@@ -486,7 +490,6 @@ def _recording(
     poses: KnownPoses,
     track: PoseTrack | None,
     edges: bool | None,
-    rendered: Callable[[], None] = lambda: None,
 ) -> Recording:
     """Set up the calibration of frames, one for each pose or by time."""
     stamps = frames.time_s
@@ -499,7 +502,7 @@ def _recording(
         background=job.background,
         reports_z=job.reports_z,
         workers=job.workers,
-        rendered=rendered,
+        rendered=job.rendered,
         track=track,
         stamp_s=stamps if moving else None,
     )
@@ -521,9 +524,7 @@ def _poses_at(track: PoseTrack, times: NDArray[np.float64]) -> KnownPoses:
     return KnownPoses(distance, delta, bearing, height, place=place, time_s=times)
 
 
-def _from_recording(
-    job: _Job, frames: FilteredFrames, poses: KnownPoses, moving: bool, rendered: Callable[[], None]
-) -> Calibration:
+def _from_recording(job: _Job, frames: FilteredFrames, poses: KnownPoses, moving: bool) -> Calibration:
     """Calibrate on many poses, by time or one for each frame."""
     notes: list[str] = []
     track = None
@@ -537,7 +538,7 @@ def _from_recording(
         poses = _poses_at(track, frames.time_s + job.assumed.delay_s)
     else:
         _check(frames, poses, job.names, True)
-    recording = _recording(job, frames, poses, track, None, rendered)
+    recording = _recording(job, frames, poses, track, None)
     if not moving:
         _check_view(recording.model, recording.evidence, job.assumed)
     _check_ranges(recording, job.assumed)
