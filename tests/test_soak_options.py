@@ -77,7 +77,7 @@ SMALL = {
     "sweep run": ("sweep.toml", "-o", "out"),
 }
 """Arguments with which a command does little."""
-LONG = {"demo": 60, "landmark design": 40, "drive": 30, "sweep run": 30, "sweep report": 30, "calibrate": 60}
+LONG = {"demo": 60, "landmark design": 40, "drive": 30, "sweep run": 30, "sweep report": 30, "calibrate": 120}
 """Seconds of commands that cannot do little, while another test runs beside them."""
 PLAN = 'views = 1\nclasses = ["cone"]\n'
 DESIGN = "n_classes = 2\n[sampling]\ndistances = 2\ndelta_step_deg = 15\n[search]\nboxes = 4\nuppers = 8\nstep_mm = 3\n"

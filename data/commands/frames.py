@@ -14,7 +14,13 @@ from phasemark import UsageError
 from phasemark.data.commands.build import build_or_estimate, merge_shards
 from phasemark.data.commands.command import Without
 from phasemark.data.commands.console import LongWork, echo_facts, echo_json, readable
-from phasemark.data.commands.inputs import background_of, load_class_or_mesh, load_sensor, refuse_unless_one
+from phasemark.data.commands.inputs import (
+    background_of,
+    load_class_or_mesh,
+    load_sensor,
+    open_frame_set,
+    refuse_unless_one,
+)
 from phasemark.data.commands.options import (
     Building,
     Floor,
@@ -65,9 +71,7 @@ def frames_info(
     as_json: Json = False,
 ) -> None:
     """Say what a frame set holds."""
-    from phasemark.data import open_frames
-
-    with open_frames(frames, untrusted=True) as opened:
+    with open_frame_set(frames) as opened:
         info = opened.info()
     echo_json(info) if as_json else echo_facts(info)
 
@@ -110,10 +114,10 @@ def frames_export(
     force: Force = False,
 ) -> None:
     """Write a frame set for other programs."""
-    from phasemark.data import export_frames, open_frames
-
     refuse_input_files([out])
-    with open_frames(frames, untrusted=True) as opened:
+    with open_frame_set(frames) as opened:
+        from phasemark.data import export_frames
+
         typer.echo(export_frames(opened, out, to, quantity=quantity, force=force))
 
 
@@ -234,13 +238,13 @@ def frames_show(
     """Draw one frame."""
     import io as bytes_io
 
-    from phasemark.data import is_frame_set, open_frames, write_atomically
+    from phasemark.data import is_frame_set, write_atomically
 
     if out.suffix.lower() != ".png":
         raise UsageError(f"the picture must be a .png file, got '{out}'")
     refuse_existing([out], force)
     if is_frame_set(frames):
-        with open_frames(frames, untrusted=True) as opened:
+        with open_frame_set(frames) as opened:
             _refuse_index(index, len(opened))
             figure = opened.frames([index]).plot()
     else:
