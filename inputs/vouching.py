@@ -104,7 +104,7 @@ def is_vouched_for(path: Path, content: bytes | BinaryIO | None = None) -> bool:
             return True
         if isinstance(content, bytes):
             break
-    raise InputFileError(f"{contradiction(path, stated, actual)} (--no-verify reads it all the same)")
+    raise InputFileError(f"{contradiction(path, stated, actual)} (unverified() reads it all the same)")
 
 
 def _digest(path: Path, content: bytes | BinaryIO | None) -> str:

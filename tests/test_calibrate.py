@@ -247,7 +247,7 @@ def test_a_plain_board_does_not_tell_a_height_and_is_refused():
     poses = KnownPoses.polar([0.8, 1.0, 1.2, 1.4], [0.0, 0.3, -0.3, 0.1])
     image = Renderer(board, PMD).render_views(Views.broadcast(poses.distance_m, poses.delta_rad))
     frames = capture(image, PMD, rng=np.random.default_rng(1), n_frames=20)
-    with pytest.raises(UsageError, match=r"height cannot be told from these poses: .* --fix height"):
+    with pytest.raises(UsageError, match=r"height cannot be told from these poses: .* fixed=height"):
         calibrate(board, filtered(frames), poses, free=("pitch", "height"))
 
 
@@ -702,7 +702,7 @@ def test_z_taken_for_range_is_doubted_with_its_cause(monkeypatch):
     frames = replace(frames, range_m=frames.range_m * TOF.axis_cosine())
     found = calibrate(BOARD, frames, poses, free=FREE, moving=True, reports_z=False, progress=step)
     assert found.doubts
-    assert found.cause == "the numbers are likely z, not range: give --quantity z"
+    assert found.cause == "the numbers are likely z, not range: give quantity=z"
     assert len(steps) > before[0] + 20
 
 

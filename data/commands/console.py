@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from phasemark.data.commands.flags import in_flags
+
 if TYPE_CHECKING:
     from rich.progress import Progress
 
@@ -98,7 +100,7 @@ def warnings_as_notes() -> Iterator[None]:
     """Write each thing the library warns of as one line, ``note: …``, to stderr."""
 
     def show(message: Warning | str, *where: object, **more: object) -> None:
-        tell(f"note: {one_line(str(message))}")
+        tell(f"note: {in_flags(one_line(str(message)))}")
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
@@ -149,7 +151,7 @@ def report_error(message: str) -> None:
     from rich.text import Text
 
     with _messages_may_be_lost():
-        Console(stderr=True).print(Text.assemble(("error: ", "bold red"), one_line(message)), soft_wrap=True)
+        Console(stderr=True).print(Text.assemble(("error: ", "bold red"), in_flags(one_line(message))), soft_wrap=True)
 
 
 def tell(message: str) -> None:

@@ -324,11 +324,11 @@ def calibrate(
     quantity: Quantity = ("phasors" if has_light and not recorded else "ranges") if on == "auto" else on
     names = (ALL_NAMES if moving else NAMES) if free is None else check_names(free, "'free'")
     if "delay" in names and not moving:
-        raise UsageError("the delay takes a moving camera: give --moving, and time stamps of frames and poses")
+        raise UsageError("the delay takes a moving camera: give moving=True, and time stamps of frames and poses")
     if recorded:
         if "albedo" in names and free is not None:
             raise UsageError(
-                "the albedo cannot be free for a moving camera or with offsets of zones: give --fix albedo"
+                "the albedo cannot be free for a moving camera or with offsets of zones: give fixed=albedo"
             )
         names = tuple(name for name in names if name != "albedo")
     lit = quantity == "phasors" or background is not None or poses.wall_m is not None
@@ -549,7 +549,7 @@ def _from_recording(job: _Job, frames: FilteredFrames, poses: KnownPoses, moving
     if "delay" in job.names and std[job.names.index("delay")] > _DELAY_UNKNOWN_S:
         raise UsageError(
             f"the delay cannot be told from this recording (± {1e3 * std[job.names.index('delay')]:.0f} ms): turn and"
-            " approach faster, or state it with --delay-ms and give --fix delay"
+            " approach faster, or state it with Mounting(delay_s=…) and give fixed=delay"
         )
     untold = [
         name for name, one in zip(job.names, std, strict=True)
@@ -708,7 +708,7 @@ def _cause(job: _Job, frames: FilteredFrames, poses: KnownPoses, edges: bool, tr
         other = replace(job, reports_z=not job.reports_z)
         return (
             misfit(other, replace(frames, range_m=changed), poses, track)[0],
-            f"the numbers are likely {right}, not {wrong}: give --quantity {right}",
+            f"the numbers are likely {right}, not {wrong}: give quantity={right}",
         )
 
     def free_delay() -> tuple[float, str]:
@@ -729,7 +729,7 @@ def _cause(job: _Job, frames: FilteredFrames, poses: KnownPoses, edges: bool, tr
 
     def flipped() -> tuple[float, str]:
         arrays = {name: getattr(frames, name)[:, :, ::-1] for name in ("range_m", "std_m", "state", "n_effective")}
-        return misfit(job, replace(frames, **arrays), poses, track)[0], "images are likely mirrored: give --flip-h"
+        return misfit(job, replace(frames, **arrays), poses, track)[0], "images are likely mirrored: give flip_h=True"
 
     alternatives: list[tuple[str, Callable[[], tuple[float, str]]]] = [
         ("quantity", other_quantity), ("mirror", mirrored), ("flip", flipped),
@@ -884,8 +884,7 @@ def _concluded(
         notes.append(
             "With exact poses the residuals are more than noise. The poses were taken to be uncertain, by what the"
             f" residuals say: {1e3 * estimated.position_m:.2g} mm in place, {math.degrees(estimated.heading_rad):.2g}°"
-            f" in heading, {math.degrees(estimated.delta_rad):.2g}° in δ (state yours with --position-std,"
-            " --heading-std and --delta-std)."
+            f" in heading, {math.degrees(estimated.delta_rad):.2g}° in δ (state yours with pose_std=…)."
         )
     if dof > 0 and p_value < _FALSE_ALARM:
         excess = place.cost / expected
@@ -903,7 +902,7 @@ def _concluded(
         notes += odd_pose_notes(poses, pose_chi2 / np.maximum(pose_residuals, 1))
     if not edges:
         notes.append(
-            "Something returns beside the landmark and no --wall, --floor or wall_m says what: pixels at the landmark's"
+            "Something returns beside the landmark and no background=… or wall_m says what: pixels at the landmark's"
             " edges were left out, which tell most."
         )
     unseen = int((pose_residuals == 0).sum())

@@ -15,6 +15,7 @@ import typer
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
+from phasemark.data.commands.flags import in_flags
 from phasemark.data.commands.inputs import background_of, load_class, load_sensor, note_too_far, open_any_bank
 from phasemark.data.commands.options import (
     Floor,
@@ -161,6 +162,7 @@ def calibrate_camera(
             workers=workers or min(processors(), 4),
             progress=progress,
         )
+    found = replace(found, notes=tuple(map(in_flags, found.notes)), cause=in_flags(found.cause))
     _write_calibration(found, out, picture, base_name, force)
     if as_json:
         echo_json({"file": str(out), "picture": str(picture), **calibration_dict(found)})
