@@ -109,6 +109,10 @@ def _described(job: Job) -> tuple[str, str]:
 class ProcessMaker:
     """Makes shards in worker processes, each an ordinary program that ends when this process does.
 
+    The standard library's ProcessPoolExecutor would lose four things: its workers outlive a parent that is killed,
+    take a main guard in the script that asks, fail all at once when one dies, and cannot be ended while they work.
+    Dask's LocalCluster is in an extra, and takes the guard, too.
+
     Parameters
     ----------
     job : Job
