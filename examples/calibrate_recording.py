@@ -22,7 +22,8 @@ from real_recording import THICKNESS_M, Recording, read_recording
 from phasemark import PhasemarkError
 from phasemark.matcher import KnownPoses, calibrate, kalman_filter
 from phasemark.matcher.calibration.mounting_model import PARAMETERS
-from phasemark.matcher.calibration.report import calibration_toml, residual_picture, shown, shown_std
+from phasemark.matcher.calibration.report import residual_picture
+from phasemark.matcher.calibration.result import shown, shown_std
 from phasemark.render import preset
 
 SENSOR = "vl53l5cx-8x8"
@@ -66,7 +67,7 @@ def main(argv: list[str] | None = None) -> int:
         return 3
     arguments.out.mkdir(parents=True, exist_ok=True)
     sensor, picture = arguments.out / "sensor.toml", arguments.out / "residuals.png"
-    sensor.write_text(calibration_toml(found, base_name=SENSOR), encoding="utf-8")
+    sensor.write_text(found.to_toml(base_name=SENSOR), encoding="utf-8")
     residual_picture(found).savefig(picture, dpi=90)
     for name in found.free:
         print(f"{name:13s} {shown(found, name):>9s} ± {shown_std(found, name)} {PARAMETERS[name].unit}")

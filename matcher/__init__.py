@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     )
     from phasemark.matcher.accuracy.grid_spacing import GridLoss, SpacingLoss, grid_loss
     from phasemark.matcher.accuracy.trials import Conditions, Trials, TrialSummary, run_trials
-    from phasemark.matcher.calibration.calibration import Calibration, calibrate, filter_poses
+    from phasemark.matcher.calibration.calibration import calibrate, filter_poses
     from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd, frames_of_poses, read_poses
     from phasemark.matcher.calibration.mounting_model import Mounting
+    from phasemark.matcher.calibration.result import Calibration
     from phasemark.matcher.diagnosis.diagnose import Change, Diagnosis, diagnose
     from phasemark.matcher.filters.filtered_frames import (
         FilteredFrames,

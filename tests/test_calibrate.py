@@ -32,7 +32,6 @@ from phasemark.matcher.calibration.judgement import likely_cause
 from phasemark.matcher.calibration.mounting_fit import Fit
 from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel
 from phasemark.matcher.calibration.pose_track import PoseTrack
-from phasemark.matcher.calibration.report import calibration_toml
 from phasemark.matcher.filters.stamps import stamp_jitter
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, preset
@@ -601,7 +600,7 @@ def test_noise_law_and_offsets_of_zones_are_those_of_the_recording(rides):
 
 def test_a_calibration_leaves_its_covariance_in_the_sensor_file(rides, tmp_path):
     _, found, _, _ = rides[0]
-    (tmp_path / "tof.toml").write_text(calibration_toml(found, base_name="tof"))
+    (tmp_path / "tof.toml").write_text(found.to_toml(base_name="tof"))
     sensor = Sensor.from_toml(tmp_path / "tof.toml")
     assert sensor == found.sensor
     assert set(sensor.calibration_fields) == {PARAMETERS[name].field for name in FREE}

@@ -29,7 +29,6 @@ from phasemark.matcher.drive import (
     pose_error,
     run_drive,
     stops_csv,
-    summary,
 )
 from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
 from phasemark.matcher.drive.odometry import OdometryModel, Reading, World, motion_jacobian, motion_noise, moved
@@ -333,7 +332,7 @@ def test_tables_and_summary_hold_the_drive(drives):
     assert last["covariance_hh_deg2"] == pytest.approx(math.degrees(1) ** 2 * drive.covariance[-1, 2, 2])
     stops = list(csv.DictReader(io.StringIO(stops_csv(drive))))
     assert [row["landmark"] for row in stops] == [stop.landmark.name for stop in drive.stops]
-    facts = json.loads(json.dumps(summary(drive), allow_nan=False))
+    facts = json.loads(json.dumps(drive.as_dict(), allow_nan=False))
     assert facts["corrections"] == len(drive.corrections)
     assert DrivePlan(**facts["plan"]) == drive.plan
 

@@ -87,15 +87,14 @@ def landmark_check(
     as_json: Json = False,
 ) -> None:
     """Check a mesh file and say what it holds."""
-    import dataclasses
-
     from phasemark.landmarks import MAX_SYMMETRY, check_mesh
 
     _, mesh = load_landmark(str(file), mesh_reading)
-    report = dataclasses.asdict(check_mesh(mesh))
+    checked = check_mesh(mesh)
     if as_json:
-        echo_json({"file": str(file), **report})
+        echo_json({"file": str(file), **checked.as_dict()})
         return
+    report = checked.as_dict()
     del report["warnings"]  # reading the file has put them on stderr
     n = report["symmetry"]
     report["symmetry"] = {1: "1 (none)", MAX_SYMMETRY: f"{n} (a body of revolution)"}.get(

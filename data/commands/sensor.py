@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -25,7 +25,7 @@ from phasemark.data.commands.options import (
 from phasemark.data.commands.outputs import output_folder, refuse_existing
 
 if TYPE_CHECKING:
-    from phasemark.render import Estimate, Sensor
+    from phasemark.render import Estimate
 
 
 def sensor_list(as_json: Json = False) -> None:
@@ -34,7 +34,7 @@ def sensor_list(as_json: Json = False) -> None:
 
     sensors = {name: preset(name) for name in preset_names()}
     if as_json:
-        echo_json([{"name": name, **_sensor_facts(sensor)} for name, sensor in sensors.items()])
+        echo_json([{"name": name, **sensor.as_dict()} for name, sensor in sensors.items()])
         return
     echo_table(
         ("preset", "pixels", "field of view", "modulation", "unambiguous range"),
@@ -60,7 +60,7 @@ def sensor_show(
     """Print every field of a sensor; the text is a sensor file again."""
     sensor = load_sensor(name_or_file)
     if as_json:
-        echo_json({"name": name_or_file, **_sensor_facts(sensor)})
+        echo_json({"name": name_or_file, **sensor.as_dict()})
         return
     if sensor.kind == "direct":
         typer.echo("# direct time of flight: no taps, no phasors; its own quantity is z, along the optical axis")
@@ -172,10 +172,6 @@ def sensor_fit(
     for note in fit.notes:
         typer.echo(note)
     typer.echo(out)
-
-
-def _sensor_facts(sensor: Sensor) -> dict[str, Any]:
-    return {**sensor.model_dump(mode="json"), "unambiguous_range_m": sensor.unambiguous_range_m}
 
 
 def value_and_error_of(value: object, estimate: Estimate) -> tuple[str, str]:

@@ -27,6 +27,7 @@ from phasemark.matcher.calibration.notes import advice, named, observability_not
 from phasemark.matcher.calibration.pose_errors import estimate_pose_std
 from phasemark.matcher.calibration.pose_track import LONGEST_GAP_S, PoseTrack
 from phasemark.matcher.calibration.recording_fit import Recorded, Recording, prior_std
+from phasemark.matcher.calibration.result import Calibration
 from phasemark.matcher.filters.filtered_frames import (
     FilteredFrames,
     PixelState,
@@ -84,91 +85,6 @@ _UNITS = {
     100.0: "100 times",
     1000.0: "1000 times",
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """How a camera is mounted, and how well that is known.
-
-    Parameters
-    ----------
-    sensor : Sensor
-        The camera with what was found; what was not free is as it was, or as `start` said.
-    base : Sensor
-        The camera as it was thought to be.
-    mounting, assumed : Mounting
-        What was found, and what it was thought to be.
-    free : tuple of str
-        Names of what was estimated (:data:`NAMES`); the other numbers of `mounting` are assumptions.
-    covariance : (p, p) float64
-        In the order of `free`; radians, metres.
-    covariance_from : str
-        What it was made of, in words.
-    chi2, dof, p_value : float, int, float
-        Test of the fit.
-    on : {"ranges", "phasors"}
-    poses : KnownPoses
-    pose_shift : (K, 3) float64
-        Estimated errors of the poses in D, δ and b; zero where poses are taken as exact.
-    pose_chi2, pose_residuals : (K,) float64, (K,) int64
-        Share of each pose in χ², and how many residuals it is made of.
-    residual_m, residual_before_m : (K, rows, cols) float64
-        Measured less modelled range with the mounting found and with the one assumed; NaN where a pixel does not count.
-    range_std_m : (K, rows, cols) float64
-        Standard deviation of the filtered range; NaN where a pixel does not count.
-    notes : tuple of str
-        Sentences on what is not observable, what does not fit, and what to do.
-    doubts : tuple of str
-        Why the result should not be used; empty for a calibration that can be trusted.
-    cause : str
-        What is likely wrong, if there are doubts.
-    held_out_m : (before, after)
-        Root mean square of the residuals of frames that were left out in turn: with the mounting assumed and with
-        that from the other frames. NaN where it is not known.
-    left_out : float
-        Share of the pixels that see the landmark by the model, but disagree with it and have no weight.
-    """
-
-    sensor: Sensor
-    base: Sensor
-    mounting: Mounting
-    assumed: Mounting
-    free: tuple[str, ...]
-    covariance: NDArray[np.float64]
-    covariance_from: str
-    chi2: float
-    dof: int
-    p_value: float
-    on: Quantity
-    poses: KnownPoses
-    pose_shift: NDArray[np.float64]
-    pose_chi2: NDArray[np.float64]
-    pose_residuals: NDArray[np.int64]
-    residual_m: NDArray[np.float64]
-    residual_before_m: NDArray[np.float64]
-    range_std_m: NDArray[np.float64]
-    notes: tuple[str, ...]
-    doubts: tuple[str, ...] = ()
-    cause: str = ""
-    held_out_m: tuple[float, float] = (math.nan, math.nan)
-    left_out: float = 0.0
-
-    def value(self, name: str) -> float:
-        """Return one number of the mounting, radians, metres or albedo."""
-        return float(getattr(self.mounting, PARAMETERS[name].attribute))
-
-    def std(self, name: str) -> float:
-        """Return its standard deviation; 0 if it was not free."""
-        if name not in self.free:
-            return 0.0
-        k = self.free.index(name)
-        return math.sqrt(float(self.covariance[k, k]))
-
-    @property
-    def correlation(self) -> NDArray[np.float64]:
-        """Correlation matrix of what was free, (p, p)."""
-        root = np.sqrt(np.diag(self.covariance))
-        return np.asarray(self.covariance / np.outer(root, root))
 
 
 def check_names(names: Sequence[str], what: str) -> tuple[str, ...]:

@@ -128,7 +128,6 @@ def calibrate_camera(
     """
     from phasemark.data.shards.executor import processors
     from phasemark.matcher import calibrate, read_poses
-    from phasemark.matcher.calibration.report import calibration_dict
 
     picture = _picture_beside(out, plot)
     refuse_existing([out, picture], force)
@@ -159,7 +158,7 @@ def calibrate_camera(
     found = replace(found, notes=tuple(map(in_flags, found.notes)), cause=in_flags(found.cause))
     _write_calibration(found, out, picture, base_name, force)
     if as_json:
-        echo_json({"file": str(out), "picture": str(picture), **calibration_dict(found)})
+        echo_json({"file": str(out), "picture": str(picture), **found.as_dict()})
         return
     _echo_calibration(found)
     typer.echo(out)
@@ -233,7 +232,7 @@ def _start(
 def _write_calibration(found: Calibration, out: Path, picture: Path, base_name: str, force: bool) -> None:
     """Write the sensor file and the picture of the residuals, unless the calibration cannot be trusted."""
     from phasemark.data import write_atomically
-    from phasemark.matcher.calibration.report import calibration_toml, residual_picture
+    from phasemark.matcher.calibration.report import residual_picture
 
     if found.doubts and not force:
         raise InputFileError(
@@ -243,7 +242,7 @@ def _write_calibration(found: Calibration, out: Path, picture: Path, base_name: 
     buffer = io.BytesIO()
     residual_picture(found).savefig(buffer, format="png", dpi=100)
     write_atomically(picture, buffer.getvalue(), force=force)
-    write_atomically(out, calibration_toml(found, base_name=readable(base_name)).encode(), force=force)
+    write_atomically(out, found.to_toml(base_name=readable(base_name)).encode(), force=force)
 
 
 def _names(text: str) -> list[str]:
@@ -271,7 +270,7 @@ def _calibration_target(landmark: str, class_name: str | None, sensor: str | Non
 def _echo_calibration(found: Calibration) -> None:
     """Print every number with its standard deviation and use, their correlations, the test of the fit and notes."""
     from phasemark.matcher.calibration.mounting_model import PARAMETERS
-    from phasemark.matcher.calibration.report import USES, shown, shown_names, shown_std
+    from phasemark.matcher.calibration.result import USES, shown, shown_names, shown_std
 
     rows = []
     for name in shown_names(found):

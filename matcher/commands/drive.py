@@ -38,7 +38,6 @@ def drive_robot(
         example_drive,
         load_drive_plan,
         run_drive,
-        summary,
         write_drive,
     )
 
@@ -52,7 +51,7 @@ def drive_robot(
             drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
         with LongWork("drawing"):
             files = write_drive(drive, out, force=force)
-    facts = summary(drive)
+    facts = drive.as_dict()
     if as_json:
         echo_json({"files": [str(path) for path in files], **facts})
         return

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank, BankPlan, build_bank
+from phasemark.data.files.json_text import finite_or_none
 from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh, catalog
@@ -105,6 +106,10 @@ class DemoResult:
     def select(self, *, shifted: bool) -> tuple[CellResult, ...]:
         """Return the cells on the bank's grid, or those between."""
         return tuple(result for result in self.cells if result.cell.shifted == shifted)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the times and the cells as plain numbers, for JSON; None where nothing was found."""
+        return {"seconds": self.seconds, "cells": [finite_or_none(row) for row in cell_rows(self.cells)]}
 
 
 def run_demo(

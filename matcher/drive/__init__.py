@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from phasemark.matcher.drive.output import OUTPUTS, path_csv, stops_csv, summary, write_drive
+from phasemark.matcher.drive.output import OUTPUTS, path_csv, stops_csv, write_drive
 from phasemark.matcher.drive.plan import (
     CameraPlan,
     DrivePlan,
@@ -39,7 +39,6 @@ __all__ = [
     "pose_error",
     "run_drive",
     "stops_csv",
-    "summary",
     "write_drive",
 ]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from phasemark.data import Bank, BankPlan, build_bank
 from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
-from phasemark.matcher.accuracy.cramer_rao import cramer_rao
+from phasemark.matcher.accuracy.cramer_rao import cramer_rao, nees
 from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
 from phasemark.matcher.drive.odometry import OdometryModel, World, moved
 from phasemark.matcher.drive.plan import DrivePlan
@@ -113,6 +114,32 @@ class Drive:
     def corrections(self) -> tuple[Stop, ...]:
         """The stops whose measurement was used."""
         return tuple(stop for stop in self.stops if stop.used)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures of a drive as plain numbers, for JSON; None where there is nothing to tell."""
+        used = self.corrections
+        after = np.array([pose_error(stop.after, stop.true) for stop in used]).reshape(-1, 3)
+        before = np.array([pose_error(stop.before, stop.true) for stop in used]).reshape(-1, 3)
+        consistency = {}
+        for when, errors in (("before", before), ("after", after)):
+            covariances = np.array([getattr(stop, f"covariance_{when}") for stop in used]).reshape(-1, 3, 3)
+            consistency[when] = float(nees(errors, covariances).mean()) / 3 if used else None
+        return {
+            "seed": self.seed,
+            "way_m": float(self.way_m[-1]),
+            "time_s": float(self.time_s[-1]),
+            "stops": len(self.stops),
+            "corrections": len(used),
+            "position_rms_after_correction_m": _rms(after[:, :2]) if used else None,
+            "heading_rms_after_correction_deg": math.degrees(_rms(after[:, 2:])) if used else None,
+            "position_rms_before_correction_m": _rms(before[:, :2]) if used else None,
+            "heading_rms_before_correction_deg": math.degrees(_rms(before[:, 2:])) if used else None,
+            "nees_per_dimension_before_correction": consistency["before"],
+            "nees_per_dimension_after_correction": consistency["after"],
+            **_drift("dead_reckoned", self.dead_reckoned, self.true),
+            **_drift("corrected", self.corrected, self.true),
+            "plan": self.plan.model_dump(mode="json", by_alias=True),
+        }
 
 
 def pose_error(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -392,3 +419,19 @@ def _where_it_is(landmark: MappedLandmark, rng: np.random.Generator) -> tuple[tu
         rng.standard_normal(3)
     )
     return (float(x), float(y)), float(yaw)
+
+
+def _drift(name: str, pose: NDArray[np.float64], true: NDArray[np.float64]) -> dict[str, float]:
+    """Return how far a path is off at the end, and at its worst."""
+    error = pose_error(pose, true)
+    distance, heading = np.hypot(error[:, 0], error[:, 1]), np.degrees(np.abs(error[:, 2]))
+    return {
+        f"{name}_final_position_error_m": float(distance[-1]),
+        f"{name}_final_heading_error_deg": float(heading[-1]),
+        f"{name}_largest_position_error_m": float(distance.max()),
+        f"{name}_largest_heading_error_deg": float(heading.max()),
+    }
+
+
+def _rms(errors: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from phasemark.data.files.csv_cell import as_cell
+from phasemark.data.files.json_text import finite_or_none
 from phasemark.matcher.accuracy.cramer_rao import Estimate, nees
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.statistics import mean_interval, rms_interval, wilson
@@ -308,6 +309,10 @@ class Cell:
         out |= {f"found_{name}": count for name, count in self.found.items()}
         return {**out, "condition_number": self.condition_number, "seconds": self.seconds}
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return :meth:`row` for JSON: None for what is not finite."""
+        return finite_or_none(self.row())
+
 
 _UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 
@@ -326,11 +331,6 @@ def trials_csv(trials: SweepTrials) -> Iterator[bytes]:
     """Yield trials.csv piece by piece."""
     for start in range(0, len(trials), _ROWS_AT_ONCE):
         yield csv_bytes(trials.trial_table(slice(start, start + _ROWS_AT_ONCE)), header=start == 0)
-
-
-def json_rows(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows for JSON: None for what is not finite."""
-    return [{k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()} for row in rows]
 
 
 def condition_axes(conditions: Sequence[Condition]) -> tuple[str, ...]:

@@ -27,7 +27,7 @@ from phasemark.data.shards.run import outputs_of, produce
 from phasemark.inputs import MOST_TOML_BYTES, read_text
 from phasemark.matcher.sweep.job import FORMAT, SCHEMA_VERSION, Round, SweepJob, check_matcher
 from phasemark.matcher.sweep.plan import SweepPlan
-from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, csv_bytes, json_rows, trials_csv
+from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, csv_bytes, trials_csv
 
 TRIALS_AT_ONCE = 50
 """Trials of a shard: of one batch of a method, whatever the number of workers, so that no rounding depends on it."""
@@ -174,7 +174,7 @@ def write_cells(plan: SweepPlan, trials: SweepTrials, folder: Path) -> tuple[Cel
     write_atomically(
         folder / "cells.csv", csv_bytes({name: [row[name] for row in rows] for name in rows[0]}), force=True
     )
-    table = {"plan": plan.model_dump(mode="json"), "versions": versions(), "cells": json_rows(rows)}
+    table = {"plan": plan.model_dump(mode="json"), "versions": versions(), "cells": [cell.as_dict() for cell in cells]}
     text = json_text(table, indent=1, allow_nan=False)
     write_atomically(folder / "sweep.json", text.encode(), force=True)
     return cells

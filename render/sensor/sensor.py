@@ -574,6 +574,10 @@ class Sensor(BaseModel):
             **fields,
         )
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return every field, and the unambiguous range, as plain numbers and text, for JSON."""
+        return {**self.model_dump(mode="json"), "unambiguous_range_m": self.unambiguous_range_m}
+
     @classmethod
     def from_toml(cls, path: str | Path) -> Sensor:
         """Read a sensor file.
