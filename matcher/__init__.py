@@ -32,8 +32,9 @@ if TYPE_CHECKING:
         phasor_mean,
     )
     from phasemark.matcher.likelihood.background_estimate import Surroundings, estimate_surroundings
+    from phasemark.matcher.likelihood.search_policy import SearchPolicy
     from phasemark.matcher.match import Candidate, Match, Matches
-    from phasemark.matcher.matcher import Matcher, background_image
+    from phasemark.matcher.matcher import Matcher
     from phasemark.matcher.position.landmark_map import LandmarkMap, MappedLandmark, Placement, load_map
     from phasemark.matcher.position.robot_pose import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
     from phasemark.matcher.recordings.stillness import MotionTest, motion_test
@@ -74,6 +75,7 @@ __all__ = [
     "Placement",
     "PoseStd",
     "RobotPose",
+    "SearchPolicy",
     "SpacingLoss",
     "Surroundings",
     "SweepPlan",
@@ -81,7 +83,6 @@ __all__ = [
     "TrialSummary",
     "Trials",
     "ViewEstimate",
-    "background_image",
     "calibrate",
     "compare_cells",
     "confusion_probability",

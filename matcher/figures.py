@@ -12,8 +12,14 @@ from phasemark.data import Bank
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match
-from phasemark.matcher.matcher import background_image
-from phasemark.render import Background, Renderer, phasor_to_range_m, predicted_range_std, wrap_difference_m
+from phasemark.render import (
+    Background,
+    Renderer,
+    background_image,
+    phasor_to_range_m,
+    predicted_range_std,
+    wrap_difference_m,
+)
 from phasemark.render.figures import draw_difference, draw_range
 
 

@@ -12,7 +12,7 @@ from phasemark.render.exposure.motion import Motion, render_moving
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
 from phasemark.render.planar import PlanarLandmark, planar_images
-from phasemark.render.renderer import Renderer
+from phasemark.render.renderer import Renderer, background_image
 from phasemark.render.sensor.camera_unit import CameraUnit, camera_unit
 from phasemark.render.sensor.correlation import Harmonic, pulse_harmonics, square_harmonics
 from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
@@ -44,6 +44,7 @@ __all__ = [
     "SensorFit",
     "Views",
     "ablate",
+    "background_image",
     "camera_unit",
     "capture",
     "capture_moving",

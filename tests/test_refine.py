@@ -15,9 +15,12 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, noise_free
 from phasemark.matcher.accuracy.trials import Conditions, noisy_frames, run_trials
-from phasemark.matcher.likelihood.descent import Settings, _Problem
-from phasemark.matcher.likelihood.images import VIEW, BankModel, RenderedModel
+from phasemark.matcher.likelihood.bank_images import BankModel
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.problem import Problem, Settings
+from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
+from phasemark.matcher.likelihood.uncertainty import std_without_one_pixel, view_covariance
 from phasemark.render import Background, Frames, Renderer, Views, capture, predicted_range_std, preset
 
 SENSOR = preset("pmd-16x16")
@@ -178,14 +181,14 @@ def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, render
         kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(2), n_frames=10)), on
     )
     used = np.ones(evidence.value.shape[1], bool)
-    problem = _Problem(
+    problem = Problem(
         RenderedModel(bank), evidence, np.zeros(1, np.int64), np.array([bank.classes.index("cone")]),
         Settings(free, used, huber), np.full(1, np.inf),
     )  # fmt: skip
     state = problem.start(np.array([[1.02, 0.5, 0.0, 0.0]]), False)
     p = len(problem.columns)
-    covariance = problem._covariance(state.sums)
-    found = problem._std_without_one(state, np.array([0]), state.images.slope, state.sums.information, covariance)
+    covariance = view_covariance(problem, state.sums)
+    found = std_without_one_pixel(problem, state, np.array([0]), state.images.slope, state.sums.information, covariance)
 
     def variance(use):
         sums = gauss_newton_sums(
@@ -308,7 +311,7 @@ def test_rendering_only_the_rows_that_turn_gives_the_whole_image(bank, on):
     behind = Renderer(None, SENSOR).render(1.0, background=WALL).phasor.reshape(-1)
     settings = Settings(VIEW[:2], np.ones(256, bool), background=behind)
     cone, evidence = np.full(2, bank.classes.index("cone")), Evidence.from_frames(frames, on)
-    problem = _Problem(RenderedModel(bank, WALL), evidence, np.arange(2), cone, settings, np.full(2, np.inf))
+    problem = Problem(RenderedModel(bank, WALL), evidence, np.arange(2), cone, settings, np.full(2, np.inf))
     state = problem.start(np.array([[1.0, 0.6, 0, 0], [1.0, 1.1, 0, 0]]), False)
     theta = state.theta.copy()
     theta[:, 1] += 0.01

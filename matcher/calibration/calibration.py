@@ -19,6 +19,7 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.data.progress import Progress, counter
+from phasemark.matcher.agreement import MIN_RETURNS
 from phasemark.matcher.calibration.judgement import doubts_about, likely_cause
 from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
 from phasemark.matcher.calibration.mounting_fit import Fit, Knowledge, Place, inverse
@@ -27,6 +28,7 @@ from phasemark.matcher.calibration.notes import advice, named, observability_not
 from phasemark.matcher.calibration.pose_errors import estimate_pose_std
 from phasemark.matcher.calibration.pose_track import LONGEST_GAP_S, PoseTrack
 from phasemark.matcher.calibration.recording_fit import Recorded, Recording, prior_std
+from phasemark.matcher.chi_squared import p_values_of
 from phasemark.matcher.filters.filtered_frames import (
     FilteredFrames,
     PixelState,
@@ -35,7 +37,6 @@ from phasemark.matcher.filters.filtered_frames import (
     phasor_mean,
 )
 from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
-from phasemark.matcher.likelihood.estimator import MIN_RETURNS, p_values_of
 from phasemark.matcher.likelihood.residuals import Evidence, Quantity
 from phasemark.render import Background, Frames, Sensor, wrap_difference_m, wrap_range_m
 from phasemark.render.sensor.sensor_file import rounded

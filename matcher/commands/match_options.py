@@ -139,7 +139,7 @@ class Search:
     def matcher(self, bank: Bank) -> Matcher:
         """Return the matcher."""
         from phasemark.matcher import Matcher
-        from phasemark.matcher.likelihood.estimator import BEARING_STD_RAD
+        from phasemark.matcher.likelihood.likelihood_matcher import BEARING_STD_RAD
 
         return Matcher(
             bank,

@@ -32,9 +32,9 @@ from phasemark.data.shards.build import Place
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState, kalman_filter, phasor_mean
-from phasemark.matcher.likelihood.estimator import LIKELY
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.sweep.plan import Method, SweepPlan
@@ -314,7 +314,7 @@ class SweepJob:
             np.where(counted, float(condition.n_frames), 0.0),
             sensor,
         )
-        squares = np.full((n, len(self.class_names)), LIKELY)
+        squares = np.full((n, len(self.class_names)), DEFAULT_POLICY.likely_cost)
         squares[:, self.class_names.index(condition.class_name)] = np.inf
         for k, match in enumerate(self._reference(condition.wall_m).match(exact)):
             for other in match.alternatives:
