@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Literal, Protocol
+from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Literal, Protocol
 
 from phasemark import UsageError
 from phasemark.data import Bank
@@ -76,6 +77,13 @@ class Matcher:
     policy : SearchPolicy
         Tuning numbers of "refine": how wide and how long it searches.
 
+    Attributes
+    ----------
+    bank, method, false_alarm
+        As given.
+    options : mapping
+        What `free`, `background`, `on`, `pixels` and `robust` were given as.
+
     Raises
     ------
     UsageError
@@ -118,7 +126,11 @@ class Matcher:
         if not 0 < false_alarm < 1:
             raise UsageError(f"'false_alarm' must be in (0, 1), got {false_alarm!r}")
         self.bank = bank
+        self.method = method
         self.false_alarm = false_alarm
+        self.options: Mapping[str, Any] = MappingProxyType(
+            {"free": free, "background": background, "on": on, "pixels": pixels, "robust": robust}
+        )
         self._method: MatchMethod
         if method == "refine":
             self._method = LikelihoodMatcher(

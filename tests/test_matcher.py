@@ -12,6 +12,7 @@ from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, Matches, PixelState, kalman_filter, noise_free
 from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.figures import match_picture, model_range_m
+from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.render import Background, Frames, PhasorImages, Renderer, capture, preset
 
@@ -84,8 +85,7 @@ def test_the_cost_is_the_whitened_squared_distance_with_the_no_return_rule():
 
 def test_matrix_product_and_exact_sum_agree_on_random_frames(bank):
     rng = np.random.default_rng(3)
-    matcher = Matcher(bank)
-    templates = matcher._pose
+    templates = NearestMatcher(bank).pose
     state = rng.choice([0, 1, 2], size=(5, 128), p=[0.7, 0.2, 0.1])
     seen = Observation(
         range_m=np.where(state == 0, rng.uniform(0.8, 1.3, (5, 128)), 0.0),

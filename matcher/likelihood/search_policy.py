@@ -217,10 +217,10 @@ class SearchPolicy:
     def _check_tuple(self, name: str, value: object, default: tuple[float, ...]) -> None:
         """Check a tuple of numbers: grids have two positive ones, the others any number of finite ones."""
         grid = name.endswith("_grid")
-        numbers = isinstance(value, tuple) and all(
-            isinstance(one, (int, float)) and math.isfinite(one) and not isinstance(one, bool) for one in value
-        )
-        good = numbers and (not grid or (len(value) == len(default) and min(value) > 0))  # type: ignore[arg-type,type-var]
+        good = isinstance(value, tuple) and (not grid or len(value) == len(default))
+        for one in value if isinstance(value, tuple) else ():
+            good = good and isinstance(one, (int, float)) and not isinstance(one, bool) and math.isfinite(one)
+            good = good and (not grid or one > 0)
         if not good:
             wanted = "two positive numbers, metres and radians" if grid else "a tuple of finite numbers"
             raise UsageError(f"'policy': {name!r} must be {wanted}, got {value!r}")

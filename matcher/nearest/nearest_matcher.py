@@ -38,7 +38,15 @@ class _Found:
 
 
 class NearestMatcher:
-    """Finds the nearest image of a bank; see :class:`~phasemark.matcher.Matcher` for the parameters."""
+    """Finds the nearest image of a bank; see :class:`~phasemark.matcher.Matcher` for the parameters.
+
+    Attributes
+    ----------
+    pose : Templates
+        The images that give distance and angle.
+    search : PrunedSearch or ExactSearch
+        Finds the nearest of them.
+    """
 
     def __init__(self, bank: Bank, *, background: Background | None = None, false_alarm: float = 0.01) -> None:
         self._bank = bank
@@ -48,16 +56,16 @@ class NearestMatcher:
         half = bank.sensor.rows // 2
         if bank.full is not None:
             self._pose_rows, self._class_rows = (0, bank.sensor.rows), None
-            self._pose = self._templates(bank.full, self._pose_rows)
+            self.pose = self._templates(bank.full, self._pose_rows)
             self._class = None
         else:
             assert bank.lower is not None
             assert bank.upper is not None
             self._pose_rows, self._class_rows = (half, bank.sensor.rows), (0, half)
-            self._pose = self._templates(bank.lower, self._pose_rows)
+            self.pose = self._templates(bank.lower, self._pose_rows)
             self._class = self._templates(bank.upper, self._class_rows)
-        self._search = nearest_search(
-            self._pose, bank.distance_m, bank.delta_rad, before_background=background is not None
+        self.search = nearest_search(
+            self.pose, bank.distance_m, bank.delta_rad, before_background=background is not None
         )
         self._none = self._nothing()
 
@@ -102,7 +110,7 @@ class NearestMatcher:
         """Find the nearest lower image, then the distance of each class's upper image at that distance."""
         assert self._class is not None
         n_class, n_distance = len(self._bank.classes), len(self._bank.distance_m)
-        best, cost = self._search.nearest(lower)
+        best, cost = self.search.nearest(lower)
         i, j = np.divmod(best, len(self._bank.delta_rad))
         costs = cost[:, None] + self._class.costs_of_each(upper, np.arange(n_class) * n_distance + i[:, None])
         return _Found(np.repeat(i[:, None], n_class, axis=1), np.repeat(j[:, None], n_class, axis=1), costs)
@@ -110,7 +118,7 @@ class NearestMatcher:
     def _search_full(self, seen: Observation) -> _Found:
         """Find the nearest image of each class."""
         n_class, n_distance, n_delta = len(self._bank.classes), len(self._bank.distance_m), len(self._bank.delta_rad)
-        nearest = [self._search.nearest(seen, c) for c in range(n_class)]
+        nearest = [self.search.nearest(seen, c) for c in range(n_class)]
         best = np.stack([found for found, _ in nearest], axis=1) - np.arange(n_class) * n_distance * n_delta
         return _Found(*np.divmod(best, n_delta), np.stack([cost for _, cost in nearest], axis=1))
 
@@ -177,7 +185,7 @@ class NearestMatcher:
         rows = np.stack([i, np.maximum(i - 1, 0), np.minimum(i + 1, n_distance - 1), i, i], axis=1)
         columns = np.stack([j, j, j, (j - 1) % n_delta, (j + 1) % n_delta], axis=1)
         block = c[:, None] if class_seen is None else np.zeros((len(c), 1), np.int64)
-        cells = _Cells.of(self._pose, pose_seen, (block * n_distance + rows) * n_delta + columns)
+        cells = _Cells.of(self.pose, pose_seen, (block * n_distance + rows) * n_delta + columns)
         if class_seen is not None:
             assert self._class is not None
             cells = cells.beside(_Cells.of(self._class, class_seen, c[:, None] * n_distance + rows))
