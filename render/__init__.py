@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from phasemark.render import compile_cache  # noqa: F401 - first, for the modules below compile functions
 from phasemark.render.background import Background
 from phasemark.render.bench.data_sheet import Characterisation, Comparison, Quantity, characterise
-from phasemark.render.bench.fit import Estimate, SensorFit, fit_sensor
+from phasemark.render.bench.fit import FittedField, SensorFit, fit_sensor
 from phasemark.render.exposure.ablation import Ablation, ablate
 from phasemark.render.exposure.capture import capture, capture_moving
 from phasemark.render.exposure.motion import Motion, render_moving
@@ -17,7 +17,7 @@ from phasemark.render.sensor.camera_unit import CameraUnit, camera_unit
 from phasemark.render.sensor.correlation import Harmonic, pulse_harmonics, square_harmonics
 from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
 from phasemark.render.sensor.sensor import Sensor, preset, preset_names
-from phasemark.render.view import Views
+from phasemark.render.view import Views, delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,7 +31,7 @@ __all__ = [
     "CameraUnit",
     "Characterisation",
     "Comparison",
-    "Estimate",
+    "FittedField",
     "Flag",
     "Frames",
     "Harmonic",
@@ -48,6 +48,7 @@ __all__ = [
     "capture",
     "capture_moving",
     "characterise",
+    "delta_period_rad",
     "fit_sensor",
     "measured_range_std",
     "phasor_to_range_m",
@@ -60,6 +61,8 @@ __all__ = [
     "render_moving",
     "square_harmonics",
     "terminal_picture",
+    "wrap_delta_difference_rad",
+    "wrap_delta_rad",
     "wrap_difference_m",
     "wrap_range_m",
 ]

@@ -152,7 +152,7 @@ def planar_images(
     asked, views = views, views.in_camera(sensor)
     _refuse_out_of_plane(sensor, views)
 
-    middle = sensor.rows // 2
+    middle = sensor.lower_rows[0]
     upper_rows = np.arange(first, min(stop, middle))
     n_lower = stop - max(first, middle)
     tan_h, tan_v = sensor.tan_half_angles

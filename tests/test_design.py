@@ -19,7 +19,6 @@ from phasemark.cli import main
 from phasemark.data import BankPlan, load_plan
 from phasemark.landmarks import Box, Cone, Cylinder, LandmarkSpec, Revolution, Sphere, build_mesh, catalog, read_mesh
 from phasemark.matcher import Matcher, cramer_rao, kalman_filter
-from phasemark.matcher.accuracy.cramer_rao import Estimate
 from phasemark.matcher.design import (
     ClassDistances,
     DesignPlan,
@@ -38,18 +37,17 @@ from phasemark.matcher.design import (
     output_names,
     pareto_csv,
     range_bound,
-    ratio,
     run_design,
     summary,
     turn_distance,
     write_design,
 )
-from phasemark.matcher.design.confirm import root_mean_square
 from phasemark.matcher.design.drawing import scale_words
 from phasemark.matcher.design.position_bound import box_alone
 from phasemark.matcher.design.search import Search
 from phasemark.matcher.design.separation import upper_appearance
 from phasemark.matcher.design.shapes import Lattice, neighbours, sample_boxes, sample_uppers
+from phasemark.matcher.statistics import Interval, ratio_interval, rms_interval
 from phasemark.render import Renderer, Views, capture, preset
 
 NEAR, FAR = 0.8, 2.0
@@ -429,7 +427,7 @@ def test_the_interval_of_a_root_mean_square_covers_the_truth():
     rng = np.random.default_rng(5)
     inside = 0
     for _ in range(400):
-        one = root_mean_square(rng.normal(0, 2, 300))
+        one = rms_interval(rng.normal(0, 2, 300), law="normal")
         inside += one.low <= 2 <= one.high
     low, high = stats.binom.ppf([0.0005, 0.9995], 400, 0.95)
     assert low <= inside <= high
@@ -439,11 +437,13 @@ def test_the_interval_of_a_ratio_covers_the_truth():
     rng = np.random.default_rng(6)
     inside = 0
     for _ in range(400):
-        quotient = ratio(root_mean_square(rng.normal(0, 3, 300)), root_mean_square(rng.normal(0, 2, 300)))
+        quotient = ratio_interval(
+            rms_interval(rng.normal(0, 3, 300), law="normal"), rms_interval(rng.normal(0, 2, 300), law="normal")
+        )
         inside += quotient.low <= 1.5 <= quotient.high
     low, high = stats.binom.ppf([0.0005, 0.9995], 400, 0.95)
     assert low <= inside <= high
-    assert isinstance(quotient, Estimate)
+    assert isinstance(quotient, Interval)
 
 
 # drawings, meshes and files

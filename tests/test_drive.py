@@ -14,7 +14,6 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.matcher import Match, Placement, RobotPose, robot_poses
-from phasemark.matcher.accuracy.cramer_rao import nees
 from phasemark.matcher.drive import (
     OUTPUTS,
     DrivePlan,
@@ -35,6 +34,7 @@ from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
 from phasemark.matcher.drive.odometry import OdometryModel, Reading, World, motion_jacobian, motion_noise, moved
 from phasemark.matcher.filters.filtered_frames import kalman_filter
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
+from phasemark.matcher.statistics import nees
 from phasemark.render import Background, capture
 
 OFFSETS = ((0.1, -0.03), (0.04, 0.02))

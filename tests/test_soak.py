@@ -9,8 +9,8 @@ from scipy import stats
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.matcher.accuracy.cramer_rao import nees
 from phasemark.matcher.drive import Equipment, default_drive, pose_error, run_drive
+from phasemark.matcher.statistics import nees
 from phasemark.render import Background, Renderer, capture, predicted_range_std, preset
 from phasemark.render.integral.intersect import make_intersector
 

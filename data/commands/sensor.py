@@ -25,7 +25,7 @@ from phasemark.data.commands.options import (
 from phasemark.data.commands.outputs import output_folder, refuse_existing
 
 if TYPE_CHECKING:
-    from phasemark.render import Estimate, Sensor
+    from phasemark.render import FittedField, Sensor
 
 
 def sensor_list(as_json: Json = False) -> None:
@@ -178,7 +178,7 @@ def _sensor_facts(sensor: Sensor) -> dict[str, Any]:
     return {**sensor.model_dump(mode="json"), "unambiguous_range_m": sensor.unambiguous_range_m}
 
 
-def value_and_error_of(value: object, estimate: Estimate) -> tuple[str, str]:
+def value_and_error_of(value: object, estimate: FittedField) -> tuple[str, str]:
     """Write a fitted field and its standard error, rounded alike; pixels are counted and have no error."""
     from phasemark.render.integral.rounding import value_and_error
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from phasemark.matcher.design.confirm import Confirmation, Trial, confirm, confirm_design, ratio
+from phasemark.matcher.design.confirm import Confirmation, Trial, confirm, confirm_design
 from phasemark.matcher.design.drawing import drawing_svg
 from phasemark.matcher.design.output import (
     landmarks_toml,
@@ -60,7 +60,6 @@ __all__ = [
     "pareto_picture",
     "pareto_rows",
     "range_bound",
-    "ratio",
     "run_design",
     "summary",
     "turn_distance",

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from phasemark.data import write_atomically
 from phasemark.data.files.csv_cell import as_cell
-from phasemark.matcher.accuracy.cramer_rao import nees
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
+from phasemark.matcher.statistics import nees
 
 OUTPUTS = ("path.csv", "stops.csv", "summary.json", "drive.png", "drive.gif")
 """Files that :func:`write_drive` writes."""

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts, disagrees
+from phasemark.matcher.information import NATURAL_UNITS, covariance_of
 from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums, robust_weight
 
 ALBEDO = "albedo"
 """Name of the factor on the landmark's brightness, profiled out on phasors."""
-SCALE = {"distance_m": 0.01, "delta_rad": np.radians(1), "bearing_rad": np.radians(1), "height_m": 0.01, ALBEDO: 0.1}
+SCALE = {**NATURAL_UNITS, ALBEDO: 0.1}
 """Natural units of the parameters: 1 cm, 1°; what a condition number and the longest step are told in."""
 _MAX_ITERATIONS = 30
 _SETTLED = 1e-4
@@ -473,7 +474,7 @@ class _Problem:
     def _moves(self, sums: Sums, which: NDArray[np.integer]) -> NDArray[np.float64]:
         """Return steps along the axes of the covariance, (k, moves, p); where there is none, natural units."""
         p = len(self.columns)
-        matrix = _inverse(sums.information[which] * np.outer(self.scale, self.scale), np.ones(p))
+        matrix = covariance_of(sums.information[which] * np.outer(self.scale, self.scale))
         known = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
         values, vectors = np.linalg.eigh(np.where(known[:, None, None], matrix, np.eye(p)))
         axes = vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), 1.0)[:, None, :]
@@ -528,7 +529,8 @@ class _Problem:
                 covariance[near] = self._covariance(sums)
             rows = state.images.slope[near] if slope is None else slope
             without_one[near] = there._std_without_one(state, near, rows, sums.information, covariance[near])
-        information = _inverse(covariance / np.outer(self.scale[:p], self.scale[:p]), 1 / self.scale[:p])
+        natural = covariance_of(covariance / np.outer(self.scale[:p], self.scale[:p]))  # of a covariance: information
+        information = natural * np.outer(1 / self.scale[:p], 1 / self.scale[:p])
         all_pixels = np.ones_like(settings.pixels)
         sums = state.sums
         if not settings.pixels.all():
@@ -603,7 +605,7 @@ class _Problem:
             residual = np.stack([(value - phasor).real, (value - phasor).imag], axis=-1)
         root = np.sqrt(robust_weight(residual, (weight * use)[..., None], self.settings.huber))
         rows = rows * root[:, None]  # (k, p, pixels, 1 or 2)
-        inverse = _inverse(information * np.outer(self.scale, self.scale), self.scale)
+        inverse = covariance_of(information, self.scale)
         moved = np.einsum("kab,kbqr->kaqr", inverse, rows)
         kept = (1 + 1e-12) * np.eye(rows.shape[3]) - np.einsum("kaqr,kaqs->kqrs", rows, moved)
         moved = moved[:, :p]
@@ -639,7 +641,7 @@ class _Problem:
     def _covariance(self, sums: Sums) -> NDArray[np.float64]:
         """Return the covariance of the view, (m, p, p): inverse information, or the sandwich."""
         p = len(self.settings.free)
-        covariance = _inverse(sums.information * np.outer(self.scale, self.scale), self.scale)
+        covariance = covariance_of(sums.information, self.scale)
         if self.settings.huber is not None:
             covariance = covariance @ sums.scatter @ covariance
         return np.ascontiguousarray(covariance[:, :p, :p])
@@ -713,17 +715,3 @@ def _picked(state: _State, which: NDArray[np.integer]) -> _State:
     images = ModelImages(**{name: values[which] for name, values in vars(state.images).items()})
     sums = Sums(**{name: values[which] for name, values in vars(state.sums).items()})
     return _State(state.theta[which], state.use[which], images, sums)
-
-
-def _inverse(matrix: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverses of symmetric matrices that were scaled to be of order one in natural units.
-
-    `matrix` is in natural units; the result is scaled back. NaN where a matrix is singular.
-    """
-    out = np.full(matrix.shape, np.nan)
-    finite = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
-    values, vectors = np.linalg.eigh(np.where(finite[:, None, None], matrix, 0.0))
-    good = finite & (values[:, 0] > 1e-12 * values[:, -1]) & (values[:, 0] > 0)
-    v, w = vectors[good], values[good]
-    out[good] = np.einsum("mij,mj,mkj->mik", v, 1 / w, v)
-    return out * np.outer(scale, scale)

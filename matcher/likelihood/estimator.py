@@ -15,16 +15,17 @@ from scipy import special
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.landmarks.symmetry import mesh_symmetry
-from phasemark.matcher.agreement import DISAGREEMENT, counts
+from phasemark.matcher.agreement import DISAGREEMENT, counts, pixel_mask
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.stamps import spread_stamps
+from phasemark.matcher.information import covariance_of, weak_direction
 from phasemark.matcher.likelihood.background_estimate import (
     NEAREST_WALL_M,
     estimate_surroundings,
     fit_background,
     without_background,
 )
-from phasemark.matcher.likelihood.descent import SCALE, Fits, Settings, refine
+from phasemark.matcher.likelihood.descent import Fits, Settings, refine
 from phasemark.matcher.likelihood.images import VIEW, BankModel, ImageModel, RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, Quantity
 from phasemark.matcher.likelihood.systematic import (
@@ -39,7 +40,18 @@ from phasemark.matcher.likelihood.systematic import (
 from phasemark.matcher.match import Candidate, Match, Reason
 from phasemark.matcher.nearest.bank_minima import Search, Starts
 from phasemark.matcher.nearest.templates import Observation
-from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, phasor_to_range_m, wrap_difference_m
+from phasemark.render import (
+    Background,
+    PhasorImages,
+    Renderer,
+    Sensor,
+    Views,
+    delta_period_rad,
+    phasor_to_range_m,
+    wrap_delta_difference_rad,
+    wrap_delta_rad,
+    wrap_difference_m,
+)
 
 Pixels = Literal["all", "lower"]
 MIN_RETURNS = 3
@@ -162,11 +174,7 @@ class MaximumLikelihood:
         if self.unknown and on != "ranges":
             raise UsageError('background="unknown" takes on="ranges": the brightness of unknown things tells nothing')
         self.background = background if isinstance(background, Background) else None
-        sensor = bank.sensor
-        used = np.ones((sensor.rows, sensor.cols), np.bool_)
-        if pixels == "lower":
-            used[: sensor.rows // 2] = False
-        self._used = used.ravel()
+        self._used = pixel_mask(pixels, bank.sensor).ravel()
         self._huber = ROBUST_FROM if robust or self.unknown else None
         self._behind = None if self.background is None else _behind(bank, self.background)
         fixed, near = self.free == VIEW[:2], bool(self._prior_std)
@@ -286,7 +294,7 @@ class MaximumLikelihood:
         if not np.isfinite(fits.cost).any():
             return fits[:0]
         best = int(fits.cost.argmin())
-        period = 2 * math.pi / self._symmetry[fits.class_index[best]]
+        period = delta_period_rad(self._symmetry[fits.class_index[best]])
         angles = np.arange(1, _OTHER_ANGLES) * period / _OTHER_ANGLES
         view = np.tile(fits.view[best], (len(angles), 1))
         view[:, 1] += angles
@@ -734,7 +742,7 @@ class MaximumLikelihood:
             if match.covariance is not None and match.class_name is not None:
                 view[k] = [getattr(match, name) for name in self.free]
                 std[k] = np.sqrt(np.diag(match.covariance))
-        period = np.array([2 * math.pi / match.symmetry for match in answers])
+        period = np.array([delta_period_rad(match.symmetry) for match in answers])
         rate = rates_of_views(spread_stamps(frames.time_s), view, std, period, self.free.index("delta_rad"))
         return [
             match if match.covariance is None or not one.any() else _with_part(match, "motion", part)
@@ -786,7 +794,7 @@ class MaximumLikelihood:
         p = len(self.free)
         if self._prior_std:
             information[:, :p, :p] += np.diag(np.array(self._prior_std) ** -2.0)
-        inverse = np.asarray(np.linalg.pinv(information, hermitian=True), np.float64)
+        inverse = covariance_of(information, weak="none")
         return carried_covariance(inverse, rows, whitened(by_fields), calibrated_covariance(sensor))[:, :p, :p]
 
     def _any_rendered(self) -> RenderedModel:
@@ -826,7 +834,7 @@ class MaximumLikelihood:
         for k, w in zip(kept, weight, strict=False):
             best_of_class[names[fits.class_index[k]]] += float(w)
         probability = {**dict.fromkeys(names, 0.0), **best_of_class, "none": float(weight[-1])}
-        condition, weak = weak_direction(fits.information[best], self.free)
+        condition, weak = weak_direction(self.free, information=fits.information[best])
         candidates = tuple(
             Candidate(
                 names[fits.class_index[k]],
@@ -887,9 +895,9 @@ class MaximumLikelihood:
     def _is_ambiguous(self, fits: Fits, kept: list[int], weight: NDArray[np.float64]) -> bool:
         """Return whether other classes, or views beyond the tolerance, are too probable; `kept` is best first."""
         best = kept[0]
-        period = 2 * math.pi / self._symmetry[fits.class_index[best]]
+        period = delta_period_rad(self._symmetry[fits.class_index[best]])
         apart = np.abs(fits.view[kept] - fits.view[best])
-        apart[:, 1] = np.abs((apart[:, 1] + period / 2) % period - period / 2)
+        apart[:, 1] = np.abs(wrap_delta_difference_rad(apart[:, 1], period))
         own = [VIEW.index(name) for name in self.free]
         std = np.sqrt(np.nan_to_num(np.einsum("kpp->kp", fits.covariance[kept]), posinf=0.0))
         apart[1:, own] += _TOLERATED_SIGMA * std[1:]  # the truth may be on the far side of the other view
@@ -910,9 +918,9 @@ class MaximumLikelihood:
         """Return fits, best first, without those that came to the same place."""
         kept: list[int] = []
         for k in own:
-            period = 2 * math.pi / self._symmetry[fits.class_index[k]]
+            period = delta_period_rad(self._symmetry[fits.class_index[k]])
             for other in kept:
-                turned = math.remainder(fits.view[k, 1] - fits.view[other, 1], period)
+                turned = wrap_delta_difference_rad(fits.view[k, 1] - fits.view[other, 1], period)
                 near = abs(fits.view[k, 0] - fits.view[other, 0]) < _SAME_M and abs(turned) < _SAME_RAD
                 if near and fits.class_index[k] == fits.class_index[other]:
                     break
@@ -921,7 +929,7 @@ class MaximumLikelihood:
         return kept
 
     def _wrapped(self, delta_rad: float, class_index: int) -> float:
-        return float(delta_rad % (2 * math.pi / self._symmetry[class_index]))
+        return float(wrap_delta_rad(delta_rad, delta_period_rad(self._symmetry[class_index])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -936,31 +944,6 @@ def _with_part(match: Match, name: str, part: NDArray[np.float64]) -> Match:
     """Return a match whose covariance holds a further part."""
     assert match.covariance is not None
     return replace(match, covariance=match.covariance + part, systematic={**match.systematic, name: part})
-
-
-def weak_direction(information: NDArray[np.float64], free: Sequence[str]) -> tuple[float, dict[str, float]]:
-    """Return the condition number of the information, and the direction known worst.
-
-    Parameters
-    ----------
-    information : (p, p) float64
-    free : sequence of str
-        Its parameters; lengths count in centimetres, angles in degrees.
-
-    Returns
-    -------
-    condition : float
-    direction : dict of str to float
-        The standard deviation along the worst direction, by parameter, metres and radians.
-    """
-    if not np.isfinite(information).all():
-        return math.inf, {}
-    scale = np.array([SCALE[name] for name in free])
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    if values[0] <= 0:
-        return math.inf, {}
-    worst = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0]) / math.sqrt(values[0]) * scale
-    return float(values[-1] / values[0]), dict(zip(free, worst.tolist(), strict=True))
 
 
 def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.float64]:
