@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from phasemark.matcher.likelihood.background_estimate import Surroundings, estimate_surroundings
     from phasemark.matcher.match import Candidate, Match, Matches
     from phasemark.matcher.matcher import Matcher, background_image
-    from phasemark.matcher.position.landmark_map import LandmarkMap, MappedLandmark, Placement, load_map
+    from phasemark.matcher.position.landmark_map import LandmarkMap, MappedLandmark, Placement, read_landmark_map
     from phasemark.matcher.position.robot_pose import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
     from phasemark.matcher.recordings.stillness import MotionTest, motion_test
     from phasemark.matcher.statistics import (
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     )
     from phasemark.matcher.sweep.compare import Difference, compare_cells
     from phasemark.matcher.sweep.examples import sweep_frames
-    from phasemark.matcher.sweep.plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, load_sweep
+    from phasemark.matcher.sweep.plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, read_sweep_plan
     from phasemark.matcher.sweep.result_tables import Cell, SweepTrials
     from phasemark.matcher.sweep.run import read_sweep, run_sweep
 else:
@@ -98,15 +98,15 @@ __all__ = [
     "kalman",
     "kalman_filter",
     "kalman_step",
-    "load_map",
-    "load_sweep",
     "mean_interval",
     "motion_test",
     "nees",
     "noise_free",
     "phasor_mean",
+    "read_landmark_map",
     "read_poses",
     "read_sweep",
+    "read_sweep_plan",
     "rms_interval",
     "robot_poses",
     "run_sweep",

@@ -1,4 +1,4 @@
-"""A picture of a match: measured, best model, residual, side by side (the paper's figure 11)."""
+"""A figure of a match: measured, best model, residual, side by side (the paper's figure 11)."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
     return np.where(noise <= limit, phasor_to_range_m(phasor, bank.sensor), np.nan)
 
 
-def match_picture(
+def match_figure(
     frames: FilteredFrames,
     match: Match,
     bank: Bank,

@@ -28,7 +28,7 @@ from phasemark.matcher.likelihood.estimator import (
     p_values_of,
 )
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.systematic import SYSTEMATICS, check_systematic
 from phasemark.matcher.match import Candidate, Match, Matches, Reason
 from phasemark.matcher.nearest.search import nearest_search
@@ -115,7 +115,7 @@ class Matcher:
         free: Sequence[str] | None = None,
         background: Background | Literal["auto", "unknown"] | None = None,
         false_alarm: float = 0.01,
-        on: Quantity = "ranges",
+        on: ResidualKind = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
         bearing_std_rad: float = BEARING_STD_RAD,

@@ -16,27 +16,27 @@ from scipy import stats
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
-from phasemark.data import BankPlan, load_plan
+from phasemark.data import BankPlan, read_bank_plan
 from phasemark.landmarks import Box, Cone, Cylinder, LandmarkSpec, Revolution, Sphere, build_mesh, catalog, read_mesh
 from phasemark.matcher import Matcher, cramer_rao, kalman_filter
 from phasemark.matcher.design import (
+    AllowedDimensions,
     ClassDistances,
     DesignPlan,
     LimitsPlan,
-    Room,
     SamplingPlan,
     SearchPlan,
+    choose_far_apart,
     confirm_design,
     default_design,
     drawing_svg,
     example_design,
     landmarks_toml,
-    load_design_plan,
     mesh_stl,
-    most_apart,
     output_names,
     pareto_csv,
     range_bound,
+    read_design_plan,
     run_design,
     summary,
     turn_distance,
@@ -62,7 +62,7 @@ SMALL = DesignPlan(
 
 @pytest.fixture(scope="module")
 def room():
-    return Room(default_design(), default_design().build_sensor())
+    return AllowedDimensions(default_design(), default_design().build_sensor())
 
 
 @pytest.fixture(scope="module")
@@ -108,14 +108,14 @@ def test_a_mistake_in_the_plan_names_file_key_and_value(tmp_path, text, said):
     file = tmp_path / "plan.toml"
     file.write_text(text)
     with pytest.raises(UsageError) as error:
-        load_design_plan(file)
+        read_design_plan(file)
     assert str(error.value).startswith(f"{file}: ")
     assert said in str(error.value)
 
 
 def test_a_plan_that_cannot_be_read_is_a_bad_file(tmp_path):
     with pytest.raises(InputFileError, match="cannot be read"):
-        load_design_plan(tmp_path / "none.toml")
+        read_design_plan(tmp_path / "none.toml")
 
 
 def _sensor_file(path, **changes):
@@ -126,7 +126,7 @@ def _sensor_file(path, **changes):
 def test_a_sensor_file_is_relative_to_the_plan(tmp_path):
     _sensor_file(tmp_path / "cam.toml", half_angle_h_deg=15.0)
     (tmp_path / "plan.toml").write_text('sensor = "cam.toml"\n')
-    assert load_design_plan(tmp_path / "plan.toml").build_sensor().half_angle_h_deg == 15.0
+    assert read_design_plan(tmp_path / "plan.toml").build_sensor().half_angle_h_deg == 15.0
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_the_field_at_the_near_end_is_0_31_m(room):
 
 def test_in_view_as_a_whole_is_what_projection_says():
     whole = DesignPlan(limits=LimitsPlan(fit="whole"))
-    room = Room(whole, whole.build_sensor())
+    room = AllowedDimensions(whole, whole.build_sensor())
     rng = np.random.default_rng(1)
     for length, width, height, r, h in rng.uniform((0.1, 0.1, 0.05, 0.02, 0.05), (0.3, 0.3, 0.2, 0.1, 0.2), (200, 5)):
         box, upper = Box(length_m=length, width_m=width, height_m=height), Cylinder(radius_m=r, height_m=h)
@@ -308,15 +308,15 @@ def test_the_best_set_is_found_among_few():
     points = rng.random((14, 2))
     distance = np.hypot(*(points[:, None] - points).transpose(2, 0, 1))
     np.fill_diagonal(distance, np.inf)
-    chosen = most_apart(distance, 2)
+    chosen = choose_far_apart(distance, 2)
     assert distance[chosen[0], chosen[1]] == distance[np.isfinite(distance)].max()
     for n in (3, 4):
         best = max(distance[np.ix_(c, c)].min() for c in map(list, combinations(range(14), n)))
-        chosen = most_apart(distance, n)
+        chosen = choose_far_apart(distance, n)
         assert len(set(chosen.tolist())) == n
         # exchanges reach an optimum that no single exchange improves; the farthest-first start is within a factor of 2
         assert distance[np.ix_(chosen, chosen)].min() >= 0.85 * best
-    assert most_apart(distance, 20).tolist() == list(range(14))
+    assert choose_far_apart(distance, 20).tolist() == list(range(14))
 
 
 def test_faces_that_reach_into_the_same_pixels_are_taken_for_one_another():
@@ -502,7 +502,7 @@ def test_a_mesh_file_is_in_millimetres(tmp_path):
 def test_the_files_say_what_the_design_is(design, confirmed, tmp_path):
     files = write_design(design, confirmed, tmp_path)
     assert [file.name for file in files] == output_names(design.plan)
-    plan = load_plan(tmp_path / "landmarks.toml")
+    plan = read_bank_plan(tmp_path / "landmarks.toml")
     assert isinstance(plan, BankPlan)
     assert plan.landmarks == design.result.specs
     assert plan.resolve().build_sensor() == design.search.sensor
@@ -525,7 +525,7 @@ def test_a_sensor_from_a_file_travels_with_the_landmarks(design, tmp_path):
     plan = DesignPlan(sensor=str(tmp_path / "cam.toml"))
     (tmp_path / "landmarks.toml").write_text(landmarks_toml(replace(design, plan=plan, search=Search(plan))))
     (tmp_path / "cam.toml").unlink()
-    read = load_plan(tmp_path / "landmarks.toml")
+    read = read_bank_plan(tmp_path / "landmarks.toml")
     assert read.build_sensor() == preset("pmd-16x16").with_(signal_e=30000.0)
     assert read.landmarks == design.result.specs
 

@@ -11,7 +11,7 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Match, Matcher, Matches, PixelState, kalman_filter, noise_free
 from phasemark.matcher.agreement import DISAGREEMENT
-from phasemark.matcher.figures import match_picture, model_range_m
+from phasemark.matcher.figures import match_figure, model_range_m
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.render import Background, Frames, PhasorImages, Renderer, capture, preset
 
@@ -240,7 +240,7 @@ def test_the_model_beside_a_match_is_the_bank_image_composed_with_the_background
     (match,) = Matcher(bank, background=WALL).match(noise_free(images, 50)[k])
     model = model_range_m(bank, match, WALL)
     np.testing.assert_allclose(model, images.range_m[k], atol=1e-6)  # float32 phasors
-    assert len(match_picture(noise_free(images, 50), match, bank, WALL, k).axes) == 6  # three panels, three colour bars
+    assert len(match_figure(noise_free(images, 50), match, bank, WALL, k).axes) == 6  # three panels, three colour bars
 
 
 def test_the_model_beside_a_match_is_found_in_a_bank_of_more_than_one_period(tmp_path):

@@ -12,7 +12,7 @@ from phasemark.data.pages.characterisation import _quantity_row
 from phasemark.matcher import Match
 from phasemark.matcher.statistics import Interval
 from phasemark.matcher.sweep.report import _with_interval
-from phasemark.render.bench.data_sheet import Quantity
+from phasemark.render.bench.data_sheet import SheetQuantity
 from phasemark.render.bench.fit import FittedField
 from phasemark.render.integral.rounding import error_text, value_and_error, with_error, with_interval
 
@@ -70,5 +70,5 @@ def test_tables_and_reports_round_alike():
     assert value_and_error_of(0.5, FittedField(0.5, 0.0002, "")) == ("0.50000", "0.00020")
     assert value_and_error_of(0.5, FittedField(0.5, None, "")) == ("0.5", "assumed")
     assert FittedField(1.0, 0.0002, "noise").comment == "measured, ± 0.00020 (standard error): noise"
-    row = _quantity_row(Quantity("x", "x", 2.0, 2.01, 0.0102, 50))
+    row = _quantity_row(SheetQuantity("x", "x", 2.0, 2.01, 0.0102, 50))
     assert (row["predicted"], row["simulated"], row["half"]) == ("2.000", "2.010", "0.020")

@@ -17,7 +17,7 @@ from phasemark import UsageError
 from phasemark.matcher.agreement import counts, pixel_mask
 from phasemark.matcher.information import covariance_of, eliminated
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.systematic import (
     calibrated_covariance,
     calibrated_fields,
@@ -74,7 +74,7 @@ def cramer_rao(
     *,
     free: Sequence[str] = VIEW[:2],
     n_frames: ArrayLike = 50,
-    on: Quantity = "ranges",
+    on: ResidualKind = "ranges",
     pixels: str | NDArray[np.bool_] = "all",
     background: Background | None = None,
     nuisances: Sequence[str] | None = None,
@@ -187,7 +187,7 @@ def _whitened(
     slope: NDArray[np.complex128],
     use: NDArray[np.bool_],
     n_frames: NDArray[np.float64],
-    on: Quantity,
+    on: ResidualKind,
     sensor: Sensor,
 ) -> NDArray[np.float64]:
     """Return the whitened Jacobian, (n, q, residuals)."""

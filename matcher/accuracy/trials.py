@@ -15,7 +15,7 @@ from phasemark import UsageError
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.match import Matches
 from phasemark.matcher.statistics import Interval, binomial_interval, error_statistics, nees, view_errors
 from phasemark.render import Background, Renderer, Sensor, Views, capture, delta_period_rad
@@ -53,7 +53,7 @@ class TrialSetup:
     bearing_rad: float = 0.0
     n_frames: int = 50
     background: Background | None = None
-    on: Quantity = "ranges"
+    on: ResidualKind = "ranges"
     free: tuple[str, ...] = VIEW[:2]
     nuisances: tuple[str, ...] | None = None
 

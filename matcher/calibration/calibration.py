@@ -37,7 +37,7 @@ from phasemark.matcher.filters.filtered_frames import (
 from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.estimator import MIN_RETURNS, p_values_of
-from phasemark.matcher.likelihood.residuals import Evidence, Quantity
+from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.render import Background, Frames, Sensor, wrap_difference_m, wrap_range_m
 from phasemark.render.sensor.sensor_file import rounded
 
@@ -140,7 +140,7 @@ class Calibration:
     chi2: float
     dof: int
     p_value: float
-    on: Quantity
+    on: ResidualKind
     poses: KnownPoses
     pose_shift: NDArray[np.float64]
     pose_chi2: NDArray[np.float64]
@@ -188,7 +188,7 @@ def check_names(names: Sequence[str], what: str) -> tuple[str, ...]:
     return tuple(name for name in ALL_NAMES if name in spelled)
 
 
-def filter_poses(frames: Sequence[Frames], on: Quantity | Literal["auto"] = "auto") -> FilteredFrames:
+def filter_poses(frames: Sequence[Frames], on: ResidualKind | Literal["auto"] = "auto") -> FilteredFrames:
     """Filter the frames of each pose: the mean phasor where phasors will be compared, else the Kalman filter.
 
     Parameters
@@ -247,7 +247,7 @@ def calibrate(
     fixed: Sequence[str] = (),
     start: Mounting | None = None,
     albedo: float = 0.8,
-    on: Quantity | Literal["auto"] = "auto",
+    on: ResidualKind | Literal["auto"] = "auto",
     background: Background | None = None,
     pose_std: PoseStd | None = None,
     reports_z: bool | None = None,
@@ -322,7 +322,7 @@ def calibrate(
         raise UsageError("'on' must be auto or ranges for a moving camera or offsets of zones, got 'phasors'")
     if zones and sensor.kind != "direct":
         raise UsageError("offsets of zones belong to sensors of 'kind' = 'direct'")
-    quantity: Quantity = ("phasors" if has_light and not recorded else "ranges") if on == "auto" else on
+    quantity: ResidualKind = ("phasors" if has_light and not recorded else "ranges") if on == "auto" else on
     names = (ALL_NAMES if moving else NAMES) if free is None else check_names(free, "'free'")
     if "delay" in names and not moving:
         raise UsageError("the delay takes a moving camera: give --moving, and time stamps of frames and poses")

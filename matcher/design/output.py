@@ -253,7 +253,7 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
     OutputExistsError, StorageError
         A file cannot be written.
     """
-    from phasemark.matcher.design.figures import bound_picture, pareto_picture  # matplotlib is slow to import
+    from phasemark.matcher.design.figures import bound_figure, pareto_figure  # matplotlib is slow to import
 
     near, far = design.plan.distance_m
     notes = [f"for {Path(design.plan.sensor).stem}, {near:g} … {far:g} m"]
@@ -264,8 +264,8 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
         landmarks_toml(design).encode(),
         pareto_csv(design).encode(),
         text.encode(),
-        figure_png(pareto_picture(design)),
-        figure_png(bound_picture(design, confirmed)),
+        figure_png(pareto_figure(design)),
+        figure_png(bound_figure(design, confirmed)),
     ]
     for spec in design.result.specs:
         contents += [mesh_stl(spec), drawing_svg(spec, notes).encode()]

@@ -163,7 +163,7 @@ class ClassDistances:
         return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
 
 
-def most_apart(distance: NDArray[np.float64], n: int) -> NDArray[np.int64]:
+def choose_far_apart(distance: NDArray[np.float64], n: int) -> NDArray[np.int64]:
     """Choose n items whose least mutual distance is large: the best pair, the farthest next, then exchanges.
 
     Parameters

@@ -27,7 +27,7 @@ from phasemark.matcher.likelihood.background_estimate import (
 )
 from phasemark.matcher.likelihood.descent import Fits, Settings, refine
 from phasemark.matcher.likelihood.images import VIEW, BankModel, ImageModel, RenderedModel
-from phasemark.matcher.likelihood.residuals import Evidence, Quantity
+from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.likelihood.systematic import (
     Systematic,
     calibrated_covariance,
@@ -144,7 +144,7 @@ class MaximumLikelihood:
         free: Sequence[str] | None = None,
         background: Background | Literal["auto", "unknown"] | None = None,
         false_alarm: float = 0.01,
-        on: Quantity = "ranges",
+        on: ResidualKind = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
         bearing_std_rad: float = BEARING_STD_RAD,
@@ -164,7 +164,7 @@ class MaximumLikelihood:
         self.bank = bank
         self.free = check_free((*VIEW[:2], "bearing_rad") if free is None else free)
         self._prior_std = (math.inf, math.inf, bearing_std_rad) if free is None else ()
-        self.on: Quantity = on
+        self.on: ResidualKind = on
         self.false_alarm = false_alarm
         self._systematic = systematic
         self._workers = workers or _usual_workers()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, wrap_delta_difference_rad
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 
 Systematic = Literal["calibration", "declared", "motion"]
 """What a calibration leaves of the sensor's fields, what the sensor declares of a pose, and the jitter of stamps."""
@@ -95,7 +95,7 @@ def rates_of_views(
         if len(near) < _RATE_NEEDS or np.ptp(since) == 0:
             continue
         away = view[near] - view[k]
-        away[:, turn] = wrap_delta_difference_rad(away[:, turn], period_rad[k])
+        away[:, turn] = (away[:, turn] + period_rad[k] / 2) % period_rad[k] - period_rad[k] / 2
         weight = 1 / np.maximum(std[near], np.median(std[near], axis=0)) ** 2
         total = weight.sum(axis=0)
         middle = (weight * since[:, None]).sum(axis=0) / total

@@ -33,7 +33,7 @@ from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, noise_free, phasor_mean
 from phasemark.matcher.likelihood.estimator import LIKELY
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.sweep.plan import Method, SweepPlan
@@ -258,7 +258,7 @@ class SweepJob:
         seen = self.raw_frames(number, image, first, on=method.on)
         return (phasor_mean if method.filter == "phasor-mean" else kalman_filter)(seen)
 
-    def raw_frames(self, number: int, image: PhasorImages, first: int, *, on: Quantity = "ranges") -> Frames:
+    def raw_frames(self, number: int, image: PhasorImages, first: int, *, on: ResidualKind = "ranges") -> Frames:
         """Return the frames of some trials, (n, n_frames, rows, cols), with the sensor that a method believes in."""
         true, believed = self.true_sensor(number), self.believed_sensor(number)
         if on == "phasors":
