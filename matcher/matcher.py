@@ -17,7 +17,7 @@ from phasemark.matcher.likelihood.likelihood_matcher import (
     LikelihoodMatcher,
     Pixels,
 )
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.likelihood.systematic import SYSTEMATICS, check_systematic
 from phasemark.matcher.match import Match, Matches
@@ -105,7 +105,7 @@ class Matcher:
         free: Sequence[str] | None = None,
         background: Background | Literal["auto", "unknown"] | None = None,
         false_alarm: float = 0.01,
-        on: Quantity = "ranges",
+        on: ResidualKind = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
         bearing_std_rad: float = BEARING_STD_RAD,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from phasemark.data import BankPlan, build_bank
-from phasemark.matcher import Conditions, Matches
+from phasemark.matcher import Matches, TrialSetup
 from phasemark.matcher.accuracy.trials import noisy_frames
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.matcher.nearest.search import ExactSearch, PrunedSearch, nearest_search
@@ -35,11 +35,9 @@ def full_bank(tmp_path_factory):
 def frames(bank, n, background=None, distance_m=DISTANCE, seed=5):
     """Return n frames of each class, any δ."""
     rng = np.random.default_rng(seed)
-    conditions = Conditions(distance_m=distance_m, background=background)
+    setup = TrialSetup(distance_m=distance_m, background=background)
     return [
-        noisy_frames(
-            Renderer(bank.mesh(name), SENSOR, albedo=0.8), SENSOR, conditions.views(n, rng, DELTA), conditions, rng
-        )
+        noisy_frames(Renderer(bank.mesh(name), SENSOR, albedo=0.8), SENSOR, setup.views(n, rng, DELTA), setup, rng)
         for name in bank.classes
     ]
 

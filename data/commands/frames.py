@@ -14,7 +14,7 @@ from phasemark import UsageError
 from phasemark.data.commands.build import build_or_estimate, merge_shards
 from phasemark.data.commands.command import Without
 from phasemark.data.commands.console import LongWork, echo_facts, echo_json, readable
-from phasemark.data.commands.inputs import background_of, load_class_or_mesh, load_sensor, refuse_unless_one
+from phasemark.data.commands.inputs import background_of, read_class_or_mesh, read_sensor, refuse_unless_one
 from phasemark.data.commands.options import (
     Building,
     Floor,
@@ -132,7 +132,7 @@ def frames_import(
     if out.suffix.lower() != ".npz":
         raise UsageError(f"the output must be a .npz file, got '{out}'")
     refuse_existing([out], force)
-    frames = reading.read(file, load_sensor(sensor), topic=topic)
+    frames = reading.read(file, read_sensor(sensor), topic=topic)
     typer.echo(write_measured(frames, out, force=force))
 
 
@@ -185,10 +185,10 @@ def frames_simulate(
         if value is not None and not moving:
             raise UsageError(f"{option} goes with --moving: a camera at rest keeps its view")
     recording_format(out)
-    camera = load_sensor(sensor)
+    camera = read_sensor(sensor)
     _refuse_many_frames(n_frames, camera)
     refuse_unwritable_files([out], force)
-    name, mesh = load_class_or_mesh(class_name, mesh_file, mesh_reading)
+    name, mesh = read_class_or_mesh(class_name, mesh_file, mesh_reading)
     way = np.linspace(0.0, 1.0, n_frames) if moving else np.zeros(n_frames)
     last_distance = 0.8 * distance if to_distance is None else to_distance
     last_delta = delta + 40.0 if to_delta is None else to_delta
@@ -225,7 +225,7 @@ def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
 def frames_show(
     *,
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, or measured frames.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The figure, .png.")],
     index: Annotated[int, typer.Option("--index", min=0, help="Number of the frame.")] = 0,
     sensor: SensorName = "pmd-16x16",
     reading: Annotated[FrameReading, Without("invalid_means", "flip_h", "flip_v", "rotate")],
@@ -237,19 +237,19 @@ def frames_show(
     from phasemark.data import is_frame_set, open_frames, write_atomically
 
     if out.suffix.lower() != ".png":
-        raise UsageError(f"the picture must be a .png file, got '{out}'")
+        raise UsageError(f"the figure must be a .png file, got '{out}'")
     refuse_existing([out], force)
     if is_frame_set(frames):
         with open_frames(frames, untrusted=True) as opened:
             _refuse_index(index, len(opened))
             figure = opened.frames([index]).plot()
     else:
-        measured = reading.read(frames, load_sensor(sensor))
+        measured = reading.read(frames, read_sensor(sensor))
         _refuse_index(index, len(measured) * measured.n_frames)
         figure = measured.plot(*divmod(index, measured.n_frames))
-    picture = bytes_io.BytesIO()
-    figure.savefig(picture, format="png", dpi=120)
-    typer.echo(write_atomically(out, picture.getvalue(), force=force))
+    buffer = bytes_io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    typer.echo(write_atomically(out, buffer.getvalue(), force=force))
 
 
 def _refuse_index(index: int, n: int) -> None:

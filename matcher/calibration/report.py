@@ -1,4 +1,4 @@
-"""A calibration as a sensor file, as plain numbers, and as a picture of its residuals."""
+"""A calibration as a sensor file, as plain numbers, and as a figure of its residuals."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def calibration_dict(found: Calibration) -> dict[str, Any]:
     }
 
 
-def residual_picture(found: Calibration) -> Figure:
+def residual_figure(found: Calibration) -> Figure:
     """Draw what the calibration leaves: residuals by pixel before and after, by pose, and against the normal law.
 
     Parameters

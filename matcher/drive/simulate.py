@@ -123,7 +123,7 @@ def pose_error(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> NDA
 
 
 @dataclass(frozen=True, eq=False)
-class Equipment:
+class RobotEquipment:
     """What a robot brings along: camera, bank, matcher, and a model of each class.
 
     One set serves any number of drives with the same classes and camera.
@@ -140,7 +140,7 @@ class Equipment:
     renderers: dict[str, Renderer] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, plan: DrivePlan, workers: int | None = None) -> Equipment:
+    def of(cls, plan: DrivePlan, workers: int | None = None) -> RobotEquipment:
         """Build the bank in memory, over the distances where the robot stops and a margin.
 
         Parameters
@@ -183,7 +183,7 @@ def run_drive(
     plan: DrivePlan,
     *,
     seed: int = 2005,
-    equipment: Equipment | None = None,
+    equipment: RobotEquipment | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Drive:
@@ -202,7 +202,7 @@ def run_drive(
     plan : DrivePlan
     seed : int
         Of everything random.
-    equipment : Equipment, optional
+    equipment : RobotEquipment, optional
         From an earlier drive; built if not given.
     workers : int, optional
         Threads; None: one for each processor.
@@ -219,13 +219,13 @@ def run_drive(
         A class or the camera is unknown, or the robot lost its path.
     """
     rng = stream(seed, "drive", 0)
-    return _Driver(plan, seed, equipment or Equipment.of(plan, workers), rng).drive(progress)
+    return _Driver(plan, seed, equipment or RobotEquipment.of(plan, workers), rng).drive(progress)
 
 
 class _Driver:
     """One drive as it goes on."""
 
-    def __init__(self, plan: DrivePlan, seed: int, equipment: Equipment, rng: np.random.Generator) -> None:
+    def __init__(self, plan: DrivePlan, seed: int, equipment: RobotEquipment, rng: np.random.Generator) -> None:
         self.plan, self.seed, self.equipment, self.rng = plan, seed, equipment, rng
         self.path = Path(plan.path.waypoints_m)
         start = np.array([*plan.path.waypoints_m[0], self.path.start_heading_rad])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -22,7 +21,7 @@ from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.search import is_doubtful, search_views
 from phasemark.matcher.likelihood.setup import Scene, Setup
-from phasemark.render import Background
+from phasemark.render import Background, delta_period_rad
 
 __all__ = ["AutoBackground"]
 
@@ -100,7 +99,7 @@ class AutoBackground:
             return fits[:0]
         best = int(fits.cost.argmin())
         n = self._setup.policy.other_angles
-        period = 2 * math.pi / self._setup.shapes.symmetry[fits.class_index[best]]
+        period = delta_period_rad(self._setup.shapes.symmetry[fits.class_index[best]])
         angles = np.arange(1, n) * period / n
         view = np.tile(fits.view[best], (len(angles), 1))
         view[:, 1] += angles

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.agreement import DISAGREEMENT
+from phasemark.render import delta_period_rad, wrap_delta_difference_rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +131,9 @@ def distinct(fits: Fits, own: NDArray[np.int64], symmetry: Sequence[int], same_m
     """
     kept: list[int] = []
     for k in own:
-        period = 2 * math.pi / symmetry[fits.class_index[k]]
+        period = delta_period_rad(symmetry[fits.class_index[k]])
         for other in kept:
-            turned = math.remainder(fits.view[k, 1] - fits.view[other, 1], period)
+            turned = wrap_delta_difference_rad(fits.view[k, 1] - fits.view[other, 1], period)
             near = abs(fits.view[k, 0] - fits.view[other, 0]) < same_m and abs(turned) < same_rad
             if near and fits.class_index[k] == fits.class_index[other]:
                 break

@@ -8,12 +8,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import whole_cost
 from phasemark.matcher.likelihood.descent import descend
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Sums
-from phasemark.matcher.likelihood.uncertainty import inverse_information, view_covariance
+from phasemark.matcher.likelihood.uncertainty import view_covariance
 
 
 def look_beside(problem: Problem, state: State) -> State:
@@ -92,7 +93,7 @@ def settle(problem: Problem, state: State) -> State:
 def _moves(problem: Problem, sums: Sums, which: NDArray[np.integer]) -> NDArray[np.float64]:
     """Return steps along the axes of the covariance, (k, moves, p); where there is none, natural units."""
     p = len(problem.columns)
-    matrix = inverse_information(sums.information[which] * np.outer(problem.scale, problem.scale), np.ones(p))
+    matrix = covariance_of(sums.information[which] * np.outer(problem.scale, problem.scale))
     known = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
     values, vectors = np.linalg.eigh(np.where(known[:, None, None], matrix, np.eye(p)))
     axes = vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), 1.0)[:, None, :]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
-from phasemark.matcher.agreement import DISAGREEMENT, counts
+from phasemark.matcher.agreement import DISAGREEMENT, counts, pixel_mask
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.likelihood.auto_background import AutoBackground
 from phasemark.matcher.likelihood.background_estimate import NEAREST_WALL_M
@@ -22,7 +22,7 @@ from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.ranking import rank
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
-from phasemark.matcher.likelihood.residuals import Evidence, Quantity
+from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.likelihood.search import search_views
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.likelihood.setup import Scene, Setup, Shapes, check_free
@@ -55,7 +55,7 @@ class LikelihoodMatcher:
         free: Sequence[str] | None = None,
         background: Background | Literal["auto", "unknown"] | None = None,
         false_alarm: float = 0.01,
-        on: Quantity = "ranges",
+        on: ResidualKind = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
         bearing_std_rad: float = BEARING_STD_RAD,
@@ -80,7 +80,7 @@ class LikelihoodMatcher:
             on=on,
             background_is_known=self._stated is not None,
             unknown=unknown,
-            used=_used_pixels(bank, pixels),
+            used=pixel_mask(pixels, bank.sensor).ravel(),
             huber=ROBUST_FROM if robust or unknown else None,
             false_alarm=false_alarm,
             tolerance={name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW},
@@ -231,14 +231,6 @@ def _check_choices(bank: Bank, background: object, on: str, pixels: str) -> None
         raise UsageError(f"the bank's model is '{bank.plan.model}', which knows no mixed pixels: refine needs 'ray'")
     if background == "unknown" and on != "ranges":
         raise UsageError('background="unknown" takes on="ranges": the brightness of unknown things tells nothing')
-
-
-def _used_pixels(bank: Bank, pixels: Pixels) -> NDArray[np.bool_]:
-    """Return which pixels give the view, (pixels,)."""
-    used = np.ones((bank.sensor.rows, bank.sensor.cols), np.bool_)
-    if pixels == "lower":
-        used[: bank.sensor.rows // 2] = False
-    return used.ravel()
 
 
 def _usual_workers() -> int:

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.agreement import MUST_RETURN_COVERAGE, counts
+from phasemark.matcher.information import NATURAL_UNITS
 from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 
 ALBEDO = "albedo"
 """Name of the factor on the landmark's brightness, profiled out on phasors."""
-SCALE = {"distance_m": 0.01, "delta_rad": np.radians(1), "bearing_rad": np.radians(1), "height_m": 0.01, ALBEDO: 0.1}
+SCALE = {**NATURAL_UNITS, ALBEDO: 0.1}
 """Natural units of the parameters: 1 cm, 1°. Condition numbers and the longest step are stated in them."""
 
 

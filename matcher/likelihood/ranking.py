@@ -12,14 +12,14 @@ from scipy import special
 from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.chi_squared import p_values_of
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.information import weak_direction
 from phasemark.matcher.likelihood.fits import Fits, distinct
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.problem import SCALE
 from phasemark.matcher.likelihood.setup import Setup
 from phasemark.matcher.match import Candidate, Match, Reason
-from phasemark.render import Background
+from phasemark.render import Background, delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
 
-__all__ = ["is_determined", "rank", "weak_direction"]
+__all__ = ["is_determined", "rank"]
 
 
 def rank(
@@ -67,31 +67,6 @@ def is_determined(setup: Setup, std: NDArray[np.float64], symmetry: int) -> bool
     return bool((error <= tolerance).all())
 
 
-def weak_direction(information: NDArray[np.float64], free: Sequence[str]) -> tuple[float, dict[str, float]]:
-    """Return the condition number of the information, and the direction known worst.
-
-    Parameters
-    ----------
-    information : (p, p) float64
-    free : sequence of str
-        Its parameters; lengths count in centimetres, angles in degrees.
-
-    Returns
-    -------
-    condition : float
-    direction : dict of str to float
-        The standard deviation along the worst direction, by parameter, metres and radians.
-    """
-    if not np.isfinite(information).all():
-        return math.inf, {}
-    scale = np.array([SCALE[name] for name in free])
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    if values[0] <= 0:
-        return math.inf, {}
-    worst = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0]) / math.sqrt(values[0]) * scale
-    return float(values[-1] / values[0]), dict(zip(free, worst.tolist(), strict=True))
-
-
 def _answer(
     setup: Setup,
     fits: Fits,
@@ -112,7 +87,7 @@ def _answer(
     weight = _weights(np.append(fits.cost[kept], min(bare, float(doubt[best]) + left)))
     reason = _reason(setup, fits, kept, weight[:-1], float(p_values[best]), bare)
     candidates = tuple(_candidate(setup, fits, k, w) for k, w in zip(kept, weight, strict=False))
-    condition, weak = weak_direction(fits.information[best], setup.free)
+    condition, weak = weak_direction(setup.free, information=fits.information[best])
     covariance = fits.covariance[best]
     is_landmark = reason != "no landmark"
     return Match(
@@ -147,9 +122,11 @@ def _candidate(setup: Setup, fits: Fits, k: int, weight: float) -> Candidate:
     """Return one fit as an explanation, δ within the landmark's period."""
     c = int(fits.class_index[k])
     distance, delta, bearing, height = (float(value) for value in fits.view[k])
-    turn = 2 * math.pi / setup.shapes.symmetry[c]
+    turn = delta_period_rad(setup.shapes.symmetry[c])
     cost = float(fits.cost[k])
-    return Candidate(setup.shapes.names[c], distance, float(delta % turn), cost, float(weight), bearing, height)
+    return Candidate(
+        setup.shapes.names[c], distance, float(wrap_delta_rad(delta, turn)), cost, float(weight), bearing, height
+    )
 
 
 def _class_probability(names: Sequence[str], candidates: Sequence[Candidate], none: float) -> dict[str, float]:
@@ -180,9 +157,9 @@ def _reason(
 def _is_ambiguous(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float64]) -> bool:
     """Return whether other classes, or views beyond the tolerance, are too probable; `kept` is best first."""
     policy, best = setup.policy, kept[0]
-    period = 2 * math.pi / setup.shapes.symmetry[fits.class_index[best]]
+    period = delta_period_rad(setup.shapes.symmetry[fits.class_index[best]])
     apart = np.abs(fits.view[kept] - fits.view[best])
-    apart[:, 1] = np.abs((apart[:, 1] + period / 2) % period - period / 2)
+    apart[:, 1] = np.abs(wrap_delta_difference_rad(apart[:, 1], period))
     own = [VIEW.index(name) for name in setup.free]
     std = np.sqrt(np.nan_to_num(np.einsum("kpp->kp", fits.covariance[kept]), posinf=0.0))
     apart[1:, own] += policy.tolerated_sigma * std[1:]  # the truth may be on the far side of the other view

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.agreement import DISAGREEMENT
+from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels
 from phasemark.matcher.likelihood.descent import descend
 from phasemark.matcher.likelihood.fits import Fits
@@ -19,7 +20,6 @@ from phasemark.matcher.likelihood.problem import Problem, Settings, State
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import (
     capped_std,
-    inverse_information,
     slopes_around,
     std_without_one_pixel,
     view_covariance,
@@ -105,9 +105,9 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
             covariance[near] = view_covariance(problem, sums)
         rows = state.images.slope[near] if slope is None else slope
         without_one[near] = std_without_one_pixel(there, state, near, rows, sums.information, covariance[near])
-    information = inverse_information(
-        covariance / np.outer(problem.scale[:p], problem.scale[:p]), 1 / problem.scale[:p]
-    )
+    scale = problem.scale[:p]
+    # the inverse of a covariance is information
+    information = covariance_of(covariance / np.outer(scale, scale)) * np.outer(1 / scale, 1 / scale)
     all_pixels = np.ones_like(settings.pixels)
     sums = state.sums
     if not settings.pixels.all():

@@ -130,9 +130,8 @@ class RenderedModel:
 
         A body of revolution looks the same from every side.
         """
-        half = self.sensor.rows // 2
         if self._factored and name == "delta_rad" and not view[:, 3].any():
-            return (half, self.sensor.rows), half * self.sensor.cols
+            return self.sensor.lower_rows, self.sensor.lower_rows[0] * self.sensor.cols
         return None, 0
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -14,7 +14,7 @@ from phasemark.landmarks.symmetry import mesh_symmetry
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.problem import Settings
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import SearchPolicy
 from phasemark.matcher.nearest.bank_minima import Search
 from phasemark.render import Background, PhasorImages
@@ -101,7 +101,7 @@ class Setup:
     shapes: Shapes
     free: tuple[str, ...]
     prior_std: tuple[float, ...]
-    on: Quantity
+    on: ResidualKind
     background_is_known: bool
     unknown: bool
     used: NDArray[np.bool_]

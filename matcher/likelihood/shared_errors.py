@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.stamps import spread_stamps
+from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.ranking import is_determined
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
@@ -27,7 +27,7 @@ from phasemark.matcher.likelihood.systematic import (
     rates_of_views,
 )
 from phasemark.matcher.match import Match
-from phasemark.render import Sensor, Views
+from phasemark.render import Sensor, Views, delta_period_rad
 
 __all__ = ["with_motion", "with_shared_errors"]
 
@@ -85,7 +85,7 @@ def with_motion(
         if match.covariance is not None and match.class_name is not None:
             view[k] = [getattr(match, name) for name in setup.free]
             std[k] = np.sqrt(np.diag(match.covariance))
-    period = np.array([2 * math.pi / match.symmetry for match in answers])
+    period = np.array([delta_period_rad(match.symmetry) for match in answers])
     rate = rates_of_views(spread_stamps(frames.time_s), view, std, period, setup.free.index("delta_rad"))
     return [
         match if match.covariance is None or not one.any() else _with_part(match, "motion", part)
@@ -150,5 +150,5 @@ def _carried(
     p = len(setup.free)
     if setup.prior_std:
         information[:, :p, :p] += np.diag(np.array(setup.prior_std) ** -2.0)
-    inverse = np.asarray(np.linalg.pinv(information, hermitian=True), np.float64)
+    inverse = covariance_of(information, weak="none")
     return carried_covariance(inverse, rows, whitened(by_fields), calibrated_covariance(sensor))[:, :p, :p]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.problem import Problem, State
 from phasemark.matcher.likelihood.residuals import Sums, robust_weight
 
@@ -12,7 +13,7 @@ from phasemark.matcher.likelihood.residuals import Sums, robust_weight
 def view_covariance(problem: Problem, sums: Sums) -> NDArray[np.float64]:
     """Return the covariance of the view, (m, p, p): inverse information, or the sandwich."""
     p = len(problem.settings.free)
-    covariance = inverse_information(sums.information * np.outer(problem.scale, problem.scale), problem.scale)
+    covariance = covariance_of(sums.information, problem.scale)
     if problem.settings.huber is not None:
         covariance = covariance @ sums.scatter @ covariance
     return np.ascontiguousarray(covariance[:, :p, :p])
@@ -70,24 +71,10 @@ def std_without_one_pixel(
         residual = np.stack([(value - phasor).real, (value - phasor).imag], axis=-1)
     root = np.sqrt(robust_weight(residual, (weight * use)[..., None], problem.settings.huber))
     rows = rows * root[:, None]  # (k, p, pixels, 1 or 2)
-    inverse = inverse_information(information * np.outer(problem.scale, problem.scale), problem.scale)
+    inverse = covariance_of(information, problem.scale)
     moved = np.einsum("kab,kbqr->kaqr", inverse, rows)
     kept = (1 + 1e-12) * np.eye(rows.shape[3]) - np.einsum("kaqr,kaqs->kqrs", rows, moved)
     moved = moved[:, :p]
     more = np.einsum("kaqr,kqrs,kaqs->kaq", moved, np.linalg.inv(kept), moved).max(axis=2)
     own = np.einsum("kaa->ka", inverse)[:, :p]
     return np.asarray(np.sqrt(np.einsum("kaa->ka", covariance) * (own + more) / own))
-
-
-def inverse_information(matrix: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverses of symmetric matrices that were scaled to be of order one in natural units.
-
-    `matrix` is in natural units; the result is scaled back. NaN where a matrix is singular.
-    """
-    out = np.full(matrix.shape, np.nan)
-    finite = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
-    values, vectors = np.linalg.eigh(np.where(finite[:, None, None], matrix, 0.0))
-    good = finite & (values[:, 0] > 1e-12 * values[:, -1]) & (values[:, 0] > 0)
-    v, w = vectors[good], values[good]
-    out[good] = np.einsum("mij,mj,mkj->mik", v, 1 / w, v)
-    return out * np.outer(scale, scale)

@@ -53,7 +53,6 @@ class NearestMatcher:
         self._false_alarm = false_alarm
         self._behind = None if background is None else background_image(background, bank.sensor)
         self._symmetry = {name: int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes}
-        half = bank.sensor.rows // 2
         if bank.full is not None:
             self._pose_rows, self._class_rows = (0, bank.sensor.rows), None
             self.pose = self._templates(bank.full, self._pose_rows)
@@ -61,7 +60,7 @@ class NearestMatcher:
         else:
             assert bank.lower is not None
             assert bank.upper is not None
-            self._pose_rows, self._class_rows = (half, bank.sensor.rows), (0, half)
+            self._pose_rows, self._class_rows = bank.sensor.lower_rows, bank.sensor.upper_rows
             self.pose = self._templates(bank.lower, self._pose_rows)
             self._class = self._templates(bank.upper, self._class_rows)
         self.search = nearest_search(
