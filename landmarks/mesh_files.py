@@ -145,7 +145,7 @@ def read_mesh(
             f"{key}: {' × '.join(f'{value * scale:.4g}' for value in extents)} m"
             for key, scale in METRES_PER_UNIT.items()
         )
-        raise UsageError(f"{name}: say in which unit it is (--unit); its extents would be {sizes}")
+        raise UsageError(f"{name}: say in which unit it is (unit=…); its extents would be {sizes}")
     vertices = vertices * METRES_PER_UNIT[unit] @ np.array(_UP[up]).T
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     if origin != "file":

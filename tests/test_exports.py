@@ -67,7 +67,7 @@ def test_range_and_z_are_told_apart(frames, tmp_path):
     )
     assert (str(of_range["quantity"]), str(of_z["quantity"])) == ("range", "z")
     np.testing.assert_allclose(of_z["range"], of_range["range"] * SENSOR.axis_cosine(), rtol=1e-6)
-    with pytest.raises(UsageError, match="--quantity must be z for bop, got 'range'"):
+    with pytest.raises(UsageError, match="quantity=… must be z for bop, got 'range'"):
         exported(frames, tmp_path, "bop", "range")
     with pytest.raises(UsageError, match=r"but .* says z"):
         read_frames(tmp_path / "z", sensor=SENSOR, quantity="range")
@@ -303,7 +303,7 @@ def matrix_of(q):
 def test_an_existing_folder_needs_force_and_is_replaced_whole(frames, tmp_path):
     folder = exported(frames, tmp_path, "ply")
     before = sorted(entry.name for entry in folder.iterdir())
-    with pytest.raises(OutputExistsError, match="--force"):
+    with pytest.raises(OutputExistsError, match="force=True"):
         exported(frames, tmp_path, "ply")
     export_frames(frames, folder, "png16", force=True)
     assert not set(before) & {entry.name for entry in folder.glob("*.ply")}

@@ -192,7 +192,7 @@ def test_parts_of_a_bank_merge_too(tmp_path):
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "1", "a/b", "1/", "-1/3"])
 def test_a_shard_is_written_i_of_n(text):
-    with pytest.raises(UsageError, match="--shard must be I/N"):
+    with pytest.raises(UsageError, match="part=… must be I/N"):
         parse_part(text)
 
 

@@ -227,7 +227,7 @@ def test_a_plan_that_names_a_program_does_not_run_it_unasked(options, tmp_path, 
 
 
 def test_a_folder_with_a_sweep_is_not_overwritten_unasked(reference):
-    with pytest.raises(OutputExistsError, match="--resume"):
+    with pytest.raises(OutputExistsError, match="resume=True"):
         run_sweep(plan(), reference[0])
     with pytest.raises(OutputExistsError, match="another plan"):
         run_sweep(plan(seed=1), reference[0], resume=True)

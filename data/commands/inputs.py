@@ -12,17 +12,34 @@ from typing import TYPE_CHECKING, Protocol
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.console import tell
 from phasemark.data.commands.options import MeshReading
+from phasemark.inputs import vouching_begun
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-    from phasemark.data import Bank
+    from phasemark.data import Bank, FrameSet
     from phasemark.render import Background, Sensor
 
 
 def open_any_bank(path: Path) -> Bank:
     """Open a bank from anywhere; say of a mesh how a bank is made of it."""
-    from phasemark.data import open_bank
+    with vouching_begun(path):
+        from phasemark.data import open_bank
+
+        _refuse_mesh(path)
+        return open_bank(path, untrusted=True)
+
+
+def open_frame_set(path: Path) -> FrameSet:
+    """Open a frame set from anywhere."""
+    with vouching_begun(path):
+        from phasemark.data import open_frames
+
+        return open_frames(path, untrusted=True)
+
+
+def _refuse_mesh(path: Path) -> None:
+    """Say of a mesh how a bank is made of it."""
     from phasemark.landmarks.mesh_files import FORMATS
 
     if path.exists() and path.suffix.lower().removeprefix(".") in FORMATS:
@@ -31,7 +48,6 @@ def open_any_bank(path: Path) -> Bank:
             f"{path}: a mesh, not a bank; if it is in millimetres, one is made of it by: phasemark bank build"
             f" --mesh {mesh} --unit mm --out {out}"
         )
-    return open_bank(path, untrusted=True)
 
 
 def read_landmark(name_or_file: str, reading: MeshReading) -> tuple[str, Trimesh]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -21,6 +21,9 @@ from phasemark.data.commands.inputs import (
 )
 from phasemark.data.commands.options import Floor, Force, MeshReading, SensorName, Wall, a_class
 from phasemark.data.commands.outputs import refuse_existing
+
+if TYPE_CHECKING:
+    from phasemark.render import PhasorImages
 
 
 def render_frame(
@@ -50,11 +53,6 @@ def render_frame(
     force: Force = False,
 ) -> None:
     """Render one noise-free frame: a figure, the phasors, and a sketch in the terminal."""
-    import io as bytes_io
-
-    import numpy as np
-
-    from phasemark.data import write_atomically
     from phasemark.render import Renderer, terminal_figure
 
     refuse_unless_one(class_name, mesh_file, mesh_reading, "render")
@@ -73,6 +71,23 @@ def render_frame(
         background=background_of(wall, floor),
         variant=variant,
     )
+    _write_image(image, out, data, force)
+    if sys.stdout.isatty():
+        from rich.console import Console
+
+        Console().print(terminal_figure(image.range_m[0], width=48))
+    typer.echo(out)
+    typer.echo(data)
+
+
+def _write_image(image: PhasorImages, out: Path, data: Path, force: bool) -> None:
+    """Write the figure of an image, and its arrays."""
+    import io as bytes_io
+
+    import numpy as np
+
+    from phasemark.data import write_atomically
+
     arrays = {
         "phasor": image.phasor[0],
         "intensity": image.intensity[0],
@@ -86,9 +101,3 @@ def render_frame(
     image.plot().savefig(figure, format="png", dpi=120)
     write_atomically(data, buffer.getvalue(), force=force)
     write_atomically(out, figure.getvalue(), force=force)
-    if sys.stdout.isatty():
-        from rich.console import Console
-
-        Console().print(terminal_figure(image.range_m[0], width=48))
-    typer.echo(out)
-    typer.echo(data)

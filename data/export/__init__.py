@@ -72,10 +72,10 @@ def export_frames(
         As :func:`phasemark.data.write_atomically`.
     """
     if to not in EXPORTS:
-        raise UsageError(f"--to must be one of {', '.join(EXPORTS)}, got '{to}'")
+        raise UsageError(f"to=… must be one of {', '.join(EXPORTS)}, got '{to}'")
     write, is_folder, quantities = EXPORTS[to]
     if quantity is not None and quantity not in quantities:
-        raise UsageError(f"--quantity must be {' or '.join(quantities)} for {to}, got '{quantity}'")
+        raise UsageError(f"quantity=… must be {' or '.join(quantities)} for {to}, got '{quantity}'")
     path = Path(path)
     refuse_inputs([path], [frames.path])
     if is_folder:

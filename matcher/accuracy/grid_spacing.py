@@ -121,7 +121,7 @@ def grid_loss(bank: Bank, n: int, *, seed: int = 0, workers: int | None = None) 
         `n` is not positive, or the bank's grid has no spacing.
     """
     if n < 1:
-        raise UsageError(f"--population must be at least 1, got {n}")
+        raise UsageError(f"n=… must be at least 1, got {n}")
     if len(bank.distance_m) < 2 or len(bank.delta_rad) < 2:
         raise UsageError(f"{bank.path}: has one distance or one angle only: there is no spacing to test")
     methods = {"nearest": Matcher(bank, "nearest")}

@@ -326,11 +326,11 @@ def calibrate(
     quantity: ResidualKind = ("phasors" if has_light and not recorded else "ranges") if on == "auto" else on
     names = (ALL_NAMES if moving else NAMES) if free is None else check_names(free, "'free'")
     if "delay" in names and not moving:
-        raise UsageError("the delay takes a moving camera: give --moving, and time stamps of frames and poses")
+        raise UsageError("the delay takes a moving camera: give moving=True, and time stamps of frames and poses")
     if recorded:
         if "albedo" in names and free is not None:
             raise UsageError(
-                "the albedo cannot be free for a moving camera or with offsets of zones: give --fix albedo"
+                "the albedo cannot be free for a moving camera or with offsets of zones: give fixed=albedo"
             )
         names = tuple(name for name in names if name != "albedo")
     lit = quantity == "phasors" or background is not None or poses.wall_m is not None
@@ -340,9 +340,11 @@ def calibrate(
     names = tuple(name for name in names if name not in kept)
     assumed = start or Mounting.of_sensor(sensor, albedo)
     z = sensor.quantity == "z" if reports_z is None else reports_z
+    rendered = counter(progress, _USUAL_RENDERINGS)
     if recorded:
-        whole = _Job(mesh, background, assumed, names, z, zones is not False and sensor.kind == "direct", workers)
-        return _from_recording(whole, frames, poses, moving, counter(progress, _USUAL_RENDERINGS))
+        with_zones = zones is not False and sensor.kind == "direct"
+        whole = _Job(mesh, background, assumed, names, z, with_zones, workers, rendered)
+        return _from_recording(whole, frames, poses, moving)
     frames = _without_zones(frames)
     _check(frames, poses, names, lit)
     evidence = Evidence.from_frames(frames, quantity)
@@ -354,7 +356,7 @@ def calibrate(
         background=background,
         reports_z=z,
         workers=workers,
-        rendered=counter(progress, _USUAL_RENDERINGS),
+        rendered=rendered,
     )
     _check_view(model, evidence, assumed)
     edges = model.has_background or not _returns_beside(model, evidence, assumed)
@@ -383,7 +385,7 @@ def calibrate(
     doubts = doubts_about(place.theta, assumed.vector, names, held_out)
     cause = ""
     if doubts:
-        job = _Job(mesh, background, assumed, tuple(n for n in names if n != "albedo"), z, False, workers)
+        job = _Job(mesh, background, assumed, tuple(n for n in names if n != "albedo"), z, False, workers, rendered)
         cause = _cause(job, frames, poses, edges)
     return replace(found, doubts=tuple(doubts), cause=cause, held_out_m=held_out)
 
@@ -422,6 +424,8 @@ class _Job:
     reports_z: bool
     zones: bool
     workers: int
+    rendered: Callable[[], None]
+    """Called each time all poses have been rendered."""
 
 
 def _without_zones(frames: FilteredFrames) -> FilteredFrames:
@@ -488,7 +492,6 @@ def _recording(
     poses: KnownPoses,
     track: PoseTrack | None,
     edges: bool | None,
-    rendered: Callable[[], None] = lambda: None,
 ) -> Recording:
     """Set up the calibration of frames, one for each pose or by time."""
     stamps = frames.time_s
@@ -501,7 +504,7 @@ def _recording(
         background=job.background,
         reports_z=job.reports_z,
         workers=job.workers,
-        rendered=rendered,
+        rendered=job.rendered,
         track=track,
         stamp_s=stamps if moving else None,
     )
@@ -523,9 +526,7 @@ def _poses_at(track: PoseTrack, times: NDArray[np.float64]) -> KnownPoses:
     return KnownPoses(distance, delta, bearing, height, place=place, time_s=times)
 
 
-def _from_recording(
-    job: _Job, frames: FilteredFrames, poses: KnownPoses, moving: bool, rendered: Callable[[], None]
-) -> Calibration:
+def _from_recording(job: _Job, frames: FilteredFrames, poses: KnownPoses, moving: bool) -> Calibration:
     """Calibrate on many poses, by time or one for each frame."""
     notes: list[str] = []
     track = None
@@ -539,7 +540,7 @@ def _from_recording(
         poses = _poses_at(track, frames.time_s + job.assumed.delay_s)
     else:
         _check(frames, poses, job.names, True)
-    recording = _recording(job, frames, poses, track, None, rendered)
+    recording = _recording(job, frames, poses, track, None)
     if not moving:
         _check_view(recording.model, recording.evidence, job.assumed)
     _check_ranges(recording, job.assumed)
@@ -550,7 +551,7 @@ def _from_recording(
     if "delay" in job.names and std[job.names.index("delay")] > _DELAY_UNKNOWN_S:
         raise UsageError(
             f"the delay cannot be told from this recording (± {1e3 * std[job.names.index('delay')]:.0f} ms): turn and"
-            " approach faster, or state it with --delay-ms and give --fix delay"
+            " approach faster, or state it with Mounting(delay_s=…) and give fixed=delay"
         )
     untold = [
         name for name, one in zip(job.names, std, strict=True)
@@ -709,7 +710,7 @@ def _cause(job: _Job, frames: FilteredFrames, poses: KnownPoses, edges: bool, tr
         other = replace(job, reports_z=not job.reports_z)
         return (
             misfit(other, replace(frames, range_m=changed), poses, track)[0],
-            f"the numbers are likely {right}, not {wrong}: give --quantity {right}",
+            f"the numbers are likely {right}, not {wrong}: give quantity={right}",
         )
 
     def free_delay() -> tuple[float, str]:
@@ -730,7 +731,7 @@ def _cause(job: _Job, frames: FilteredFrames, poses: KnownPoses, edges: bool, tr
 
     def flipped() -> tuple[float, str]:
         arrays = {name: getattr(frames, name)[:, :, ::-1] for name in ("range_m", "std_m", "state", "n_effective")}
-        return misfit(job, replace(frames, **arrays), poses, track)[0], "images are likely mirrored: give --flip-h"
+        return misfit(job, replace(frames, **arrays), poses, track)[0], "images are likely mirrored: give flip_h=True"
 
     alternatives: list[tuple[str, Callable[[], tuple[float, str]]]] = [
         ("quantity", other_quantity), ("mirror", mirrored), ("flip", flipped),
@@ -885,8 +886,7 @@ def _concluded(
         notes.append(
             "With exact poses the residuals are more than noise. The poses were taken to be uncertain, by what the"
             f" residuals say: {1e3 * estimated.position_m:.2g} mm in place, {math.degrees(estimated.heading_rad):.2g}°"
-            f" in heading, {math.degrees(estimated.delta_rad):.2g}° in δ (state yours with --position-std,"
-            " --heading-std and --delta-std)."
+            f" in heading, {math.degrees(estimated.delta_rad):.2g}° in δ (state yours with pose_std=…)."
         )
     if dof > 0 and p_value < _FALSE_ALARM:
         excess = place.cost / expected
@@ -904,7 +904,7 @@ def _concluded(
         notes += odd_pose_notes(poses, pose_chi2 / np.maximum(pose_residuals, 1))
     if not edges:
         notes.append(
-            "Something returns beside the landmark and no --wall, --floor or wall_m says what: pixels at the landmark's"
+            "Something returns beside the landmark and no background=… or wall_m says what: pixels at the landmark's"
             " edges were left out, which tell most."
         )
     unseen = int((pose_residuals == 0).sum())

@@ -15,6 +15,7 @@ import typer
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
+from phasemark.data.commands.flags import in_flags
 from phasemark.data.commands.inputs import background_of, class_mesh, note_too_far, open_any_bank, read_sensor
 from phasemark.data.commands.options import (
     Floor,
@@ -134,16 +135,10 @@ def calibrate_camera(
     background = background_of(wall, floor)
     mesh, base, base_name = _calibration_target(landmark, class_name, sensor)
     known = read_poses(poses, landmark_xy_m=landmark_xy, landmark_yaw_rad=math.radians(landmark_yaw))
-    furthest_m = float(known.distance_m.max()) if len(known.distance_m) else None
-    note_too_far(base, {f"{poses}: the landmark": furthest_m, "--wall": wall})
+    note_too_far(base, {f"{poses}: the landmark": max(known.distance_m.tolist(), default=None), "--wall": wall})
     filtered = _filtered([reading.read(path, base) for path in frames], known, on, moving)
-    fixed = [] if fix is None else _names(fix)
-    if delay_ms is not None:
-        if not moving:
-            raise UsageError("--delay-ms takes --moving: still poses have no delay")
-        fixed.append("delay")
-    bright = float(mesh.metadata.get("albedo", 0.8)) if albedo is None else albedo
-    start = _start(base, bright, height, bearing, delay_ms)
+    fixed = _fixed_names(fix, delay_ms, moving)
+    start = _start(base, _albedo(mesh, albedo), height, bearing, delay_ms)
     with LongWork("rendering poses") as progress:
         found = calibrate(
             mesh,
@@ -161,6 +156,7 @@ def calibrate_camera(
             workers=workers or min(processors(), 4),
             progress=progress,
         )
+    found = replace(found, notes=tuple(map(in_flags, found.notes)), cause=in_flags(found.cause))
     _write_calibration(found, out, figure, base_name, force)
     if as_json:
         echo_json({"file": str(out), "picture": str(figure), **calibration_dict(found)})
@@ -202,14 +198,30 @@ def _filtered(
     return kalman_filter(measured[0].each_a_position())
 
 
+def _fixed_names(fix: str | None, delay_ms: float | None, moving: bool) -> list[str]:
+    """Return the names of what is not estimated; a delay that is given is one of them."""
+    fixed = [] if fix is None else _names(fix)
+    if delay_ms is None:
+        return fixed
+    if not moving:
+        raise UsageError("--delay-ms takes --moving: still poses have no delay")
+    return [*fixed, "delay"]
+
+
+def _albedo(mesh: Trimesh, stated: float | None) -> float:
+    """Return the albedo that was stated, or that of the mesh."""
+    albedo = float(mesh.metadata.get("albedo", 0.8)) if stated is None else stated
+    if not 0 < albedo <= 1:
+        raise UsageError(f"--albedo must be in (0, 1], got {albedo:g}")
+    return albedo
+
+
 def _start(
     base: Sensor, albedo: float, height: float | None, bearing_deg: float | None, delay_ms: float | None
 ) -> Mounting:
     """Return the mounting as it is thought to be."""
     from phasemark.matcher.calibration.mounting_model import Mounting
 
-    if not 0 < albedo <= 1:
-        raise UsageError(f"--albedo must be in (0, 1], got {albedo:g}")
     start = Mounting.of_sensor(base, albedo)
     if height is not None:
         start = replace(start, height_m=height)

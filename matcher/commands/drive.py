@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -55,6 +56,13 @@ def drive_robot(
     if as_json:
         echo_json({"files": [str(path) for path in files], **facts})
         return
+    _echo_drive(facts)
+    for path in files:
+        typer.echo(path)
+
+
+def _echo_drive(facts: Mapping[str, Any]) -> None:
+    """Print the errors of a drive with its odometry alone and with corrections."""
     echo_table(
         ("error", "at the end", "largest", "heading at the end", "largest"),
         (
@@ -69,5 +77,3 @@ def drive_robot(
         ),
     )
     typer.echo(f"{facts['way_m']:.1f} m, {facts['corrections']} corrections at {facts['stops']} stops")
-    for path in files:
-        typer.echo(path)

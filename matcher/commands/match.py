@@ -104,7 +104,8 @@ class _Answers:
 
         self._search, self._place, self._results, self._landmarks = search, place, results, landmarks
         self._plots, self._moving = plots, moving
-        self._table, self.estimated = Table(), EstimateTable(search.parameters)
+        self._table: Table | None = None  # its columns are those of the first match
+        self.estimated = EstimateTable(search.parameters)
         self.answers: list[dict[str, Any]] = []  # all of them only for --json, whose answers are one list
         self.drawn: dict[int, tuple[FilteredFrames, Match]] = {}
         self._refused: tuple[int, FilteredFrames] | None = None
@@ -147,7 +148,9 @@ class _Answers:
             for k, answer in enumerate(answers, start):
                 typer.echo(json.dumps({"index": k, **answer}, ensure_ascii=False, allow_nan=False))
         else:
-            self._table.echo(match_rows(answers, start, self._moving))
+            rows = match_rows(answers, start, self._moving)
+            self._table = self._table or Table(list(rows[0]))
+            self._table.echo([list(row.values()) for row in rows])
 
     def diagnose(self, matcher: Matcher, reading: FrameReading) -> None:
         """Say which setting would make the first refused position fit."""

@@ -371,7 +371,7 @@ def refuse_programs(plan: SweepPlan, trusted: Collection[str], where: str) -> No
         if method.is_program and method.method not in trusted:
             raise UsageError(
                 f"{where}: the method '{method.name}' would run the program '{method.method}': name it with"
-                f" --matcher {method.method}, or give --trust-plan if you trust whoever wrote the plan"
+                f" trusted={method.method}, or leave refuse_programs() out if you trust whoever wrote the plan"
             )
 
 

@@ -163,7 +163,7 @@ def read_sweep(folder: str | os.PathLike[str]) -> tuple[SweepPlan, SweepTrials]:
     while _round_path(folder, n).is_file():
         n += 1
     if n == 0:
-        raise InputFileError(f"{folder}: its sweep is not finished: 'phasemark sweep run --resume' goes on")
+        raise InputFileError(f"{folder}: its sweep is not finished: run_sweep(resume=True) goes on")
     return plan, _read(plan, folder, n)
 
 
@@ -227,11 +227,11 @@ def _begin(plan: SweepPlan, ours: OwnedFiles, *, resume: bool, force: bool) -> N
     old = _stored_plan(folder) if _PLAN in ours.names else None
     if old is not None:
         if not resume:
-            raise OutputExistsError(f"{folder}: holds a sweep: --resume goes on with it, --force starts over")
+            raise OutputExistsError(f"{folder}: holds a sweep: resume=True goes on with it, force=True starts over")
         changes = difference(old.model_dump(mode="json"), plan.model_dump(mode="json"))
         if changes:
             raise OutputExistsError(
-                f"{folder}: was begun with another plan ({'; '.join(changes[:4])}): --force starts over"
+                f"{folder}: was begun with another plan ({'; '.join(changes[:4])}): force=True starts over"
             )
     ours.claim(*(path.name for path in sweep_outputs(folder)))
     if old is None:

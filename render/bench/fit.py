@@ -950,7 +950,7 @@ def _noise_of_electrons(
     if signal <= 2 * signal_error:
         raise UsageError(
             f"the frames do not show the signal: {what} rises by {with_error(signal, signal_error)} electrons a "
-            "unit of light; are amplitude and intensity in electrons (--amplitude-unit)?"
+            "unit of light; are amplitude and intensity in electrons (amplitude_unit=…)?"
         )
     contrast = modulated / signal
     contrast_error = contrast * math.hypot(modulated_error / modulated, signal_error / signal)
