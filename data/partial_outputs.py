@@ -327,7 +327,9 @@ class MergeJob:
         return [np.concatenate(values) for values in found]
 
 
-def estimate(plan: BankPlan | FramePlan, *, workers: int = 1, trial_seconds: float | None = None) -> dict[str, Any]:
+def estimate_build(
+    plan: BankPlan | FramePlan, *, workers: int = 1, trial_seconds: float | None = None
+) -> dict[str, Any]:
     """Return how large a bank or frame set would be and about how long it would take, from a small trial.
 
     Parameters

@@ -128,7 +128,7 @@ def _fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     def fail(name_or_file: str) -> Sensor:
         raise error
 
-    monkeypatch.setattr("phasemark.data.commands.sensor.load_sensor", fail)
+    monkeypatch.setattr("phasemark.data.commands.sensor.read_sensor", fail)
 
 
 def test_termination_unwinds_and_exits_with_143() -> None:
@@ -144,7 +144,7 @@ def test_termination_unwinds_and_exits_with_143() -> None:
             finally:
                 print("cleaned up")
 
-        sensor.load_sensor = wait
+        sensor.read_sensor = wait
         sys.exit(cli.main(["sensor", "show", "ideal"]))
     """
     command = [sys.executable, "-c", textwrap.dedent(program)]

@@ -15,7 +15,7 @@ from phasemark.cli import main
 from phasemark.data.commands import console
 from phasemark.data.files.folder_marker import MARKER
 from phasemark.matcher.plan_kinds import plan_schema
-from phasemark.matcher.sweep.plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
+from phasemark.matcher.sweep.plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, read_sweep_plan
 from phasemark.matcher.sweep.report import write_report
 from phasemark.matcher.sweep.run import read_sweep, run_sweep, sweep_folder
 
@@ -257,9 +257,9 @@ def test_the_schema_names_every_axis():
 
 def test_shipped_plans_are_plans():
     for name in SHIPPED_SWEEPS:
-        assert load_sweep(name).name == name
+        assert read_sweep_plan(name).name == name
     # 4 classes and 2 strangers, at 3 distances and 3 angles
-    assert len(load_sweep("paper").conditions()) == 36 + 18
+    assert len(read_sweep_plan("paper").conditions()) == 36 + 18
 
 
 FOREIGN = (

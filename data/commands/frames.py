@@ -16,9 +16,9 @@ from phasemark.data.commands.command import Without
 from phasemark.data.commands.console import LongWork, echo_facts, echo_json, readable
 from phasemark.data.commands.inputs import (
     background_of,
-    load_class_or_mesh,
-    load_sensor,
     open_frame_set,
+    read_class_or_mesh,
+    read_sensor,
     refuse_unless_one,
 )
 from phasemark.data.commands.options import (
@@ -136,7 +136,7 @@ def frames_import(
     if out.suffix.lower() != ".npz":
         raise UsageError(f"the output must be a .npz file, got '{out}'")
     refuse_existing([out], force)
-    frames = reading.read(file, load_sensor(sensor), topic=topic)
+    frames = reading.read(file, read_sensor(sensor), topic=topic)
     typer.echo(write_measured(frames, out, force=force))
 
 
@@ -186,10 +186,10 @@ def frames_simulate(
         if value is not None and not moving:
             raise UsageError(f"{option} goes with --moving: a camera at rest keeps its view")
     recording_format(out)
-    camera = load_sensor(sensor)
+    camera = read_sensor(sensor)
     _refuse_many_frames(n_frames, camera)
     refuse_unwritable_files([out], force)
-    name, mesh = load_class_or_mesh(class_name, mesh_file, mesh_reading)
+    name, mesh = read_class_or_mesh(class_name, mesh_file, mesh_reading)
     last = (
         (0.8 * distance if to_distance is None else to_distance, delta + 40.0 if to_delta is None else to_delta)
         if moving
@@ -236,7 +236,7 @@ def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
 def frames_show(
     *,
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, or measured frames.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The figure, .png.")],
     index: Annotated[int, typer.Option("--index", min=0, help="Number of the frame.")] = 0,
     sensor: SensorName = "pmd-16x16",
     reading: Annotated[FrameReading, Without("invalid_means", "flip_h", "flip_v", "rotate")],
@@ -248,19 +248,19 @@ def frames_show(
     from phasemark.data import is_frame_set, write_atomically
 
     if out.suffix.lower() != ".png":
-        raise UsageError(f"the picture must be a .png file, got '{out}'")
+        raise UsageError(f"the figure must be a .png file, got '{out}'")
     refuse_existing([out], force)
     if is_frame_set(frames):
         with open_frame_set(frames) as opened:
             _refuse_index(index, len(opened))
             figure = opened.frames([index]).plot()
     else:
-        measured = reading.read(frames, load_sensor(sensor))
+        measured = reading.read(frames, read_sensor(sensor))
         _refuse_index(index, len(measured) * measured.n_frames)
         figure = measured.plot(*divmod(index, measured.n_frames))
-    picture = bytes_io.BytesIO()
-    figure.savefig(picture, format="png", dpi=120)
-    typer.echo(write_atomically(out, picture.getvalue(), force=force))
+    buffer = bytes_io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    typer.echo(write_atomically(out, buffer.getvalue(), force=force))
 
 
 def _refuse_index(index: int, n: int) -> None:

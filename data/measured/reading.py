@@ -27,7 +27,7 @@ from phasemark.inputs import opened
 from phasemark.render import Frames, Sensor
 
 Unit = Literal["m", "cm", "mm"]
-Quantity = Literal["range", "z"]
+RangeOrZ = Literal["range", "z"]
 InvalidMeans = Literal["missing", "no-return"]
 
 METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -65,7 +65,7 @@ def read_frames(
     *,
     sensor: Sensor,
     unit: Unit | None = None,
-    quantity: Quantity | None = None,
+    quantity: RangeOrZ | None = None,
     invalid_means: InvalidMeans = "missing",
     valid_status: Collection[int] | None = None,
     flip_h: bool = False,

@@ -19,15 +19,17 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.data.progress import Progress, counter
+from phasemark.matcher.agreement import MIN_RETURNS
 from phasemark.matcher.calibration.judgement import doubts_about, likely_cause
 from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
-from phasemark.matcher.calibration.mounting_fit import Fit, Knowledge, Place, inverse
+from phasemark.matcher.calibration.mounting_fit import Fit, Knowledge, Place
 from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel, Mounting
 from phasemark.matcher.calibration.notes import advice, named, observability_notes, odd_pose_notes
 from phasemark.matcher.calibration.pose_errors import estimate_pose_std
 from phasemark.matcher.calibration.pose_track import LONGEST_GAP_S, PoseTrack
 from phasemark.matcher.calibration.recording_fit import Recorded, Recording, prior_std
 from phasemark.matcher.calibration.result import Calibration
+from phasemark.matcher.chi_squared import p_values_of
 from phasemark.matcher.filters.filtered_frames import (
     FilteredFrames,
     PixelState,
@@ -36,8 +38,8 @@ from phasemark.matcher.filters.filtered_frames import (
     phasor_mean,
 )
 from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
-from phasemark.matcher.likelihood.estimator import MIN_RETURNS, p_values_of
-from phasemark.matcher.likelihood.residuals import Evidence, Quantity
+from phasemark.matcher.information import covariance_of
+from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.render import Background, Frames, Sensor, wrap_difference_m, wrap_range_m
 from phasemark.render.sensor.sensor_file import rounded
 
@@ -103,7 +105,7 @@ def check_names(names: Sequence[str], what: str) -> tuple[str, ...]:
     return tuple(name for name in ALL_NAMES if name in spelled)
 
 
-def filter_poses(frames: Sequence[Frames], on: Quantity | Literal["auto"] = "auto") -> FilteredFrames:
+def filter_poses(frames: Sequence[Frames], on: ResidualKind | Literal["auto"] = "auto") -> FilteredFrames:
     """Filter the frames of each pose: the mean phasor where phasors will be compared, else the Kalman filter.
 
     Parameters
@@ -162,7 +164,7 @@ def calibrate(
     fixed: Sequence[str] = (),
     start: Mounting | None = None,
     albedo: float = 0.8,
-    on: Quantity | Literal["auto"] = "auto",
+    on: ResidualKind | Literal["auto"] = "auto",
     background: Background | None = None,
     pose_std: PoseStd | None = None,
     reports_z: bool | None = None,
@@ -237,7 +239,7 @@ def calibrate(
         raise UsageError("'on' must be auto or ranges for a moving camera or offsets of zones, got 'phasors'")
     if zones and sensor.kind != "direct":
         raise UsageError("offsets of zones belong to sensors of 'kind' = 'direct'")
-    quantity: Quantity = ("phasors" if has_light and not recorded else "ranges") if on == "auto" else on
+    quantity: ResidualKind = ("phasors" if has_light and not recorded else "ranges") if on == "auto" else on
     names = (ALL_NAMES if moving else NAMES) if free is None else check_names(free, "'free'")
     if "delay" in names and not moving:
         raise UsageError("the delay takes a moving camera: give moving=True, and time stamps of frames and poses")
@@ -319,7 +321,7 @@ def _leave_one_out(fit: Fit, place: Place, found: Calibration) -> tuple[float, f
     after = found.residual_m.reshape(len(by_pose), -1).copy()
     before = found.residual_before_m.reshape(after.shape)
     for k, gradient in enumerate(by_pose):
-        step = inverse(linear.information - own[k], fit.scale) @ gradient
+        step = covariance_of(linear.information - own[k], fit.scale, weak="wide") @ gradient
         after[k] += np.einsum("pr,p->r", slope_m[k], np.clip(step, -10 * fit.scale, 10 * fit.scale))
     both = np.isfinite(before) & np.isfinite(after)
     if not both.any():
@@ -749,7 +751,7 @@ def _check_pixels(use: NDArray[np.bool_], poses: KnownPoses, evidence: Evidence)
 
 
 def _check_observable(information: NDArray[np.float64], fit: Fit, poses: KnownPoses) -> None:
-    covariance = inverse(information, fit.scale)
+    covariance = covariance_of(information, fit.scale, weak="wide")
     scaled = covariance / np.outer(fit.scale, fit.scale)
     values, vectors = np.linalg.eigh(scaled)
     if not math.sqrt(float(values[-1])) > _UNKNOWN:
@@ -788,7 +790,7 @@ def _concluded(
     pose_residuals = place.use.sum(axis=1) * evidence.per_pixel
     pose_chi2 = (place.residual**2).sum(axis=1)
     dof, p_value = _degrees_of_freedom(fit, place), _fit_probability(fit, place, frames)
-    covariance = inverse(knowledge.information, fit.scale)
+    covariance = covariance_of(knowledge.information, fit.scale, weak="wide")
     expected, source = float(max(dof, 1)), "the noise law"
     if frames.std_from_scatter:
         # weights that were estimated from ν + 1 frames are too large in the mean by ν / (ν − 2), and scatter themselves
@@ -805,7 +807,7 @@ def _concluded(
     if dof > 0 and p_value < _FALSE_ALARM:
         excess = place.cost / expected
         if len(poses) >= _POSES_FOR_SANDWICH * len(fit.free):
-            plain = inverse(knowledge.information, fit.scale)
+            plain = covariance_of(knowledge.information, fit.scale, weak="wide")
             covariance = plain @ knowledge.scatter @ plain * len(poses) / (len(poses) - len(fit.free))
             source = "the scatter of the poses (sandwich), for the residuals are more than noise"
         else:

@@ -1,4 +1,4 @@
-"""A calibration as a picture of its residuals."""
+"""A calibration as a figure of its residuals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from phasemark.render.figures import draw_difference
 _SIGMAS, _BINS = 5.0, 50
 
 
-def residual_picture(found: Calibration) -> Figure:
+def residual_figure(found: Calibration) -> Figure:
     """Draw what the calibration leaves: residuals by pixel before and after, by pose, and against the normal law.
 
     Parameters

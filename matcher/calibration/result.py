@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from phasemark.matcher.calibration.known_poses import POSE_UNITS, KnownPoses
 from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, Mounting
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.render import Sensor
 from phasemark.render.integral.rounding import error_text, value_and_error
 from phasemark.render.sensor.sensor_file import sensor_toml
@@ -87,7 +87,7 @@ class Calibration:
     chi2: float
     dof: int
     p_value: float
-    on: Quantity
+    on: ResidualKind
     poses: KnownPoses
     pose_shift: NDArray[np.float64]
     pose_chi2: NDArray[np.float64]

@@ -20,7 +20,7 @@ def drive_robot(
     plan_file: Annotated[
         Path | None, typer.Argument(metavar="[PLAN]", help="A plan (.toml); without it a tour of 20 m.")
     ] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for tables, summary, picture and animation.")] = Path(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for tables, summary, figure and animation.")] = Path(
         "out/drive"
     ),
     seed: Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")] = 2005,
@@ -36,7 +36,7 @@ def drive_robot(
         OUTPUTS,
         default_drive,
         example_drive,
-        load_drive_plan,
+        read_drive_plan,
         run_drive,
         write_drive,
     )
@@ -44,7 +44,7 @@ def drive_robot(
     if example:
         typer.echo(example_drive(), nl=False)
         return
-    plan = default_drive() if plan_file is None else load_drive_plan(plan_file)
+    plan = default_drive() if plan_file is None else read_drive_plan(plan_file)
     note_plan_too_far(plan)
     with output_folder(out, "drive", OUTPUTS, force, plan):
         with LongWork("driving, cm") as progress:

@@ -81,7 +81,7 @@ def match_frames(
         if results.estimates is not None:
             write_atomically(results.estimates, printed.estimated.to_csv().encode(), force=results.force)
         for k, path in plots.items():
-            _save_match_picture(path, *printed.drawn[k], opened, search.background, results.force)
+            _save_match_figure(path, *printed.drawn[k], opened, search.background, results.force)
     if not (results.as_json or results.as_jsonl):
         for path in results.files(plots):
             typer.echo(path)
@@ -194,15 +194,15 @@ def _note_motion(measured: Frames, file: Path) -> None:
         )
 
 
-def _save_match_picture(
+def _save_match_figure(
     path: Path, filtered: FilteredFrames, match: Match, bank: Bank, background: Background | None, force: bool
 ) -> None:
     """Draw one position."""
     import io as bytes_io
 
     from phasemark.data import write_atomically
-    from phasemark.matcher.figures import match_picture
+    from phasemark.matcher.figures import match_figure
 
     buffer = bytes_io.BytesIO()
-    match_picture(filtered, match, bank, background).savefig(buffer, format="png", dpi=120)
+    match_figure(filtered, match, bank, background).savefig(buffer, format="png", dpi=120)
     write_atomically(path, buffer.getvalue(), force=force)

@@ -45,11 +45,11 @@ def sweep_run(
     force: Annotated[bool, typer.Option("--force", help="Start over where the folder holds a sweep.")] = False,
 ) -> None:
     """Run a sweep and write its tables and report."""
-    from phasemark.matcher.sweep.plan import Method, SweepPlan, load_sweep, refuse_programs
+    from phasemark.matcher.sweep.plan import Method, SweepPlan, read_sweep_plan, refuse_programs
     from phasemark.matcher.sweep.report import write_report
     from phasemark.matcher.sweep.run import run_sweep, sweep_outputs
 
-    loaded = load_sweep(plan)
+    loaded = read_sweep_plan(plan)
     changes: dict[str, Any] = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     if not trust_plan:
         refuse_programs(loaded, () if matcher is None else (matcher,), plan)

@@ -1,4 +1,4 @@
-"""What a drive leaves behind: tables of the path and of the stops, a summary, a picture and an animation."""
+"""What a drive leaves behind: tables of the path and of the stops, a summary, a figure and an animation."""
 
 from __future__ import annotations
 
@@ -87,16 +87,16 @@ def write_drive(drive: Drive, folder: Path, *, force: bool = False) -> list[Path
     OutputExistsError, StorageError
         A file cannot be written.
     """
-    from phasemark.matcher.drive.figures import drive_animation, drive_picture  # matplotlib is slow to import
+    from phasemark.matcher.drive.figures import drive_animation, drive_figure  # matplotlib is slow to import
 
-    picture = io.BytesIO()
-    drive_picture(drive).savefig(picture, format="png", dpi=130)
+    figure = io.BytesIO()
+    drive_figure(drive).savefig(figure, format="png", dpi=130)
     text = json.dumps(drive.as_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     contents = (
         path_csv(drive).encode(),
         stops_csv(drive).encode(),
         text.encode(),
-        picture.getvalue(),
+        figure.getvalue(),
         drive_animation(drive),
     )
     return [

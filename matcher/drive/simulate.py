@@ -15,7 +15,7 @@ from phasemark.data import Bank, BankPlan, build_bank
 from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
-from phasemark.matcher.accuracy.cramer_rao import cramer_rao, nees
+from phasemark.matcher.accuracy.cramer_rao import cramer_rao
 from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
 from phasemark.matcher.drive.odometry import OdometryModel, World, moved
 from phasemark.matcher.drive.plan import DrivePlan
@@ -24,6 +24,7 @@ from phasemark.matcher.filters.filtered_frames import kalman_filter
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.position.landmark_map import MappedLandmark
+from phasemark.matcher.statistics import nees
 from phasemark.render import Background, Renderer, Sensor, Views, capture
 
 FREE = ("distance_m", "delta_rad", "bearing_rad")
@@ -150,7 +151,7 @@ def pose_error(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> NDA
 
 
 @dataclass(frozen=True, eq=False)
-class Equipment:
+class RobotEquipment:
     """What a robot brings along: camera, bank, matcher, and a model of each class.
 
     One set serves any number of drives with the same classes and camera.
@@ -167,7 +168,7 @@ class Equipment:
     renderers: dict[str, Renderer] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, plan: DrivePlan, workers: int | None = None) -> Equipment:
+    def of(cls, plan: DrivePlan, workers: int | None = None) -> RobotEquipment:
         """Build the bank in memory, over the distances where the robot stops and a margin.
 
         Parameters
@@ -210,7 +211,7 @@ def run_drive(
     plan: DrivePlan,
     *,
     seed: int = 2005,
-    equipment: Equipment | None = None,
+    equipment: RobotEquipment | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Drive:
@@ -229,7 +230,7 @@ def run_drive(
     plan : DrivePlan
     seed : int
         Of everything random.
-    equipment : Equipment, optional
+    equipment : RobotEquipment, optional
         From an earlier drive; built if not given.
     workers : int, optional
         Threads; None: one for each processor.
@@ -246,13 +247,13 @@ def run_drive(
         A class or the camera is unknown, or the robot lost its path.
     """
     rng = stream(seed, "drive", 0)
-    return _Driver(plan, seed, equipment or Equipment.of(plan, workers), rng).drive(progress)
+    return _Driver(plan, seed, equipment or RobotEquipment.of(plan, workers), rng).drive(progress)
 
 
 class _Driver:
     """One drive as it goes on."""
 
-    def __init__(self, plan: DrivePlan, seed: int, equipment: Equipment, rng: np.random.Generator) -> None:
+    def __init__(self, plan: DrivePlan, seed: int, equipment: RobotEquipment, rng: np.random.Generator) -> None:
         self.plan, self.seed, self.equipment, self.rng = plan, seed, equipment, rng
         self.path = Path(plan.path.waypoints_m)
         start = np.array([*plan.path.waypoints_m[0], self.path.start_heading_rad])

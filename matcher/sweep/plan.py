@@ -375,7 +375,7 @@ def refuse_programs(plan: SweepPlan, trusted: Collection[str], where: str) -> No
             )
 
 
-def load_sweep(name_or_file: str | os.PathLike[str]) -> SweepPlan:
+def read_sweep_plan(name_or_file: str | os.PathLike[str]) -> SweepPlan:
     """Return a shipped plan, or read one from a TOML file.
 
     Parameters

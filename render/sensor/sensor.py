@@ -705,6 +705,16 @@ class Sensor(BaseModel):
         return 2 * self.read_noise_e**2 + self.code_e**2 / 6
 
     @property
+    def upper_rows(self) -> tuple[int, int]:
+        """First and stop of the image rows above the middle line, which see the upper part of a landmark."""
+        return 0, self.rows // 2
+
+    @property
+    def lower_rows(self) -> tuple[int, int]:
+        """First and stop of the image rows below the middle line; of an odd number the middle row is among them."""
+        return self.rows // 2, self.rows
+
+    @property
     def metres_per_radian(self) -> float:
         """Range per radian of phase, c / 4πf."""
         return SPEED_OF_LIGHT_M_S / (4 * math.pi * self.modulation_hz)
