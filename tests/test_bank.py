@@ -499,13 +499,13 @@ def test_sparse_memory_is_a_file(tmp_path):
             data = rng.bytes(int(size))
             for target in (memory, file):
                 target.seek(int(at))
-                assert target.write(data) == size
+                assert target.write(memoryview(data)) == size
         for at, size in zip(rng.integers(0, 700_000, 50), rng.integers(0, 200_000, 50), strict=True):
             answers = []
             for target in (memory, file):
                 buffer = bytearray(int(size))
                 target.seek(int(at))
-                answers.append((target.readinto(buffer), bytes(buffer)))
+                answers.append((target.readinto(memoryview(buffer)), bytes(buffer)))
             assert answers[0] == answers[1]
         for target in (memory, file):
             target.truncate(300_000)

@@ -2,6 +2,7 @@
 
 import math
 import time
+from typing import Any
 
 import h5py
 import numpy as np
@@ -14,7 +15,7 @@ from phasemark.render import Flag, Sensor, preset
 PMD = preset("pmd-16x16")
 SMALL = Sensor(rows=2, cols=3, half_angle_h_deg=30, half_angle_v_deg=20)
 IMAGE = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-STATED = {"unit": "m", "quantity": "range"}
+STATED: dict[str, Any] = {"unit": "m", "quantity": "range"}
 
 
 def csv_file(tmp_path, text):

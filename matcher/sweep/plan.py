@@ -341,7 +341,7 @@ class SweepPlan(ScenePlan):
             meshes=self.meshes,
             sensor=self.sensor,
             sensor_overrides=self.sensor_overrides,
-            distance_m=f"{low!r}:{high!r}:{method.bank_step[0]!r}",  # type: ignore[arg-type]  # a grid's text
+            distance_m=f"{low!r}:{high!r}:{method.bank_step[0]!r}",  # a grid's text
             model=method.bank_model,
         ).resolve()
         symmetry = common_symmetry([*plan.landmarks, *plan.meshes])
