@@ -317,12 +317,12 @@ def test_labelled_frames_go_through_a_data_loader_with_worker_processes(tmp_path
     assert "PyTorch: a batch of (32, 2, 16, 16), 4 classes in it" in done.stdout
 
 
-def test_without_xarray_the_example_says_what_to_install(tmp_path):
+def test_without_xarray_the_example_says_what_to_install(tmp_path, monkeypatch):
     for name in ("xarray", "torch"):  # as if they were not there
         (tmp_path / f"{name}.py").write_text("raise ImportError")
-    program = [sys.executable, "-W", "error", str(EXAMPLE.with_name("labelled_frames.py")), "--views", "8"]
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run(program, capture_output=True, text=True, cwd=tmp_path, env=environment)
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    done = run_example("labelled_frames.py", "--views", 8, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[:2] == [
         "xarray: not installed (pip install xarray h5netcdf)",
