@@ -47,7 +47,7 @@ def test_a_direct_sensor_measures_nothing_beyond_its_range_or_below_its_intensit
     assert not counts(far.phasor, far.intensity, DIRECT).any()
 
 
-def test_the_table_of_frame_against_model():
+def test_frame_and_model_disagree_where_the_table_says():
     yes, no = np.array([True]), np.array([False])
     assert disagrees(yes, no, no, no).all()  # a return where nothing can
     assert disagrees(no, yes, yes, yes).all()  # none where something must
