@@ -38,6 +38,7 @@ types: $(VENV)/.installed-test
 	mkdir -p .typing
 	ln -sfn .. .typing/phasemark
 	$(BIN)/mypy
+	$(BIN)/mypy --config-file tests/mypy.ini
 
 wheel-check: $(VENV)/.installed-test
 	$(BIN)/python .ci/wheel_check.py

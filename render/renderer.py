@@ -461,3 +461,19 @@ class _Sums:
         self.coverage = np.zeros(n)
         self.upper = np.zeros(n)
         self.state = np.zeros(shape, np.uint8)
+
+
+def background_image(background: Background, sensor: Sensor) -> PhasorImages:
+    """Return what a background alone returns, straight ahead.
+
+    Parameters
+    ----------
+    background : Background
+    sensor : Sensor
+
+    Returns
+    -------
+    PhasorImages
+        One image.
+    """
+    return Renderer(None, sensor).render(distance_m=1.0, background=background)

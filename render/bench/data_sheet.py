@@ -133,7 +133,7 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class SheetQuantity:
     """One number of a data sheet.
 
     Parameters
@@ -181,7 +181,7 @@ class Characterisation:
     reference_range_m : float
         Range of the flat fields whose range is of no account.
     comparisons : tuple of Comparison
-    quantities : tuple of Quantity
+    quantities : tuple of SheetQuantity
     maps : mapping of str to (rows, cols) float64
         Simulated patterns by name with unit; NaN where a pixel is dead or hot.
     defects : mapping of str to (rows, cols) bool
@@ -194,7 +194,7 @@ class Characterisation:
     n_frames: int
     reference_range_m: float
     comparisons: tuple[Comparison, ...]
-    quantities: tuple[Quantity, ...]
+    quantities: tuple[SheetQuantity, ...]
     maps: dict[str, _Float] = field(default_factory=dict)
     defects: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -203,7 +203,7 @@ class Characterisation:
         """Return the series of a figure; none if the sensor does not have it."""
         return tuple(one for one in self.comparisons if one.figure == figure)
 
-    def quantity(self, name: str) -> Quantity | None:
+    def quantity(self, name: str) -> SheetQuantity | None:
         """Return a number of the data sheet, or None if the sensor does not have it."""
         return next((one for one in self.quantities if one.name == name), None)
 
@@ -302,7 +302,7 @@ class _Part:
     """What one measurement adds to the whole."""
 
     comparisons: tuple[Comparison, ...] = ()
-    quantities: tuple[Quantity, ...] = ()
+    quantities: tuple[SheetQuantity, ...] = ()
     maps: dict[str, _Float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -397,14 +397,14 @@ def _photon_transfer(bench: _Bench) -> _Part:
         mean, np.array(predicted), variance, error, np.full(len(mean), 8 * bench.samples),
         compared, line, shot * line + floor * per_e**2,
     )  # fmt: skip
-    quantities: list[Quantity] = []
+    quantities: list[SheetQuantity] = []
     linear = compared & (mean <= _EMVA_LINEAR_SHARE * full * per_e)
     if linear.sum() >= 3:
         slope, offset, slope_error, offset_error = fit_line(mean[linear], variance[linear], error[linear])
         used_samples = int(points.samples[linear].sum())
         quantities.append(
-            Quantity(f"photon_transfer_slope_{unit}", f"photon-transfer slope ({unit}²/{unit})", shot, slope,
-                     slope_error, used_samples)
+            SheetQuantity(f"photon_transfer_slope_{unit}", f"photon-transfer slope ({unit}²/{unit})", shot, slope,
+                          slope_error, used_samples)
         )  # fmt: skip
         # the root of a variance that is compatible with 0 has the error of √(its error)
         noise = math.sqrt(max(offset, 0.0)) / per_e
@@ -412,8 +412,8 @@ def _photon_transfer(bench: _Bench) -> _Part:
             offset_error / (2 * noise * per_e**2) if noise > 0 else math.inf, math.sqrt(offset_error) / per_e
         )
         quantities.append(
-            Quantity("dark_noise_e", "noise floor of a tap, read noise and quantisation (e-)", math.sqrt(floor), noise,
-                     noise_error, used_samples)
+            SheetQuantity("dark_noise_e", "noise floor of a tap, read noise and quantisation (e-)", math.sqrt(floor),
+                          noise, noise_error, used_samples)
         )  # fmt: skip
     notes = () if linear.sum() >= 3 else ("Without noise that a converter can see there is no photon transfer to fit.",)
     return _Part((points,), tuple(quantities), notes=notes)
@@ -495,7 +495,7 @@ def _linearity(bench: _Bench) -> _Part:
     )  # fmt: skip
     # Between the points where the prediction is extreme: the noise's own extremes would always add to it.
     top, bottom = int(points.predicted.argmax()), int(points.predicted.argmin())
-    wiggling = Quantity(
+    wiggling = SheetQuantity(
         "wiggling_peak_to_peak_m", "error of the mean range, largest less smallest predicted point (m)",
         float(points.predicted[top] - points.predicted[bottom]),
         float(points.simulated[top] - points.simulated[bottom]),
@@ -533,13 +533,13 @@ def _patterns(bench: _Bench) -> _Part:
     prnu, prnu_error = _spatial_std((bright_image - dark_image) / step, (bright_noise + dark_noise) / step**2)
     range_std, range_std_error = _spatial_std(offset, float((error**2).mean()))
     quantities = (
-        Quantity("fixed_pattern_range_std_m", "range offset from pixel to pixel, standard deviation (m)",
-                 _spatial_std(truth, 0.0)[0], range_std, range_std_error, bench.samples),
-        Quantity("prnu_percent", "PRNU with the shading of stray light, standard deviation over taps (%)",
-                 100 * _spatial_std((true_bright - true_dark) / true_step, 0.0)[0], 100 * prnu, 100 * prnu_error,
-                 16 * bench.samples),
-        Quantity("dsnu_e", "DSNU, standard deviation over taps (e-)",
-                 _spatial_std(true_dark, 0.0)[0], dsnu, dsnu_error, 8 * bench.samples),
+        SheetQuantity("fixed_pattern_range_std_m", "range offset from pixel to pixel, standard deviation (m)",
+                      _spatial_std(truth, 0.0)[0], range_std, range_std_error, bench.samples),
+        SheetQuantity("prnu_percent", "PRNU with the shading of stray light, standard deviation over taps (%)",
+                      100 * _spatial_std((true_bright - true_dark) / true_step, 0.0)[0], 100 * prnu, 100 * prnu_error,
+                      16 * bench.samples),
+        SheetQuantity("dsnu_e", "DSNU, standard deviation over taps (e-)",
+                      _spatial_std(true_dark, 0.0)[0], dsnu, dsnu_error, 8 * bench.samples),
     )  # fmt: skip
     maps = {
         "range_offset_m": _image(offset, bench),
@@ -603,8 +603,8 @@ def _saturation(bench: _Bench) -> _Part:
         true_signal = _crossing(predicted_share, at, 0.0, top)
         signal, signal_error = _found_beside(points, at, true_signal)
         quantities.append(
-            Quantity(f"saturation_flags_{name}_e", f"signal at which {words} flagged as saturated (e-)",
-                     true_signal, signal, signal_error, bench.samples * len(signals))
+            SheetQuantity(f"saturation_flags_{name}_e", f"signal at which {words} flagged as saturated (e-)",
+                          true_signal, signal, signal_error, bench.samples * len(signals))
         )  # fmt: skip
     return _Part((points,), tuple(quantities))
 
@@ -680,7 +680,7 @@ def _threshold(bench: _Bench, albedo: float) -> _Part:
         np.zeros(len(distances), np.bool_), distances, np.array(predicted),
     )  # fmt: skip
     found, found_error = _found_beside(points, 0.5, middle)
-    return _Part((points,), (Quantity(name, title, middle, found, found_error, bench.samples * len(distances)),))
+    return _Part((points,), (SheetQuantity(name, title, middle, found, found_error, bench.samples * len(distances)),))
 
 
 def _return_probability(expected: ExpectedFlatField) -> _Float:
@@ -761,4 +761,4 @@ def _dropout(bench: _Bench, albedo: float) -> _Part:
     found, found_error = _found_beside(points, 0.5, edge)
     name = f"threshold_distance_albedo_{albedo:g}_m"
     title = f"distance at which it drops out, albedo {albedo:g} (m)"
-    return _Part((points,), (Quantity(name, title, edge, found, found_error, bench.samples * len(distances)),))
+    return _Part((points,), (SheetQuantity(name, title, edge, found, found_error, bench.samples * len(distances)),))

@@ -62,7 +62,7 @@ _Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Estimate:
+class FittedField:
     """One field of a fitted sensor.
 
     Parameters
@@ -95,7 +95,7 @@ class SensorFit:
     ----------
     sensor : Sensor
         The fitted camera.
-    estimates : dict of str to Estimate
+    estimates : dict of str to FittedField
         By the name of the sensor's field, in the order of its fields.
     notes : tuple of str
         Sentences on what could not be told apart, and on what is odd.
@@ -114,7 +114,7 @@ class SensorFit:
     """
 
     sensor: Sensor
-    estimates: dict[str, Estimate]
+    estimates: dict[str, FittedField]
     notes: tuple[str, ...]
     pixel_offset_m: _Float
     pixel_offset_std_error_m: _Float
@@ -228,7 +228,7 @@ def fit_sensor(
                 f"pixel's noise to {100 * _PIXEL_STD_ERROR:.0f} %"
             )
     notes: list[str] = []
-    estimates: dict[str, Estimate] = {}
+    estimates: dict[str, FittedField] = {}
     distance_std = _distance_std(distance_m, distance_std_m)
     data = _Data.of(frames, distance_m, distance_std, albedos, base).of_usable_boards(distance_m, notes)
     if assumed_albedo and base.kind == "phase":
@@ -545,7 +545,7 @@ def _range_error_m(phase: _Float, delay: float, harmonics: tuple[Harmonic, ...],
 
 
 def _fit_offsets(
-    data: _Data, base: Sensor, estimates: dict[str, Estimate], notes: list[str], widening: float
+    data: _Data, base: Sensor, estimates: dict[str, FittedField], notes: list[str], widening: float
 ) -> dict[str, Any]:
     """Fit the global offset, and wiggling if the distances allow it, to the mean error of each board."""
     good = data.good
@@ -586,7 +586,7 @@ def _fit_offsets(
     text = f"mean error of {int(good.sum())} pixels at {where}"
     if base.kind == "phase" and m == 1:
         text += "; wiggling at that distance is in it"
-    estimates["range_offset_m"] = Estimate(float(found.x[0]), error, text)
+    estimates["range_offset_m"] = FittedField(float(found.x[0]), error, text)
     changes = {"range_offset_m": float(found.x[0])}
     if none_seen:
         return {**changes, **_SINE}
@@ -615,7 +615,7 @@ def _fit_wiggling(
     orders: tuple[int, ...],
     mean: _Float,
     std: _Float,
-    estimates: dict[str, Estimate],
+    estimates: dict[str, FittedField],
     notes: list[str],
 ) -> dict[str, Any] | None:
     """Fit offset and orders of the correlation to the mean errors.
@@ -653,10 +653,10 @@ def _fit_wiggling(
     if all(h.amplitude < _SEEN_SIGMAS * e for h, e in zip(found_harmonics, parts, strict=True)):
         notes.append(f"No wiggling is seen at {m} distances: {described}.")
         return None
-    estimates["range_offset_m"] = Estimate(
+    estimates["range_offset_m"] = FittedField(
         offset_m, math.sqrt(covariance[0, 0]) * sensor.metres_per_radian, f"mean error at {m} distances, less wiggling"
     )
-    estimates["harmonics"] = Estimate(
+    estimates["harmonics"] = FittedField(
         found_harmonics[0].amplitude,
         parts[0],
         f"wiggling at {m} distances ({described}); orders 3 and 5, 7 and 9 move ranges alike: all put down to 3, 7",
@@ -677,7 +677,7 @@ def _pattern_fields(
     offset_error_m: _Float,
     moved_m: _Float,
     odd: NDArray[np.bool_],
-    estimates: dict[str, Estimate],
+    estimates: dict[str, FittedField],
 ) -> dict[str, Any]:
     """Return the fields about single pixels."""
     good = data.good
@@ -686,7 +686,7 @@ def _pattern_fields(
         "dead_pixels": tuple((int(row), int(col)) for row, col in np.argwhere(dead)),
         "dead_share": 0.0,
     }
-    estimates["dead_pixels"] = Estimate(
+    estimates["dead_pixels"] = FittedField(
         float(dead.sum()), 0.0, f"valid in less than {100 * _DEAD_SHARE:.0f} % of the frames at every distance"
     )
     if base.kind == "direct":
@@ -694,7 +694,7 @@ def _pattern_fields(
         return changes
     changes["hot_pixels"] = tuple((int(row), int(col)) for row, col in np.argwhere(odd))
     changes["hot_share"] = 0.0
-    estimates["hot_pixels"] = Estimate(
+    estimates["hot_pixels"] = FittedField(
         float(odd.sum()), 0.0, f"stuck, noisier than {_NOISY_FACTOR:g} times the median or {_OUTLIER_SIGMAS:g} σ off"
     )
     count = int(good.sum())
@@ -711,7 +711,7 @@ def _pattern_fields(
     std_m = math.sqrt(variance)
     error_m = of_variance / (2 * std_m) if variance > of_variance else math.sqrt(of_variance)
     scale = base.metres_per_radian
-    estimates["phase_offset_std_rad"] = Estimate(
+    estimates["phase_offset_std_rad"] = FittedField(
         std_m / scale, error_m / scale,
         f"spread of {count} pixels' offsets less noise, {1e3 * std_m:.3g} mm; a tilt of the board is in it",
     )  # fmt: skip
@@ -721,7 +721,7 @@ def _pattern_fields(
 
 
 def _fit_noise(
-    data: _Data, base: Sensor, amplitude_unit: AmplitudeUnit, estimates: dict[str, Estimate], notes: list[str]
+    data: _Data, base: Sensor, amplitude_unit: AmplitudeUnit, estimates: dict[str, FittedField], notes: list[str]
 ) -> dict[str, Any]:
     """Return the fields that the noise of single frames tells, the errors of the distances in their standard errors."""
     good = data.good
@@ -729,9 +729,9 @@ def _fit_noise(
         variance = data.variance_m2[:, good]
         degrees = float((data.n[:, good] - 1).sum())
         std = math.sqrt(float(variance.mean()))
-        estimates["range_std_m"] = Estimate(std, std / math.sqrt(2 * degrees), "noise of single frames")
+        estimates["range_std_m"] = FittedField(std, std / math.sqrt(2 * degrees), "noise of single frames")
         return {"range_std_m": std}
-    found: dict[str, Estimate] = {}
+    found: dict[str, FittedField] = {}
     changes = _fit_light(data, base, amplitude_unit, found, notes)
     variance_of = dict.fromkeys(found, 0.0)
     for board, (distance, std) in enumerate(zip(data.distance_m, data.distance_std_m, strict=True)):
@@ -755,9 +755,9 @@ def _fit_noise(
     return changes
 
 
-def _refitted(data: _Data, base: Sensor, amplitude_unit: AmplitudeUnit) -> dict[str, Estimate]:
+def _refitted(data: _Data, base: Sensor, amplitude_unit: AmplitudeUnit) -> dict[str, FittedField]:
     """Return the estimates of other data; none if these do not show the signal."""
-    found: dict[str, Estimate] = {}
+    found: dict[str, FittedField] = {}
     try:
         _fit_light(data, base, amplitude_unit, found, [])
     except UsageError:
@@ -766,7 +766,7 @@ def _refitted(data: _Data, base: Sensor, amplitude_unit: AmplitudeUnit) -> dict[
 
 
 def _fit_light(
-    data: _Data, base: Sensor, amplitude_unit: AmplitudeUnit, estimates: dict[str, Estimate], notes: list[str]
+    data: _Data, base: Sensor, amplitude_unit: AmplitudeUnit, estimates: dict[str, FittedField], notes: list[str]
 ) -> dict[str, Any]:
     """Fit signal, contrast, ambient light and read noise to given distances; ambient light may come out negative."""
     good = data.good
@@ -862,10 +862,12 @@ def _solve(design: _Float, target: _Float) -> tuple[_Float, _Float]:
     return covariance @ ((design / scale).T @ target) / scale, covariance / np.outer(scale, scale)
 
 
-def _noise_of_ranges(law: _NoiseData, base: Sensor, estimates: dict[str, Estimate], notes: list[str]) -> dict[str, Any]:
+def _noise_of_ranges(
+    law: _NoiseData, base: Sensor, estimates: dict[str, FittedField], notes: list[str]
+) -> dict[str, Any]:
     """Turn σ_φ² = a/S + b/S² into signal and constant noise, the contrast assumed."""
     contrast = base.contrast
-    estimates["contrast"] = Estimate(contrast, None, "ranges alone do not tell it from signal_e")
+    estimates["contrast"] = FittedField(contrast, None, "ranges alone do not tell it from signal_e")
     constant_e2 = base.ambient_e + base.dark_e + base.read_variance_e2
     if law.levels_differ:
         (a, b), covariance = law.two_terms(law.phase_variance, 1 / law.light, 1 / law.light**2)
@@ -881,8 +883,8 @@ def _noise_of_ranges(law: _NoiseData, base: Sensor, estimates: dict[str, Estimat
                 "Ranges alone tell signal_e · contrast² and the noise that does not follow the light; the latter is "
                 "put down to ambient light, beside the assumed dark current and read noise."
             )
-            estimates["signal_e"] = Estimate(signal, signal_error, "noise against light, for the assumed contrast")
-            estimates["ambient_e"] = Estimate(
+            estimates["signal_e"] = FittedField(signal, signal_error, "noise against light, for the assumed contrast")
+            estimates["ambient_e"] = FittedField(
                 ambient, noise_error, "noise that does not follow the light: read noise may be in it"
             )
             return {"signal_e": signal, "ambient_e": ambient}
@@ -896,7 +898,9 @@ def _noise_of_ranges(law: _NoiseData, base: Sensor, estimates: dict[str, Estimat
         f"light differs by {_NOISE_LEVELS_RATIO:g} times and more, or amplitudes. signal_e is that for the assumed "
         "contrast, ambient light and read noise."
     )
-    estimates["signal_e"] = Estimate(signal, y_error / slope, "range noise, for the assumed contrast and ambient light")
+    estimates["signal_e"] = FittedField(
+        signal, y_error / slope, "range noise, for the assumed contrast and ambient light"
+    )
     return {"signal_e": signal}
 
 
@@ -906,7 +910,7 @@ def _noise_of_electrons(
     amplitude_e: _Float,
     intensity_e: _Float | None,
     scale_error: float,
-    estimates: dict[str, Estimate],
+    estimates: dict[str, FittedField],
     notes: list[str],
 ) -> dict[str, Any]:
     """Turn amplitudes, and intensities if there are any, in electrons into signal, contrast and noise.
@@ -929,7 +933,7 @@ def _noise_of_electrons(
         signal_error, offset_error = np.sqrt(np.diag(covariance))
         ambient = offset - (constant - base.ambient_e)
         note = f"{what} without light, less the assumed dark current"
-        estimates["ambient_e"] = Estimate(
+        estimates["ambient_e"] = FittedField(
             float(ambient),
             math.hypot(offset_error, scale_error * offset),
             note if intensity_e is not None else f"{note} and read noise",
@@ -948,16 +952,16 @@ def _noise_of_electrons(
     if signal <= 2 * signal_error:
         raise UsageError(
             f"the frames do not show the signal: {what} rises by {with_error(signal, signal_error)} electrons a "
-            "unit of light; are amplitude and intensity in electrons (--amplitude-unit)?"
+            "unit of light; are amplitude and intensity in electrons (amplitude_unit=…)?"
         )
     contrast = modulated / signal
     contrast_error = contrast * math.hypot(modulated_error / modulated, signal_error / signal)
-    estimates["signal_e"] = Estimate(
+    estimates["signal_e"] = FittedField(
         float(signal),
         math.hypot(signal_error, scale_error * signal),
         f"{what} against light at {boards} distance{'s' if boards > 1 else ''}",
     )
-    estimates["contrast"] = Estimate(
+    estimates["contrast"] = FittedField(
         float(contrast), float(contrast_error), f"amplitude, {modulated:.5g} electrons at |S| = 1, over signal_e"
     )
     changes |= {"signal_e": float(signal), "contrast": float(contrast)}
@@ -966,12 +970,14 @@ def _noise_of_electrons(
         per_tap = (extra - base.code_e**2 / 6) / 2
         read_noise = math.sqrt(max(per_tap, 0.0))
         error = min(extra_error / (4 * read_noise) if read_noise > 0 else math.inf, math.sqrt(extra_error / 2))
-        estimates["read_noise_e"] = Estimate(
+        estimates["read_noise_e"] = FittedField(
             read_noise, error, "noise over that of the electrons counted" + ("" if per_tap > 0 else "; none was seen")
         )
         changes["read_noise_e"] = read_noise
     else:
-        estimates["read_noise_e"] = Estimate(base.read_noise_e, None, "without intensities it looks like ambient light")
+        estimates["read_noise_e"] = FittedField(
+            base.read_noise_e, None, "without intensities it looks like ambient light"
+        )
     return changes
 
 
@@ -1026,7 +1032,7 @@ def _excess(variance_e2: _Float, intensity_e: _Float, law: _NoiseData, scale_err
     return mean, math.hypot(chance, scale_error * lever)
 
 
-def _possible_contrast(fields: dict[str, Any], estimates: dict[str, Estimate], notes: list[str]) -> float:
+def _possible_contrast(fields: dict[str, Any], estimates: dict[str, FittedField], notes: list[str]) -> float:
     """Return the contrast, at most what lets no tap count less than nothing."""
     harmonics = tuple(Harmonic(*entry) for entry in fields["harmonics"])
     peak = correlation_peak(harmonics) if fields["modulation"] == "harmonics" else 1.0
@@ -1038,7 +1044,7 @@ def _possible_contrast(fields: dict[str, Any], estimates: dict[str, Estimate], n
             "the unit of the amplitudes right?"
         )
         estimate = estimates["contrast"]
-        estimates["contrast"] = Estimate(
+        estimates["contrast"] = FittedField(
             limit, estimate.std_error, f"{estimate.note}; lowered to the most there can be"
         )
         return limit

@@ -574,6 +574,10 @@ class Sensor(BaseModel):
             **fields,
         )
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return every field, and the unambiguous range, as plain numbers and text, for JSON."""
+        return {**self.model_dump(mode="json"), "unambiguous_range_m": self.unambiguous_range_m}
+
     @classmethod
     def from_toml(cls, path: str | Path) -> Sensor:
         """Read a sensor file.
@@ -699,6 +703,16 @@ class Sensor(BaseModel):
     def read_variance_e2(self) -> float:
         """Variance that reading adds to one phase image's N_a − N_b, 2σ_r² + q²/6 (PHYSICS section 4), e-²."""
         return 2 * self.read_noise_e**2 + self.code_e**2 / 6
+
+    @property
+    def upper_rows(self) -> tuple[int, int]:
+        """First and stop of the image rows above the middle line, which see the upper part of a landmark."""
+        return 0, self.rows // 2
+
+    @property
+    def lower_rows(self) -> tuple[int, int]:
+        """First and stop of the image rows below the middle line; of an odd number the middle row is among them."""
+        return self.rows // 2, self.rows
 
     @property
     def metres_per_radian(self) -> float:
