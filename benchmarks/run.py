@@ -38,7 +38,7 @@ from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, 
 
 ROOT = Path(__file__).resolve().parent.parent
 SENSOR = preset("pmd-16x16")
-WRONG_IN_THE_REFERENCE = (5, 4, 6)  # frame, row, column: tests/test_reference.py has the proof
+WRONG_IN_THE_REFERENCE = (5, 4, 6)  # frame, row, column: tests/test_reference_frames.py has the proof
 SEED = 2005
 Table = dict[str, Any]
 

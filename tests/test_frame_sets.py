@@ -164,7 +164,7 @@ def test_quantities_are_independent_of_one_another():
     [{"workers": 1}, {"workers": 3, "shard_items": 7}, {"workers": 8, "shard_items": 1}, {"scheduler": "local:2"}],
     ids=str,
 )
-def test_the_same_bytes_for_any_workers_shards_and_processes(frames_file, tmp_path, options):
+def test_workers_shards_and_processes_do_not_change_the_bytes(frames_file, tmp_path, options):
     build_frames(PLAN, tmp_path / "again.h5", **options).close()
     assert sha256(tmp_path / "again.h5") == sha256(frames_file)
 

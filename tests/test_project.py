@@ -91,7 +91,7 @@ def test_imports_point_one_way() -> None:
 @pytest.mark.parametrize("name", [*ROOMS, "cli"])
 @pytest.mark.parametrize("statement", ["import {}", "from {} import x", "from {}.y import x"])
 def test_a_bare_import_of_a_room_is_refused(name: str, statement: str) -> None:
-    command = [BIN / "ruff", "check", "--select", "TID251", "--stdin-filename", ROOT / "data" / "x.py", "-"]
+    command = [str(BIN / "ruff"), "check", "--select", "TID251", "--stdin-filename", str(ROOT / "data" / "x.py"), "-"]
     done = subprocess.run(command, cwd=ROOT, input=statement.format(name) + "\n", capture_output=True, text=True)
     assert done.returncode == 1
     assert f"import phasemark.{name}" in done.stdout

@@ -15,7 +15,7 @@ from phasemark import UsageError
 from phasemark.inputs.toml_file import toml_value
 from phasemark.matcher import kalman_filter
 from phasemark.matcher.agreement import counts
-from phasemark.matcher.nearest.templates import assumed_std_m
+from phasemark.matcher.filters.filtered_frames import assumed_std_m
 from phasemark.render import (
     Background,
     Flag,

@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ pytestmark = pytest.mark.soak
 SENSOR = preset("pmd-16x16")
 WALL = Background(wall_m=4.0)
 FIXED, BEARING = VIEW[:2], VIEW[:3]
-ROWS = {
+ROWS: dict[str, tuple[int, float, TrialSetup, dict[str, Any]]] = {
     "ranges": (5000, 1.05, TrialSetup(), {"free": FIXED}),
     "wall": (5000, 1.05, TrialSetup(background=WALL), {"free": FIXED, "background": WALL}),
     "phasors": (5000, 1.07, TrialSetup(on="phasors"), {"free": FIXED, "on": "phasors"}),
@@ -130,7 +131,8 @@ def test_frames_of_another_renderer_are_matched_as_well(bank, renderers, name):
     rng, n = np.random.default_rng(17), 40
     views = Views.broadcast(rng.uniform(0.8, 1.6, n), rng.uniform(0, math.pi, n))
     images = [adaptive_images(renderers[name], views[k : k + 1], tolerance=1e-4, last=8) for k in range(n)]
-    theirs = PhasorImages(*(np.stack(part) for part in zip(*images, strict=True)), SENSOR, views)
+    phasor, intensity, coverage = (np.stack(part) for part in zip(*images, strict=True))
+    theirs = PhasorImages(phasor, intensity, coverage, SENSOR, views)
     bound = cramer_rao(renderers[name], views)
     matcher = Matcher(bank, "refine", free=FIXED)
     figures = []

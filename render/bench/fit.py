@@ -159,7 +159,7 @@ class SensorFit:
 
 def fit_sensor(
     frames: Sequence[Frames],
-    distance_m: Sequence[float],
+    distance_m: Sequence[float] | NDArray[np.floating],
     *,
     base: Sensor,
     albedo: Sequence[float] | None = None,
@@ -274,7 +274,9 @@ def fit_sensor(
     )
 
 
-def _distance_std(distance_m: Sequence[float], stated: float | Sequence[float] | None) -> list[float]:
+def _distance_std(
+    distance_m: Sequence[float] | NDArray[np.floating], stated: float | Sequence[float] | None
+) -> list[float]:
     """Return the standard deviation of each distance."""
     std = np.atleast_1d(np.asarray(DISTANCE_STD_M if stated is None else stated, np.float64)).ravel().tolist()
     if len(std) == 1:
@@ -328,7 +330,7 @@ class _Data:
     def of(
         cls,
         frames: Sequence[Frames],
-        distance_m: Sequence[float],
+        distance_m: Sequence[float] | NDArray[np.floating],
         distance_std_m: Sequence[float],
         albedo: Sequence[float],
         base: Sensor,
@@ -371,7 +373,7 @@ class _Data:
             np.zeros(share.shape[1:], np.bool_),
         )
 
-    def of_usable_boards(self, distance_m: Sequence[float], notes: list[str]) -> _Data:
+    def of_usable_boards(self, distance_m: Sequence[float] | NDArray[np.floating], notes: list[str]) -> _Data:
         """Leave out the distances at which too few pixels answer, and then the pixels that do not answer at the rest.
 
         Raises

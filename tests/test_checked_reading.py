@@ -12,6 +12,7 @@ import time
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -37,7 +38,7 @@ from phasemark.landmarks import read_mesh
 from phasemark.render import Sensor, preset
 
 SENSOR = preset("pmd-16x16")
-STATED = {"unit": "m", "quantity": "range"}
+STATED: dict[str, Any] = {"unit": "m", "quantity": "range"}
 BANK = BankPlan(classes=["cone"], distance_m="1", delta_deg="0:90:45", model="planar")
 FRAMES = FramePlan(classes=["cone"], views=3, frames_per_view=2)
 

@@ -30,7 +30,7 @@ def test_default_distances_are_141_exactly_rounded_decimals():
         ((3,), [3]),
     ],
 )
-def test_forms_of_a_grid(text, values):
+def test_every_form_of_a_grid_gives_its_values(text, values):
     assert parse_grid(text).tolist() == values
 
 

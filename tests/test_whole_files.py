@@ -18,7 +18,7 @@ def names(folder: Path) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def test_writes_bytes_and_pieces(tmp_path):
+def test_bytes_and_pieces_are_written(tmp_path):
     assert write_atomically(tmp_path / "a", b"whole").read_bytes() == b"whole"
     assert write_atomically(tmp_path / "b", (bytes([i]) for i in range(3))).read_bytes() == b"\0\1\2"
     assert names(tmp_path) == ["a", "b"]
