@@ -30,7 +30,8 @@ from tolerance import tolerance
 
 from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import FilteredFrames, Matcher, TrialSetup, kalman_filter, phasor_mean
+from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, phasor_mean
+from phasemark.matcher.accuracy import TrialSetup
 from phasemark.matcher.accuracy.trials import noisy_frames
 from phasemark.matcher.nearest.search import ExactSearch, nearest_search
 from phasemark.matcher.nearest.templates import Observation

@@ -15,9 +15,10 @@ import trimesh
 import xarray
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
-from phasemark.data import BankPlan, build_bank, mesh_sha256, open_bank, verify_checksum, versions
+from phasemark.data import BankPlan, build_bank, open_bank
+from phasemark.data.files import mesh_sha256, versions
 from phasemark.data.files.hdf5_layout import Layout, SparseMemory
-from phasemark.inputs import checksum_path
+from phasemark.inputs import checksum_path, verify_checksum
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import PhasorImages, Renderer, preset
 

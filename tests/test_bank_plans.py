@@ -7,7 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from phasemark import InputFileError, UsageError
-from phasemark.data import BankPlan, MeshPlan, read_bank_plan
+from phasemark.data import BankPlan
+from phasemark.data.plans import MeshPlan, read_bank_plan
 from phasemark.data.plans.bank_plan import factored_refusal
 from phasemark.landmarks import catalog
 from phasemark.matcher.plan_kinds import KINDS, plan_schema

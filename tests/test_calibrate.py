@@ -17,16 +17,8 @@ from phasemark import InputFileError, UsageError
 from phasemark.cli import main
 from phasemark.data.commands import console
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import (
-    KnownPoses,
-    Mounting,
-    PoseStd,
-    calibrate,
-    filter_poses,
-    frames_of_poses,
-    kalman_filter,
-    read_poses,
-)
+from phasemark.matcher import calibrate, kalman_filter
+from phasemark.matcher.calibration import KnownPoses, Mounting, PoseStd, filter_poses, frames_of_poses, read_poses
 from phasemark.matcher.calibration import calibration as calibration_module
 from phasemark.matcher.calibration.judgement import likely_cause
 from phasemark.matcher.calibration.mounting_fit import Fit

@@ -20,20 +20,21 @@ import pytest
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
-from phasemark.data import (
-    BankPlan,
-    FramePlan,
-    build_bank,
-    build_frames,
-    export_frames,
-    open_bank,
-    read_frames,
-    unverified,
-    verify_frames,
-    write_checksum,
-)
+from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_bank, read_frames
+from phasemark.data.export import export_frames
+from phasemark.data.files import write_checksum
 from phasemark.data.files.narrow import narrowed
-from phasemark.inputs import ahead, checksum_path, is_vouched_for, read_whole, remembered, sha256_of, vouching_begun
+from phasemark.data.verify import verify_frames
+from phasemark.inputs import (
+    ahead,
+    checksum_path,
+    is_vouched_for,
+    read_whole,
+    remembered,
+    sha256_of,
+    unverified,
+    vouching_begun,
+)
 from phasemark.landmarks import read_mesh
 from phasemark.render import Sensor, preset
 

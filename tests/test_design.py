@@ -16,8 +16,10 @@ from scipy import stats
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
-from phasemark.data import BankPlan, read_bank_plan
-from phasemark.landmarks import Box, Cone, Cylinder, LandmarkSpec, Revolution, Sphere, build_mesh, catalog, read_mesh
+from phasemark.data import BankPlan
+from phasemark.data.plans import read_bank_plan
+from phasemark.landmarks import LandmarkSpec, build_mesh, catalog, read_mesh
+from phasemark.landmarks.spec import Box, Cone, Cylinder, Revolution, Sphere
 from phasemark.matcher import Matcher, cramer_rao, kalman_filter
 from phasemark.matcher.design import (
     AllowedDimensions,

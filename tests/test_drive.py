@@ -15,7 +15,7 @@ from scipy import stats
 
 from phasemark import UsageError
 from phasemark.cli import main
-from phasemark.matcher import Match, Placement, RobotPose, robot_poses
+from phasemark.matcher import Match, RobotPose, robot_poses
 from phasemark.matcher.drive import (
     OUTPUTS,
     DrivePlan,
@@ -35,6 +35,7 @@ from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
 from phasemark.matcher.drive.odometry import OdometryModel, Reading, World, motion_jacobian, motion_noise, moved
 from phasemark.matcher.filters.filtered_frames import kalman_filter
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
+from phasemark.matcher.position import Placement
 from phasemark.matcher.statistics import nees
 from phasemark.render import Background, capture
 

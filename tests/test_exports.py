@@ -11,7 +11,8 @@ from PIL.PngImagePlugin import PngImageFile
 
 from phasemark import OutputExistsError, UsageError
 from phasemark.cli import main
-from phasemark.data import FramePlan, build_frames, export_frames, read_frames
+from phasemark.data import FramePlan, build_frames, read_frames
+from phasemark.data.export import export_frames
 from phasemark.render import Views, preset
 
 MOUNT = {"bearing_offset_deg": 3.0, "height_offset_m": -0.03}  # two pixels aside and one down

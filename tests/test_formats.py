@@ -15,7 +15,8 @@ from programs.regenerate_golden import BANK, BANK_PLAN, FRAMES, FRAMES_PLAN
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
-from phasemark.data import build_bank, build_frames, open_bank, open_frames, verify_bank, verify_frames
+from phasemark.data import build_bank, build_frames, open_bank, open_frames
+from phasemark.data.verify import verify_bank, verify_frames
 from phasemark.inputs import checksum_path
 from phasemark.matcher.plan_kinds import KINDS, check_plan, plan_example, plan_schema
 

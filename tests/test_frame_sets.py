@@ -11,25 +11,12 @@ import pytest
 import xarray
 
 from phasemark import InputFileError, OutputExistsError, UsageError
-from phasemark.data import (
-    BankPlan,
-    Distribution,
-    FramePlan,
-    build_bank,
-    build_frames,
-    build_part,
-    estimate_build,
-    merge_parts,
-    open_frames,
-    parse_part,
-    planned_size,
-    read_frames,
-    verify_bank,
-    verify_frames,
-    write_checksum,
-)
-from phasemark.data.partial_outputs import job_for
+from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_frames, read_frames
+from phasemark.data.files import write_checksum
+from phasemark.data.partial_outputs import build_part, estimate_build, job_for, merge_parts, parse_part
+from phasemark.data.plans import Distribution, planned_size
 from phasemark.data.seeds import stream
+from phasemark.data.verify import verify_bank, verify_frames
 from phasemark.inputs import checksum_path
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, capture, preset

@@ -10,10 +10,12 @@ import pytest
 
 from phasemark import UsageError
 from phasemark.cli import main
-from phasemark.data import BankPlan, build_bank, open_bank, write_checksum
+from phasemark.data import BankPlan, build_bank, open_bank
+from phasemark.data.files import write_checksum
 from phasemark.inputs import checksum_path
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import grid_loss, noise_free
+from phasemark.matcher.accuracy import grid_loss
+from phasemark.matcher.filters import noise_free
 from phasemark.render import Renderer, capture, predicted_range_std, preset
 
 SENSOR = preset("pmd-16x16")

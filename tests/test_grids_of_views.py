@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from phasemark import UsageError
-from phasemark.data import format_grid, parse_grid
+from phasemark.data.plans import format_grid, parse_grid
 from phasemark.data.plans.grid_axis import MAX_POINTS, drop_repeated_stop
 
 

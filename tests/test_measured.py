@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from phasemark import InputFileError, UsageError
-from phasemark.data import read_frames, write_measured
+from phasemark.data import read_frames
+from phasemark.data.measured import write_measured
 from phasemark.render import Flag, Sensor, preset
 
 PMD = preset("pmd-16x16")

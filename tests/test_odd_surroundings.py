@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from phasemark import UsageError
-from phasemark.data import open_bank, verify_checksum
+from phasemark.data import open_bank
+from phasemark.inputs import verify_checksum
 from phasemark.render.compile_cache import prepare_compile_cache
 
 PHASEMARK = str(Path(sys.executable).with_name("phasemark"))

@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.style import Style
 
 from phasemark import UsageError
-from phasemark.render import PAPER_CMAP, Flag, Frames, PhasorImages, Views, preset, range_figure, terminal_figure
-from phasemark.render.figures import RANGE_COLOURS
+from phasemark.render import Flag, Frames, PhasorImages, Views, preset
+from phasemark.render.figures import PAPER_CMAP, RANGE_COLOURS, range_figure, terminal_figure
 
 SENSOR = preset("ideal")
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phasemark.landmarks import Cone, build_mesh, catalog
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.landmarks.spec import Cone
 from phasemark.render import Background, Renderer, Views, preset
 
 WRONG_IN_THE_REFERENCE = (5, 4, 6)  # frame, row, column: see the closed form below

@@ -13,8 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, noise_free
+from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
 from phasemark.matcher.accuracy.trials import TrialSetup, noisy_frames, run_trials
+from phasemark.matcher.filters import noise_free
 from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import Problem, Settings

@@ -21,13 +21,13 @@ from phasemark.render import (
     Flag,
     Renderer,
     Sensor,
-    ablate,
     capture,
     measured_range_std,
     predicted_range_std,
     preset,
     preset_names,
 )
+from phasemark.render.exposure import ablate
 from phasemark.render.sensor.sensor_file import sensor_toml
 
 PMD = preset("pmd-16x16")

@@ -14,18 +14,11 @@ from oracles.images import adaptive_images
 
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import (
-    Matcher,
-    Trials,
-    TrialSetup,
-    binomial_interval,
-    confusion_probability,
-    cramer_rao,
-    kalman_filter,
-    noise_free,
-    run_trials,
-)
+from phasemark.matcher import Matcher, cramer_rao, kalman_filter
+from phasemark.matcher.accuracy import Trials, TrialSetup, confusion_probability, run_trials
+from phasemark.matcher.filters import noise_free
 from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.statistics import binomial_interval
 from phasemark.render import Background, PhasorImages, Renderer, Views, capture, preset
 
 pytestmark = pytest.mark.soak

@@ -16,7 +16,8 @@ from phasemark.matcher.statistics import (
     rms_interval,
     view_errors,
 )
-from phasemark.render import Views, delta_period_rad, preset, wrap_delta_difference_rad, wrap_delta_rad
+from phasemark.render import Views, preset
+from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
 
 
 @pytest.mark.parametrize("symmetry", [1, 2, 4])

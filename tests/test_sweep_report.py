@@ -15,7 +15,8 @@ from test_sweep_tables import linear_sweep
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.data import build_bank, read_frames
-from phasemark.landmarks import Box, Cylinder, LandmarkSpec, build_mesh, catalog
+from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
+from phasemark.landmarks.spec import Box, Cylinder
 from phasemark.matcher.filters.filtered_frames import kalman_filter
 from phasemark.matcher.sweep.compare import compare_cells
 from phasemark.matcher.sweep.examples import sweep_frames

@@ -10,9 +10,10 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Matcher, cramer_rao, kalman_filter, within_ellipsoid
+from phasemark.matcher import Matcher, cramer_rao, kalman_filter
 from phasemark.matcher.filters.filtered_frames import noise_free
 from phasemark.matcher.likelihood.systematic import calibrated_slopes, rates_of_views
+from phasemark.matcher.statistics import within_ellipsoid
 from phasemark.render import Background, Frames, Renderer, Views, capture
 
 VIEW = ("distance_m", "delta_rad")

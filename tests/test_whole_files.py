@@ -10,8 +10,8 @@ import pytest
 from builders import run_program
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
-from phasemark.data import read_checksum, verify_checksum, write_atomically, write_checksum
-from phasemark.data.files import renames
+from phasemark.data.files import renames, write_atomically, write_checksum
+from phasemark.inputs import read_checksum, verify_checksum
 
 
 def names(folder: Path) -> list[str]:

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from phasemark import InputFileError, UsageError
 from phasemark.inputs import read_text
-from phasemark.render import Frames, wrap_delta_rad
+from phasemark.render import Frames
+from phasemark.render.view import wrap_delta_rad
 
 POLAR = ("distance_m", "delta_deg")
 CARTESIAN = ("x_m", "y_m", "heading_deg")

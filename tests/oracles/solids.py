@@ -5,7 +5,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.landmarks import Cone, Cylinder, Sphere, catalog
+from phasemark.landmarks import catalog
+from phasemark.landmarks.spec import Cone, Cylinder, Sphere
 
 Hit: TypeAlias = tuple[NDArray[Any], NDArray[Any]]
 """Range and cosine of the angle of incidence, (n,) each; inf and 0 where nothing is met."""

@@ -13,8 +13,8 @@ from pathlib import Path
 from programs.system_calls import Trap, in_fork
 
 from phasemark import OutputExistsError, StorageError
-from phasemark.data import verify_checksum, write_atomically
-from phasemark.inputs import checksum_path
+from phasemark.data.files import write_atomically
+from phasemark.inputs import checksum_path, verify_checksum
 
 
 def second(path: Path, force: bool) -> int:

@@ -32,10 +32,10 @@ from phasemark.data import BankPlan, FramePlan, open_bank, open_frames, read_fra
 from phasemark.data.shards.build import _Manifest
 from phasemark.inputs import checksum_path, read_checksum
 from phasemark.landmarks import build_mesh, catalog, export_mesh, read_mesh
-from phasemark.matcher import read_landmark_map
 from phasemark.matcher.calibration.known_poses import read_poses
 from phasemark.matcher.plan_kinds import KINDS as PLANS
 from phasemark.matcher.plan_kinds import check_plan, plan_example
+from phasemark.matcher.position import read_landmark_map
 from phasemark.render import Sensor, preset
 
 CORPUS = Path(__file__).resolve().parent.parent / "corpus"
@@ -220,7 +220,8 @@ def _good_frames(folder: Path) -> list[bytes]:
 
 
 def _good_bag(folder: Path) -> list[bytes]:
-    from phasemark.data import build_frames, export_frames
+    from phasemark.data import build_frames
+    from phasemark.data.export import export_frames
 
     plan = FramePlan(classes=["cone"], views=2, sensor_overrides={"rows": 4, "cols": 4})
     with build_frames(plan, folder / "g.h5") as found:
