@@ -89,6 +89,18 @@ def test_a_plate_that_fills_the_view_may_be_its_front_or_its_back(thin_bank, set
     assert set(matches.reason) <= {"ambiguous", "undetermined"}
 
 
+def test_a_plate_is_not_taken_for_its_back_where_the_search_stopped_beside_its_front(tmp_path):
+    # with these distances the search of the bank ends at 5°, a side minimum; from there the back is found, which
+    # looks exactly like the front at 8.4°
+    bank = bank_of("bracket", "pmd-16x16", tmp_path, distance="0.45:1.25:0.01")
+    views = Views.broadcast(np.array([0.608, 0.625, 0.569, 0.605]), np.radians([8.4, 1.4, 24.5, 14.2]))
+    image = Renderer(bank.mesh("bracket"), bank.sensor, albedo=0.8).render_views(views, background=WALL)
+    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(9), n_frames=1))
+    matches = Matcher(bank, "refine", **SETTINGS["fixed"]).match(frames)
+    assert not matches.accepted.any()
+    assert set(matches.reason) <= {"ambiguous", "undetermined"}
+
+
 def test_a_bearing_that_nothing_tells_is_undetermined(thin_bank):
     # the panel fills the 16 × 16 camera's view: its heading is known, but not where along it the camera looks
     found = count(thin_bank("panel", "pmd-16x16"), "bearing", 8, 10, np.random.default_rng(6))

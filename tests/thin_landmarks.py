@@ -63,13 +63,13 @@ class Counts:
     answers: tuple[Match, ...] = ()
 
 
-def bank_of(name: str, sensor: str, folder: Path) -> Bank:
+def bank_of(name: str, sensor: str, folder: Path, distance: str = "0.35:1.5:0.01") -> Bank:
     """Build the bank of a thin landmark from its file, as a user does."""
     mesh, symmetry = meshes()[name]
     mesh.export(folder / f"{name}.stl")
     path = folder / f"{name}-{sensor}.h5"
     arguments = ["bank", "build", "--mesh", f"{name}={folder / name}.stl", "--unit", "m", "--origin", "center"]
-    grid = ["--distance", "0.35:1.5:0.01", "--delta", f"0:{360 // symmetry}:2", "--symmetry", str(symmetry)]
+    grid = ["--distance", distance, "--delta", f"0:{360 // symmetry}:2", "--symmetry", str(symmetry)]
     assert main([*arguments, *grid, "--sensor", sensor, "--out", str(path)]) == 0
     return open_bank(path)
 

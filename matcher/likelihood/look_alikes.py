@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.likelihood.fits import Fits, best_of_frame
+from phasemark.matcher.likelihood.fits import Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.images import ImageModel
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import Evidence
@@ -21,10 +21,27 @@ def fit_look_alikes(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) 
 
     A mesh with a symmetry that its bank does not have looks the same from several sides. A thin landmark looks
     nearly the same from the front and from the back, its middle seen at the same place. A flat one looks nearly the
-    same under every bearing, its heading kept.
+    same under every bearing, its heading kept. Where one of them explains a frame better than its best view did, the
+    search had stopped at a side minimum: then what looks like that one is tried too.
     """
+    n = len(evidence.weight)
+    parts = [fits]
     best = best_of_frame(fits)
     best = best[np.isfinite(fits.cost[best])]
+    for _ in range(setup.policy.look_alike_rounds):
+        least = least_of_frame(fits, n)
+        found = _fit_once(setup, scene, evidence, fits, best)
+        parts.append(found)
+        best = best_of_frame(found)
+        best = best[found.cost[best] < least[found.frame[best]] - _BETTER]
+        fits = found
+        if not best.size:
+            break
+    return Fits.joined(parts[1:])
+
+
+def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: NDArray[np.int64]) -> Fits:
+    """Fit what looks like some fits."""
     candidates = [*_other_sides(setup, fits, best), *_from_behind(setup, scene, fits, best)]
     if setup.bearing_is_free:
         candidates.extend(_other_bearings(setup, scene, fits, best))
@@ -44,6 +61,8 @@ def fit_look_alikes(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) 
     )
 
 
+_BETTER = 1.0
+"""By how much a cost must be lower: below that both views remain, and the answer is ambiguous anyway."""
 _Candidates = list[tuple[NDArray[np.int64], NDArray[np.float64]]]
 """Indices of fits, and as many views to try instead of theirs."""
 

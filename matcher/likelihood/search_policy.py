@@ -99,6 +99,8 @@ class SearchPolicy:
     odd_ratio, odd_sigma : float
         Those returns: residuals beyond this ratio to the median, and beyond this many σ.
 
+    look_alike_rounds : int
+        How often what looks like the best view is tried: again where that found a better one.
     most_equals : int
         Sides of one landmark that look the same and are all told.
     slides, slides_with_prior : tuple of float
@@ -178,6 +180,7 @@ class SearchPolicy:
     odd_ratio: float = 3.0
     odd_sigma: float = 5.0
 
+    look_alike_rounds: int = 3
     most_equals: int = 12
     slides: tuple[float, ...] = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
     slides_with_prior: tuple[float, ...] = (-1.0, 1.0)
