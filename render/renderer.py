@@ -27,9 +27,9 @@ from phasemark.render.integral.accumulate import (
     share_faces,
     sum_samples,
 )
-from phasemark.render.integral.edge_projection import MeshTopology
 from phasemark.render.integral.footprint import Scratch
 from phasemark.render.integral.intersect import make_intersector
+from phasemark.render.integral.mesh_topology import MeshTopology
 from phasemark.render.integral.shells import unite_shells
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.sensor.sensor import Sensor

@@ -15,7 +15,9 @@ from numba import njit
 
 from phasemark.render.background import background_edge, background_hit
 from phasemark.render.integral.edge_projection import project_edges
-from phasemark.render.integral.footprint import bin_segments, gauss_legendre, sample_pixel
+from phasemark.render.integral.footprint import sample_pixel
+from phasemark.render.integral.pixel_clipping import bin_segments
+from phasemark.render.integral.quadrature_rules import gauss_legendre
 
 _NODES, _WEIGHTS = gauss_legendre(4)
 
