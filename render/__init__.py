@@ -4,8 +4,10 @@ from typing import TYPE_CHECKING
 
 from phasemark.render import compile_cache  # noqa: F401 - first, for the modules below compile functions
 from phasemark.render.background import Background
-from phasemark.render.bench.data_sheet import Characterisation, Comparison, Quantity, characterise
-from phasemark.render.bench.fit import Estimate, SensorFit, fit_sensor
+from phasemark.render.bench.data_sheet.characterise import characterise
+from phasemark.render.bench.data_sheet.results import Characterisation, Comparison, Quantity
+from phasemark.render.bench.fit.fit_sensor import fit_sensor
+from phasemark.render.bench.fit.fitted_sensor import Estimate, SensorFit
 from phasemark.render.exposure.ablation import Ablation, ablate
 from phasemark.render.exposure.capture import capture, capture_moving
 from phasemark.render.exposure.motion import Motion, render_moving
