@@ -18,7 +18,8 @@ from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.camera_unit import CameraUnit, camera_unit
 from phasemark.render.sensor.correlation import Harmonic, pulse_harmonics, square_harmonics
 from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
-from phasemark.render.sensor.sensor import Sensor, preset, preset_names
+from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.shipped_sensors import preset, preset_names
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:

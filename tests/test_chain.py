@@ -26,7 +26,7 @@ from phasemark.render.exposure import photoelectrons as read_out
 from phasemark.render.exposure.random_streams import fill_normal, fill_uniform, philox, uniform_pair
 from phasemark.render.exposure.stray_light import spread_light
 from phasemark.render.sensor.correlation import correlation_curve, correlation_peak
-from phasemark.render.sensor.sensor import PATTERN_BOUND
+from phasemark.render.sensor.sensor_checks import PATTERN_BOUND
 
 PMD = preset("pmd-16x16")
 
