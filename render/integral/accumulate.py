@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from phasemark.render.background import background_edge, background_hit
 from phasemark.render.integral.edge_projection import project_edges
 from phasemark.render.integral.footprint import sample_pixel
 from phasemark.render.integral.pixel_clipping import bin_segments
 from phasemark.render.integral.quadrature_rules import gauss_legendre
+from phasemark.render.kernel import inlined, kernel
 
 _NODES, _WEIGHTS = gauss_legendre(4)
 
@@ -29,7 +29,7 @@ UNTRUSTED = 2
 """Pixel state: sampled, but too many edges for an exact split."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def plan_rays(  # type: ignore[no-untyped-def]
     first, mesh, lens, matrix, offset, bearing, camera, level, row_range, splits, background,
     segments, limb, head, link, owner, scratch, points, weights, regions, pixel, state,
@@ -110,7 +110,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
     return len(lens), n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pick_scouts(n, regions, chosen):  # type: ignore[no-untyped-def]
     """Choose the middle sample of every interval.
 
@@ -126,7 +126,7 @@ def pick_scouts(n, regions, chosen):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def share_faces(n, regions, pixel, state, plain, scout_face, share, face, chosen):  # type: ignore[no-untyped-def]
     """Hand the face a scout met to its interval where that is all there is to know, and list the samples left to cast.
 
@@ -154,7 +154,7 @@ def share_faces(n, regions, pixel, state, plain, scout_face, share, face, chosen
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def aim(n, chosen, points, pixel, lens, matrix, camera, pixels_per_view, origins, directions):  # type: ignore[no-untyped-def]
     """Write the float32 rays of some samples, landmark frame."""
     for i in range(n):
@@ -167,7 +167,7 @@ def aim(n, chosen, points, pixel, lens, matrix, camera, pixels_per_view, origins
             directions[i, a] = matrix[view, 0, a] + matrix[view, 1, a] * y + matrix[view, 2, a] * z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sum_samples(  # type: ignore[no-untyped-def]
     n, points, weights, pixel, face, mesh, lens, matrix, bearing, camera, level, background, albedo,
     radians_per_metre, orders, vignetting, pixels_per_view, phasor, intensity, coverage, upper,
@@ -243,7 +243,7 @@ def sum_samples(  # type: ignore[no-untyped-def]
             phasor[index, j] += complex(a * math.cos(phase), a * math.sin(phase))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _hit_curved(ox, oy, oz, dx, dy, dz, t, facing, f, vertices, faces, shares, normals):  # type: ignore[no-untyped-def]
     """Return the multiple of the ray at its hit, and |cos θ| of the shading normal times the ray's length.
 
@@ -275,7 +275,7 @@ def _hit_curved(ox, oy, oz, dx, dy, dz, t, facing, f, vertices, faces, shares, n
     return t, max(cos_theta, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_background(  # type: ignore[no-untyped-def]
     start, stop, state, bearing, camera, level, row_range, background, radians_per_metre, orders, vignetting,
     phasor, intensity,

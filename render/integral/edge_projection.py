@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from phasemark.render.integral.mesh_topology import CLUSTER
+from phasemark.render.kernel import inlined, kernel
 
 _NEAR_M = 1e-6
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  # type: ignore[no-untyped-def]
     """Project the creases and silhouettes of one view.
 
@@ -84,13 +83,13 @@ def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  #
     return n
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _height(planes, f, lens):  # type: ignore[no-untyped-def]
     """Return how far before the front of a face the lens is."""
     return planes[f, 0] * lens[0] + planes[f, 1] * lens[1] + planes[f, 2] * lens[2] - planes[f, 3]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _project(vertices, a, b, matrix, offset, scale, centre, segments, n):  # type: ignore[no-untyped-def]
     ax = matrix[0, 0] * vertices[a, 0] + matrix[0, 1] * vertices[a, 1] + matrix[0, 2] * vertices[a, 2] + offset[0]
     bx = matrix[0, 0] * vertices[b, 0] + matrix[0, 1] * vertices[b, 1] + matrix[0, 2] * vertices[b, 2] + offset[0]

@@ -14,13 +14,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from phasemark.render.integral.limbs import MAX_LIMBS, collect_limbs, lists_limb
 from phasemark.render.integral.pixel_clipping import MAX_SEGMENTS, clip, clip_to_box
 from phasemark.render.integral.quadrature_rules import G2X, G3W, G3X
 from phasemark.render.integral.strips import MAX_EVENTS, MAX_LINKS, MAX_SLABS, find_events, sweep_box
+from phasemark.render.kernel import kernel
 
 _MAX_DEPTH = 5
 
@@ -79,7 +79,7 @@ class Scratch(NamedTuple):
         )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sample_pixel(  # type: ignore[no-untyped-def]
     r, c, bent, width, height, splits, segments, limb, head, link, owner, scratch, points, weights, regions, n, region
 ):

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from phasemark.render.integral.limbs import nearest_limb
 from phasemark.render.integral.pixel_clipping import edge_at
 from phasemark.render.integral.quadrature_rules import FELT, place_points
+from phasemark.render.kernel import inlined, kernel
 
 EMPTY = 1e-10
 """Pieces narrower than this (pixels) are not sampled."""
@@ -29,7 +29,7 @@ _SHRINKS = 0.3
 """An interval shrinks to a point at an end of a strip where it is narrower than this share of its middle."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sample_strip(  # type: ignore[no-untyped-def]
     n_slabs, k, x0, x1, sweep_v, scratch, curved, bent, scale, points, weights, regions, n, region
 ):
@@ -90,7 +90,7 @@ def sample_strip(  # type: ignore[no-untyped-def]
     return n, region
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
     """Return where, from 0 to 1, a strip of some widths at its ends and in its middle is cut, t of the pieces on.
 
@@ -106,7 +106,7 @@ def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
     return t
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, edges, slabs, links):  # type: ignore[no-untyped-def]
     """Return the Gauss rule for the width of an interval from `lo` to `hi` as weight.
 
@@ -154,7 +154,7 @@ def _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, edges, slabs, links):  # type: ig
     return 2, m0, max(s_a, lo), min(s_b, hi), above / root
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _bounds(s, slab, i, k, x0, x1, edges, links):  # type: ignore[no-untyped-def]
     """Return the ends of interval i on the line at s, which lies in a slab."""
     a = x0 if i == 0 else edge_at(edges, links[slab * k + i - 1], s)
@@ -162,7 +162,7 @@ def _bounds(s, slab, i, k, x0, x1, edges, links):  # type: ignore[no-untyped-def
     return a, b
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _interval(  # type: ignore[no-untyped-def]
     s, n_slabs, i, k, x0, x1, edges, slabs, links, limbs, n_limbs, seek_left, seek_right
 ):

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from phasemark.render.kernel import kernel
 
 MAX_LIMBS = 256
 _REACH = 0.5
 """How far along the sweep (pixels) the end of a limb is felt."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lists_limb(entry, link, owner, limb):  # type: ignore[no-untyped-def]
     """Return whether a limb is among the segments listed from `entry` on."""
     while entry >= 0:
@@ -20,7 +21,7 @@ def lists_limb(entry, link, owner, limb):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def collect_limbs(entry, link, owner, segments, limb, sweep_v, limbs, count):  # type: ignore[no-untyped-def]
     """Append a pixel's limbs: rows of s, x at the low end, s at the high end, slope dx/ds.
 
@@ -48,7 +49,7 @@ def collect_limbs(entry, link, owner, segments, limb, sweep_v, limbs, count):  #
         count[which] += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def nearest_limb(limbs, n_limbs, s, side, bound):  # type: ignore[no-untyped-def]
     """Find, of limbs with their surface on our side, the one nearest to `bound` and beyond it, on or near a line.
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from phasemark.render.kernel import inlined, kernel
 
 MAX_SEGMENTS = 128
 """Edges in a box above which it is quartered rather than swept: crossings are searched pair by pair."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def bin_segments(segments, n_segments, rows, cols, head, link, owner):  # type: ignore[no-untyped-def]
     """List the segments of every pixel, with a border of one pixel around the image.
 
@@ -59,7 +59,7 @@ def bin_segments(segments, n_segments, rows, cols, head, link, owner):  # type: 
     return n
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
     """Return the shares (lo, hi) of a segment between which it lies in a box; lo ≥ hi where it does not."""
     du, dv = ub - ua, vb - va
@@ -74,7 +74,7 @@ def clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
     return lo, hi
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore[no-untyped-def]
     """Clip a pixel's segments to a box, into ``scratch.edges``.
 
@@ -119,7 +119,7 @@ def clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, scr
     return m
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def edge_at(edges, i, s):  # type: ignore[no-untyped-def]
     """Return where an edge meets the line at `s`."""
     return edges[i, 1] + (s - edges[i, 0]) * edges[i, 5]

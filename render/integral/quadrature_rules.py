@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from phasemark.render.kernel import kernel
 
 _THIN = 0.15
 """Intervals narrower than this (pixels) get one Gauss point."""
@@ -35,7 +36,7 @@ G4X, G4W = gauss_legendre(4)
 G5X, G5W = gauss_legendre(5)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def place_points(a, b, left, right, bent, points, weights):  # type: ignore[no-untyped-def]
     """Place Gauss points on one interval [a, b], with limbs at `left` and `right` (∓inf: none).
 

@@ -6,10 +6,9 @@ line across it meets them in the same order.
 
 from __future__ import annotations
 
-from numba import njit
-
 from phasemark.render.integral.intervals import EMPTY, sample_strip
 from phasemark.render.integral.pixel_clipping import MAX_SEGMENTS, edge_at
+from phasemark.render.kernel import kernel
 
 MAX_EVENTS = 4 * MAX_SEGMENTS + 64
 MAX_SLABS = 256
@@ -22,7 +21,7 @@ PINCH = 1e-6
 """Edges closer than this (pixels) at the end of a slab meet there."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_events(s0, s1, edges, m, events):  # type: ignore[no-untyped-def]
     """Collect, sorted, where the order of the edges across the sweep may change.
 
@@ -64,7 +63,7 @@ def find_events(s0, s1, edges, m, events):  # type: ignore[no-untyped-def]
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _activate(lo, hi, edges, m, started, active, n_active):  # type: ignore[no-untyped-def]
     """Update the list of edges that span the slab [lo, hi], ordered along its middle line.
 
@@ -93,7 +92,7 @@ def _activate(lo, hi, edges, m, started, active, n_active):  # type: ignore[no-u
     return started, n_active
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _continues(edges, m, links, last, after, n, stop, lo):  # type: ignore[no-untyped-def]
     """Tell whether the edges of two neighbouring slabs are the same, or links of the same smooth curves.
 
@@ -128,7 +127,7 @@ def _continues(edges, m, links, last, after, n, stop, lo):  # type: ignore[no-un
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sweep_box(  # type: ignore[no-untyped-def]
     n_events, s0, s1, x0, x1, sweep_v, scratch, m, curved, bent, scale, points, weights, regions, n, region
 ):
