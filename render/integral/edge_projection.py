@@ -17,7 +17,7 @@ _NEAR_M = 1e-6
 
 
 @kernel
-def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  # type: ignore[no-untyped-def]
+def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-def]
     """Project the creases and silhouettes of one view.
 
     A fold is a silhouette where the lens lies before one of its faces and behind the other. Both faces' planes pass
@@ -27,17 +27,12 @@ def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  #
     Parameters
     ----------
     mesh : MeshTopology
-    lens : (3,)
-        The lens in the landmark frame.
-    matrix, offset : (3, 3), (3,)
-        p_image = matrix · p' + offset: landmark frame to the tilted camera's frame (x along the axis).
-    scale, centre : (2,)
-        u = centre[0] − scale[0] · y/x, v = centre[1] − scale[1] · z/x.
-    segments : (e, 4) float64, overwritten
-        u, v of both ends.
-    limb : (e,) int8, overwritten
-        1 for a silhouette of a smooth surface; then the surface lies on the side where
-        du·(v − v_a) − dv·(u − u_a) < 0.
+    poses : Poses
+    view : int
+        Which of the poses.
+    camera : Camera
+    edges : Edges
+        ``segments`` and ``limb`` are overwritten.
 
     Returns
     -------
@@ -47,6 +42,7 @@ def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  #
     vertices, planes, creases, concave, folds = mesh.vertices, mesh.planes, mesh.creases, mesh.concave, mesh.folds
     face_folds, smooth_faces, smooth_planes = mesh.face_folds, mesh.smooth_faces, mesh.smooth_planes
     clusters = mesh.clusters
+    lens, matrix, offset, limb = poses.lens[view], poses.matrix[view], poses.offset[view], edges.limb
     n = 0
     for e in range(len(creases)):
         start, end, face, other = creases[e, 0], creases[e, 1], creases[e, 2], creases[e, 3]
@@ -55,7 +51,7 @@ def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  #
             before, before_other = _height(planes, face, lens) > 0.0, _height(planes, other, lens) > 0.0
             if not (before or before_other) or (concave[e] and not (before and before_other)):
                 continue
-        if _project(vertices, start, end, matrix, offset, scale, centre, segments, n):
+        if _project(vertices, start, end, matrix, offset, camera, edges.segments, n):
             limb[n] = 0
             n += 1
     farthest = mesh.radius_m + math.sqrt(lens[0] * lens[0] + lens[1] * lens[1] + lens[2] * lens[2])
@@ -77,7 +73,7 @@ def project_edges(mesh, lens, matrix, offset, scale, centre, segments, limb):  #
                 if before == (_height(planes, folds[e, 3], lens) > 0.0):
                     continue
                 a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
-                if _project(vertices, a, b, matrix, offset, scale, centre, segments, n):
+                if _project(vertices, a, b, matrix, offset, camera, edges.segments, n):
                     limb[n] = 1
                     n += 1
     return n
@@ -90,7 +86,7 @@ def _height(planes, f, lens):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _project(vertices, a, b, matrix, offset, scale, centre, segments, n):  # type: ignore[no-untyped-def]
+def _project(vertices, a, b, matrix, offset, camera, segments, n):  # type: ignore[no-untyped-def]
     ax = matrix[0, 0] * vertices[a, 0] + matrix[0, 1] * vertices[a, 1] + matrix[0, 2] * vertices[a, 2] + offset[0]
     bx = matrix[0, 0] * vertices[b, 0] + matrix[0, 1] * vertices[b, 1] + matrix[0, 2] * vertices[b, 2] + offset[0]
     if ax < _NEAR_M and bx < _NEAR_M:
@@ -105,8 +101,8 @@ def _project(vertices, a, b, matrix, offset, scale, centre, segments, n):  # typ
     elif bx < _NEAR_M:
         w = (_NEAR_M - bx) / (ax - bx)
         bx, by, bz = _NEAR_M, by + w * (ay - by), bz + w * (az - bz)
-    segments[n, 0] = centre[0] - scale[0] * ay / ax
-    segments[n, 1] = centre[1] - scale[1] * az / ax
-    segments[n, 2] = centre[0] - scale[0] * by / bx
-    segments[n, 3] = centre[1] - scale[1] * bz / bx
+    segments[n, 0] = camera.centre_u - camera.scale_u * ay / ax
+    segments[n, 1] = camera.centre_v - camera.scale_v * az / ax
+    segments[n, 2] = camera.centre_u - camera.scale_u * by / bx
+    segments[n, 3] = camera.centre_v - camera.scale_v * bz / bx
     return 1

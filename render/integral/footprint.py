@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.render.integral.intervals import Box
 from phasemark.render.integral.limbs import MAX_LIMBS, collect_limbs, lists_limb
 from phasemark.render.integral.pixel_clipping import MAX_SEGMENTS, clip, clip_to_box
 from phasemark.render.integral.quadrature_rules import G2X, G3W, G3X
@@ -80,9 +81,7 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def sample_pixel(  # type: ignore[no-untyped-def]
-    r, c, bent, width, height, splits, segments, limb, head, link, owner, scratch, points, weights, regions, n, region
-):
+def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, n, region):  # type: ignore[no-untyped-def]
     """Place the samples of one pixel.
 
     Parameters
@@ -91,31 +90,30 @@ def sample_pixel(  # type: ignore[no-untyped-def]
         Row and column.
     bent : bool
         Whether the pixel may see the inside of a curved surface, which takes more points than a flat one.
-    width, height : float
-        Fill factor.
     splits : int
         Boxes a side that the active area is cut into before anything else.
-    segments, limb, head, link, owner
+    camera : Camera
+    edges : Edges
         As :func:`project_edges` and :func:`bin_segments` left them.
     scratch : Scratch
-    points : (m, 2) float64
-        u, v of the samples, written from `n` on.
-    weights : (m,) float64
-        Shares of the active area; they add up to one.
-    regions : (m,) int32
-        Number of the interval a sample lies in, counted from `region`.
+    samples : Samples
+        ``points``, ``weights``, which add up to one, and ``regions``, counted from `region`, are written from `n` on.
+    n, region : int
 
     Returns
     -------
     n, region, trusted : int, int, bool
         Where the next pixel starts (n = −1: the arrays are full), and whether every box could be split exactly.
     """
+    head, segments, limb, link, owner = edges.head, edges.segments, edges.limb, edges.link, edges.owner
+    points, weights, regions = samples.points, samples.weights, samples.regions
+    width, height = camera.fill_u, camera.fill_v
     u0 = c + 0.5 - 0.5 * width
     v0 = r + 0.5 - 0.5 * height
     inverse_area = 1.0 / (width * height)
     i, j = r + 1, c + 1
-    sideways = lists_limb(head[i, j - 1], link, owner, limb) or lists_limb(head[i, j + 1], link, owner, limb)
-    upright = lists_limb(head[i - 1, j], link, owner, limb) or lists_limb(head[i + 1, j], link, owner, limb)
+    sideways = lists_limb(head[i, j - 1], edges) or lists_limb(head[i, j + 1], edges)
+    upright = lists_limb(head[i - 1, j], edges) or lists_limb(head[i + 1, j], edges)
     if head[i, j] < 0 and not sideways and not upright:
         count = 3 if bent else 2
         if n + (splits * count) ** 2 > len(weights):
@@ -157,12 +155,12 @@ def sample_pixel(  # type: ignore[no-untyped-def]
         # the pixel itself and its neighbours across the sweep may hold the limb this pixel's surface ends at
         before, after = (head[i, j - 1], head[i, j + 1]) if sweep_v else (head[i - 1, j], head[i + 1, j])
         for near in (head[i, j], before, after):
-            collect_limbs(near, link, owner, segments, limb, sweep_v, scratch.limbs, scratch.n_limbs)
+            collect_limbs(near, edges, sweep_v, scratch)
     stack = scratch.boxes
-    box, depth, trusted = 0, 0, True
-    while depth > 0 or box < splits * splits:
+    part, depth, trusted = 0, 0, True
+    while depth > 0 or part < splits * splits:
         if depth == 0:
-            row, col = divmod(box, splits)
+            row, col = divmod(part, splits)
             stack[0] = (
                 u0 + width * col / splits,
                 v0 + height * row / splits,
@@ -170,12 +168,15 @@ def sample_pixel(  # type: ignore[no-untyped-def]
                 v0 + height * (row + 1) / splits,
                 0.0,
             )
-            box, depth = box + 1, 1
+            part, depth = part + 1, 1
         depth -= 1
         bu0, bv0, bu1, bv1, level = stack[depth]
-        m = clip_to_box(head[i, j], link, owner, segments, limb, bu0, bv0, bu1, bv1, sweep_v, scratch)
-        s0, s1, x0, x1 = (bv0, bv1, bu0, bu1) if sweep_v else (bu0, bu1, bv0, bv1)
-        n_events = find_events(s0, s1, scratch.edges, m, scratch.events) if m >= 0 else -1
+        m = clip_to_box(head[i, j], edges, bu0, bv0, bu1, bv1, sweep_v, scratch)
+        if sweep_v:
+            box = Box(bv0, bv1, bu0, bu1, sweep_v, curved, bent, inverse_area)
+        else:
+            box = Box(bu0, bu1, bv0, bv1, sweep_v, curved, bent, inverse_area)
+        n_events = find_events(box, m, scratch) if m >= 0 else -1
         if n_events < 0 and level < _MAX_DEPTH:
             um, vm = 0.5 * (bu0 + bu1), 0.5 * (bv0 + bv1)
             stack[depth] = (bu0, bv0, um, vm, level + 1)
@@ -186,11 +187,8 @@ def sample_pixel(  # type: ignore[no-untyped-def]
             continue
         if n_events < 0:
             m, trusted = 0, False
-            n_events = find_events(s0, s1, scratch.edges, m, scratch.events)
-        n, region = sweep_box(
-            n_events, s0, s1, x0, x1, sweep_v, scratch, m, curved, bent, inverse_area, points, weights, regions,
-            n, region,
-        )  # fmt: skip
+            n_events = find_events(box, m, scratch)
+        n, region = sweep_box(box, n_events, m, scratch, samples, n, region)
         if n < 0:
             return -1, region, trusted
     return n, region, trusted

@@ -7,6 +7,7 @@ lie in one interval see one smooth patch of the surface.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,35 +30,60 @@ _SHRINKS = 0.3
 """An interval shrinks to a point at an end of a strip where it is narrower than this share of its middle."""
 
 
+class Box(NamedTuple):
+    """A part of a pixel that is swept.
+
+    Parameters
+    ----------
+    s0, s1, x0, x1 : float
+        Begin and end along the sweep, and across it.
+    sweep_v : bool
+        Whether the sweep runs along v; s is v then, and x is u.
+    curved : bool
+        Whether a limb is near.
+    bent : bool
+        Whether the inside of a curved surface may be seen, which takes more points than a flat one.
+    scale : float
+        Turns areas into weights.
+    """
+
+    s0: float
+    s1: float
+    x0: float
+    x1: float
+    sweep_v: bool
+    curved: bool
+    bent: bool
+    scale: float
+
+
+class Strip(NamedTuple):
+    """Neighbouring slabs with the same curves: how many slabs, and how many curves."""
+
+    n_slabs: int
+    k: int
+
+
 @kernel
-def sample_strip(  # type: ignore[no-untyped-def]
-    n_slabs, k, x0, x1, sweep_v, scratch, curved, bent, scale, points, weights, regions, n, region
-):
+def sample_strip(strip, box, scratch, samples, n, region):  # type: ignore[no-untyped-def]
     """Sample the k + 1 intervals between the k curves of a strip.
 
     An interval's light is ∫ width(s) · mean over x of f(s, x) ds. The width is known exactly; its moments give the
     two-point Gauss rule for it as a weight, exact wherever the mean is cubic in s, and the area always.
     """
-    edges, slabs, links = scratch.edges, scratch.slabs, scratch.links
-    limbs, n_limbs = scratch.limbs, scratch.n_limbs
-    start, stop = slabs[0, 0], slabs[n_slabs - 1, 1]
-    for i in range(k + 1):
-        a, b, left, right = _interval(
-            0.5 * (start + stop), n_slabs, i, k, x0, x1, edges, slabs, links, limbs, n_limbs, curved, curved
-        )
+    points, weights, regions = samples.points, samples.weights, samples.regions
+    start, stop = scratch.slabs[0, 0], scratch.slabs[strip.n_slabs - 1, 1]
+    for i in range(strip.k + 1):
+        a, b, left, right = _interval(0.5 * (start + stop), i, strip, box, scratch, box.curved, box.curved)
         near_left, near_right = a - left < FELT, right - b < FELT
         limb, width = near_left or near_right, b - a
-        a_low, b_low = _bounds(start, 0, i, k, x0, x1, edges, links)
-        a_high, b_high = _bounds(stop, n_slabs - 1, i, k, x0, x1, edges, links)
+        a_low, b_low = _bounds(start, 0, i, strip, box, scratch)
+        a_high, b_high = _bounds(stop, strip.n_slabs - 1, i, strip, box, scratch)
         extent = max(stop - start, abs(a_high - a_low), abs(b_high - b_low))
         steep = False
         if limb:
-            _, _, left_low, right_low = _interval(
-                start, n_slabs, i, k, x0, x1, edges, slabs, links, limbs, n_limbs, near_left, near_right
-            )
-            _, _, left_high, right_high = _interval(
-                stop, n_slabs, i, k, x0, x1, edges, slabs, links, limbs, n_limbs, near_left, near_right
-            )
+            _, _, left_low, right_low = _interval(start, i, strip, box, scratch, near_left, near_right)
+            _, _, left_high, right_high = _interval(stop, i, strip, box, scratch, near_left, near_right)
             for near, at_low, at_high in ((near_left, left_low, left_high), (near_right, right_low, right_high)):
                 moved = max(abs(at_high - at_low - a_high + a_low), abs(at_high - at_low - b_high + b_low))
                 steep = steep or (near and not moved < _PARALLEL)
@@ -68,22 +94,20 @@ def sample_strip(  # type: ignore[no-untyped-def]
         for piece in range(pieces):
             lo = start + (stop - start) * _cut(piece / pieces, low, width, high)
             hi = start + (stop - start) * _cut((piece + 1) / pieces, low, width, high)
-            nodes, area, s_a, s_b, share = _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, edges, slabs, links)
+            nodes, area, s_a, s_b, share = _gauss_rule(lo, hi, i, strip, box, scratch)
             for g in range(nodes):
                 s = s_a if g == 0 else s_b
                 weight = area * (share if g == 0 else 1.0 - share)
-                a, b, left, right = _interval(
-                    s, n_slabs, i, k, x0, x1, edges, slabs, links, limbs, n_limbs, near_left, near_right
-                )
+                a, b, left, right = _interval(s, i, strip, box, scratch, near_left, near_right)
                 if n + 5 > len(weights):
                     return -1, region
-                placed = place_points(a, b, left, right, bent, points[n:], weights[n:])
+                placed = place_points(a, b, left, right, box.bent, points[n:], weights[n:])
                 for j in range(n, n + placed):
-                    weights[j] *= weight * scale
+                    weights[j] *= weight * box.scale
                     regions[j] = region
                     x = points[j, 0]
-                    points[j, 0] = x if sweep_v else s
-                    points[j, 1] = s if sweep_v else x
+                    points[j, 0] = x if box.sweep_v else s
+                    points[j, 1] = s if box.sweep_v else x
                 n += placed
         if n > before:
             region += 1
@@ -107,7 +131,7 @@ def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, edges, slabs, links):  # type: ignore[no-untyped-def]
+def _gauss_rule(lo, hi, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     """Return the Gauss rule for the width of an interval from `lo` to `hi` as weight.
 
     Returns
@@ -120,15 +144,16 @@ def _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, edges, slabs, links):  # type: ig
     share : float
         Of the first node in the area.
     """
+    slabs = scratch.slabs
     origin = 0.5 * (lo + hi)
     m0, m1, m2, m3 = 0.0, 0.0, 0.0, 0.0
     first_a, first_b, last_a, last_b, met = 0.0, 0.0, 0.0, 0.0, False
-    for slab in range(n_slabs):
+    for slab in range(strip.n_slabs):
         begin, end = max(slabs[slab, 0], lo), min(slabs[slab, 1], hi)
         if end <= begin:
             continue
-        a, b = _bounds(begin, slab, i, k, x0, x1, edges, links)
-        last_a, last_b = _bounds(end, slab, i, k, x0, x1, edges, links)
+        a, b = _bounds(begin, slab, i, strip, box, scratch)
+        last_a, last_b = _bounds(end, slab, i, strip, box, scratch)
         if not met:
             first_a, first_b, met = a, b, True
         low, high = max(b - a, 0.0), max(last_b - last_a, 0.0)
@@ -155,30 +180,32 @@ def _gauss_rule(lo, hi, n_slabs, i, k, x0, x1, edges, slabs, links):  # type: ig
 
 
 @inlined
-def _bounds(s, slab, i, k, x0, x1, edges, links):  # type: ignore[no-untyped-def]
+def _bounds(s, slab, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     """Return the ends of interval i on the line at s, which lies in a slab."""
-    a = x0 if i == 0 else edge_at(edges, links[slab * k + i - 1], s)
-    b = x1 if i == k else edge_at(edges, links[slab * k + i], s)
+    row, edges, links = slab * strip.k, scratch.edges, scratch.links
+    a = box.x0 if i == 0 else edge_at(edges, links[row + i - 1], s)
+    b = box.x1 if i == strip.k else edge_at(edges, links[row + i], s)
     return a, b
 
 
 @kernel
 def _interval(  # type: ignore[no-untyped-def]
-    s, n_slabs, i, k, x0, x1, edges, slabs, links, limbs, n_limbs, seek_left, seek_right
+    s, i, strip, box, scratch, seek_left, seek_right
 ):
     """Return the ends of interval i on the line at s, and where its surface's limbs are, ∓inf where there is none.
 
     Limbs beyond the strip are looked for where `seek_left` and `seek_right` say so.
     """
-    low, high = 0, n_slabs - 1
+    edges, slabs, links = scratch.edges, scratch.slabs, scratch.links
+    low, high = 0, strip.n_slabs - 1
     while low < high:
         middle = (low + high) // 2
         if slabs[middle, 1] < s:
             low = middle + 1
         else:
             high = middle
-    row = low * k
-    a, b = _bounds(s, low, i, k, x0, x1, edges, links)
+    row = low * strip.k
+    a, b = _bounds(s, low, i, strip, box, scratch)
     left, right = -np.inf, np.inf
     behind_limb = False
     for j in range(i - 1, -1, -1):
@@ -189,7 +216,7 @@ def _interval(  # type: ignore[no-untyped-def]
                 left = edge_at(edges, links[row + j], s)
             break
     before_limb, alone = False, True
-    for j in range(i, k):
+    for j in range(i, strip.k):
         side = edges[links[row + j], 4]
         if side != 0.0:
             before_limb, alone = side > 0.0, False
@@ -198,7 +225,7 @@ def _interval(  # type: ignore[no-untyped-def]
             break
     if not behind_limb:
         if seek_left and left == -np.inf and not before_limb:
-            left = nearest_limb(limbs, n_limbs, s, 1.0, a)
+            left = nearest_limb(scratch, s, 1.0, a)
         if seek_right and alone:
-            right = nearest_limb(limbs, n_limbs, s, -1.0, b)
+            right = nearest_limb(scratch, s, -1.0, b)
     return a, b, left, right

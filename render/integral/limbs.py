@@ -12,22 +12,24 @@ _REACH = 0.5
 
 
 @kernel
-def lists_limb(entry, link, owner, limb):  # type: ignore[no-untyped-def]
+def lists_limb(entry, edges):  # type: ignore[no-untyped-def]
     """Return whether a limb is among the segments listed from `entry` on."""
     while entry >= 0:
-        if limb[owner[entry]]:
+        if edges.limb[edges.owner[entry]]:
             return True
-        entry = link[entry]
+        entry = edges.link[entry]
     return False
 
 
 @kernel
-def collect_limbs(entry, link, owner, segments, limb, sweep_v, limbs, count):  # type: ignore[no-untyped-def]
+def collect_limbs(entry, edges, sweep_v, scratch):  # type: ignore[no-untyped-def]
     """Append a pixel's limbs: rows of s, x at the low end, s at the high end, slope dx/ds.
 
-    Those whose surface lies towards larger x go to ``limbs[0]``, the others to ``limbs[1]``; `count` has their numbers.
-    What no longer fits is left out.
+    Those whose surface lies towards larger x go to ``scratch.limbs[0]``, the others to ``scratch.limbs[1]``;
+    ``scratch.n_limbs`` has their numbers. What no longer fits is left out.
     """
+    segments, limb, link, owner = edges.segments, edges.limb, edges.link, edges.owner
+    limbs, count = scratch.limbs, scratch.n_limbs
     while entry >= 0:
         k = owner[entry]
         entry = link[entry]
@@ -50,11 +52,12 @@ def collect_limbs(entry, link, owner, segments, limb, sweep_v, limbs, count):  #
 
 
 @kernel
-def nearest_limb(limbs, n_limbs, s, side, bound):  # type: ignore[no-untyped-def]
+def nearest_limb(scratch, s, side, bound):  # type: ignore[no-untyped-def]
     """Find, of limbs with their surface on our side, the one nearest to `bound` and beyond it, on or near a line.
 
     A limb that ends before it reaches the line (at a rim, say) still shapes the surface beside its end.
     """
+    limbs, n_limbs = scratch.limbs, scratch.n_limbs
     which = 0 if side > 0 else 1
     best = -np.inf if side > 0 else np.inf
     closest = _REACH

@@ -11,23 +11,24 @@ MAX_SEGMENTS = 128
 
 
 @kernel
-def bin_segments(segments, n_segments, rows, cols, head, link, owner):  # type: ignore[no-untyped-def]
+def bin_segments(n_segments, camera, edges):  # type: ignore[no-untyped-def]
     """List the segments of every pixel, with a border of one pixel around the image.
 
     Parameters
     ----------
-    segments : (e, 4) float64
-        u, v of both ends.
-    head : (rows + 2, cols + 2) int32, overwritten
-        First entry of each pixel's list, −1: none.
-    link, owner : (m,) int32, overwritten
-        Next entry, and the entry's segment.
+    n_segments : int
+        How many of the segments there are.
+    camera : Camera
+    edges : Edges
+        ``head``, ``link`` and ``owner`` are overwritten.
 
     Returns
     -------
     int
-        Entries used, or −1 if m was too small.
+        Entries used, or −1 if ``link`` is too short.
     """
+    segments, head, link, owner = edges.segments, edges.head, edges.link, edges.owner
+    rows, cols = camera.rows, camera.cols
     head[:] = -1
     n = 0
     for i in range(n_segments):
@@ -75,14 +76,15 @@ def clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore[no-untyped-def]
+def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore[no-untyped-def]
     """Clip a pixel's segments to a box, into ``scratch.edges``.
 
     Its rows are s, x of both ends (s rising), the limb's side and the slope, sorted by where they begin. The
     side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number, or
     −1 if there are too many.
     """
-    edges, order = scratch.clipped, scratch.order
+    segments, limb, link, owner = edges.segments, edges.limb, edges.link, edges.owner
+    clipped, order = scratch.clipped, scratch.order
     m = 0
     while entry >= 0:
         k = owner[entry]
@@ -101,21 +103,21 @@ def clip_to_box(entry, link, owner, segments, limb, u0, v0, u1, v1, sweep_v, scr
             sa, xa, sb, xb = ua + lo * du, va + lo * dv, ua + hi * du, va + hi * dv
             side = -1.0 if du > 0 else 1.0
         if sa <= sb:
-            edges[m, 0], edges[m, 1], edges[m, 2], edges[m, 3] = sa, xa, sb, xb
+            clipped[m, 0], clipped[m, 1], clipped[m, 2], clipped[m, 3] = sa, xa, sb, xb
         else:
-            edges[m, 0], edges[m, 1], edges[m, 2], edges[m, 3] = sb, xb, sa, xa
-        edges[m, 4] = side if limb[k] else 0.0
-        length = edges[m, 2] - edges[m, 0]
-        edges[m, 5] = (edges[m, 3] - edges[m, 1]) / length if length > 0.0 else 0.0
-        begin, place = edges[m, 0], m
-        while place > 0 and edges[order[place - 1], 0] > begin:
+            clipped[m, 0], clipped[m, 1], clipped[m, 2], clipped[m, 3] = sb, xb, sa, xa
+        clipped[m, 4] = side if limb[k] else 0.0
+        length = clipped[m, 2] - clipped[m, 0]
+        clipped[m, 5] = (clipped[m, 3] - clipped[m, 1]) / length if length > 0.0 else 0.0
+        begin, place = clipped[m, 0], m
+        while place > 0 and clipped[order[place - 1], 0] > begin:
             order[place] = order[place - 1]
             place -= 1
         order[place] = m
         m += 1
     for i in range(m):
         for j in range(6):
-            scratch.edges[i, j] = edges[order[i], j]
+            scratch.edges[i, j] = clipped[order[i], j]
     return m
 
 

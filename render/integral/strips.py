@@ -6,7 +6,7 @@ line across it meets them in the same order.
 
 from __future__ import annotations
 
-from phasemark.render.integral.intervals import EMPTY, sample_strip
+from phasemark.render.integral.intervals import EMPTY, Strip, sample_strip
 from phasemark.render.integral.pixel_clipping import MAX_SEGMENTS, edge_at
 from phasemark.render.kernel import kernel
 
@@ -22,18 +22,19 @@ PINCH = 1e-6
 
 
 @kernel
-def find_events(s0, s1, edges, m, events):  # type: ignore[no-untyped-def]
+def find_events(box, m, scratch):  # type: ignore[no-untyped-def]
     """Collect, sorted, where the order of the edges across the sweep may change.
 
     Returns their number, or −1 if there are too many.
     """
-    events[0] = s0
+    edges, events = scratch.edges, scratch.events
+    events[0] = box.s0
     n = 1
     for i in range(m):
         events[n] = edges[i, 0]
         events[n + 1] = edges[i, 2]
         n += 2
-    events[n] = s1
+    events[n] = box.s1
     n += 1
     for i in range(m):
         for j in range(i + 1, m):
@@ -64,11 +65,12 @@ def find_events(s0, s1, edges, m, events):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _activate(lo, hi, edges, m, started, active, n_active):  # type: ignore[no-untyped-def]
+def _activate(lo, hi, m, started, n_active, scratch):  # type: ignore[no-untyped-def]
     """Update the list of edges that span the slab [lo, hi], ordered along its middle line.
 
     Returns how many edges have started, and how many are active.
     """
+    edges, active = scratch.edges, scratch.active
     middle = 0.5 * (lo + hi)
     kept = 0
     for i in range(n_active):
@@ -93,13 +95,14 @@ def _activate(lo, hi, edges, m, started, active, n_active):  # type: ignore[no-u
 
 
 @kernel
-def _continues(edges, m, links, last, after, n, stop, lo):  # type: ignore[no-untyped-def]
+def _continues(m, last, n, stop, lo, scratch):  # type: ignore[no-untyped-def]
     """Tell whether the edges of two neighbouring slabs are the same, or links of the same smooth curves.
 
     Not so where edges cross, begin or end alone, where one lies along the border between the slabs, where a link stands
     at a noticeable angle to the one before, or where the curve has turned far since the strip's first slab. The last
     slab's edges stand in `links` from `last` on.
     """
+    edges, links, after = scratch.edges, scratch.links, scratch.active
     for i in range(n):
         old, new = links[last + i], after[i]
         if old == new:
@@ -128,29 +131,25 @@ def _continues(edges, m, links, last, after, n, stop, lo):  # type: ignore[no-un
 
 
 @kernel
-def sweep_box(  # type: ignore[no-untyped-def]
-    n_events, s0, s1, x0, x1, sweep_v, scratch, m, curved, bent, scale, points, weights, regions, n, region
-):
-    """Sample a box strip by strip; `scale` turns areas into weights.
+def sweep_box(box, n_events, m, scratch, samples, n, region):  # type: ignore[no-untyped-def]
+    """Sample a box strip by strip.
 
     A rim or silhouette is a chain of many short edges, each of which begins and ends a slab. Neighbouring slabs in
     which the same chains run side by side make one strip, in which the chains are smooth curves.
     """
-    edges, events, active, slabs, links = scratch.edges, scratch.events, scratch.active, scratch.slabs, scratch.links
+    events, active, slabs, links = scratch.events, scratch.active, scratch.slabs, scratch.links
     started, n_active, n_slabs, k = 0, 0, 0, 0
     for e in range(n_events - 1):
-        lo, hi = max(events[e], s0), min(events[e + 1], s1)
+        lo, hi = max(events[e], box.s0), min(events[e + 1], box.s1)
         if hi - lo <= EMPTY:
             continue
-        started, n_active = _activate(lo, hi, edges, m, started, active, n_active)
+        started, n_active = _activate(lo, hi, m, started, n_active, scratch)
         if n_slabs > 0:
             stop = slabs[n_slabs - 1, 1]
             full = n_slabs == len(slabs) or (n_slabs + 1) * k > len(links)
             joined = not full and n_active == k and lo - stop <= EMPTY
-            if not (joined and _continues(edges, m, links, (n_slabs - 1) * k, active, k, stop, lo)):
-                n, region = sample_strip(
-                    n_slabs, k, x0, x1, sweep_v, scratch, curved, bent, scale, points, weights, regions, n, region
-                )
+            if not (joined and _continues(m, (n_slabs - 1) * k, k, stop, lo, scratch)):
+                n, region = sample_strip(Strip(n_slabs, k), box, scratch, samples, n, region)
                 if n < 0:
                     return -1, region
                 n_slabs = 0
@@ -160,7 +159,5 @@ def sweep_box(  # type: ignore[no-untyped-def]
             links[n_slabs * k + i] = active[i]
         n_slabs += 1
     if n_slabs > 0:
-        n, region = sample_strip(
-            n_slabs, k, x0, x1, sweep_v, scratch, curved, bent, scale, points, weights, regions, n, region
-        )
+        n, region = sample_strip(Strip(n_slabs, k), box, scratch, samples, n, region)
     return n, region
