@@ -358,15 +358,16 @@ class Renderer:
             aim(count, samples, poses, camera)
             return self._intersector.first_face(samples.origins[:count], samples.directions[:count])
 
+        mesh = self.topology
         scouts = cast(pick_scouts(n, samples))
-        rest = share_faces(n, self.topology, self.topology.closed, scouts, samples, state)
+        rest = share_faces(n, mesh, mesh.closed, scouts, samples, poses, camera, state)
         samples.face[samples.chosen[:rest]] = cast(rest)
 
     def _check_lens_outside(self, views: Views) -> None:
         """Refuse views whose lens lies inside the landmark, or within a millimetre of its axis-aligned box."""
         if not len(self.topology.faces):
             return
-        low, high = self.topology.vertices.min(axis=0), self.topology.vertices.max(axis=0)
+        low, high = self.topology.low, self.topology.high
         lens = views.lens_in_landmark()
         near = np.flatnonzero(((lens > low - 1e-3) & (lens < high + 1e-3)).all(axis=1))
         if near.size:

@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
+from phasemark.render.integral.face_search import FaceGrid
 
 CREASE_RAD = math.radians(30.0)
 CLUSTER = 32
@@ -43,6 +44,11 @@ class MeshTopology(NamedTuple):
         Whether all faces of the face's smooth patch are flat, which makes the patch a plane.
     patch : (f,) int32
         Number of the smooth patch, faces joined without a crease between them.
+    search : (f, 16) float32
+        What the search of a face asks: plane (4), corner shares (8), the face of the same patch beyond the edge from
+        each corner to the next (3; −1: there is none), and the patch.
+    grid : FaceGrid
+        Where the faces of curved patches are.
     part : (f,) int8
         0 for the landmark's lower part, 1 for the upper one.
     concave : (e,) bool
@@ -59,6 +65,8 @@ class MeshTopology(NamedTuple):
     clusters : (c, 10) float64
         Per cluster a point, a mean normal, its offset from the point's plane, how far the faces' normals and offsets
         differ from those at most, and the largest reach.
+    low, high : (3,) float64
+        Corners of the box around all vertices.
     radius_m : float
         Distance of the farthest vertex from the origin.
     closed : bool
@@ -73,6 +81,8 @@ class MeshTopology(NamedTuple):
     flat: NDArray[np.bool_]
     plain: NDArray[np.bool_]
     patch: NDArray[np.int32]
+    search: NDArray[np.float32]
+    grid: FaceGrid
     part: NDArray[np.int8]
     creases: NDArray[np.int32]
     concave: NDArray[np.bool_]
@@ -81,6 +91,8 @@ class MeshTopology(NamedTuple):
     smooth_faces: NDArray[np.int32]
     smooth_planes: NDArray[np.float64]
     clusters: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
     radius_m: float
     closed: bool
 
@@ -120,6 +132,8 @@ class MeshTopology(NamedTuple):
         # the corner of the other face off the edge lies before the first face's plane
         off_edge = vertices[faces[other]].sum(axis=1) - vertices[edges[:, 0]] - vertices[edges[:, 1]]
         concave = np.einsum("ij,ij->i", planes[first, :3], off_edge) > planes[first, 3]
+        plain = np.bincount(patch, ~flat)[patch] == 0
+        shares = _corner_shares(vertices[faces])
         face_folds, fold_reach = _folds_of_faces(edges[fold], normals)
         smooth_faces, clusters = _cluster_faces(vertices[faces].mean(axis=1), planes, fold_reach)
         shell = _components(len(faces), edges[other >= 0][:, 2:])
@@ -130,11 +144,15 @@ class MeshTopology(NamedTuple):
             vertices=np.ascontiguousarray(vertices),
             faces=np.ascontiguousarray(faces, dtype=np.int32),
             planes=np.ascontiguousarray(planes),
-            corner_shares=_corner_shares(vertices[faces]),
+            corner_shares=shares,
             corner_normals=np.ascontiguousarray(corners, dtype=np.float32),
             flat=np.ascontiguousarray(flat),
-            plain=np.bincount(patch, ~flat)[patch] == 0,
+            plain=plain,
             patch=patch,
+            search=np.ascontiguousarray(
+                np.column_stack([planes, shares.reshape(-1, 8), _neighbours(faces, edges[~crease]), patch]), np.float32
+            ),
+            grid=FaceGrid.of_faces(vertices[faces], ~plain),
             part=np.ascontiguousarray(part),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
             concave=np.ascontiguousarray(concave[crease]),
@@ -143,6 +161,8 @@ class MeshTopology(NamedTuple):
             smooth_faces=smooth_faces,
             smooth_planes=np.ascontiguousarray(np.column_stack([planes, fold_reach])[smooth_faces]),
             clusters=clusters,
+            low=vertices.min(axis=0),
+            high=vertices.max(axis=0),
             radius_m=float(np.linalg.norm(vertices, axis=1).max()),
             closed=bool(regular.all() and (six_volumes > 0).all()),
         )
@@ -159,6 +179,8 @@ class MeshTopology(NamedTuple):
             flat=np.zeros(0, np.bool_),
             plain=np.zeros(0, np.bool_),
             patch=np.zeros(0, np.int32),
+            search=np.zeros((0, 16), np.float32),
+            grid=FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_)),
             part=np.zeros(0, np.int8),
             creases=np.zeros((0, 4), np.int32),
             concave=np.zeros(0, np.bool_),
@@ -167,6 +189,8 @@ class MeshTopology(NamedTuple):
             smooth_faces=np.zeros(0, np.int32),
             smooth_planes=np.zeros((0, 5)),
             clusters=np.zeros((0, 10)),
+            low=np.zeros(3),
+            high=np.zeros(3),
             radius_m=0.0,
             closed=True,
         )
@@ -204,6 +228,15 @@ def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool
     opposed = half[starts, 0] == half[second, 1]
     edges = np.column_stack([half[starts], owner[starts], other])
     return edges, (count == 2) & opposed
+
+
+def _neighbours(faces: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return the face beyond each edge of each face, (f, 3), where one of the given edges is; −1 elsewhere."""
+    table = np.full(faces.shape, -1, np.int32)
+    start, end, first, other = edges.T
+    for corner, face, beyond in ((start, first, other), (end, other, first)):  # the other face has the edge reversed
+        table[face, (faces[face] == corner[:, None]).argmax(axis=1)] = beyond
+    return table
 
 
 def _folds_of_faces(
