@@ -209,6 +209,14 @@ def _run(arguments: list[str]) -> None:
         raise UsageError(f"{message}: see '{path} --help'") from None
 
 
+def _set_up_libraries() -> None:
+    """Set what libraries look at when they are imported."""
+    os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")  # before HDF5 is loaded: no file makes it load code
+    # before NumPy is: its small products gain nothing from threads that fight our workers' for the processors
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ["MPLBACKEND"] = "agg"  # pictures become files: a window that is not there is no reason to fail
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
@@ -228,10 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _open_closed_streams()
     if arguments is None and _COMPLETION in os.environ:  # the shell asks what may follow
         app(prog_name="phasemark")
-    os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")  # before HDF5 is loaded: no file makes it load code
-    # before NumPy is: its small products gain nothing from threads that fight our workers' for the processors
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ["MPLBACKEND"] = "agg"  # pictures become files: a window that is not there is no reason to fail
+    _set_up_libraries()
     from phasemark.inputs import pipes_read_once
 
     if isinstance(sys.stdout, io.TextIOWrapper):

@@ -13,8 +13,9 @@ import numpy as np
 
 from phasemark.data import Bank, BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import FilteredFrames, Matcher, cramer_rao, efficiency, kalman_filter
+from phasemark.matcher import FilteredFrames, Matcher, cramer_rao, kalman_filter, rms_interval
 from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.statistics import wrapped_errors
 from phasemark.render import Background, Renderer, Sensor, Views, capture
 
 N_VIEWS = 1000
@@ -63,15 +64,14 @@ def row(
     began = time.perf_counter()
     estimate = method()
     seconds = time.perf_counter() - began
-    error = estimate - truth
-    error[:, 1] -= math.pi * np.round(error[:, 1] / math.pi)
+    error = wrapped_errors(estimate - truth, VIEW[:2], math.pi)
     scaled = np.abs(error / std)
     inner = (scaled < OUTLIER).all(axis=1)
     figures: dict[str, Any] = {"background": background, "method": name}
     for k, symbol in enumerate("Dδ"):
         figures[f"{symbol}: median"] = round(float(np.nanmedian(scaled[:, k])) / 0.6745, 2)
     for k, symbol in enumerate("Dδ"):
-        ratio = efficiency(scaled[inner, k], np.ones(inner.sum())) if inner.sum() > 1 else None
+        ratio = rms_interval(scaled[inner, k]) if inner.sum() > 1 else None
         figures[f"{symbol}: r.m.s."] = "" if ratio is None else round(ratio.value, 2)
     figures["beyond 5 bounds"] = f"{1 - inner.mean():.1%}"
     figures["ms a frame"] = float(f"{1e3 * seconds / len(truth):.2g}")
@@ -99,14 +99,14 @@ def neighbours(bank: Bank, frames: FilteredFrames, background: Background | None
     phasor = bank.lower.phasor.astype(np.complex128)
     if background is not None:
         behind = Renderer(None, sensor).render_views(Views.broadcast(1.0), background=background)
-        rows = slice(sensor.rows // 2, None)
+        rows = slice(*sensor.lower_rows)
         phasor = phasor + (1 - bank.lower.coverage) * behind.phasor[0, rows]
     ranges = np.angle(phasor.reshape(-1, phasor.shape[-2] * phasor.shape[-1])) % (2 * np.pi)
     table = np.where(np.abs(phasor.reshape(ranges.shape)) > 0, ranges * sensor.metres_per_radian, 0.0)
     # a bank's image has light in pixels the sensor would refuse: those of a hundredth of the brightest
     dim = np.abs(phasor.reshape(ranges.shape))
     table[dim < 0.01 * dim.max(axis=1, keepdims=True)] = 0.0
-    seen = np.nan_to_num(frames.range_m[:, sensor.rows // 2 :].reshape(len(frames), -1))
+    seen = np.nan_to_num(frames.range_m[:, slice(*sensor.lower_rows)].reshape(len(frames), -1))
     n_delta = len(bank.delta_rad)
     index = NearestNeighbors(n_neighbors=1, algorithm="brute").fit(table)
 

@@ -22,7 +22,7 @@ from phasemark.matcher import KnownPoses, Mounting, filter_poses
 from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.calibration.mounting_fit import Fit
 from phasemark.matcher.calibration.mounting_model import NAMES, SCALE, STEP, CalibrationModel
-from phasemark.matcher.likelihood.residuals import Evidence, Quantity
+from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.render import Frames, Renderer, Views, capture, preset
 
 SENSOR = preset("pmd-16x16")
@@ -35,7 +35,7 @@ def mounting() -> dict[str, Any]:
     """Time ``phasemark calibrate`` in a process of its own, its fit alone, and the same residuals in SciPy's solver."""
     rows = []
     frames, poses = recording(np.random.default_rng(2005))
-    quantities: tuple[Quantity, ...] = ("phasors", "ranges")
+    quantities: tuple[ResidualKind, ...] = ("phasors", "ranges")
     with tempfile.TemporaryDirectory() as folder:
         whole = {on: command_seconds(Path(folder), frames, poses, on) for on in quantities}
     for on in quantities:
@@ -100,8 +100,8 @@ def recording(rng: np.random.Generator) -> tuple[Frames, KnownPoses]:
     return Frames(frames.range_m, frames.amplitude_e, frames.intensity_e, flags=frames.flags, sensor=SENSOR), poses
 
 
-def command_seconds(folder: Path, frames: Frames, poses: KnownPoses, on: Quantity, runs: int = 3) -> list[float]:
-    """Return wall clock seconds of whole commands, program start, files and picture included."""
+def command_seconds(folder: Path, frames: Frames, poses: KnownPoses, on: ResidualKind, runs: int = 3) -> list[float]:
+    """Return wall clock seconds of whole commands, program start, files and figure included."""
     path, csv = folder / "frames.npz", folder / "poses.csv"
     np.savez(
         path, range=frames.range_m, amplitude=frames.amplitude_e, intensity=frames.intensity_e, unit="m",

@@ -30,7 +30,7 @@ from tolerance import tolerance
 
 from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Conditions, FilteredFrames, Matcher, kalman_filter, phasor_mean
+from phasemark.matcher import FilteredFrames, Matcher, TrialSetup, kalman_filter, phasor_mean
 from phasemark.matcher.accuracy.trials import noisy_frames
 from phasemark.matcher.nearest.search import ExactSearch, nearest_search
 from phasemark.matcher.nearest.templates import Observation
@@ -271,7 +271,7 @@ def chain() -> Table:
             one = kalman_filter(frames)
             many = one[np.tile(np.arange(len(one)), 10)]
             plain, several = Matcher(opened), random_frames(2000)
-            seen = Observation.from_frames(several, (SENSOR.rows // 2, SENSOR.rows))
+            seen = Observation.from_frames(several, SENSOR.lower_rows)
             pruned = nearest_search(plain._pose, opened.distance_m, opened.delta_rad)
             exact = ExactSearch(plain._pose, len(plain._pose))
             rows += [
@@ -302,9 +302,9 @@ def chain() -> Table:
 
 def random_frames(n: int) -> FilteredFrames:
     """Return frames of random views straight ahead, the cone's, each the mean of 50."""
-    conditions, rng = Conditions(distance_m=(0.75, 2.1)), np.random.default_rng(SEED)
+    setup, rng = TrialSetup(distance_m=(0.75, 2.1)), np.random.default_rng(SEED)
     renderer = Renderer(build_mesh(catalog()["cone"]), SENSOR, albedo=0.8)
-    return noisy_frames(renderer, SENSOR, conditions.views(n, rng, np.pi), conditions, rng)
+    return noisy_frames(renderer, SENSOR, setup.views(n, rng, np.pi), setup, rng)
 
 
 def capturing() -> Table:

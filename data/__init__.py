@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from phasemark.data.measured.reading import read_frames, write_measured
     from phasemark.data.measured.simulated import SimulatedRecording, simulate_recording, write_recording
     from phasemark.data.pages.characterisation import summary_sentences, write_characterisation
-    from phasemark.data.partial_outputs import build_part, estimate, merge_parts, parse_part
-    from phasemark.data.plans.bank_plan import BankPlan, MeshPlan, load_plan, read_plan
+    from phasemark.data.partial_outputs import build_part, estimate_build, merge_parts, parse_part
+    from phasemark.data.plans.bank_plan import BankPlan, MeshPlan, read_bank_plan, read_plan
     from phasemark.data.plans.frame_plan import Distribution, FramePlan
     from phasemark.data.plans.grid_axis import format_grid, parse_grid
     from phasemark.data.plans.size import planned_size
@@ -38,11 +38,10 @@ __all__ = [
     "build_bank",
     "build_frames",
     "build_part",
-    "estimate",
+    "estimate_build",
     "export_frames",
     "format_grid",
     "is_frame_set",
-    "load_plan",
     "merge_parts",
     "mesh_sha256",
     "open_bank",
@@ -50,6 +49,7 @@ __all__ = [
     "parse_grid",
     "parse_part",
     "planned_size",
+    "read_bank_plan",
     "read_checksum",
     "read_frames",
     "read_plan",

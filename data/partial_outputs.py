@@ -80,7 +80,7 @@ def parse_part(text: str) -> tuple[int, int]:
     first, _, last = text.partition("/")
     part, parts = as_count(first), as_count(last)
     if part is None or parts is None or not 1 <= part <= parts <= MOST_PARTS:
-        raise UsageError(f"--shard must be I/N with 1 ≤ I ≤ N ≤ {MOST_PARTS}, 2/8 for instance, got '{text[:40]}'")
+        raise UsageError(f"part=… must be I/N with 1 ≤ I ≤ N ≤ {MOST_PARTS}, 2/8 for instance, got '{text[:40]}'")
     return part, parts
 
 
@@ -99,7 +99,7 @@ class PartJob:
         self._total = sum(job.items)
         self.start, self.stop = self._total * (part - 1) // parts, self._total * part // parts
         if self.start == self.stop:
-            raise UsageError(f"--shard {part}/{parts} would be empty: there are only {self._total} items to share")
+            raise UsageError(f"part={part}/{parts} would be empty: there are only {self._total} items to share")
         self._pieces = list(pieces(job.items, self.start, self.stop))
 
     @property
@@ -327,7 +327,9 @@ class MergeJob:
         return [np.concatenate(values) for values in found]
 
 
-def estimate(plan: BankPlan | FramePlan, *, workers: int = 1, trial_seconds: float | None = None) -> dict[str, Any]:
+def estimate_build(
+    plan: BankPlan | FramePlan, *, workers: int = 1, trial_seconds: float | None = None
+) -> dict[str, Any]:
     """Return how large a bank or frame set would be and about how long it would take, from a small trial.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Draw the pictures of the documentation into docs/images: ``make figures``, or ``python docs/figures.py --runs``.
+"""Draw the figures of the documentation into docs/images: ``make figures``, or ``python docs/figures.py --runs``.
 
 Some show what a run of a minute or more has left in out/. Without ``--runs``, where that is not there they stay as they
 are, and the command is named.
@@ -22,9 +22,9 @@ from matplotlib.image import imread
 
 from phasemark.data import write_atomically
 from phasemark.data.seeds import stream
-from phasemark.landmarks import build_mesh, catalog, mesh_picture
+from phasemark.landmarks import build_mesh, catalog, mesh_figure
 from phasemark.matcher import kalman_filter
-from phasemark.matcher.drive import default_drive, drive_picture, run_drive
+from phasemark.matcher.drive import default_drive, drive_figure, run_drive
 from phasemark.render import Background, Renderer, capture, preset
 from phasemark.render.figures import draw_range
 
@@ -62,7 +62,7 @@ def demo_figure() -> Figure:
     above, below = figure.subplots(2, 4, height_ratios=(1.15, 1))
     for k, (name, spec) in enumerate(catalog().items()):
         mesh = build_mesh(spec)
-        above[k].imshow(imread(io.BytesIO(mesh_picture(mesh))))
+        above[k].imshow(imread(io.BytesIO(mesh_figure(mesh))))
         above[k].set_axis_off()
         above[k].set_title(name)
         image = Renderer(mesh, sensor, albedo=spec.albedo).render(
@@ -113,7 +113,7 @@ def cost_figure(rows: list[dict[str, Any]]) -> Figure:
 
 
 def write(figure: Figure, name: str) -> None:
-    """Write a picture."""
+    """Write a figure."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=90)
     IMAGES.mkdir(exist_ok=True)
@@ -121,15 +121,15 @@ def write(figure: Figure, name: str) -> None:
 
 
 def main() -> None:
-    """Write every picture."""
-    parser = argparse.ArgumentParser(description="Draw the pictures of the documentation into docs/images.")
+    """Write every figure."""
+    parser = argparse.ArgumentParser(description="Draw the figures of the documentation into docs/images.")
     parser.add_argument("--runs", action="store_true", help="make the runs that are missing in out/, ten minutes")
     runs = parser.parse_args().runs
     write(demo_figure(), "demo.png")
-    write(drive_picture(run_drive(default_drive())), "drive.png")
-    for command, pictures in LEFT_BY.items():
-        made = made_by(f"{command} --force", [OUT / source for source in pictures.values()], runs, *PHASEMARK)
-        for name, source in pictures.items() if made else ():
+    write(drive_figure(run_drive(default_drive())), "drive.png")
+    for command, figures in LEFT_BY.items():
+        made = made_by(f"{command} --force", [OUT / source for source in figures.values()], runs, *PHASEMARK)
+        for name, source in figures.items() if made else ():
             write_atomically(IMAGES / name, (OUT / source).read_bytes(), force=True)
     bench = OUT / "bench.json"
     if runs and bench.exists() and "peer" not in json.loads(bench.read_text(encoding="utf-8")):

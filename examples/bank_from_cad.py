@@ -16,7 +16,7 @@ import trimesh
 
 from phasemark import PhasemarkError, UsageError
 from phasemark.data import BankPlan, MeshPlan, build_bank, parse_grid, write_atomically
-from phasemark.landmarks import check_mesh, export_mesh, mesh_picture, read_mesh
+from phasemark.landmarks import check_mesh, export_mesh, mesh_figure, read_mesh
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.render import Renderer, capture, preset
 
@@ -51,7 +51,7 @@ def main() -> int:
         mesh = read_mesh(path, unit=unit, origin="center")
         report = check_mesh(mesh)
         print(f"{path}: {' × '.join(f'{100 * side:.1f}' for side in mesh.extents)} cm, {report.faces} faces")
-        write_atomically(out / "part.png", mesh_picture(mesh), force=True)
+        write_atomically(out / "part.png", mesh_figure(mesh), force=True)
 
         plan = BankPlan(
             classes=(),

@@ -5,7 +5,7 @@
 The CSV file is that of ``examples/real_recording.py``, with the truth of motion capture: ``panel_x_m``, ``panel_y_m``,
 ``panel_z_m`` (a marker on the panel minus the camera, world axes, x along the panel's normal) and ``yaw_deg``. What
 comes out is a sensor file with tilt, bearing, field of view, range offset, the delay of the stamps, offsets of the
-zones, a noise law and systematic errors, held against frames that were left out, and a picture of the residuals.
+zones, a noise law and systematic errors, held against frames that were left out, and a figure of the residuals.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from real_recording import THICKNESS_M, Recording, read_recording
 from phasemark import PhasemarkError
 from phasemark.matcher import KnownPoses, calibrate, kalman_filter
 from phasemark.matcher.calibration.mounting_model import PARAMETERS
-from phasemark.matcher.calibration.report import calibration_toml, residual_picture, shown, shown_std
+from phasemark.matcher.calibration.report import residual_figure
+from phasemark.matcher.calibration.result import shown, shown_std
 from phasemark.render import preset
 
 SENSOR = "vl53l5cx-8x8"
@@ -42,7 +43,7 @@ def known_poses(recording: Recording) -> KnownPoses:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Calibrate and write the sensor file and the picture of the residuals."""
+    """Calibrate and write the sensor file and the figure of the residuals."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("csv", type=Path, help="the recording")
     parser.add_argument("--first-half", action="store_const", const="first", help="calibrate on the first half alone")
@@ -65,14 +66,14 @@ def main(argv: list[str] | None = None) -> int:
         print(f"error: nothing was written: {'; '.join(found.doubts)}. Likely cause: {found.cause}", file=sys.stderr)
         return 3
     arguments.out.mkdir(parents=True, exist_ok=True)
-    sensor, picture = arguments.out / "sensor.toml", arguments.out / "residuals.png"
-    sensor.write_text(calibration_toml(found, base_name=SENSOR), encoding="utf-8")
-    residual_picture(found).savefig(picture, dpi=90)
+    sensor, figure = arguments.out / "sensor.toml", arguments.out / "residuals.png"
+    sensor.write_text(found.to_toml(base_name=SENSOR), encoding="utf-8")
+    residual_figure(found).savefig(figure, dpi=90)
     for name in found.free:
         print(f"{name:13s} {shown(found, name):>9s} ± {shown_std(found, name)} {PARAMETERS[name].unit}")
     before, after = found.held_out_m
     print(f"residuals of held-out frames, r.m.s.: {1e3 * before:.1f} mm before, {1e3 * after:.1f} mm after")
-    print(*found.notes, sensor, picture, sep="\n")
+    print(*found.notes, sensor, figure, sep="\n")
     return 0
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from phasemark import PhasemarkError, UsageError
-from phasemark.matcher import FilteredFrames, Match, Method, SweepPlan, load_sweep, read_sweep, run_sweep
+from phasemark.matcher import FilteredFrames, Match, Method, SweepPlan, read_sweep, read_sweep_plan, run_sweep
 from phasemark.matcher.sweep.report import write_report
 
 AXIS_BEHIND_FACE_M = 0.10
@@ -43,7 +43,7 @@ def main() -> int:
     arguments = parser.parse_args()
     sys.path.append(str(Path(__file__).parent))  # where the sweep finds the matcher by its name
     try:
-        plan = load_sweep(Path(__file__).with_suffix(".toml"))
+        plan = read_sweep_plan(Path(__file__).with_suffix(".toml"))
         own = Method(name="median range", method="own_matcher:match", bank_step=plan.methods[0].bank_step)
         changes = {"trials": arguments.trials, "methods": (*plan.methods, own)}
         plan = SweepPlan(**{**plan.model_dump(), **changes})

@@ -226,7 +226,7 @@ def write_estimates(path: Path, matches: Matches, pose: Floats, covariance: Floa
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Match a recording, write estimates and picture, and compare."""
+    """Match a recording, write estimates and figure, and compare."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("csv", type=Path, help="the recording")
     parser.add_argument("--sensor", type=Path, help="sensor file of calibrate_recording.py; the preset without it")
@@ -246,9 +246,9 @@ def main(argv: list[str] | None = None) -> int:
         return 3
     pose, covariance = panel_pose(matches)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    estimates, picture = arguments.out / "estimates.csv", arguments.out / "estimates.png"
+    estimates, figure = arguments.out / "estimates.csv", arguments.out / "estimates.png"
     write_estimates(estimates, matches, pose, covariance, recording.columns["t_ms"] / 1e3)
-    draw(recording, pose, covariance, matches.accepted, sensor.delay_s).savefig(picture, dpi=90)
+    draw(recording, pose, covariance, matches.accepted, sensor.delay_s).savefig(figure, dpi=90)
     print(f"{matches.accepted.sum()} of {len(matches)} frames accepted, {len(matches) / seconds:.0f} frames/s")
     if {"panel_x_m", "yaw_deg"} <= set(recording.columns):
         print(describe(recording, pose, covariance, matches.accepted, sensor.delay_s))
@@ -257,7 +257,7 @@ def main(argv: list[str] | None = None) -> int:
             print(f"this run's own delay: {1e3 * delay:.0f} ± {1e3 * std[0]:.0f} ms in its middle,", end=" ")
             print(f"drifting by {1e3 * drift:.1f} ± {1e3 * std[1]:.1f} ms per second")
             print(describe(recording, pose, covariance, matches.accepted, delay))
-    print(estimates, picture, sep="\n")
+    print(estimates, figure, sep="\n")
     return 0
 
 

@@ -29,10 +29,15 @@ def cache_file() -> Path | None:
     return Path(folder) / "phasemark" / "digests.json" if os.path.isabs(folder) else None
 
 
+def is_worth_remembering(status: os.stat_result) -> bool:
+    """Return whether a file takes longer to be summed up than its digest to be looked up."""
+    return stat.S_ISREG(status.st_mode) and status.st_size >= _SMALLEST_BYTES
+
+
 def remembered_digest(status: os.stat_result) -> str | None:
     """Return the SHA-256 of a file of that status, or None if it is not known."""
     key, sign = _key(status), _sign(status)
-    found = _read().get(key) if status.st_size >= _SMALLEST_BYTES else None
+    found = _read().get(key) if is_worth_remembering(status) else None
     return found[1] if found is not None and found[0] == sign else None
 
 
@@ -46,8 +51,7 @@ def remember_digest(before: os.stat_result, after: os.stat_result, digest: str) 
     digest : str
     """
     if (
-        not stat.S_ISREG(before.st_mode)
-        or before.st_size < _SMALLEST_BYTES
+        not is_worth_remembering(before)
         or (_key(before), _sign(before)) != (_key(after), _sign(after))
         or abs(time.time_ns() - max(after.st_mtime_ns, after.st_ctime_ns)) < _SETTLED_NS
     ):

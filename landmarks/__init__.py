@@ -9,7 +9,7 @@ from phasemark.landmarks.spec import Box, Cone, Cylinder, LandmarkSpec, Revoluti
 from phasemark.landmarks.symmetry import MAX_SYMMETRY, has_symmetry, mesh_symmetry, symmetry_tolerance_m
 
 if TYPE_CHECKING:
-    from phasemark.landmarks.figures import mesh_html, mesh_picture
+    from phasemark.landmarks.figures import mesh_figure, mesh_html
 
 __all__ = [
     "DEFAULT_TOLERANCE_M",
@@ -30,28 +30,28 @@ __all__ = [
     "check_mesh",
     "export_mesh",
     "has_symmetry",
+    "mesh_figure",
     "mesh_html",
-    "mesh_picture",
     "mesh_symmetry",
     "read_mesh",
     "symmetry_tolerance_m",
 ]
 
 
-def _picture(spec: LandmarkSpec) -> bytes:
+def _figure(spec: LandmarkSpec) -> bytes:
     """Draw a landmark as a PNG."""
-    from phasemark.landmarks.figures import mesh_picture
+    from phasemark.landmarks.figures import mesh_figure
 
-    return mesh_picture(build_mesh(spec))
+    return mesh_figure(build_mesh(spec))
 
 
-LandmarkSpec.picture = staticmethod(_picture)
+LandmarkSpec.figure = staticmethod(_figure)
 
 
 def __getattr__(name: str) -> object:
-    """Import pictures when they are asked for: matplotlib takes half a second to load."""
-    if name in ("mesh_html", "mesh_picture"):
-        from phasemark.landmarks import figures as picture
+    """Import figures when they are asked for: matplotlib takes half a second to load."""
+    if name in ("mesh_html", "mesh_figure"):
+        from phasemark.landmarks import figures
 
-        return getattr(picture, name)
+        return getattr(figures, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

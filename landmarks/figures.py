@@ -19,7 +19,7 @@ _CREASE_RAD = np.radians(30)
 _COLOUR = np.array([0.47, 0.65, 0.85])
 
 
-def mesh_picture(mesh: trimesh.Trimesh, *, azimuth_deg: float = -50.0, elevation_deg: float = 22.0) -> bytes:
+def mesh_figure(mesh: trimesh.Trimesh, *, azimuth_deg: float = -50.0, elevation_deg: float = 22.0) -> bytes:
     """Draw a mesh, shaded, its edges marked.
 
     Parameters

@@ -8,7 +8,7 @@ import os
 import re
 import struct
 import warnings
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,7 @@ class MeshReport:
     extents_m : tuple of float
         Size of the bounding box.
     area_m2, volume_m3 : float
-        Volume is that of a watertight mesh, negative if it is inside out; NaN of an open one.
+        Volume is that of a watertight mesh, negative if it is inside out; None of an open one.
     symmetry : int
         How many turns about z' leave the mesh as it is (:func:`phasemark.landmarks.mesh_symmetry`); 360 for a body of
         revolution.
@@ -77,6 +77,10 @@ class MeshReport:
     volume_m3: float | None
     symmetry: int
     warnings: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain numbers and text, for JSON; the volume of an open mesh is None."""
+        return asdict(self)
 
 
 def read_mesh(
@@ -145,7 +149,7 @@ def read_mesh(
             f"{key}: {' × '.join(f'{value * scale:.4g}' for value in extents)} m"
             for key, scale in METRES_PER_UNIT.items()
         )
-        raise UsageError(f"{name}: say in which unit it is (--unit); its extents would be {sizes}")
+        raise UsageError(f"{name}: say in which unit it is (unit=…); its extents would be {sizes}")
     vertices = vertices * METRES_PER_UNIT[unit] @ np.array(_UP[up]).T
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     if origin != "file":

@@ -203,7 +203,7 @@ class LandmarkSpec(_Spec):
     2
     """
 
-    picture: ClassVar[Callable[..., bytes]]
+    figure: ClassVar[Callable[..., bytes]]
     """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
@@ -230,4 +230,4 @@ class LandmarkSpec(_Spec):
 
     def _repr_png_(self) -> bytes:
         """Show the landmark in a notebook."""
-        return type(self).picture(self)
+        return type(self).figure(self)

@@ -5,21 +5,13 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
-    from phasemark.matcher.accuracy.cramer_rao import (
-        Bound,
-        Estimate,
-        confusion_probability,
-        covers,
-        cramer_rao,
-        efficiency,
-        nees,
-        share,
-    )
+    from phasemark.matcher.accuracy.cramer_rao import Bound, confusion_probability, cramer_rao
     from phasemark.matcher.accuracy.grid_spacing import GridLoss, SpacingLoss, grid_loss
-    from phasemark.matcher.accuracy.trials import Conditions, Trials, TrialSummary, run_trials
-    from phasemark.matcher.calibration.calibration import Calibration, calibrate, filter_poses
+    from phasemark.matcher.accuracy.trials import Trials, TrialSetup, TrialSummary, run_trials
+    from phasemark.matcher.calibration.calibration import calibrate, filter_poses
     from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd, frames_of_poses, read_poses
     from phasemark.matcher.calibration.mounting_model import Mounting
+    from phasemark.matcher.calibration.result import Calibration
     from phasemark.matcher.diagnosis.diagnose import Change, Diagnosis, diagnose
     from phasemark.matcher.filters.filtered_frames import (
         FilteredFrames,
@@ -32,14 +24,25 @@ if TYPE_CHECKING:
         phasor_mean,
     )
     from phasemark.matcher.likelihood.background_estimate import Surroundings, estimate_surroundings
+    from phasemark.matcher.likelihood.search_policy import SearchPolicy
     from phasemark.matcher.match import Candidate, Match, Matches
-    from phasemark.matcher.matcher import Matcher, background_image
-    from phasemark.matcher.position.landmark_map import LandmarkMap, MappedLandmark, Placement, load_map
+    from phasemark.matcher.matcher import Matcher
+    from phasemark.matcher.position.landmark_map import LandmarkMap, MappedLandmark, Placement, read_landmark_map
     from phasemark.matcher.position.robot_pose import PRIOR_STD, RobotPose, ViewEstimate, robot_poses
     from phasemark.matcher.recordings.stillness import MotionTest, motion_test
+    from phasemark.matcher.statistics import (
+        ErrorStatistics,
+        Interval,
+        binomial_interval,
+        error_statistics,
+        mean_interval,
+        nees,
+        rms_interval,
+        within_ellipsoid,
+    )
     from phasemark.matcher.sweep.compare import Difference, compare_cells
     from phasemark.matcher.sweep.examples import sweep_frames
-    from phasemark.matcher.sweep.plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, load_sweep
+    from phasemark.matcher.sweep.plan import SHIPPED_SWEEPS, Condition, Method, SweepPlan, read_sweep_plan
     from phasemark.matcher.sweep.result_tables import Cell, SweepTrials
     from phasemark.matcher.sweep.run import read_sweep, run_sweep
 else:
@@ -54,12 +57,12 @@ __all__ = [
     "Cell",
     "Change",
     "Condition",
-    "Conditions",
     "Diagnosis",
     "Difference",
-    "Estimate",
+    "ErrorStatistics",
     "FilteredFrames",
     "GridLoss",
+    "Interval",
     "KnownPoses",
     "LandmarkMap",
     "MappedLandmark",
@@ -74,21 +77,22 @@ __all__ = [
     "Placement",
     "PoseStd",
     "RobotPose",
+    "SearchPolicy",
     "SpacingLoss",
     "Surroundings",
     "SweepPlan",
     "SweepTrials",
+    "TrialSetup",
     "TrialSummary",
     "Trials",
     "ViewEstimate",
-    "background_image",
+    "binomial_interval",
     "calibrate",
     "compare_cells",
     "confusion_probability",
-    "covers",
     "cramer_rao",
     "diagnose",
-    "efficiency",
+    "error_statistics",
     "estimate_surroundings",
     "filter_poses",
     "frames_of_poses",
@@ -96,17 +100,19 @@ __all__ = [
     "kalman",
     "kalman_filter",
     "kalman_step",
-    "load_map",
-    "load_sweep",
+    "mean_interval",
     "motion_test",
     "nees",
     "noise_free",
     "phasor_mean",
+    "read_landmark_map",
     "read_poses",
     "read_sweep",
+    "read_sweep_plan",
+    "rms_interval",
     "robot_poses",
     "run_sweep",
     "run_trials",
-    "share",
     "sweep_frames",
+    "within_ellipsoid",
 ]

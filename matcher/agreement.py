@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark import UsageError
 from phasemark.render import Sensor, phasor_to_range_m, predicted_range_std
 
 DISAGREEMENT = 25.0
@@ -24,6 +25,8 @@ MUST_RETURN_COVERAGE = 0.3
 """A pixel that sees this much of the landmark must return something."""
 MAY_RETURN_COVERAGE = 0.005
 """A pixel that sees less of the landmark than this returns nothing, unless a background does."""
+MIN_RETURNS = 3
+"""A frame with fewer returns decides nothing: two numbers are sought."""
 _USUAL_LIMIT_RAD = 0.1
 _ROUNDING = 1e-9
 
@@ -55,6 +58,30 @@ def counts(phasor: NDArray[np.complexfloating], intensity: NDArray[np.floating],
             lit &= np.where(lit, phasor_to_range_m(np.where(lit, phasor, 1.0), sensor), 0.0) <= sensor.max_range_m
     std = predicted_range_std(amplitude, intensity, sensor)
     return np.asarray(lit & (std <= one_frame_limit_m(sensor) * (1 + _ROUNDING)))
+
+
+def pixel_mask(pixels: str | NDArray[np.bool_], sensor: Sensor) -> NDArray[np.bool_]:
+    """Return which pixels may count by their place, (..., rows, cols).
+
+    Parameters
+    ----------
+    pixels : {"all", "lower"} or (..., rows, cols) bool
+        "lower": those of the lower half of the rows; an array is taken as it is.
+    sensor : Sensor
+
+    Raises
+    ------
+    UsageError
+        A name is unknown.
+    """
+    if not isinstance(pixels, str):
+        return np.asarray(pixels, np.bool_)
+    if pixels not in ("all", "lower"):
+        raise UsageError(f"'pixels' must be all, lower or an array, got {pixels!r}")
+    mask = np.ones((sensor.rows, sensor.cols), np.bool_)
+    if pixels == "lower":
+        mask[slice(*sensor.upper_rows)] = False
+    return mask
 
 
 def disagrees(

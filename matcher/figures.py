@@ -1,4 +1,4 @@
-"""A picture of a match: measured, best model, residual, side by side (the paper's figure 11)."""
+"""A figure of a match: measured, best model, residual, side by side (the paper's figure 11)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,16 @@ from phasemark.data import Bank
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match
-from phasemark.matcher.matcher import background_image
-from phasemark.render import Background, Renderer, phasor_to_range_m, predicted_range_std, wrap_difference_m
+from phasemark.render import (
+    Background,
+    Renderer,
+    background_image,
+    delta_period_rad,
+    phasor_to_range_m,
+    predicted_range_std,
+    wrap_delta_difference_rad,
+    wrap_difference_m,
+)
 from phasemark.render.figures import draw_difference, draw_range
 
 
@@ -41,9 +49,8 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
         counted = counts(rendered.phasor[0], rendered.intensity[0], bank.sensor)
         return np.where(counted, rendered.range_m[0], np.nan)
     i = int(np.abs(bank.distance_m - match.distance_m).argmin())
-    period = 2 * math.pi / match.symmetry
-    turned = np.abs(bank.delta_rad - match.delta_rad)
-    j = int(np.minimum(turned, period - turned).argmin())
+    turned = wrap_delta_difference_rad(bank.delta_rad - match.delta_rad, delta_period_rad(match.symmetry))
+    j = int(np.abs(turned).argmin())
     image = bank.image(name, i, j)
     phasor, intensity = image.phasor[0], image.intensity[0]
     if background is not None:
@@ -55,7 +62,7 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
     return np.where(noise <= limit, phasor_to_range_m(phasor, bank.sensor), np.nan)
 
 
-def match_picture(
+def match_figure(
     frames: FilteredFrames,
     match: Match,
     bank: Bank,

@@ -1,56 +1,37 @@
-"""Matching frames against a bank: the paper's nearest image, or maximum likelihood in between.
-
-The paper's minimum-distance classifier (its section 4.2) lives here: the lower pixels give distance and angle, then the
-upper pixels give the class, and the answer lies on the bank's grid. Maximum likelihood lives in
-:mod:`phasemark.matcher.likelihood.estimator`.
-"""
+"""Matching frames against a bank: the paper's nearest image, or maximum likelihood in between."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
-from typing import Literal
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Literal, Protocol
 
 from phasemark import UsageError
 from phasemark.data import Bank
-from phasemark.data.bank.bank_file import BankGroup
-from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
-from phasemark.matcher.likelihood.estimator import (
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.likelihood_matcher import (
     BEARING_STD_RAD,
     TOLERANCE_M,
     TOLERANCE_RAD,
-    MaximumLikelihood,
+    LikelihoodMatcher,
     Pixels,
-    p_values_of,
 )
-from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
+from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.likelihood.systematic import SYSTEMATICS, check_systematic
-from phasemark.matcher.match import Candidate, Match, Matches, Reason
-from phasemark.matcher.nearest.search import nearest_search
-from phasemark.matcher.nearest.templates import Observation, Templates
-from phasemark.render import Background, PhasorImages, Renderer, Sensor, wrap_difference_m
+from phasemark.matcher.match import Match, Matches
+from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
+from phasemark.render import Background
 
 METHODS = ("nearest", "refine")
-MIN_RETURNS = 3
-"""Fewer returns among the pixels that give distance and angle decide nothing: two numbers are sought."""
-_FRAMES_AT_ONCE = 128
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """The nearest template of every class: (n, classes) arrays.
+class MatchMethod(Protocol):
+    """What a method of matching does."""
 
-    `i` and `j` index distance and angle, `cost` is the distance from the frame.
-    """
-
-    i: NDArray[np.int64]
-    j: NDArray[np.int64]
-    cost: NDArray[np.float64]
+    def match(self, frames: FilteredFrames) -> list[Match]:
+        """Return one answer for each of n filtered frames, whose range offset was taken off."""
 
 
 class Matcher:
@@ -93,6 +74,15 @@ class Matcher:
         more than 0.001, or where a view farther away than this costs less than one contradicted pixel more.
     workers : int, optional
         Threads that render (None: one for each processor), where "refine" renders; the answer does not depend on it.
+    policy : SearchPolicy
+        Tuning numbers of "refine": how wide and how long it searches.
+
+    Attributes
+    ----------
+    bank, method, false_alarm
+        As given.
+    options : mapping
+        What `free`, `background`, `on`, `pixels` and `robust` were given as.
 
     Raises
     ------
@@ -115,7 +105,7 @@ class Matcher:
         free: Sequence[str] | None = None,
         background: Background | Literal["auto", "unknown"] | None = None,
         false_alarm: float = 0.01,
-        on: Quantity = "ranges",
+        on: ResidualKind = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
         bearing_std_rad: float = BEARING_STD_RAD,
@@ -123,6 +113,7 @@ class Matcher:
         tolerance_m: float = TOLERANCE_M,
         tolerance_rad: float = TOLERANCE_RAD,
         workers: int | None = None,
+        policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
         if method not in METHODS:
             raise UsageError(f"unknown method {method!r}: the methods are {', '.join(METHODS)}")
@@ -135,10 +126,14 @@ class Matcher:
         if not 0 < false_alarm < 1:
             raise UsageError(f"'false_alarm' must be in (0, 1), got {false_alarm!r}")
         self.bank = bank
+        self.method = method
         self.false_alarm = false_alarm
-        self._likelihood: MaximumLikelihood | None = None
+        self.options: Mapping[str, Any] = MappingProxyType(
+            {"free": free, "background": background, "on": on, "pixels": pixels, "robust": robust}
+        )
+        self._method: MatchMethod
         if method == "refine":
-            self._likelihood = MaximumLikelihood(
+            self._method = LikelihoodMatcher(
                 bank,
                 free=free,
                 background=background,
@@ -151,6 +146,7 @@ class Matcher:
                 tolerance_m=tolerance_m,
                 tolerance_rad=tolerance_rad,
                 workers=workers,
+                policy=policy,
             )
             return
         fixed = free is None or tuple(free) == VIEW[:2]
@@ -158,23 +154,7 @@ class Matcher:
             raise UsageError(
                 "'free', 'on', 'pixels', 'robust' and an automatic background belong to method 'refine', not 'nearest'"
             )
-        self._behind = None if background is None else background_image(background, bank.sensor)
-        self._symmetry = {name: int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes}
-        half = bank.sensor.rows // 2
-        if bank.full is not None:
-            self._pose_rows, self._class_rows = (0, bank.sensor.rows), None
-            self._pose = self._templates(bank.full, self._pose_rows)
-            self._class = None
-        else:
-            assert bank.lower is not None
-            assert bank.upper is not None
-            self._pose_rows, self._class_rows = (half, bank.sensor.rows), (0, half)
-            self._pose = self._templates(bank.lower, self._pose_rows)
-            self._class = self._templates(bank.upper, self._class_rows)
-        self._search = nearest_search(
-            self._pose, bank.distance_m, bank.delta_rad, before_background=background is not None
-        )
-        self._none = self._nothing()
+        self._method = NearestMatcher(bank, background=background, false_alarm=false_alarm)
 
     def match(self, frames: FilteredFrames) -> Matches:
         """Match a batch of filtered frames.
@@ -197,185 +177,4 @@ class Matcher:
         difference = frames.sensor.optics_difference(self.bank.sensor)
         if difference is not None:
             raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
-        frames = frames.without_offset().with_pooled_noise()
-        if self._likelihood is not None:
-            return Matches(self._likelihood.match(frames))
-        matches: list[Match] = []
-        for start in range(0, len(frames), _FRAMES_AT_ONCE):
-            matches.extend(self._match_some(frames[start : start + _FRAMES_AT_ONCE]))
-        return Matches(matches)
-
-    def _templates(self, group: BankGroup, rows: tuple[int, int]) -> Templates:
-        return Templates.build(group.phasor, group.intensity, group.coverage, self.bank.sensor, self._behind, rows)
-
-    def _match_some(self, frames: FilteredFrames) -> list[Match]:
-        pose_seen = Observation.from_frames(frames, self._pose_rows)
-        if self._class is None:
-            class_seen = None
-            found = self._search_full(pose_seen)
-        else:
-            assert self._class_rows is not None
-            class_seen = Observation.from_frames(frames, self._class_rows)
-            found = self._search_factored(pose_seen, class_seen)
-        seen = Observation.from_frames(frames, (0, self.bank.sensor.rows))
-        none_cost = self._none.costs_of_each(seen, np.zeros((len(frames), 1), np.int64))[:, 0]
-        enough = pose_seen.returned.sum(axis=1) >= MIN_RETURNS
-        chi2, dof = self._goodness(pose_seen, class_seen, found)
-        p_value = p_values_of(chi2, dof, frames, np.arange(len(frames)))
-        nothing = Match(
-            class_name=None,
-            accepted=False,
-            class_probability=self._probabilities(np.empty(0), 0.0),
-            reason="no landmark",
-        )
-        return [
-            self._answer(found, k, float(none_cost[k]), float(chi2[k]), int(dof[k]), float(p_value[k]))
-            if enough[k]
-            else nothing
-            for k in range(len(frames))
-        ]
-
-    def _search_factored(self, lower: Observation, upper: Observation) -> _Found:
-        """Find the nearest lower image, then the distance of each class's upper image at that distance."""
-        assert self._class is not None
-        n_class, n_distance = len(self.bank.classes), len(self.bank.distance_m)
-        best, cost = self._search.nearest(lower)
-        i, j = np.divmod(best, len(self.bank.delta_rad))
-        costs = cost[:, None] + self._class.costs_of_each(upper, np.arange(n_class) * n_distance + i[:, None])
-        return _Found(np.repeat(i[:, None], n_class, axis=1), np.repeat(j[:, None], n_class, axis=1), costs)
-
-    def _search_full(self, seen: Observation) -> _Found:
-        """Find the nearest image of each class."""
-        n_class, n_distance, n_delta = len(self.bank.classes), len(self.bank.distance_m), len(self.bank.delta_rad)
-        nearest = [self._search.nearest(seen, c) for c in range(n_class)]
-        best = np.stack([found for found, _ in nearest], axis=1) - np.arange(n_class) * n_distance * n_delta
-        return _Found(*np.divmod(best, n_delta), np.stack([cost for _, cost in nearest], axis=1))
-
-    def _nothing(self) -> Templates:
-        """Return the one template of a scene without a landmark."""
-        shape = (1, self.bank.sensor.rows, self.bank.sensor.cols)
-        nothing = np.zeros(shape, np.float32)
-        return Templates.build(
-            np.zeros(shape, np.complex64), nothing, nothing, self.bank.sensor, self._behind, (0, self.bank.sensor.rows)
-        )
-
-    def _answer(self, found: _Found, k: int, none_cost: float, chi2: float, dof: int, p_value: float) -> Match:
-        """Turn what was found for one frame into an answer."""
-        order = np.argsort(found.cost[k], kind="stable")
-        candidates = tuple(
-            Candidate(
-                self.bank.classes[c],
-                float(self.bank.distance_m[found.i[k, c]]),
-                float(self.bank.delta_rad[found.j[k, c]]),
-                float(found.cost[k, c]),
-            )
-            for c in order
-        )
-        best = candidates[0]
-        is_landmark = best.cost < none_cost
-        reason: Reason = "no landmark" if not is_landmark else "poor fit" if p_value < self.false_alarm else ""
-        return Match(
-            class_name=best.class_name if is_landmark else None,
-            accepted=not reason,
-            distance_m=best.distance_m,
-            delta_rad=best.delta_rad,
-            chi2=chi2,
-            dof=dof,
-            p_value=p_value,
-            class_probability=self._probabilities(found.cost[k], none_cost),
-            alternatives=candidates[1:] if is_landmark else candidates,
-            symmetry=self._symmetry[best.class_name],
-            reason=reason,
-        )
-
-    def _probabilities(self, cost: NDArray[np.float64], none_cost: float) -> dict[str, float]:
-        """Weigh classes and "none" by exp(−cost / 2), as Gaussian residuals and equal priors have it.
-
-        Without costs "none" is certain.
-        """
-        names = [*self.bank.classes, "none"]
-        values = np.full(len(names), np.inf)
-        values[: len(cost)], values[-1] = cost, none_cost
-        weight = np.exp(-0.5 * (values - values.min()))
-        return dict(zip(names, (weight / weight.sum()).tolist(), strict=True))
-
-    def _goodness(
-        self, pose_seen: Observation, class_seen: Observation | None, found: _Found
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return χ² and degrees of freedom of the best images, the linear change in a cell taken out; (n,) each."""
-        n_distance, n_delta = len(self.bank.distance_m), len(self.bank.delta_rad)
-        c = np.argmin(found.cost, axis=1)
-        i, j = (np.take_along_axis(index, c[:, None], axis=1)[:, 0] for index in (found.i, found.j))
-        rows = np.stack([i, np.maximum(i - 1, 0), np.minimum(i + 1, n_distance - 1), i, i], axis=1)
-        columns = np.stack([j, j, j, (j - 1) % n_delta, (j + 1) % n_delta], axis=1)
-        block = c[:, None] if class_seen is None else np.zeros((len(c), 1), np.int64)
-        cells = _Cells.of(self._pose, pose_seen, (block * n_distance + rows) * n_delta + columns)
-        if class_seen is not None:
-            assert self._class is not None
-            cells = cells.beside(_Cells.of(self._class, class_seen, c[:, None] * n_distance + rows))
-        chi2, n_fitted = cells.chi2()
-        return chi2, np.maximum(n_fitted - 2, 0)
-
-
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """Residuals of n frames at a grid point each, and how their models change over the cell; (n, pixels) arrays.
-
-    `variance` is infinite where frame and models cannot be compared. `slope` is the change of range over one step of
-    distance and of angle, (n, pixels, 2); `bend` what a linear change leaves over half a step; `disagrees` counts a
-    pixel whose return the model contradicts at the grid point and at all its neighbours.
-    """
-
-    residual: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    bend: NDArray[np.float64]
-    disagrees: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, templates: Templates, seen: Observation, at: NDArray[np.integer]) -> _Cells:
-        """Look at grid points `at`, (n, 5): the point itself, then its neighbours in distance and in angle."""
-        may, must = templates.may_return[at], templates.must_return[at]
-        usable = seen.returned & may.all(axis=1)
-        model = templates.range_m[at].astype(np.float64)
-        step = wrap_difference_m(model[:, 1:] - model[:, :1], templates.sensor)
-        residual = wrap_difference_m(templates.about(seen) - model[:, 0], templates.sensor)
-        slope = np.stack([step[:, 1] - step[:, 0], step[:, 3] - step[:, 2]], axis=-1) / 2
-        bend = (np.abs(step[:, 1] + step[:, 0]) + np.abs(step[:, 3] + step[:, 2])) / 2
-        lost = seen.returned & ~may.any(axis=1)
-        absent = seen.not_returned & must.all(axis=1)
-        variance = np.divide(1.0, seen.weight, out=np.full(usable.shape, np.inf), where=usable)
-        return cls(residual, variance, slope, bend, lost | absent)
-
-    def beside(self, other: _Cells) -> _Cells:
-        """Add further pixels of the same frames."""
-        return _Cells(*(np.concatenate([getattr(c, f.name) for c in (self, other)], axis=1) for f in fields(self)))
-
-    def chi2(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Fit the positions in the cells and return χ² with the number of pixels in it; (n,) each."""
-        weight = 1 / (self.variance + self.bend**2)
-        n_compared = np.isfinite(self.variance).sum(axis=1)
-        weighted = self.slope * weight[..., None]
-        # what the pixels do not tell stays 0: the least solution of the normal equations
-        inverse = np.linalg.pinv(self.slope.transpose(0, 2, 1) @ weighted, rcond=1e-12, hermitian=True)
-        offset = np.einsum("nij,npj,np->ni", inverse, weighted, self.residual, optimize=True)
-        offset = np.clip(offset, -0.6, 0.6) * (n_compared >= MIN_RETURNS)[:, None]
-        left = self.residual - np.einsum("npi,ni->np", self.slope, offset)
-        n_disagree = self.disagrees.sum(axis=1)
-        return np.sum(weight * left**2, axis=1) + DISAGREEMENT * n_disagree, n_compared + n_disagree
-
-
-def background_image(background: Background, sensor: Sensor) -> PhasorImages:
-    """Return what a background alone returns, straight ahead.
-
-    Parameters
-    ----------
-    background : Background
-    sensor : Sensor
-
-    Returns
-    -------
-    PhasorImages
-        One image.
-    """
-    return Renderer(None, sensor).render(distance_m=1.0, background=background)
+        return Matches(self._method.match(frames.without_offset().with_pooled_noise()))

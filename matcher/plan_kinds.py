@@ -15,9 +15,9 @@ from phasemark import InputFileError, UsageError
 from phasemark.data.plans.bank_plan import BankPlan, ScenePlan, read_plan
 from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.inputs.toml_file import read_toml
-from phasemark.matcher.design import DesignPlan, example_design, load_design_plan
-from phasemark.matcher.drive import DrivePlan, example_drive, load_drive_plan
-from phasemark.matcher.sweep.plan import SweepPlan, load_sweep
+from phasemark.matcher.design import DesignPlan, example_design, read_design_plan
+from phasemark.matcher.drive import DrivePlan, example_drive, read_drive_plan
+from phasemark.matcher.sweep.plan import SweepPlan, read_sweep_plan
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ def _shipped(package: str, name: str) -> Callable[[], str]:
     return partial(resources.files(package).joinpath(name).read_text, encoding="utf-8")
 
 
-def _load_scene(model: type[ScenePlan], path: str | os.PathLike[str]) -> BaseModel:
+def _read_scene(model: type[ScenePlan], path: str | os.PathLike[str]) -> BaseModel:
     plan = read_plan(path, model)
     try:
         return plan.resolve()
@@ -43,15 +43,15 @@ def _load_scene(model: type[ScenePlan], path: str | os.PathLike[str]) -> BaseMod
 
 _KINDS = {
     # first, for what might be any of them
-    "bank": _Kind(BankPlan, _shipped("phasemark.data.plans", "examples/bank.toml"), partial(_load_scene, BankPlan)),
+    "bank": _Kind(BankPlan, _shipped("phasemark.data.plans", "examples/bank.toml"), partial(_read_scene, BankPlan)),
     "frames": _Kind(
-        FramePlan, _shipped("phasemark.data.plans", "examples/frames.toml"), partial(_load_scene, FramePlan)
+        FramePlan, _shipped("phasemark.data.plans", "examples/frames.toml"), partial(_read_scene, FramePlan)
     ),
     "sweep": _Kind(
-        SweepPlan, _shipped("phasemark.matcher.sweep", "plans/paper.toml"), lambda path: load_sweep(path).resolve()
+        SweepPlan, _shipped("phasemark.matcher.sweep", "plans/paper.toml"), lambda path: read_sweep_plan(path).resolve()
     ),
-    "drive": _Kind(DrivePlan, example_drive, load_drive_plan),
-    "design": _Kind(DesignPlan, example_design, load_design_plan),
+    "drive": _Kind(DrivePlan, example_drive, read_drive_plan),
+    "design": _Kind(DesignPlan, example_design, read_design_plan),
 }
 KINDS = tuple(_KINDS)
 """Names of all kinds."""

@@ -49,7 +49,7 @@ _FLAG_COLOURS = {
 }
 
 
-def range_picture(
+def range_figure(
     range_m: NDArray[np.float64],
     *,
     near_m: float | None = None,
@@ -86,7 +86,7 @@ def draw_range(
     far_m: float | None = None,
     colour_bar: bool = True,
 ) -> AxesImage:
-    """Draw a range image into axes of a larger figure; the arguments are those of :func:`range_picture`.
+    """Draw a range image into axes of a larger figure; the arguments are those of :func:`range_figure`.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def draw_difference(axes: Axes, difference_m: NDArray[np.float64], *, span_mm: f
     return image
 
 
-def plot_phasor_image(images: PhasorImages, index: int = 0) -> Figure:
+def phasor_figure(images: PhasorImages, index: int = 0) -> Figure:
     """Draw range, amplitude and coverage of one view side by side.
 
     Parameters
@@ -158,7 +158,7 @@ def plot_phasor_image(images: PhasorImages, index: int = 0) -> Figure:
     return figure
 
 
-def plot_frame(frames: Frames, index: int = 0, frame: int = 0) -> Figure:
+def frame_figure(frames: Frames, index: int = 0, frame: int = 0) -> Figure:
     """Draw range, amplitude (if there is one) and flags of one frame side by side.
 
     Parameters
@@ -187,7 +187,7 @@ def plot_frame(frames: Frames, index: int = 0, frame: int = 0) -> Figure:
     return figure
 
 
-def terminal_picture(
+def terminal_figure(
     range_m: NDArray[np.float64],
     *,
     width: int = 32,

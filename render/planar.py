@@ -1,8 +1,8 @@
 """The generator of the 2005 paper: model images from a top view in two dimensions (PHYSICS section 5, paper eq. 6-9).
 
 Each pixel column is a line through the lens, and its value is the distance to the nearest point where that line meets
-the landmark's outline: the four sides of the box in the lower rows, a circle in the upper ones. What the ray caster
-adds to this (area, edges, elevation, what ends within the image) is the difference between the two.
+the landmark's outline: the four sides of the box in the lower rows, a circle in the upper ones. What the exact
+integral adds to this (area, edges, elevation, what ends within the image) is the difference between the two.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def planar_images(
     asked, views = views, views.in_camera(sensor)
     _refuse_out_of_plane(sensor, views)
 
-    middle = sensor.rows // 2
+    middle = sensor.lower_rows[0]
     upper_rows = np.arange(first, min(stop, middle))
     n_lower = stop - max(first, middle)
     tan_h, tan_v = sensor.tan_half_angles

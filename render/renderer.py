@@ -378,6 +378,22 @@ class Renderer:
             )
 
 
+def background_image(background: Background, sensor: Sensor) -> PhasorImages:
+    """Return what a background alone returns, straight ahead.
+
+    Parameters
+    ----------
+    background : Background
+    sensor : Sensor
+
+    Returns
+    -------
+    PhasorImages
+        One image.
+    """
+    return Renderer(None, sensor).render(distance_m=1.0, background=background)
+
+
 _TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
 _MOST_TOPOLOGIES = 16
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,55 @@ if TYPE_CHECKING:
 
 FARTHEST_M = 1e6
 """No distance and no height is larger: beyond it float32 images and squared ranges lose their meaning."""
+
+
+def delta_period_rad(symmetry: int) -> float:
+    """Return the period after which δ repeats, 2π / symmetry, radians.
+
+    Parameters
+    ----------
+    symmetry : int
+        How many turns about its axis leave the landmark as it is.
+    """
+    return 2 * math.pi / symmetry
+
+
+def wrap_delta_rad(delta_rad: ArrayLike, period_rad: ArrayLike) -> NDArray[np.float64]:
+    """Return angles δ brought into [0, period).
+
+    Parameters
+    ----------
+    delta_rad, period_rad : array_like
+        They broadcast; the period is :func:`delta_period_rad`, or a full turn where the symmetry is not known.
+
+    Examples
+    --------
+    >>> float(wrap_delta_rad(-0.5, 2.0))
+    1.5
+    """
+    period = np.asarray(period_rad, dtype=np.float64)
+    wrapped = np.asarray(delta_rad, dtype=np.float64) % period
+    # the modulo of a tiny negative angle rounds up to the period itself
+    return np.where(wrapped >= period, 0.0, wrapped)
+
+
+def wrap_delta_difference_rad(difference_rad: ArrayLike, period_rad: ArrayLike) -> NDArray[np.float64]:
+    """Return differences of two δ brought into ± half a period: the shorter way round.
+
+    A difference that is already within half a period keeps every bit.
+
+    Parameters
+    ----------
+    difference_rad, period_rad : array_like
+        They broadcast.
+
+    Examples
+    --------
+    >>> float(wrap_delta_difference_rad(1.5, 2.0))
+    -0.5
+    """
+    difference, period = np.asarray(difference_rad, dtype=np.float64), np.asarray(period_rad, dtype=np.float64)
+    return np.asarray(difference - period * np.round(difference / period))
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """What several tests build or start: cameras of one pixel, images of given phasors, odd meshes, the programs."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,15 @@ from phasemark.render import PhasorImages, Sensor, Views
 TESTS = Path(__file__).parent
 HELPERS_IN_PATH = {**os.environ, "PYTHONPATH": str(TESTS)}
 """The environment of a process that imports the tests' helpers."""
+
+
+PROGRESS_LINE = re.compile(r"[a-z ,]+:( \d+/\d+,)?( \d+ (h|min|s))+ elapsed")
+"""What long work writes to a standard error that is no terminal."""
+
+
+def error_lines(stderr):
+    """Return the lines of standard error that are neither notes nor progress."""
+    return [line for line in stderr.splitlines() if not line.startswith("note: ") and not PROGRESS_LINE.fullmatch(line)]
 
 
 def run_program(name, *arguments):

@@ -301,7 +301,7 @@ def test_progress_counts_images(painted, tmp_path):
 def test_an_existing_bank_needs_force_and_is_asked_about_before_rendering(bank_file, monkeypatch):
     before = bank_file.read_bytes()
     monkeypatch.setattr("phasemark.data.bank.build_bank.Renderer", None)
-    with pytest.raises(OutputExistsError, match="--force"):
+    with pytest.raises(OutputExistsError, match="force=True"):
         build_bank(PLAN, bank_file)
     monkeypatch.setattr("phasemark.data.bank.build_bank.Renderer", Painter)
     build_bank(FULL, bank_file, force=True).close()
@@ -359,7 +359,7 @@ def test_a_file_size_limit_of_the_system_is_an_error_not_a_crash(tmp_path, paint
         ({"sensor_overrides": {"pitch_deg": 1}}, "no factored bank: the sensor is tilted"),
         (
             {"meshes": [{"name": "part", "path": "part.stl", "unit": "mm"}]},
-            "comes from a mesh file; build a full one (--full",
+            "comes from a mesh file; build a full one (layout='full')",
         ),
     ],
 )
@@ -367,7 +367,7 @@ def test_a_factored_bank_that_cannot_be_is_refused_with_the_way_out(tmp_path, pa
     with pytest.raises(UsageError) as caught:
         build_bank(BankPlan(**GRID, **fields), tmp_path / "bank.h5")
     assert reason in str(caught.value)
-    assert "layout = 'full'" in str(caught.value)
+    assert "layout='full'" in str(caught.value)
     assert names(tmp_path) == []
 
 

@@ -9,15 +9,9 @@ from scipy import stats
 
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher.accuracy.cramer_rao import (
-    confusion_probability,
-    covers,
-    cramer_rao,
-    efficiency,
-    eliminated,
-    nees,
-    share,
-)
+from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
+from phasemark.matcher.information import eliminated
+from phasemark.matcher.statistics import binomial_interval, nees, rms_interval, within_ellipsoid
 from phasemark.render import Background, Renderer, Views, predicted_range_std, preset
 
 SENSOR = preset("pmd-16x16")
@@ -102,10 +96,10 @@ def test_figures_of_merit_are_right_on_gaussian_errors():
     covariance = np.array([[4.0, 1.2], [1.2, 1.0]])
     error = rng.multivariate_normal([0, 0], covariance, 20_000)
     stacked = np.broadcast_to(covariance, (20_000, 2, 2))
-    assert abs(efficiency(error[:, 0], np.full(20_000, 2.0)).value - 1) < 3.3 / math.sqrt(40_000)
+    assert abs(rms_interval(error[:, 0] / 2.0, law="normal").value - 1) < 3.3 / math.sqrt(40_000)
     assert abs(nees(error, stacked).mean() - 2) < 3.3 * 2 / math.sqrt(20_000)
-    assert abs(covers(error, stacked).mean() - 0.95) < 3.3 * math.sqrt(0.95 * 0.05 / 20_000)
-    interval = share(0, 500)
+    assert abs(within_ellipsoid(error, stacked).mean() - 0.95) < 3.3 * math.sqrt(0.95 * 0.05 / 20_000)
+    interval = binomial_interval(0, 500)
     assert interval.high == pytest.approx(1 - 0.025 ** (1 / 500))  # Clopper–Pearson of no success
 
 

@@ -10,10 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from builders import error_lines
 from scipy import stats
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
+from phasemark.data.commands import console
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import (
     KnownPoses,
@@ -25,10 +27,11 @@ from phasemark.matcher import (
     kalman_filter,
     read_poses,
 )
+from phasemark.matcher.calibration import calibration as calibration_module
+from phasemark.matcher.calibration.judgement import likely_cause
 from phasemark.matcher.calibration.mounting_fit import Fit
 from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel
 from phasemark.matcher.calibration.pose_track import PoseTrack
-from phasemark.matcher.calibration.report import calibration_toml
 from phasemark.matcher.filters.stamps import stamp_jitter
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, preset
@@ -243,7 +246,7 @@ def test_a_plain_board_does_not_tell_a_height_and_is_refused():
     poses = KnownPoses.polar([0.8, 1.0, 1.2, 1.4], [0.0, 0.3, -0.3, 0.1])
     image = Renderer(board, PMD).render_views(Views.broadcast(poses.distance_m, poses.delta_rad))
     frames = capture(image, PMD, rng=np.random.default_rng(1), n_frames=20)
-    with pytest.raises(UsageError, match=r"height cannot be told from these poses: .* --fix height"):
+    with pytest.raises(UsageError, match=r"height cannot be told from these poses: .* fixed=height"):
         calibrate(board, filtered(frames), poses, free=("pitch", "height"))
 
 
@@ -597,7 +600,7 @@ def test_noise_law_and_offsets_of_zones_are_those_of_the_recording(rides):
 
 def test_a_calibration_leaves_its_covariance_in_the_sensor_file(rides, tmp_path):
     _, found, _, _ = rides[0]
-    (tmp_path / "tof.toml").write_text(calibration_toml(found, base_name="tof"))
+    (tmp_path / "tof.toml").write_text(found.to_toml(base_name="tof"))
     sensor = Sensor.from_toml(tmp_path / "tof.toml")
     assert sensor == found.sensor
     assert set(sensor.calibration_fields) == {PARAMETERS[name].field for name in FREE}
@@ -682,12 +685,24 @@ def test_a_wrong_delay_that_is_fixed_is_doubted_with_its_cause():
     assert "leave the delay free" in found.cause
 
 
-def test_z_taken_for_range_is_doubted_with_its_cause():
+def test_z_taken_for_range_is_doubted_with_its_cause(monkeypatch):
+    """The search for the cause counts as progress, too: it takes as long as the fit."""
+    steps, before = [], []
+
+    def searched(baseline, alternatives):
+        before.append(len(steps))
+        return likely_cause(baseline, alternatives)
+
+    def step(done, total):
+        steps.append(done)
+
+    monkeypatch.setattr(calibration_module, "likely_cause", searched)
     frames, poses, _ = record(np.random.default_rng(5), TURNING)
     frames = replace(frames, range_m=frames.range_m * TOF.axis_cosine())
-    found = calibrate(BOARD, frames, poses, free=FREE, moving=True, reports_z=False)
+    found = calibrate(BOARD, frames, poses, free=FREE, moving=True, reports_z=False, progress=step)
     assert found.doubts
-    assert found.cause == "the numbers are likely z, not range: give --quantity z"
+    assert found.cause == "the numbers are likely z, not range: give quantity=z"
+    assert len(steps) > before[0] + 20
 
 
 def test_a_moving_camera_takes_time_stamps_in_one_clock_and_the_unit_stated():
@@ -742,11 +757,14 @@ def test_the_command_refuses_to_write_what_cannot_be_trusted(folder, tmp_path, c
             found.append(calibrate(*given, **options))
         return found[0]
 
-    monkeypatch.setattr("phasemark.matcher.calibration", calibrated)  # both commands calibrate alike
+    monkeypatch.setattr("phasemark.matcher.calibrate", calibrated)  # both commands calibrate alike
+    monkeypatch.setattr(console, "PROGRESS_SECONDS", 0.01)  # as if it took long: its lines are none of errors
     free = ("--free", "pitch,half_angle_h,range_offset", "--on", "ranges")
     assert command(folder[0], tmp_path, *free, landmark="cone") == 3
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert "cannot be trusted" in error
+    told = capsys.readouterr().err
+    (error,) = error_lines(told)
+    assert len(told.splitlines()) > 1
+    assert error.startswith("error: nothing was written, for the calibration cannot be trusted")
     assert "are the landmark and its size right" in error
     assert "--force" in error
     assert not (tmp_path / "cam.toml").exists()

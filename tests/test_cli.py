@@ -128,7 +128,7 @@ def _fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     def fail(name_or_file: str) -> Sensor:
         raise error
 
-    monkeypatch.setattr("phasemark.data.commands.sensor.load_sensor", fail)
+    monkeypatch.setattr("phasemark.data.commands.sensor.read_sensor", fail)
 
 
 def test_termination_unwinds_and_exits_with_143() -> None:
@@ -144,7 +144,7 @@ def test_termination_unwinds_and_exits_with_143() -> None:
             finally:
                 print("cleaned up")
 
-        sensor.load_sensor = wait
+        sensor.read_sensor = wait
         sys.exit(cli.main(["sensor", "show", "ideal"]))
     """
     command = [sys.executable, "-c", textwrap.dedent(program)]
@@ -258,3 +258,27 @@ def test_help_imports_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0
     assert heavy.isdisjoint(done.stdout.splitlines()[-1].split())
+
+
+def test_a_table_in_pieces_is_aligned_and_has_no_spaces_at_the_end(capsys: pytest.CaptureFixture[str]) -> None:
+    table = console.Table(("class", "[D]", "m"))
+    table.echo([("cone", "1.0", "")])
+    table.echo([("a long name", "2.0", "x " * 100 + "x")])
+    table.echo([("cone", "\u00e9", "y")])
+    assert capsys.readouterr().out.splitlines() == [
+        "class  [D]  m",
+        "cone   1.0",
+        "a long name  2.0  " + "x " * 100 + "x",
+        "cone         \u00e9    y",
+    ]
+
+
+def test_a_table_is_folded_to_a_narrow_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    console.echo_table(("name", "text"), [("cone", "one two three four five six seven eight")])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 30
+    assert " ".join(" ".join(lines).split()) == "name text cone one two three four five six seven eight"

@@ -16,40 +16,38 @@ from scipy import stats
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
-from phasemark.data import BankPlan, load_plan
+from phasemark.data import BankPlan, read_bank_plan
 from phasemark.landmarks import Box, Cone, Cylinder, LandmarkSpec, Revolution, Sphere, build_mesh, catalog, read_mesh
 from phasemark.matcher import Matcher, cramer_rao, kalman_filter
-from phasemark.matcher.accuracy.cramer_rao import Estimate
 from phasemark.matcher.design import (
+    AllowedDimensions,
     ClassDistances,
     DesignPlan,
     LimitsPlan,
-    Room,
     SamplingPlan,
     SearchPlan,
+    choose_far_apart,
     confirm_design,
     default_design,
     drawing_svg,
     example_design,
     landmarks_toml,
-    load_design_plan,
     mesh_stl,
-    most_apart,
     output_names,
     pareto_csv,
     range_bound,
-    ratio,
+    read_design_plan,
     run_design,
     summary,
     turn_distance,
     write_design,
 )
-from phasemark.matcher.design.confirm import root_mean_square
 from phasemark.matcher.design.drawing import scale_words
 from phasemark.matcher.design.position_bound import box_alone
 from phasemark.matcher.design.search import Search
 from phasemark.matcher.design.separation import upper_appearance
 from phasemark.matcher.design.shapes import Lattice, neighbours, sample_boxes, sample_uppers
+from phasemark.matcher.statistics import Interval, ratio_interval, rms_interval
 from phasemark.render import Renderer, Views, capture, preset
 
 NEAR, FAR = 0.8, 2.0
@@ -64,7 +62,7 @@ SMALL = DesignPlan(
 
 @pytest.fixture(scope="module")
 def room():
-    return Room(default_design(), default_design().build_sensor())
+    return AllowedDimensions(default_design(), default_design().build_sensor())
 
 
 @pytest.fixture(scope="module")
@@ -110,14 +108,14 @@ def test_a_mistake_in_the_plan_names_file_key_and_value(tmp_path, text, said):
     file = tmp_path / "plan.toml"
     file.write_text(text)
     with pytest.raises(UsageError) as error:
-        load_design_plan(file)
+        read_design_plan(file)
     assert str(error.value).startswith(f"{file}: ")
     assert said in str(error.value)
 
 
 def test_a_plan_that_cannot_be_read_is_a_bad_file(tmp_path):
     with pytest.raises(InputFileError, match="cannot be read"):
-        load_design_plan(tmp_path / "none.toml")
+        read_design_plan(tmp_path / "none.toml")
 
 
 def _sensor_file(path, **changes):
@@ -128,7 +126,7 @@ def _sensor_file(path, **changes):
 def test_a_sensor_file_is_relative_to_the_plan(tmp_path):
     _sensor_file(tmp_path / "cam.toml", half_angle_h_deg=15.0)
     (tmp_path / "plan.toml").write_text('sensor = "cam.toml"\n')
-    assert load_design_plan(tmp_path / "plan.toml").build_sensor().half_angle_h_deg == 15.0
+    assert read_design_plan(tmp_path / "plan.toml").build_sensor().half_angle_h_deg == 15.0
 
 
 @pytest.mark.parametrize(
@@ -156,7 +154,7 @@ def test_the_field_at_the_near_end_is_0_31_m(room):
 
 def test_in_view_as_a_whole_is_what_projection_says():
     whole = DesignPlan(limits=LimitsPlan(fit="whole"))
-    room = Room(whole, whole.build_sensor())
+    room = AllowedDimensions(whole, whole.build_sensor())
     rng = np.random.default_rng(1)
     for length, width, height, r, h in rng.uniform((0.1, 0.1, 0.05, 0.02, 0.05), (0.3, 0.3, 0.2, 0.1, 0.2), (200, 5)):
         box, upper = Box(length_m=length, width_m=width, height_m=height), Cylinder(radius_m=r, height_m=h)
@@ -310,15 +308,15 @@ def test_the_best_set_is_found_among_few():
     points = rng.random((14, 2))
     distance = np.hypot(*(points[:, None] - points).transpose(2, 0, 1))
     np.fill_diagonal(distance, np.inf)
-    chosen = most_apart(distance, 2)
+    chosen = choose_far_apart(distance, 2)
     assert distance[chosen[0], chosen[1]] == distance[np.isfinite(distance)].max()
     for n in (3, 4):
         best = max(distance[np.ix_(c, c)].min() for c in map(list, combinations(range(14), n)))
-        chosen = most_apart(distance, n)
+        chosen = choose_far_apart(distance, n)
         assert len(set(chosen.tolist())) == n
         # exchanges reach an optimum that no single exchange improves; the farthest-first start is within a factor of 2
         assert distance[np.ix_(chosen, chosen)].min() >= 0.85 * best
-    assert most_apart(distance, 20).tolist() == list(range(14))
+    assert choose_far_apart(distance, 20).tolist() == list(range(14))
 
 
 def test_faces_that_reach_into_the_same_pixels_are_taken_for_one_another():
@@ -429,7 +427,7 @@ def test_the_interval_of_a_root_mean_square_covers_the_truth():
     rng = np.random.default_rng(5)
     inside = 0
     for _ in range(400):
-        one = root_mean_square(rng.normal(0, 2, 300))
+        one = rms_interval(rng.normal(0, 2, 300), law="normal")
         inside += one.low <= 2 <= one.high
     low, high = stats.binom.ppf([0.0005, 0.9995], 400, 0.95)
     assert low <= inside <= high
@@ -439,11 +437,13 @@ def test_the_interval_of_a_ratio_covers_the_truth():
     rng = np.random.default_rng(6)
     inside = 0
     for _ in range(400):
-        quotient = ratio(root_mean_square(rng.normal(0, 3, 300)), root_mean_square(rng.normal(0, 2, 300)))
+        quotient = ratio_interval(
+            rms_interval(rng.normal(0, 3, 300), law="normal"), rms_interval(rng.normal(0, 2, 300), law="normal")
+        )
         inside += quotient.low <= 1.5 <= quotient.high
     low, high = stats.binom.ppf([0.0005, 0.9995], 400, 0.95)
     assert low <= inside <= high
-    assert isinstance(quotient, Estimate)
+    assert isinstance(quotient, Interval)
 
 
 # drawings, meshes and files
@@ -502,7 +502,7 @@ def test_a_mesh_file_is_in_millimetres(tmp_path):
 def test_the_files_say_what_the_design_is(design, confirmed, tmp_path):
     files = write_design(design, confirmed, tmp_path)
     assert [file.name for file in files] == output_names(design.plan)
-    plan = load_plan(tmp_path / "landmarks.toml")
+    plan = read_bank_plan(tmp_path / "landmarks.toml")
     assert isinstance(plan, BankPlan)
     assert plan.landmarks == design.result.specs
     assert plan.resolve().build_sensor() == design.search.sensor
@@ -525,7 +525,7 @@ def test_a_sensor_from_a_file_travels_with_the_landmarks(design, tmp_path):
     plan = DesignPlan(sensor=str(tmp_path / "cam.toml"))
     (tmp_path / "landmarks.toml").write_text(landmarks_toml(replace(design, plan=plan, search=Search(plan))))
     (tmp_path / "cam.toml").unlink()
-    read = load_plan(tmp_path / "landmarks.toml")
+    read = read_bank_plan(tmp_path / "landmarks.toml")
     assert read.build_sensor() == preset("pmd-16x16").with_(signal_e=30000.0)
     assert read.landmarks == design.result.specs
 

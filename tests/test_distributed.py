@@ -90,6 +90,40 @@ def test_a_worker_process_that_dies_is_replaced(reference, tmp_path):
     assert (tmp_path / "frames.h5").read_bytes() == reference
 
 
+def test_a_script_without_a_main_guard_may_have_worker_processes(reference, tmp_path):
+    """The standard library's pools import such a script again in each worker, and end with BrokenProcessPool."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from phasemark.data import FramePlan, build_frames\n"
+        f"plan = FramePlan(**{PLAN.model_dump(exclude_unset=True)!r})\n"
+        "build_frames(plan, 'frames.h5', scheduler='local:2', shard_items=7).close()\n",
+        encoding="utf-8",
+    )
+    done = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "frames.h5").read_bytes() == reference
+
+
+def test_a_shard_of_one_worker_that_dies_is_the_only_one_made_again(tmp_path):
+    maker = ProcessMaker(FrameJob(PLAN), 2)
+    made = []
+    try:
+        threads = [threading.Thread(target=lambda k=k: made.append(maker.make(k, k + 1))) for k in range(2)]
+        for thread in threads:
+            thread.start()
+        while len(maker._all) < 2:
+            time.sleep(0.01)
+        first, second = list(maker._all)
+        os.kill(first._child.pid, signal.SIGKILL)
+        for thread in threads:
+            thread.join()
+        assert len(made) == 2
+        assert second in maker._all
+        assert second._child.poll() is None
+    finally:
+        maker.close()
+
+
 def test_a_worker_that_would_make_other_bytes_is_refused():
     class Elsewhere(FrameJob):
         def identity(self):

@@ -14,27 +14,26 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.matcher import Match, Placement, RobotPose, robot_poses
-from phasemark.matcher.accuracy.cramer_rao import nees
 from phasemark.matcher.drive import (
     OUTPUTS,
     DrivePlan,
-    Equipment,
     OdometryPlan,
     PoseFilter,
+    RobotEquipment,
     default_drive,
     drive_animation,
     example_drive,
-    load_drive_plan,
     path_csv,
     pose_error,
+    read_drive_plan,
     run_drive,
     stops_csv,
-    summary,
 )
 from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
 from phasemark.matcher.drive.odometry import OdometryModel, Reading, World, motion_jacobian, motion_noise, moved
 from phasemark.matcher.filters.filtered_frames import kalman_filter
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
+from phasemark.matcher.statistics import nees
 from phasemark.render import Background, capture
 
 OFFSETS = ((0.1, -0.03), (0.04, 0.02))
@@ -45,7 +44,7 @@ EXACT = OdometryModel(0, 0, 0, 0, 0, 0, 0)
 
 @pytest.fixture(scope="module")
 def equipment():
-    return Equipment.of(default_drive())
+    return RobotEquipment.of(default_drive())
 
 
 @pytest.fixture(scope="module")
@@ -254,10 +253,10 @@ def test_the_shipped_plan_is_a_tour_of_20_m_past_four_landmarks_of_four_classes(
 def test_a_plan_may_name_a_map_file_beside_it(tmp_path):
     (tmp_path / "map.toml").write_text('[[landmark]]\nname = "a"\nclass = "cone"\nx_m = 1\ny_m = 2\n')
     (tmp_path / "plan.toml").write_text('map = "map.toml"\n[path]\nwaypoints_m = [[0, 0], [1, 0]]\n')
-    assert load_drive_plan(tmp_path / "plan.toml").map.landmark[0].xy_m == (1.0, 2.0)
+    assert read_drive_plan(tmp_path / "plan.toml").map.landmark[0].xy_m == (1.0, 2.0)
     (tmp_path / "map.toml").write_text("landmark = 3\n")
     with pytest.raises(UsageError, match=r"map\.toml: 'landmark' must be a list, got 3"):
-        load_drive_plan(tmp_path / "plan.toml")
+        read_drive_plan(tmp_path / "plan.toml")
 
 
 @pytest.mark.parametrize(
@@ -278,7 +277,7 @@ def test_a_wrong_plan_is_refused_with_file_key_value_and_what_would_be_right(tmp
     path = tmp_path / "plan.toml"
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(UsageError, match=message) as caught:
-        load_drive_plan(path)
+        read_drive_plan(path)
     assert str(caught.value).startswith(f"{path}: ")
 
 
@@ -286,7 +285,7 @@ def test_a_class_that_the_catalogue_lacks_is_refused():
     table = default_drive().model_dump(by_alias=True)
     table["map"]["landmark"][0]["class"] = "obelisk"
     with pytest.raises(UsageError, match=r"'map\.landmark\.class' must be one of cylinder.*got 'obelisk'"):
-        Equipment.of(DrivePlan(**table))
+        RobotEquipment.of(DrivePlan(**table))
 
 
 # whole drives
@@ -333,7 +332,7 @@ def test_tables_and_summary_hold_the_drive(drives):
     assert last["covariance_hh_deg2"] == pytest.approx(math.degrees(1) ** 2 * drive.covariance[-1, 2, 2])
     stops = list(csv.DictReader(io.StringIO(stops_csv(drive))))
     assert [row["landmark"] for row in stops] == [stop.landmark.name for stop in drive.stops]
-    facts = json.loads(json.dumps(summary(drive), allow_nan=False))
+    facts = json.loads(json.dumps(drive.as_dict(), allow_nan=False))
     assert facts["corrections"] == len(drive.corrections)
     assert DrivePlan(**facts["plan"]) == drive.plan
 

@@ -67,7 +67,7 @@ def test_range_and_z_are_told_apart(frames, tmp_path):
     )
     assert (str(of_range["quantity"]), str(of_z["quantity"])) == ("range", "z")
     np.testing.assert_allclose(of_z["range"], of_range["range"] * SENSOR.axis_cosine(), rtol=1e-6)
-    with pytest.raises(UsageError, match="--quantity must be z for bop, got 'range'"):
+    with pytest.raises(UsageError, match="quantity=… must be z for bop, got 'range'"):
         exported(frames, tmp_path, "bop", "range")
     with pytest.raises(UsageError, match=r"but .* says z"):
         read_frames(tmp_path / "z", sensor=SENSOR, quantity="range")
@@ -169,7 +169,7 @@ def test_a_bop_model_is_in_millimetres_about_its_centre_and_knows_its_symmetry(f
     assert np.median(distance) < 1.0  # mm: the turned box has its corners where it had them
 
 
-def load_json(path):
+def read_json_file(path):
     """Load JSON as bop_toolkit does: keys that are numbers become numbers."""
 
     def with_numbers(pairs):
@@ -178,7 +178,7 @@ def load_json(path):
     return json.loads(path.read_text(), object_hook=with_numbers)
 
 
-def load_bop_ply(path):
+def read_bop_ply(path):
     """Load a model by bop_toolkit's rules: ASCII, four types, a vertex or three indices a line; strict in all of it."""
     lines = path.read_text("ascii").splitlines()
     assert lines[:2] == ["ply", "format ascii 1.0"]
@@ -204,12 +204,12 @@ def load_bop_ply(path):
 
 def test_bop_files_load_as_the_toolkit_loads_them(frames, tmp_path):
     folder = exported(frames, tmp_path, "bop")
-    camera = load_json(folder / "camera.json")
+    camera = read_json_file(folder / "camera.json")
     assert set(camera) >= {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}
-    infos = load_json(folder / "models" / "models_info.json")
+    infos = read_json_file(folder / "models" / "models_info.json")
     assert sorted(infos) == [1, 2]  # object numbers count from 1
     for number, info in infos.items():
-        points, normals, faces = load_bop_ply(folder / "models" / f"obj_{number:06d}.ply")
+        points, normals, faces = read_bop_ply(folder / "models" / f"obj_{number:06d}.ply")
         assert faces.max() < len(points)
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
         for k, axis in enumerate("xyz"):
@@ -221,7 +221,9 @@ def test_bop_files_load_as_the_toolkit_loads_them(frames, tmp_path):
         scenes = [entry for entry in (folder / kind).iterdir() if entry.name.isdigit()]
         assert scenes
         for scene in scenes:
-            cameras, truths, facts = (load_json(scene / f"scene_{name}.json") for name in ("camera", "gt", "gt_info"))
+            cameras, truths, facts = (
+                read_json_file(scene / f"scene_{name}.json") for name in ("camera", "gt", "gt_info")
+            )
             assert set(cameras) == set(truths) == set(facts)
             for image, of_objects in truths.items():
                 assert np.array(cameras[image]["cam_K"], float).reshape(3, 3)[2].tolist() == [0, 0, 1]
@@ -241,8 +243,8 @@ def test_bop_files_load_as_the_toolkit_loads_them(frames, tmp_path):
                             mask = np.asarray(picture) > 0
                     assert fact["px_count_valid"] == (mask & (depth_mm > 0)).sum()
                     assert fact["visib_fract"] == fact["px_count_visib"] / fact["px_count_all"] == 1
-    for target in load_json(folder / "test_targets_bop19.json"):
-        truths = load_json(folder / "test" / f"{target['scene_id']:06d}" / "scene_gt.json")
+    for target in read_json_file(folder / "test_targets_bop19.json"):
+        truths = read_json_file(folder / "test" / f"{target['scene_id']:06d}" / "scene_gt.json")
         assert [truth["obj_id"] for truth in truths[target["im_id"]]] == [target["obj_id"]]
 
 
@@ -301,7 +303,7 @@ def matrix_of(q):
 def test_an_existing_folder_needs_force_and_is_replaced_whole(frames, tmp_path):
     folder = exported(frames, tmp_path, "ply")
     before = sorted(entry.name for entry in folder.iterdir())
-    with pytest.raises(OutputExistsError, match="--force"):
+    with pytest.raises(OutputExistsError, match="force=True"):
         exported(frames, tmp_path, "ply")
     export_frames(frames, folder, "png16", force=True)
     assert not set(before) & {entry.name for entry in folder.glob("*.ply")}

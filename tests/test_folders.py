@@ -35,7 +35,7 @@ def test_a_folder_carries_a_marker_that_lists_it(tmp_path):
 
 def test_force_replaces_a_folder_of_ours_whole(tmp_path):
     folder = write(tmp_path / "out", "one")
-    with pytest.raises(OutputExistsError, match="exists; use --force"):
+    with pytest.raises(OutputExistsError, match="exists; use force=True"):
         write(folder, "two")
     write(folder, "two", force=True)
     assert names(tmp_path) == ["out", f"out/{MARKER}", "out/inner", "out/inner/deep", "out/two"]

@@ -18,7 +18,7 @@ from phasemark.data import (
     build_bank,
     build_frames,
     build_part,
-    estimate,
+    estimate_build,
     merge_parts,
     open_frames,
     parse_part,
@@ -192,7 +192,7 @@ def test_parts_of_a_bank_merge_too(tmp_path):
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "1", "a/b", "1/", "-1/3"])
 def test_a_shard_is_written_i_of_n(text):
-    with pytest.raises(UsageError, match="--shard must be I/N"):
+    with pytest.raises(UsageError, match="part=… must be I/N"):
         parse_part(text)
 
 
@@ -226,13 +226,13 @@ def test_a_larger_plan_makes_the_file_larger_by_what_the_arithmetic_says(small, 
 
 
 def test_a_trial_that_has_no_time_still_estimates_the_time():
-    facts = estimate(PLAN, trial_seconds=0.0)
+    facts = estimate_build(PLAN, trial_seconds=0.0)
     assert facts["views"] == 20
     assert 0 < facts["seconds"] < 600
 
 
 def test_a_dry_run_knows_the_size(frames_file):
-    facts = estimate(PLAN)
+    facts = estimate_build(PLAN)
     assert facts["bytes"] == frames_file.stat().st_size
     assert (facts["views"], facts["frames"]) == (20, 60)
     assert facts["seconds"] > 0

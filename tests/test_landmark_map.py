@@ -9,8 +9,8 @@ import pytest
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank
-from phasemark.matcher import LandmarkMap, Match, load_map, robot_poses
-from phasemark.matcher.commands.match_table import plain_pose, pose_text
+from phasemark.matcher import LandmarkMap, Match, read_landmark_map, robot_poses
+from phasemark.matcher.commands.match_table import pose_text
 from phasemark.render import Renderer, capture
 
 DOOR = {"name": "door", "class": "cone", "x_m": 2.0, "y_m": 1.0, "yaw_deg": 30.0}
@@ -31,7 +31,7 @@ def landmark_text(**changes):
 
 def test_a_map_file_says_where_each_landmark_stands_and_how_well_that_is_known(tmp_path):
     text = landmark_text(xy_std_m=0.01, yaw_std_deg=2.0)
-    (landmark,) = load_map(map_file(tmp_path, text)).landmark
+    (landmark,) = read_landmark_map(map_file(tmp_path, text)).landmark
     assert (landmark.name, landmark.class_name, landmark.xy_m) == ("door", "cone", (2.0, 1.0))
     assert landmark.yaw_rad == pytest.approx(math.pi / 6)
     np.testing.assert_allclose(landmark.covariance, np.diag([1e-4, 1e-4, math.radians(2) ** 2]))
@@ -54,16 +54,16 @@ def test_a_map_file_says_where_each_landmark_stands_and_how_well_that_is_known(t
 def test_a_wrong_map_is_refused_with_file_key_value_and_what_would_be_right(tmp_path, text, message):
     path = map_file(tmp_path, text)
     with pytest.raises(UsageError, match=message) as caught:
-        load_map(path)
+        read_landmark_map(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
 
 
 def test_a_file_that_is_no_map_is_an_input_error(tmp_path):
     with pytest.raises(InputFileError, match="cannot be read"):
-        load_map(tmp_path / "absent.toml")
+        read_landmark_map(tmp_path / "absent.toml")
     with pytest.raises(InputFileError, match="not a TOML file"):
-        load_map(map_file(tmp_path, "[["))
+        read_landmark_map(map_file(tmp_path, "[["))
 
 
 def test_the_wall_behind_is_the_first_one_that_a_ray_meets():
@@ -171,6 +171,6 @@ def test_options_that_make_no_sense_are_one_line(capsys, bank_and_frames, option
 def test_a_pose_with_covariance_is_printed_with_its_standard_deviations():
     match = Match("cone", True, 1.2, 0.4, covariance=np.diag([1e-6, 1e-4]), symmetry=1)
     (placement,) = LandmarkMap(landmark=[DOOR]).poses(match)
-    pose = plain_pose(placement.pose)
+    pose = placement.pose.as_dict()
     assert pose["std"]["heading_deg"] == pytest.approx(math.degrees(0.01))
     assert f"heading {pose['heading_deg']:.2f} ± 0.57°" in pose_text(pose)

@@ -18,8 +18,8 @@ from phasemark.landmarks import (
     Sphere,
     build_mesh,
     catalog,
+    mesh_figure,
     mesh_html,
-    mesh_picture,
 )
 
 BOX = Box(length_m=0.24, width_m=0.16, height_m=0.15)
@@ -170,7 +170,7 @@ def test_too_fine_a_tolerance_is_refused():
 
 def test_a_landmark_is_drawn_and_its_page_loads_nothing():
     mesh = build_mesh(catalog()["post"])
-    assert mesh_picture(mesh).startswith(b"\x89PNG\r\n")
+    assert mesh_figure(mesh).startswith(b"\x89PNG\r\n")
     page = mesh_html(mesh, "<post> & co")
     assert "&lt;post&gt; &amp; co" in page
     assert "http:" not in page

@@ -9,9 +9,10 @@ import pytest
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import FilteredFrames, Matcher, Matches, PixelState, kalman_filter, noise_free
+from phasemark.matcher import FilteredFrames, Match, Matcher, Matches, PixelState, kalman_filter, noise_free
 from phasemark.matcher.agreement import DISAGREEMENT
-from phasemark.matcher.figures import match_picture, model_range_m
+from phasemark.matcher.figures import match_figure, model_range_m
+from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.render import Background, Frames, PhasorImages, Renderer, capture, preset
 
@@ -84,8 +85,7 @@ def test_the_cost_is_the_whitened_squared_distance_with_the_no_return_rule():
 
 def test_matrix_product_and_exact_sum_agree_on_random_frames(bank):
     rng = np.random.default_rng(3)
-    matcher = Matcher(bank)
-    templates = matcher._pose
+    templates = NearestMatcher(bank).pose
     state = rng.choice([0, 1, 2], size=(5, 128), p=[0.7, 0.2, 0.1])
     seen = Observation(
         range_m=np.where(state == 0, rng.uniform(0.8, 1.3, (5, 128)), 0.0),
@@ -240,4 +240,14 @@ def test_the_model_beside_a_match_is_the_bank_image_composed_with_the_background
     (match,) = Matcher(bank, background=WALL).match(noise_free(images, 50)[k])
     model = model_range_m(bank, match, WALL)
     np.testing.assert_allclose(model, images.range_m[k], atol=1e-6)  # float32 phasors
-    assert len(match_picture(noise_free(images, 50), match, bank, WALL, k).axes) == 6  # three panels, three colour bars
+    assert len(match_figure(noise_free(images, 50), match, bank, WALL, k).axes) == 6  # three panels, three colour bars
+
+
+def test_the_model_beside_a_match_is_found_in_a_bank_of_more_than_one_period(tmp_path):
+    plan = BankPlan(classes=("cone",), distance_m="0.9:1.1:0.1", delta_deg="0:360:30")  # repeats after 180°
+    with build_bank(plan, tmp_path / "bank.h5") as opened:
+        match = Match("cone", True, distance_m=1.0, delta_rad=math.radians(30), symmetry=2)
+        model, image = model_range_m(opened, match, None), opened.image("cone", 1, 1)
+        shown = np.isfinite(model)
+        assert shown.sum() > 20
+        np.testing.assert_allclose(model[shown], image.range_m[0][shown], atol=1e-6)

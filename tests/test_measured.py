@@ -173,7 +173,7 @@ def test_amplitude_and_validity_turn_with_the_range(tmp_path):
 def test_status_needs_the_values_that_are_valid(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, range=IMAGE, status=np.array([[5, 9, 0], [255, 5, 5]]))
-    with pytest.raises(UsageError, match="--valid-status"):
+    with pytest.raises(UsageError, match="valid_status=…"):
         read_frames(path, sensor=SMALL, **STATED)
     frames = read_frames(path, sensor=SMALL, valid_status={5, 9}, **STATED)
     assert frames.valid[0, 0].tolist() == [[True, True, False], [False, True, True]]
@@ -189,9 +189,9 @@ def test_a_file_that_states_unit_and_quantity_needs_no_options(tmp_path, kind):
     frames = read_frames(path, sensor=SMALL)
     np.testing.assert_allclose(frames.range_m[0, 0], IMAGE, rtol=1e-15)  # one rounding of a product
     read_frames(path, sensor=SMALL, unit="mm", quantity="range")
-    with pytest.raises(UsageError, match=r"--unit is m, but .* says mm"):
+    with pytest.raises(UsageError, match=r"unit=… is m, but .* says mm"):
         read_frames(path, sensor=SMALL, unit="m")
-    with pytest.raises(UsageError, match=r"--quantity is z, but .* says range"):
+    with pytest.raises(UsageError, match=r"quantity=… is z, but .* says range"):
         read_frames(path, sensor=SMALL, quantity="z")
 
 
@@ -204,10 +204,10 @@ def test_hdf5_frames_with_amplitudes(tmp_path):
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"quantity": "range"}, r"does not say its unit: give --unit m\|cm\|mm"),
-        ({"unit": "m"}, r"does not say its quantity: give --quantity range\|z"),
-        ({"unit": "inch", "quantity": "range"}, "--unit must be one of m, cm, mm, got 'inch'"),
-        ({"unit": "m", "quantity": "depth"}, "--quantity must be one of range, z, got 'depth'"),
+        ({"quantity": "range"}, r"does not say its unit: give unit=m\|cm\|mm"),
+        ({"unit": "m"}, r"does not say its quantity: give quantity=range\|z"),
+        ({"unit": "inch", "quantity": "range"}, "unit=… must be one of m, cm, mm, got 'inch'"),
+        ({"unit": "m", "quantity": "depth"}, "quantity=… must be one of range, z, got 'depth'"),
         ({**STATED, "rotate": 45}, "'rotate' must be 0, 90, 180 or 270, got 45"),
         ({**STATED, "invalid_means": "far"}, "'invalid_means' must be"),
     ],
@@ -221,7 +221,7 @@ def test_a_missing_or_wrong_option_is_a_usage_error_that_names_it(tmp_path, opti
 def test_a_file_that_says_one_of_unit_and_quantity_has_lost_the_other(tmp_path):
     path = tmp_path / "frames.npz"
     np.savez(path, range=IMAGE[None], unit="m")
-    with pytest.raises(InputFileError, match=r"does not say its quantity: give --quantity range\|z"):
+    with pytest.raises(InputFileError, match=r"does not say its quantity: give quantity=range\|z"):
         read_frames(path, sensor=SMALL)
     assert read_frames(path, sensor=SMALL, quantity="range").range_m[0, 0].tolist() == IMAGE.tolist()
 
@@ -247,13 +247,13 @@ def test_nothing_but_zeros_is_an_error(tmp_path):
 
 
 def test_unit_and_quantity_are_asked_for_at_once(tmp_path):
-    with pytest.raises(UsageError, match=r"unit and quantity: give --unit m\|cm\|mm and --quantity range .*z"):
+    with pytest.raises(UsageError, match=r"unit and quantity: give unit=m\|cm\|mm and quantity=range .*z"):
         read_frames(csv_file(tmp_path, "1,2,3,4,5,6\n"), sensor=SMALL)
 
 
 def test_millimetres_read_as_metres_are_an_error_that_asks_for_the_unit(tmp_path):
     path = csv_file(tmp_path, "1000,2000,3000,4000,5000,6000\n")
-    with pytest.raises(InputFileError, match=r"6 of 6 ranges .* is --unit right\?"):
+    with pytest.raises(InputFileError, match=r"6 of 6 ranges .* is unit=… right\?"):
         read_frames(path, sensor=SMALL, **STATED)
 
 
@@ -263,20 +263,20 @@ DIRECT = SMALL.with_(kind="direct", modulation_hz=1e3, max_range_m=4.0)
 @pytest.mark.parametrize(
     ("sensor", "unit", "text", "fitting"),
     [
-        (DIRECT, "m", "590,700,800,900,1000,1693\n", "--unit mm (dividing by 1000)"),
-        (DIRECT, "m", "59,70,80,90,100,169\n", "--unit cm (dividing by 100) or --unit mm (dividing by 1000)"),
-        (DIRECT, "cm", "590,700,800,900,1000,1693\n", "--unit mm (dividing by 10)"),
-        (SMALL, "m", "1600,2000,3000,4000,5000,6000\n", "--unit mm (dividing by 1000)"),
+        (DIRECT, "m", "590,700,800,900,1000,1693\n", "unit=mm (dividing by 1000)"),
+        (DIRECT, "m", "59,70,80,90,100,169\n", "unit=cm (dividing by 100) or unit=mm (dividing by 1000)"),
+        (DIRECT, "cm", "590,700,800,900,1000,1693\n", "unit=mm (dividing by 10)"),
+        (SMALL, "m", "1600,2000,3000,4000,5000,6000\n", "unit=mm (dividing by 1000)"),
     ],
 )
 def test_the_error_names_the_units_in_which_every_range_would_be_possible(tmp_path, sensor, unit, text, fitting):
     with pytest.raises(InputFileError) as caught:
         read_frames(csv_file(tmp_path, text), sensor=sensor, unit=unit, quantity="range")
-    assert str(caught.value).endswith(f"is --unit right? All would fit with {fitting}")
+    assert str(caught.value).endswith(f"is unit=… right? All would fit with {fitting}")
 
 
 def test_no_unit_is_proposed_where_none_would_help(tmp_path):
-    with pytest.raises(InputFileError, match=r"is --unit right\?$"):
+    with pytest.raises(InputFileError, match=r"is unit=… right\?$"):
         read_frames(csv_file(tmp_path, "-1,-2,-3,-4,-5,1\n"), sensor=SMALL, **STATED)
 
 
@@ -382,7 +382,7 @@ def test_a_bad_header_or_line_of_a_recording_is_named(tmp_path, text, reason):
 
 
 def test_millimetres_do_not_say_whether_they_are_range_or_z(tmp_path):
-    with pytest.raises(UsageError, match=r"does not say its quantity: give --quantity range\|z"):
+    with pytest.raises(UsageError, match=r"does not say its quantity: give quantity=range\|z"):
         read_frames(csv_file(tmp_path, named("mm")), sensor=SMALL)
 
 

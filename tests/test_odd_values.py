@@ -13,7 +13,7 @@ from phasemark.cli import main
 from phasemark.data import BankPlan, FramePlan, planned_size
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.data.measured.csv_frames import parse_csv
-from phasemark.data.partial_outputs import estimate
+from phasemark.data.partial_outputs import estimate_build
 from phasemark.landmarks import build_mesh, catalog, export_mesh, mesh_html, read_mesh
 from phasemark.render import Background, Renderer, Views, preset
 from phasemark.render.integral.intersect import MOST_SCENES, EmbreeIntersector
@@ -90,7 +90,7 @@ def test_a_mesh_whose_path_holds_nul_is_refused_in_one_line(answer, kind, symmet
 
 
 def test_a_build_beyond_the_limits_is_refused_before_its_size_is_noted(answer, monkeypatch):
-    monkeypatch.setattr("phasemark.data.estimate", lambda *_, **__: pytest.fail("timed what cannot be built"))
+    monkeypatch.setattr("phasemark.data.estimate_build", lambda *_, **__: pytest.fail("timed what cannot be built"))
     Path("many.toml").write_text('views = 6000000\nclasses = ["cone"]\n', encoding="utf-8")
     grid = ("--class", "cone", "--distance", "1:10:0.001", "--delta", "0:89.99:0.01")
     for command, what in (
@@ -163,7 +163,7 @@ def test_a_dry_run_of_any_size_is_answered_from_arithmetic(answer, capsys):
 
 def test_the_time_of_a_large_plan_is_that_of_a_sample():
     plan = FramePlan(views=4_000_000, classes=["cone"], sensor="vl53l5cx-8x8", variants=[])
-    found = estimate(plan, trial_seconds=0.0)
+    found = estimate_build(plan, trial_seconds=0.0)
     assert found["views"] == 4_000_000
     assert 0 <= found["bytes"] - planned_size(plan)["bytes"] < 5e6  # header and meshes
     assert found["seconds"] > 0

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from phasemark import InputFileError, UsageError
-from phasemark.data import BankPlan, MeshPlan, load_plan
+from phasemark.data import BankPlan, MeshPlan, read_bank_plan
 from phasemark.data.plans.bank_plan import factored_refusal
 from phasemark.landmarks import catalog
 from phasemark.matcher.plan_kinds import KINDS, plan_schema
@@ -86,7 +86,7 @@ def test_a_plan_file_sets_every_key(tmp_path):
         albedo = 0.5
         """,
     )
-    plan = load_plan(path)
+    plan = read_bank_plan(path)
     assert plan.classes == ("cone", "post")
     assert plan.distance_m == (1.0, 1.5, 2.0)
     assert plan.delta_deg == (0.0, 30.0)
@@ -141,7 +141,7 @@ def test_a_plan_file_sets_every_key(tmp_path):
 def test_a_wrong_plan_is_one_line_with_file_key_value_and_remedy(tmp_path, text, reason):
     path = plan_file(tmp_path, text)
     with pytest.raises(UsageError) as caught:
-        load_plan(path)
+        read_bank_plan(path)
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert reason in message
@@ -167,9 +167,9 @@ def test_what_does_not_exist_is_named(fields, reason):
 
 def test_an_unreadable_plan_is_an_input_error(tmp_path):
     with pytest.raises(InputFileError, match=r"absent\.toml: cannot be read"):
-        load_plan(tmp_path / "absent.toml")
+        read_bank_plan(tmp_path / "absent.toml")
     with pytest.raises(InputFileError, match="not a TOML file"):
-        load_plan(plan_file(tmp_path, "classes = ["))
+        read_bank_plan(plan_file(tmp_path, "classes = ["))
 
 
 @pytest.mark.parametrize(

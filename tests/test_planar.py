@@ -1,4 +1,4 @@
-"""The paper's generator against closed forms and against the ray caster."""
+"""The paper's generator against closed forms and against the exact integral."""
 
 from __future__ import annotations
 

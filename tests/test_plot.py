@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from phasemark import UsageError
-from phasemark.render import PAPER_CMAP, Flag, Frames, PhasorImages, Views, preset, range_picture, terminal_picture
+from phasemark.render import PAPER_CMAP, Flag, Frames, PhasorImages, Views, preset, range_figure, terminal_figure
 from phasemark.render.figures import RANGE_COLOURS
 
 SENSOR = preset("ideal")
@@ -53,7 +53,7 @@ def test_near_is_white_far_is_black_and_between_is_blue():
 
 def test_a_surface_half_way_is_blue_too_and_every_caption_says_so():
     range_m = np.array([[1.0, 1.0, 2.0, 2.0, 3.0, 3.0]])  # three surfaces, no pixel that mixes two of them
-    red, _, blue = (int(c) for c in pixel_colour(range_picture(range_m), 0, 2))
+    red, _, blue = (int(c) for c in pixel_colour(range_figure(range_m), 0, 2))
     assert blue > red + 100
     root = Path(__file__).resolve().parent.parent
     readme = " ".join((root / "README.md").read_text(encoding="utf-8").split())
@@ -67,7 +67,7 @@ def test_a_surface_half_way_is_blue_too_and_every_caption_says_so():
 def test_row_zero_is_drawn_at_the_top_and_column_zero_at_the_left():
     image = np.full((16, 16), 3.0)
     image[0, 0] = 1.0
-    figure = range_picture(image)
+    figure = range_figure(image)
     np.testing.assert_array_equal(pixel_colour(figure, 0, 0), 255)
     for row, col in ((0, 15), (15, 0), (15, 15)):
         np.testing.assert_array_equal(pixel_colour(figure, row, col), 0)
@@ -76,18 +76,18 @@ def test_row_zero_is_drawn_at_the_top_and_column_zero_at_the_left():
 
 
 def test_nothing_returned_is_hatched_and_named():
-    figure = range_picture(range_image(), near_m=0.5, far_m=4.0, title="cone")
+    figure = range_figure(range_image(), near_m=0.5, far_m=4.0, title="cone")
     assert {"cone", "no range", "range (m)", "u (pixel columns)", "v (pixel rows)"} <= texts(figure)
     assert figure.axes[0].patch.get_hatch()
     red, _, blue = (int(c) for c in pixel_colour(figure, 3, 5))
     assert red > blue  # the paper behind is warm, no colour of the map is
-    assert "no range" not in texts(range_picture(np.ones((16, 16))))
+    assert "no range" not in texts(range_figure(np.ones((16, 16))))
 
 
 @pytest.mark.parametrize("image", [np.full((16, 16), np.nan), np.full((16, 16), 2.0)])
 def test_empty_and_flat_images_can_be_drawn(image):
-    assert png_size(range_picture(image))[0] > 300
-    assert "m" in terminal_picture(image).plain
+    assert png_size(range_figure(image))[0] > 300
+    assert "m" in terminal_figure(image).plain
 
 
 def test_images_and_frames_can_be_drawn_for_a_first_look():
@@ -115,7 +115,7 @@ def test_images_and_frames_can_be_drawn_for_a_first_look():
 
 def test_terminal_picture_draws_two_pixels_in_a_character():
     image = np.array([[1.0, 2.0], [3.0, np.nan], [1.0, 3.0]])
-    text = terminal_picture(image, width=2)
+    text = terminal_figure(image, width=2)
     lines = text.plain.split("\n")
     assert lines[:2] == ["▀▀", "▀▀"]
     assert lines[2].endswith("1.00 … 3.00 m  █ no range")
@@ -128,23 +128,23 @@ def test_terminal_picture_draws_two_pixels_in_a_character():
 
 
 def test_terminal_picture_fills_the_width_by_whole_pixels():
-    lines = terminal_picture(range_image(), width=40).plain.split("\n")
+    lines = terminal_figure(range_image(), width=40).plain.split("\n")
     assert {len(line) for line in lines[:-1]} == {32}
     assert len(lines) == 17
     stream = io.StringIO()
-    Console(file=stream, force_terminal=True, color_system="truecolor", width=80).print(terminal_picture(range_image()))
+    Console(file=stream, force_terminal=True, color_system="truecolor", width=80).print(terminal_figure(range_image()))
     assert "\x1b[38;2;255;255;255" in stream.getvalue()
 
 
 def test_pictures_are_of_one_image():
     with pytest.raises(UsageError, match=r"must be one image, \(rows, cols\), got shape \(1, 16, 16\)"):
-        range_picture(range_image()[None])
+        range_figure(range_image()[None])
 
 
 def test_matplotlib_loads_only_when_a_picture_is_drawn_and_pyplot_never():
     code = (
         "import sys, phasemark.render as r; assert 'matplotlib' not in sys.modules;"
-        "r.range_picture; assert 'matplotlib' in sys.modules; assert 'matplotlib.pyplot' not in sys.modules"
+        "r.range_figure; assert 'matplotlib' in sys.modules; assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

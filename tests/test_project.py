@@ -206,3 +206,16 @@ def test_ci_runs_the_command_that_the_readme_names() -> None:
     assert os.access(script, os.X_OK)
     assert "\nmake test" in script.read_text(encoding="utf-8")
     assert "\nmake test" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_no_function_of_a_command_is_longer_than_forty_lines():
+    """Its signature, which is the help of its options, and its docstring left out."""
+    long = {}
+    for path in [ROOT / "cli.py", *ROOT.glob("*/commands/*.py")]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                statements = node.body[1:] if ast.get_docstring(node) and len(node.body) > 1 else node.body
+                length = node.end_lineno - statements[0].lineno + 1
+                if length > 40:
+                    long[f"{path.name} {node.name}"] = length
+    assert long == {}

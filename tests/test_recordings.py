@@ -62,7 +62,7 @@ def drawn(monkeypatch, capsys):
         printed.append(capsys.readouterr().out)
         return Figure(figsize=(1, 1))
 
-    monkeypatch.setattr("phasemark.matcher.figures.match_picture", picture)
+    monkeypatch.setattr("phasemark.matcher.figures.match_figure", picture)
     return printed
 
 

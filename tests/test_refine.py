@@ -14,10 +14,13 @@ from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, noise_free
-from phasemark.matcher.accuracy.trials import Conditions, noisy_frames, run_trials
-from phasemark.matcher.likelihood.descent import Settings, _Problem
-from phasemark.matcher.likelihood.images import VIEW, BankModel, RenderedModel
+from phasemark.matcher.accuracy.trials import TrialSetup, noisy_frames, run_trials
+from phasemark.matcher.likelihood.bank_images import BankModel
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.problem import Problem, Settings
+from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
+from phasemark.matcher.likelihood.uncertainty import std_without_one_pixel, view_covariance
 from phasemark.render import Background, Frames, Renderer, Views, capture, predicted_range_std, preset
 
 SENSOR = preset("pmd-16x16")
@@ -99,7 +102,7 @@ def test_the_error_of_distance_and_angle_is_the_bound_and_the_covariance_says_so
     # N = 500 over the four classes; 99.9 % intervals over 7 figures
     rng = np.random.default_rng(20)
     match = Matcher(bank, "refine", free=VIEW[:2]).match
-    errors = [run_trials(match, renderers[name], name, Conditions(), 125, rng) for name in NAMES]
+    errors = [run_trials(match, renderers[name], name, TrialSetup(), 125, rng) for name in NAMES]
     for trials in errors:
         assert (trials.found == trials.class_name).all()
     scaled = np.concatenate([t.scaled[~t.outlier] for t in errors])
@@ -122,9 +125,9 @@ def test_the_error_of_distance_and_angle_is_the_bound_and_the_covariance_says_so
 
 def test_before_a_wall_mixed_pixels_inform_and_the_error_is_that_bound(bank, renderers):
     # N = 40: a matcher that stops at a side peak, or at ranges of the landmark alone, is off by tens of bounds
-    conditions = Conditions(background=WALL)
+    setup = TrialSetup(background=WALL)
     matcher = Matcher(bank, "refine", free=VIEW[:2], background=WALL)
-    trials = run_trials(matcher.match, renderers["cone"], "cone", conditions, 40, np.random.default_rng(2))
+    trials = run_trials(matcher.match, renderers["cone"], "cone", setup, 40, np.random.default_rng(2))
     inner = trials.scaled[~trials.outlier]
     assert len(inner) >= 38
     assert np.sqrt((inner**2).mean()) < 1.05 + 3.3 / math.sqrt(4 * len(inner))
@@ -135,9 +138,9 @@ def test_before_a_wall_mixed_pixels_inform_and_the_error_is_that_bound(bank, ren
 def test_on_phasors_the_albedo_does_not_matter(bank):
     # 30 % darker than the bank has it; N = 30
     dark = Renderer(build_mesh(catalog()["cylinder"]), SENSOR, albedo=0.56)
-    conditions = Conditions(on="phasors", distance_m=(0.8, 1.2))
+    setup = TrialSetup(on="phasors", distance_m=(0.8, 1.2))
     matcher = Matcher(bank, "refine", free=VIEW[:2], on="phasors")
-    trials = run_trials(matcher.match, dark, "cylinder", conditions, 30, np.random.default_rng(3))
+    trials = run_trials(matcher.match, dark, "cylinder", setup, 30, np.random.default_rng(3))
     inner = trials.scaled[~trials.outlier]
     assert len(inner) >= 29
     assert np.sqrt((inner**2).mean()) < 1.05 + 3.3 / math.sqrt(4 * len(inner))
@@ -147,15 +150,15 @@ def test_on_phasors_the_albedo_does_not_matter(bank):
 def test_a_free_bearing_is_found_with_the_rest(bank, renderers):
     free = VIEW[:3]
     matcher = Matcher(bank, "refine", free=free)
-    conditions = Conditions(free=free, bearing_rad=0.06, distance_m=(0.8, 1.2))
-    trials = run_trials(matcher.match, renderers["cylinder"], "cylinder", conditions, 12, np.random.default_rng(5))
+    setup = TrialSetup(free=free, bearing_rad=0.06, distance_m=(0.8, 1.2))
+    trials = run_trials(matcher.match, renderers["cylinder"], "cylinder", setup, 12, np.random.default_rng(5))
     assert not trials.outlier.any()
     assert np.sqrt((trials.scaled**2).mean()) < 1.05 + 3.3 / math.sqrt(6 * 12)
 
 
 def test_trials_of_a_matcher_that_estimates_something_else_are_refused(bank, renderers):
     with pytest.raises(UsageError, match="estimates distance_m, delta_rad, bearing_rad, and 'free'"):
-        run_trials(Matcher(bank, "refine").match, renderers["cone"], "cone", Conditions(), 1, np.random.default_rng(1))
+        run_trials(Matcher(bank, "refine").match, renderers["cone"], "cone", TrialSetup(), 1, np.random.default_rng(1))
 
 
 @pytest.mark.parametrize("background", [None, Background(wall_m=2.5), Background(floor_m=0.3)])
@@ -178,14 +181,14 @@ def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, render
         kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(2), n_frames=10)), on
     )
     used = np.ones(evidence.value.shape[1], bool)
-    problem = _Problem(
+    problem = Problem(
         RenderedModel(bank), evidence, np.zeros(1, np.int64), np.array([bank.classes.index("cone")]),
         Settings(free, used, huber), np.full(1, np.inf),
     )  # fmt: skip
     state = problem.start(np.array([[1.02, 0.5, 0.0, 0.0]]), False)
     p = len(problem.columns)
-    covariance = problem._covariance(state.sums)
-    found = problem._std_without_one(state, np.array([0]), state.images.slope, state.sums.information, covariance)
+    covariance = view_covariance(problem, state.sums)
+    found = std_without_one_pixel(problem, state, np.array([0]), state.images.slope, state.sums.information, covariance)
 
     def variance(use):
         sums = gauss_newton_sums(
@@ -207,7 +210,7 @@ def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, render
 def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, renderers):
     view = Views.broadcast([0.9, 1.2], [0.5, 2.0])
     wall = Background(wall_m=3.3, wall_albedo=0.4)
-    frames = noisy_frames(renderers["sphere"], SENSOR, view, Conditions(background=wall), np.random.default_rng(6))
+    frames = noisy_frames(renderers["sphere"], SENSOR, view, TrialSetup(background=wall), np.random.default_rng(6))
     for match, distance, delta in zip(
         Matcher(bank, "refine", background="auto").match(frames), view.distance_m, view.delta_rad, strict=True
     ):
@@ -303,12 +306,12 @@ def test_the_range_offset_of_a_sensor_is_taken_off(bank, method):
 def test_rendering_only_the_rows_that_turn_gives_the_whole_image(bank, on):
     dim = Renderer(build_mesh(catalog()["cone"]), SENSOR, albedo=0.5)
     frames = noisy_frames(
-        dim, SENSOR, Views.broadcast(1.0, [0.6, 1.1]), Conditions(on=on, background=WALL), np.random.default_rng(4)
+        dim, SENSOR, Views.broadcast(1.0, [0.6, 1.1]), TrialSetup(on=on, background=WALL), np.random.default_rng(4)
     )
     behind = Renderer(None, SENSOR).render(1.0, background=WALL).phasor.reshape(-1)
     settings = Settings(VIEW[:2], np.ones(256, bool), background=behind)
     cone, evidence = np.full(2, bank.classes.index("cone")), Evidence.from_frames(frames, on)
-    problem = _Problem(RenderedModel(bank, WALL), evidence, np.arange(2), cone, settings, np.full(2, np.inf))
+    problem = Problem(RenderedModel(bank, WALL), evidence, np.arange(2), cone, settings, np.full(2, np.inf))
     state = problem.start(np.array([[1.0, 0.6, 0, 0], [1.0, 1.1, 0, 0]]), False)
     theta = state.theta.copy()
     theta[:, 1] += 0.01
@@ -323,7 +326,7 @@ def test_rendering_only_the_rows_that_turn_gives_the_whole_image(bank, on):
 
 
 def test_lower_pixels_alone_can_give_the_view(bank, renderers):
-    frames = noisy_frames(renderers["cone"], SENSOR, Views.broadcast(1.0, 0.8), Conditions(), np.random.default_rng(10))
+    frames = noisy_frames(renderers["cone"], SENSOR, Views.broadcast(1.0, 0.8), TrialSetup(), np.random.default_rng(10))
     lower = Matcher(bank, "refine", pixels="lower").match(frames)[0]
     both = Matcher(bank, "refine").match(frames)[0]
     assert lower.class_name == "cone"

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from phasemark.data.commands.sensor import value_and_error_of
 from phasemark.data.pages.characterisation import _quantity_row
 from phasemark.matcher import Match
-from phasemark.matcher.accuracy.cramer_rao import Estimate as Interval
+from phasemark.matcher.statistics import Interval
 from phasemark.matcher.sweep.report import _with_interval
-from phasemark.render.bench.data_sheet.results import Quantity
-from phasemark.render.bench.fit.fitted_sensor import Estimate
+from phasemark.render.bench.data_sheet.results import SheetQuantity
+from phasemark.render.bench.fit.fitted_sensor import FittedField
 from phasemark.render.integral.rounding import error_text, value_and_error, with_error, with_interval
 
 
@@ -66,9 +66,9 @@ def test_tables_and_reports_round_alike():
     assert "1.23400 ± 0.00020" in match._repr_html_()
     assert "28.65 ± 0.30" in match._repr_html_()
     assert _with_interval(Interval(0.003, 0.00288, 0.00312), 1e3) == "3.00 [2.88, 3.12]"
-    assert value_and_error_of(35571.23, Estimate(35571.23, 89.0, "")) == ("35571", "89")
-    assert value_and_error_of(0.5, Estimate(0.5, 0.0002, "")) == ("0.50000", "0.00020")
-    assert value_and_error_of(0.5, Estimate(0.5, None, "")) == ("0.5", "assumed")
-    assert Estimate(1.0, 0.0002, "noise").comment == "measured, ± 0.00020 (standard error): noise"
-    row = _quantity_row(Quantity("x", "x", 2.0, 2.01, 0.0102, 50))
+    assert value_and_error_of(35571.23, FittedField(35571.23, 89.0, "")) == ("35571", "89")
+    assert value_and_error_of(0.5, FittedField(0.5, 0.0002, "")) == ("0.50000", "0.00020")
+    assert value_and_error_of(0.5, FittedField(0.5, None, "")) == ("0.5", "assumed")
+    assert FittedField(1.0, 0.0002, "noise").comment == "measured, ± 0.00020 (standard error): noise"
+    row = _quantity_row(SheetQuantity("x", "x", 2.0, 2.01, 0.0102, 50))
     assert (row["predicted"], row["simulated"], row["half"]) == ("2.000", "2.010", "0.020")

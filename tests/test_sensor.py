@@ -278,10 +278,10 @@ def test_a_direct_sensor_has_no_taps_to_keep():
 
 def test_the_variants_of_a_frame_add_one_error_after_another():
     sensor = preset("pmd-16x16-wiggle")
-    hard, mixed = pure_image(1.0, sensor, 0.8), pure_image(1.1, sensor, 0.8)
-    variants = ablate(hard, mixed, sensor, rng=np.random.default_rng(3), n_frames=50)
+    hard, exact = pure_image(1.0, sensor, 0.8), pure_image(1.1, sensor, 0.8)
+    variants = ablate(hard, exact, sensor, rng=np.random.default_rng(3), n_frames=50)
     np.testing.assert_allclose(variants.hard.range_m, 1.0, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(variants.mixed.range_m, 1.1, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(variants.exact.range_m, 1.1, rtol=0, atol=1e-12)
     z = stats.norm.ppf(1 - FALSE_ALARM / 2)
     law = predicted_range_std(0.8, 0.8, PMD)
     assert np.std(variants.shot.range_m) == pytest.approx(law, rel=z / math.sqrt(2 * 256 * 50))

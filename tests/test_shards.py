@@ -120,7 +120,7 @@ def test_a_run_of_another_plan_is_not_continued_and_the_difference_named(unfinis
 
 
 def test_an_unfinished_run_is_not_thrown_away_unasked(unfinished):
-    with pytest.raises(OutputExistsError, match="--resume continues it, --force starts over"):
+    with pytest.raises(OutputExistsError, match="resume=True continues it, force=True starts over"):
         build(ToyJob(), unfinished)
     build(ToyJob(), unfinished, force=True)
     check_toy_file(unfinished)
@@ -253,7 +253,7 @@ def test_differences_are_named_by_key():
 
 @pytest.mark.parametrize("scheduler", ["local", "local:0", "local:x", "processes", "dask"])
 def test_an_unknown_scheduler_is_named(scheduler):
-    with pytest.raises(UsageError, match="--scheduler"):
+    with pytest.raises(UsageError, match="scheduler="):
         open_maker(scheduler, ToyJob())
 
 

@@ -9,8 +9,8 @@ from scipy import stats
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.matcher.accuracy.cramer_rao import nees
-from phasemark.matcher.drive import Equipment, default_drive, pose_error, run_drive
+from phasemark.matcher.drive import RobotEquipment, default_drive, pose_error, run_drive
+from phasemark.matcher.statistics import nees
 from phasemark.render import Background, Renderer, capture, predicted_range_std, preset
 from phasemark.render.integral.intersect import make_intersector
 
@@ -102,7 +102,7 @@ def test_the_right_class_is_found_in_two_thousand_random_trials(tmp_path):
 
 def test_fifty_drives_stay_within_2_cm_and_0_6_degrees_after_corrections_and_know_how_well_they_do():
     plan = default_drive()
-    equipment = Equipment.of(plan)
+    equipment = RobotEquipment.of(plan)
     drives = [run_drive(plan, seed=seed, equipment=equipment) for seed in range(50)]
     stops = [stop for drive in drives for stop in drive.corrections]
     assert len(stops) >= 4 * len(drives)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from builders import error_lines
 
 from phasemark.cli import app
 from phasemark.landmarks import build_mesh, catalog, export_mesh
@@ -76,7 +77,7 @@ SMALL = {
     "sweep run": ("sweep.toml", "-o", "out"),
 }
 """Arguments with which a command does little."""
-LONG = {"demo": 60, "landmark design": 40, "drive": 30, "sweep run": 30, "sweep report": 30, "calibrate": 30}
+LONG = {"demo": 60, "landmark design": 40, "drive": 30, "sweep run": 30, "sweep report": 30, "calibrate": 120}
 """Seconds of commands that cannot do little, while another test runs beside them."""
 PLAN = 'views = 1\nclasses = ["cone"]\n'
 DESIGN = "n_classes = 2\n[sampling]\ndistances = 2\ndelta_step_deg = 15\n[search]\nboxes = 4\nuppers = 8\nstep_mm = 3\n"
@@ -178,7 +179,7 @@ def outcome(arguments, place, seconds):
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         return f"took more than {seconds} s"
-    lines = [line for line in done.stderr.decode("utf-8", "replace").splitlines() if not line.startswith("note: ")]
+    lines = error_lines(done.stderr.decode("utf-8", "replace"))
     if done.returncode not in CODES:
         return f"exit code {done.returncode}: {lines[-1:]}"
     if done.returncode and (len(lines) != 1 or not lines[0].startswith("error: ")):

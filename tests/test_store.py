@@ -36,7 +36,7 @@ def test_new_file_has_the_permissions_the_umask_leaves(tmp_path):
 def test_an_existing_output_needs_force(tmp_path):
     path = tmp_path / "a"
     write_atomically(path, b"old")
-    with pytest.raises(OutputExistsError, match=r"a: exists; use --force"):
+    with pytest.raises(OutputExistsError, match=r"a: exists; use force=True"):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     write_atomically(path, b"new", force=True)
@@ -255,7 +255,7 @@ def test_a_file_made_by_somebody_else_between_the_last_look_and_the_rename_stays
         real(source, target)
 
     monkeypatch.setattr(renames, "rename_new", late)
-    with pytest.raises(OutputExistsError, match="exists; use --force"):
+    with pytest.raises(OutputExistsError, match="exists; use force=True"):
         write_atomically(path, b"mine")
     assert path.read_bytes() == b"theirs"
     assert names(tmp_path) == ["a"]

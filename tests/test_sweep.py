@@ -15,7 +15,7 @@ from phasemark.cli import main
 from phasemark.data.commands import console
 from phasemark.data.files.folder_marker import MARKER
 from phasemark.matcher.plan_kinds import plan_schema
-from phasemark.matcher.sweep.plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, load_sweep
+from phasemark.matcher.sweep.plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, read_sweep_plan
 from phasemark.matcher.sweep.report import write_report
 from phasemark.matcher.sweep.run import read_sweep, run_sweep, sweep_folder
 
@@ -227,7 +227,7 @@ def test_a_plan_that_names_a_program_does_not_run_it_unasked(options, tmp_path, 
 
 
 def test_a_folder_with_a_sweep_is_not_overwritten_unasked(reference):
-    with pytest.raises(OutputExistsError, match="--resume"):
+    with pytest.raises(OutputExistsError, match="resume=True"):
         run_sweep(plan(), reference[0])
     with pytest.raises(OutputExistsError, match="another plan"):
         run_sweep(plan(seed=1), reference[0], resume=True)
@@ -257,9 +257,9 @@ def test_the_schema_names_every_axis():
 
 def test_shipped_plans_are_plans():
     for name in SHIPPED_SWEEPS:
-        assert load_sweep(name).name == name
+        assert read_sweep_plan(name).name == name
     # 4 classes and 2 strangers, at 3 distances and 3 angles
-    assert len(load_sweep("paper").conditions()) == 36 + 18
+    assert len(read_sweep_plan("paper").conditions()) == 36 + 18
 
 
 FOREIGN = (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from phasemark.matcher.statistics import mean_interval, rms_interval, wilson
+from phasemark.matcher.statistics import binomial_interval, mean_interval, rms_interval
 from phasemark.matcher.sweep.plan import Condition
 from phasemark.matcher.sweep.result_tables import LEVELS, SweepTrials
 
@@ -97,13 +97,13 @@ def test_an_error_that_the_bound_explains_is_no_outlier():
 def test_wilson_solves_its_quadratic():
     z = stats.norm.ppf(0.975)
     for k, n in ((3, 17), (50, 60)):
-        share = wilson(k, n)
+        share = binomial_interval(k, n, law="student")
         for edge in (share.low, share.high):  # the ends are where |p − edge| is z standard errors of a share `edge`
             assert abs(k / n - edge) == pytest.approx(z * math.sqrt(edge * (1 - edge) / n), rel=1e-12)
-    assert (wilson(0, 5).low, wilson(5, 5).high) == (0.0, 1.0)
+    assert (binomial_interval(0, 5, law="student").low, binomial_interval(5, 5, law="student").high) == (0.0, 1.0)
 
 
 def test_too_few_trials_have_an_open_interval():
     assert mean_interval([1.0]).high == math.inf
     assert rms_interval([]).low == 0.0
-    assert math.isnan(wilson(0, 0).value)
+    assert math.isnan(binomial_interval(0, 0).value)

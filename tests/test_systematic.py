@@ -10,7 +10,7 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Matcher, covers, cramer_rao, kalman_filter
+from phasemark.matcher import Matcher, cramer_rao, kalman_filter, within_ellipsoid
 from phasemark.matcher.filters.filtered_frames import noise_free
 from phasemark.matcher.likelihood.systematic import calibrated_slopes, rates_of_views
 from phasemark.render import Background, Frames, Renderer, Views, capture
@@ -96,8 +96,9 @@ def test_views_measured_by_many_cameras_scatter_as_the_covariance_says(bank):
     total = [matches[k].covariance for k in known]
     noise = [matches[k].covariance - matches[k].systematic["calibration"] for k in known]
     n = len(known)
-    assert stats.binom.ppf(5e-4, n, 0.95) <= covers(error, total).sum()
-    assert covers(error, noise).sum() < stats.binom.ppf(5e-4, n, 0.95)  # noise alone does not explain the errors
+    assert stats.binom.ppf(5e-4, n, 0.95) <= within_ellipsoid(error, total).sum()
+    # noise alone does not explain the errors
+    assert within_ellipsoid(error, noise).sum() < stats.binom.ppf(5e-4, n, 0.95)
 
 
 def test_each_term_can_be_left_out_and_is_listed(bank):

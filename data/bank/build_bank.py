@@ -301,7 +301,7 @@ def _refuse_impossible(plan: BankPlan) -> None:
     refuse_too_many(plan)
     reason = factored_refusal(plan) if plan.layout == "factored" else None
     if reason is not None:
-        raise UsageError(f"no factored bank: {reason}; build a full one (--full, layout = 'full')")
+        raise UsageError(f"no factored bank: {reason}; build a full one (layout='full')")
     if plan.model == "planar" and plan.meshes:
         raise UsageError(
             f"'model' must be 'ray' or 'hard' for '{plan.meshes[0].name}', which comes from a mesh file, got 'planar'"

@@ -54,7 +54,7 @@ def bank_build(
         Literal["ray", "hard", "planar"] | None,
         typer.Option(
             "--model",
-            help="ray; hard: centre rays, nothing mixed; or planar: the paper's own generator.",
+            help="ray: the exact integral; hard: centre rays, nothing mixed; or planar: the paper's own generator.",
         ),
     ] = None,
     albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmarks, in place of their own.")] = None,
@@ -64,12 +64,12 @@ def bank_build(
     building: Building,
 ) -> None:
     """Build a bank of noise-free model images."""
-    from phasemark.data import BankPlan, build_bank, load_plan
+    from phasemark.data import BankPlan, build_bank, read_bank_plan
     from phasemark.landmarks import catalog
 
     if plan_file is not None and str(plan_file) in catalog():
         raise UsageError(f"'{plan_file}' is a class of the catalogue, not a plan: give --class {plan_file}")
-    plan = BankPlan() if plan_file is None else load_plan(plan_file)
+    plan = BankPlan() if plan_file is None else read_bank_plan(plan_file)
     layout_stated = full or "layout" in plan.model_fields_set
     options: dict[str, Any] = {
         "sensor": sensor, "distance_m": distance, "delta_deg": delta, "model": model, "albedo": albedo,

@@ -59,7 +59,7 @@ def build_or_estimate(build: Callable[..., Any], plan: BankPlan | FramePlan, out
 
 def _echo_estimate(plan: BankPlan | FramePlan, size: Mapping[str, int], fits: bool, building: Building) -> None:
     """Print how large a build would be, and about how long it would take if it is not too large to be tried."""
-    from phasemark.data import estimate
+    from phasemark.data import estimate_build
     from phasemark.data.plans.size import too_many
     from phasemark.data.shards.executor import processors
 
@@ -67,7 +67,7 @@ def _echo_estimate(plan: BankPlan | FramePlan, size: Mapping[str, int], fits: bo
     many = too_many(size)
     about = f"not tried: {many or 'the file would be larger than --max-size'}"
     if fits and many is None:
-        facts = estimate(plan, workers=building.workers or processors())
+        facts = estimate_build(plan, workers=building.workers or processors())
         about = f"about {facts['seconds']:.3g}"
     if building.as_json:
         echo_json({**facts, "seconds": facts.get("seconds")})
@@ -79,7 +79,7 @@ def _note_large(
     plan: BankPlan | FramePlan, out: Path, size: Mapping[str, int], parts: int, limit: int, building: Building
 ) -> None:
     """Refuse a file above the limit; say of a large one how large it is and about how long it takes."""
-    from phasemark.data import estimate
+    from phasemark.data import estimate_build
     from phasemark.data.plans.size import format_size, refuse_too_many
     from phasemark.data.shards.executor import processors
     from phasemark.data.shards.run import refuse_unwritable_output
@@ -97,7 +97,7 @@ def _note_large(
         refuse_too_many(plan)
         refuse_unwritable_output(out, force=building.force, resume=building.resume)
         threads = building.workers or processors()
-        seconds = estimate(plan, workers=threads, trial_seconds=_TRIAL_SECONDS)["seconds"] / parts
+        seconds = estimate_build(plan, workers=threads, trial_seconds=_TRIAL_SECONDS)["seconds"] / parts
         tell(f"note: {described}; about {duration(seconds)} on {threads} processors here")
 
 

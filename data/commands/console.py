@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
 import threading
@@ -15,12 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from phasemark.data.commands.flags import in_flags
+
 if TYPE_CHECKING:
     from rich.progress import Progress
 
 
 PROGRESS_SECONDS = 10.0
 """Time between two lines of progress where stderr is no terminal; work that takes less writes none."""
+_GAP = 2
+"""Spaces between two columns."""
 
 
 class LongWork:
@@ -82,7 +85,7 @@ def duration(seconds: float) -> str:
 
 def echo_facts(facts: Mapping[str, Any]) -> None:
     """Print one fact a line, names aligned."""
-    width = max(map(len, facts))
+    rows = []
     for key, value in facts.items():
         if isinstance(value, Mapping):
             value = ", ".join(f"{k} {v}" for k, v in value.items())
@@ -90,7 +93,8 @@ def echo_facts(facts: Mapping[str, Any]) -> None:
             value = ", ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value)
         elif isinstance(value, float):
             value = f"{value:.6g}"
-        typer.echo(f"{key.replace('_', ' ').ljust(width)}  {value}")
+        rows.append((key.replace("_", " "), str(value)))
+    Table().echo(rows)
 
 
 @contextmanager
@@ -98,17 +102,12 @@ def warnings_as_notes() -> Iterator[None]:
     """Write each thing the library warns of as one line, ``note: …``, to stderr."""
 
     def show(message: Warning | str, *where: object, **more: object) -> None:
-        tell(f"note: {one_line(str(message))}")
+        tell(f"note: {in_flags(one_line(str(message)))}")
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = show
         yield
-
-
-def finite_or_none(value: str | int | float) -> str | int | float | None:
-    """Return None for a number that JSON does not have."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def echo_json(value: object) -> None:
@@ -118,29 +117,52 @@ def echo_json(value: object) -> None:
 
 def echo_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print aligned columns."""
-    table = [header, *rows]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    for row in table:
-        typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    Table(header).echo(rows)
 
 
 class Table:
-    """Aligned columns that are printed in pieces: the header with the first, and later ones as wide at least."""
+    """Aligned columns that are printed in pieces: the header with the first, and later ones as wide at least.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    header : sequence of str, optional
+        Without it rows are printed alone.
+    """
+
+    def __init__(self, header: Sequence[str] | None = None) -> None:
+        self._header = header
         self._widths: list[int] = []
 
-    def echo(self, rows: Sequence[Mapping[str, str]]) -> None:
-        """Print some rows."""
-        table = [list(row.values()) for row in rows]
-        if not self._widths:
-            table.insert(0, list(rows[0]))
-            self._widths = [0] * len(table[0])
+    def echo(self, rows: Iterable[Sequence[str]]) -> None:
+        """Print some rows; on a terminal that is too narrow for them, long cells are folded."""
+        from rich.cells import cell_len
+        from rich.console import Console
+        from rich.table import Column
+        from rich.table import Table as Grid
+        from rich.text import Text
+
+        pieces = [list(row) for row in rows]
+        if self._header is not None:
+            pieces.insert(0, list(self._header))
+            self._header = None
+        if not pieces:
+            return
+        known = self._widths or [0] * len(pieces[0])
         self._widths = [
-            max(width, *map(len, column)) for width, column in zip(self._widths, zip(*table, strict=True), strict=True)
+            max(width, *map(cell_len, column)) for width, column in zip(known, zip(*pieces, strict=True), strict=True)
         ]
-        for row in table:
-            typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, self._widths, strict=True)).rstrip())
+        full = sum(self._widths) + _GAP * len(self._widths)
+        console = Console(width=None if sys.stdout.isatty() else full, highlight=False)
+        fits = full <= console.width
+        grid = Grid.grid(
+            *(Column(min_width=width if fits else None) for width in self._widths), padding=(0, _GAP, 0, 0)
+        )
+        for piece in pieces:
+            grid.add_row(*map(Text, piece))
+        with console.capture() as printed:
+            console.print(grid)
+        for line in printed.get().splitlines():
+            typer.echo(line.rstrip())
 
 
 def report_error(message: str) -> None:
@@ -149,7 +171,7 @@ def report_error(message: str) -> None:
     from rich.text import Text
 
     with _messages_may_be_lost():
-        Console(stderr=True).print(Text.assemble(("error: ", "bold red"), one_line(message)), soft_wrap=True)
+        Console(stderr=True).print(Text.assemble(("error: ", "bold red"), in_flags(one_line(message))), soft_wrap=True)
 
 
 def tell(message: str) -> None:

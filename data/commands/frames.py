@@ -14,7 +14,13 @@ from phasemark import UsageError
 from phasemark.data.commands.build import build_or_estimate, merge_shards
 from phasemark.data.commands.command import Without
 from phasemark.data.commands.console import LongWork, echo_facts, echo_json, readable
-from phasemark.data.commands.inputs import background_of, load_class_or_mesh, load_sensor, refuse_unless_one
+from phasemark.data.commands.inputs import (
+    background_of,
+    open_frame_set,
+    read_class_or_mesh,
+    read_sensor,
+    refuse_unless_one,
+)
 from phasemark.data.commands.options import (
     Building,
     Floor,
@@ -33,7 +39,7 @@ from phasemark.data.commands.options import (
 from phasemark.data.commands.outputs import refuse_existing, refuse_input_files, refuse_unwritable_files
 
 if TYPE_CHECKING:
-    from phasemark.render import Sensor
+    from phasemark.render import Sensor, Views
 
 ExportFormat = Literal["npz", "csv", "png16", "ply", "bop", "rosbag"]
 
@@ -65,9 +71,7 @@ def frames_info(
     as_json: Json = False,
 ) -> None:
     """Say what a frame set holds."""
-    from phasemark.data import open_frames
-
-    with open_frames(frames, untrusted=True) as opened:
+    with open_frame_set(frames) as opened:
         info = opened.info()
     echo_json(info) if as_json else echo_facts(info)
 
@@ -110,10 +114,10 @@ def frames_export(
     force: Force = False,
 ) -> None:
     """Write a frame set for other programs."""
-    from phasemark.data import export_frames, open_frames
-
     refuse_input_files([out])
-    with open_frames(frames, untrusted=True) as opened:
+    with open_frame_set(frames) as opened:
+        from phasemark.data import export_frames
+
         typer.echo(export_frames(opened, out, to, quantity=quantity, force=force))
 
 
@@ -132,7 +136,7 @@ def frames_import(
     if out.suffix.lower() != ".npz":
         raise UsageError(f"the output must be a .npz file, got '{out}'")
     refuse_existing([out], force)
-    frames = reading.read(file, load_sensor(sensor), topic=topic)
+    frames = reading.read(file, read_sensor(sensor), topic=topic)
     typer.echo(write_measured(frames, out, force=force))
 
 
@@ -174,30 +178,24 @@ def frames_simulate(
     The file says that it is simulated. A direct sensor writes z in millimetres and status codes (5: valid), another one
     ranges in metres with amplitudes. The truth of each frame stands in columns truth_..., which other commands ignore.
     """
-    import numpy as np
-
     from phasemark.data import simulate_recording, write_recording
     from phasemark.data.measured.simulated import recording_format
-    from phasemark.render import Views
 
     refuse_unless_one(class_name, mesh_file, mesh_reading, "record")
     for option, value in (("--to-distance", to_distance), ("--to-delta", to_delta)):
         if value is not None and not moving:
             raise UsageError(f"{option} goes with --moving: a camera at rest keeps its view")
     recording_format(out)
-    camera = load_sensor(sensor)
+    camera = read_sensor(sensor)
     _refuse_many_frames(n_frames, camera)
     refuse_unwritable_files([out], force)
-    name, mesh = load_class_or_mesh(class_name, mesh_file, mesh_reading)
-    way = np.linspace(0.0, 1.0, n_frames) if moving else np.zeros(n_frames)
-    last_distance = 0.8 * distance if to_distance is None else to_distance
-    last_delta = delta + 40.0 if to_delta is None else to_delta
-    views = Views.broadcast(
-        distance + way * (last_distance - distance),
-        np.radians(delta + way * (last_delta - delta)),
-        math.radians(bearing),
-        height,
+    name, mesh = read_class_or_mesh(class_name, mesh_file, mesh_reading)
+    last = (
+        (0.8 * distance if to_distance is None else to_distance, delta + 40.0 if to_delta is None else to_delta)
+        if moving
+        else (distance, delta)
     )
+    views = _views_between((distance, delta), last, n_frames, bearing, height)
     recording = simulate_recording(
         mesh,
         readable(name),
@@ -210,6 +208,19 @@ def frames_simulate(
     described = readable(f"landmark={name} sensor={Path(sensor).name}")
     description = f"{described} seed={seed} {'moving' if moving else 'still'}"
     typer.echo(write_recording(recording, out, description=description, force=force))
+
+
+def _views_between(
+    first: tuple[float, float], last: tuple[float, float], n: int, bearing_deg: float, height_m: float
+) -> Views:
+    """Return views whose distance (m) and δ (degrees) change evenly from the first to the last."""
+    import numpy as np
+
+    from phasemark.render import Views
+
+    way = np.linspace(0.0, 1.0, n)
+    distance_m, delta_deg = (start + way * (end - start) for start, end in zip(first, last, strict=True))
+    return Views.broadcast(distance_m, np.radians(delta_deg), math.radians(bearing_deg), height_m)
 
 
 def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
@@ -225,7 +236,7 @@ def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
 def frames_show(
     *,
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, or measured frames.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The figure, .png.")],
     index: Annotated[int, typer.Option("--index", min=0, help="Number of the frame.")] = 0,
     sensor: SensorName = "pmd-16x16",
     reading: Annotated[FrameReading, Without("invalid_means", "flip_h", "flip_v", "rotate")],
@@ -234,22 +245,22 @@ def frames_show(
     """Draw one frame."""
     import io as bytes_io
 
-    from phasemark.data import is_frame_set, open_frames, write_atomically
+    from phasemark.data import is_frame_set, write_atomically
 
     if out.suffix.lower() != ".png":
-        raise UsageError(f"the picture must be a .png file, got '{out}'")
+        raise UsageError(f"the figure must be a .png file, got '{out}'")
     refuse_existing([out], force)
     if is_frame_set(frames):
-        with open_frames(frames, untrusted=True) as opened:
+        with open_frame_set(frames) as opened:
             _refuse_index(index, len(opened))
             figure = opened.frames([index]).plot()
     else:
-        measured = reading.read(frames, load_sensor(sensor))
+        measured = reading.read(frames, read_sensor(sensor))
         _refuse_index(index, len(measured) * measured.n_frames)
         figure = measured.plot(*divmod(index, measured.n_frames))
-    picture = bytes_io.BytesIO()
-    figure.savefig(picture, format="png", dpi=120)
-    typer.echo(write_atomically(out, picture.getvalue(), force=force))
+    buffer = bytes_io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    typer.echo(write_atomically(out, buffer.getvalue(), force=force))
 
 
 def _refuse_index(index: int, n: int) -> None:

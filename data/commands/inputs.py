@@ -12,17 +12,34 @@ from typing import TYPE_CHECKING, Protocol
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.console import tell
 from phasemark.data.commands.options import MeshReading
+from phasemark.inputs import vouching_begun
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-    from phasemark.data import Bank
+    from phasemark.data import Bank, FrameSet
     from phasemark.render import Background, Sensor
 
 
 def open_any_bank(path: Path) -> Bank:
     """Open a bank from anywhere; say of a mesh how a bank is made of it."""
-    from phasemark.data import open_bank
+    with vouching_begun(path):
+        from phasemark.data import open_bank
+
+        _refuse_mesh(path)
+        return open_bank(path, untrusted=True)
+
+
+def open_frame_set(path: Path) -> FrameSet:
+    """Open a frame set from anywhere."""
+    with vouching_begun(path):
+        from phasemark.data import open_frames
+
+        return open_frames(path, untrusted=True)
+
+
+def _refuse_mesh(path: Path) -> None:
+    """Say of a mesh how a bank is made of it."""
     from phasemark.landmarks.mesh_files import FORMATS
 
     if path.exists() and path.suffix.lower().removeprefix(".") in FORMATS:
@@ -31,20 +48,19 @@ def open_any_bank(path: Path) -> Bank:
             f"{path}: a mesh, not a bank; if it is in millimetres, one is made of it by: phasemark bank build"
             f" --mesh {mesh} --unit mm --out {out}"
         )
-    return open_bank(path, untrusted=True)
 
 
-def load_landmark(name_or_file: str, reading: MeshReading) -> tuple[str, Trimesh]:
+def read_landmark(name_or_file: str, reading: MeshReading) -> tuple[str, Trimesh]:
     """Return the name and mesh of a class of the catalogue, or of a mesh file."""
     from phasemark.landmarks import catalog, read_mesh
 
     path = Path(name_or_file)
     if name_or_file in catalog() or not (path.suffix or path.exists()):
-        return name_or_file, load_class(name_or_file)
+        return name_or_file, class_mesh(name_or_file)
     return path.stem, read_mesh(path, unit=reading.unit, up=reading.up, origin=reading.origin)
 
 
-def load_class(name: str) -> Trimesh:
+def class_mesh(name: str) -> Trimesh:
     """Return the mesh of a class of the catalogue."""
     from phasemark.landmarks import build_mesh, catalog
 
@@ -54,12 +70,12 @@ def load_class(name: str) -> Trimesh:
     return build_mesh(specs[name])
 
 
-def load_class_or_mesh(class_name: str | None, mesh: str | None, reading: MeshReading) -> tuple[str, Trimesh]:
+def read_class_or_mesh(class_name: str | None, mesh: str | None, reading: MeshReading) -> tuple[str, Trimesh]:
     """Return the name and mesh that one of --class and --mesh names."""
     if class_name is not None:
-        return class_name, load_class(class_name)
+        return class_name, class_mesh(class_name)
     name, path = name_and_file(mesh or "")
-    return name, load_landmark(path, reading)[1]
+    return name, read_landmark(path, reading)[1]
 
 
 def refuse_unless_one(class_name: str | None, mesh: str | None, reading: MeshReading, doing: str) -> None:
@@ -109,7 +125,7 @@ class PlanWithDistances(Protocol):
         """Return the greatest distance of each key that has one."""
 
 
-def load_sensor(name_or_file: str) -> Sensor:
+def read_sensor(name_or_file: str) -> Sensor:
     """Return a preset, or the sensor of a file; a preset's name wins over a file of that name."""
     from phasemark.render import Sensor, preset, preset_names
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from phasemark.data.commands.console import echo_facts, echo_json, echo_table, readable
-from phasemark.data.commands.inputs import load_class, load_landmark
+from phasemark.data.commands.inputs import class_mesh, read_landmark
 from phasemark.data.commands.options import Force, Json, MeshReading, a_class
 from phasemark.data.commands.outputs import make_folder, refuse_existing, refuse_input_files
 
@@ -51,18 +51,18 @@ def landmark_show(
     mesh_reading: MeshReading,
     force: Force = False,
 ) -> None:
-    """Draw a landmark: a shaded picture, and a page to turn it in 3D."""
+    """Draw a landmark: a shaded figure, and a page to turn it in 3D."""
     from phasemark.data import write_atomically
-    from phasemark.landmarks import mesh_html, mesh_picture
+    from phasemark.landmarks import mesh_figure, mesh_html
 
-    name, mesh = load_landmark(name_or_file, mesh_reading)
+    name, mesh = read_landmark(name_or_file, mesh_reading)
     folder = out or Path()
-    picture, page = folder / f"{name}.png", folder / f"{name}.html"
-    refuse_existing([picture, page], force)
+    figure, page = folder / f"{name}.png", folder / f"{name}.html"
+    refuse_existing([figure, page], force)
     make_folder(folder)
-    write_atomically(picture, mesh_picture(mesh), force=force)
+    write_atomically(figure, mesh_figure(mesh), force=force)
     write_atomically(page, mesh_html(mesh, readable(name)).encode(), force=force)
-    typer.echo(picture)
+    typer.echo(figure)
     typer.echo(page)
 
 
@@ -76,7 +76,7 @@ def landmark_export(
     from phasemark.landmarks import export_mesh
 
     refuse_input_files([out])
-    mesh = load_class(name)
+    mesh = class_mesh(name)
     typer.echo(write_atomically(out, export_mesh(mesh, out.suffix.removeprefix(".")), force=force))
 
 
@@ -87,15 +87,14 @@ def landmark_check(
     as_json: Json = False,
 ) -> None:
     """Check a mesh file and say what it holds."""
-    import dataclasses
-
     from phasemark.landmarks import MAX_SYMMETRY, check_mesh
 
-    _, mesh = load_landmark(str(file), mesh_reading)
-    report = dataclasses.asdict(check_mesh(mesh))
+    _, mesh = read_landmark(str(file), mesh_reading)
+    checked = check_mesh(mesh)
     if as_json:
-        echo_json({"file": str(file), **report})
+        echo_json({"file": str(file), **checked.as_dict()})
         return
+    report = checked.as_dict()
     del report["warnings"]  # reading the file has put them on stderr
     n = report["symmetry"]
     report["symmetry"] = {1: "1 (none)", MAX_SYMMETRY: f"{n} (a body of revolution)"}.get(

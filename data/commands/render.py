@@ -7,25 +7,28 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from phasemark import UsageError
 from phasemark.data.commands.inputs import (
     background_of,
-    load_class_or_mesh,
-    load_sensor,
     note_too_far,
+    read_class_or_mesh,
+    read_sensor,
     refuse_unless_one,
 )
 from phasemark.data.commands.options import Floor, Force, MeshReading, SensorName, Wall, a_class
 from phasemark.data.commands.outputs import refuse_existing
 
+if TYPE_CHECKING:
+    from phasemark.render import PhasorImages
+
 
 def render_frame(
     *,
-    out: Annotated[Path, typer.Option("-o", "--out", help="The picture, .png; the data go beside it as .npz.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The figure, .png; the data go beside it as .npz.")],
     distance: Annotated[
         float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")
     ] = 1.0,
@@ -49,21 +52,16 @@ def render_frame(
     ] = "exact",
     force: Force = False,
 ) -> None:
-    """Render one noise-free frame: a picture, the phasors, and a sketch in the terminal."""
-    import io as bytes_io
-
-    import numpy as np
-
-    from phasemark.data import write_atomically
-    from phasemark.render import Renderer, terminal_picture
+    """Render one noise-free frame: a figure, the phasors, and a sketch in the terminal."""
+    from phasemark.render import Renderer, terminal_figure
 
     refuse_unless_one(class_name, mesh_file, mesh_reading, "render")
     if out.suffix.lower() != ".png":
-        raise UsageError(f"the picture must be a .png file, got '{out}'")
+        raise UsageError(f"the figure must be a .png file, got '{out}'")
     data = out.with_suffix(".npz")
     refuse_existing([out, data], force)
-    _, mesh = load_class_or_mesh(class_name, mesh_file, mesh_reading)
-    camera = load_sensor(sensor)
+    _, mesh = read_class_or_mesh(class_name, mesh_file, mesh_reading)
+    camera = read_sensor(sensor)
     note_too_far(camera, {"--distance": distance, "--wall": wall})
     image = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8)).render(
         distance,
@@ -73,6 +71,23 @@ def render_frame(
         background=background_of(wall, floor),
         variant=variant,
     )
+    _write_image(image, out, data, force)
+    if sys.stdout.isatty():
+        from rich.console import Console
+
+        Console().print(terminal_figure(image.range_m[0], width=48))
+    typer.echo(out)
+    typer.echo(data)
+
+
+def _write_image(image: PhasorImages, out: Path, data: Path, force: bool) -> None:
+    """Write the figure of an image, and its arrays."""
+    import io as bytes_io
+
+    import numpy as np
+
+    from phasemark.data import write_atomically
+
     arrays = {
         "phasor": image.phasor[0],
         "intensity": image.intensity[0],
@@ -81,14 +96,8 @@ def render_frame(
         "unit": "m",
         "quantity": "range",
     }
-    buffer, picture = bytes_io.BytesIO(), bytes_io.BytesIO()
+    buffer, figure = bytes_io.BytesIO(), bytes_io.BytesIO()
     np.savez(buffer, **arrays)
-    image.plot().savefig(picture, format="png", dpi=120)
+    image.plot().savefig(figure, format="png", dpi=120)
     write_atomically(data, buffer.getvalue(), force=force)
-    write_atomically(out, picture.getvalue(), force=force)
-    if sys.stdout.isatty():
-        from rich.console import Console
-
-        Console().print(terminal_picture(image.range_m[0], width=48))
-    typer.echo(out)
-    typer.echo(data)
+    write_atomically(out, figure.getvalue(), force=force)

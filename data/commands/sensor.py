@@ -6,14 +6,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from phasemark import UsageError
 from phasemark.data.commands.command import Without
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
-from phasemark.data.commands.inputs import load_sensor, note_too_far
+from phasemark.data.commands.inputs import note_too_far, read_sensor
 from phasemark.data.commands.options import (
     Force,
     FrameReading,
@@ -25,7 +25,7 @@ from phasemark.data.commands.options import (
 from phasemark.data.commands.outputs import output_folder, refuse_existing
 
 if TYPE_CHECKING:
-    from phasemark.render import Estimate, Sensor
+    from phasemark.render import FittedField
 
 
 def sensor_list(as_json: Json = False) -> None:
@@ -34,7 +34,7 @@ def sensor_list(as_json: Json = False) -> None:
 
     sensors = {name: preset(name) for name in preset_names()}
     if as_json:
-        echo_json([{"name": name, **_sensor_facts(sensor)} for name, sensor in sensors.items()])
+        echo_json([{"name": name, **sensor.as_dict()} for name, sensor in sensors.items()])
         return
     echo_table(
         ("preset", "pixels", "field of view", "modulation", "unambiguous range"),
@@ -58,9 +58,9 @@ def sensor_show(
     as_json: Json = False,
 ) -> None:
     """Print every field of a sensor; the text is a sensor file again."""
-    sensor = load_sensor(name_or_file)
+    sensor = read_sensor(name_or_file)
     if as_json:
-        echo_json({"name": name_or_file, **_sensor_facts(sensor)})
+        echo_json({"name": name_or_file, **sensor.as_dict()})
         return
     if sensor.kind == "direct":
         typer.echo("# direct time of flight: no taps, no phasors; its own quantity is z, along the optical axis")
@@ -94,7 +94,7 @@ def sensor_characterise(
     from phasemark.data.seeds import stream
     from phasemark.render import characterise
 
-    sensor = load_sensor(name_or_file)
+    sensor = read_sensor(name_or_file)
     with output_folder(out, "sensor characterise", NAMES, force), LongWork("measuring"):
         found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
         report = write_characterisation(found, readable(name_or_file), out, seed=seed, force=force)[0]
@@ -149,7 +149,7 @@ def sensor_fit(
     if out.suffix.lower() != ".toml":
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")
     refuse_existing([out], force)
-    base = load_sensor(sensor)
+    base = read_sensor(sensor)
     measured = [reading.read(path, base) for path in frames]
     note_too_far(base, {"--distance": max(distance)})
     fit = fit_sensor(
@@ -174,11 +174,7 @@ def sensor_fit(
     typer.echo(out)
 
 
-def _sensor_facts(sensor: Sensor) -> dict[str, Any]:
-    return {**sensor.model_dump(mode="json"), "unambiguous_range_m": sensor.unambiguous_range_m}
-
-
-def value_and_error_of(value: object, estimate: Estimate) -> tuple[str, str]:
+def value_and_error_of(value: object, estimate: FittedField) -> tuple[str, str]:
     """Write a fitted field and its standard error, rounded alike; pixels are counted and have no error."""
     from phasemark.render.integral.rounding import value_and_error
 

@@ -16,13 +16,13 @@ from phasemark.data.files.atomic_write import refuse_unwritable, replacing
 from phasemark.data.files.replaced_folder import refuse_folder, replacing_folder
 from phasemark.data.files.same_file import refuse_inputs
 from phasemark.data.frames.frame_set_file import FrameSet
-from phasemark.data.measured.reading import Quantity
+from phasemark.data.measured.reading import RangeOrZ
 
 __all__ = ["EXPORTS", "export_frames"]
 
-Writer = Callable[[FrameSet, Path, Quantity], None]
+Writer = Callable[[FrameSet, Path, RangeOrZ], None]
 
-EXPORTS: dict[str, tuple[Writer, bool, tuple[Quantity, ...]]] = {
+EXPORTS: dict[str, tuple[Writer, bool, tuple[RangeOrZ, ...]]] = {
     "npz": (write_npz, False, ("range", "z")),
     "csv": (write_csv, False, ("range", "z")),
     "png16": (write_png16, True, ("range", "z")),
@@ -38,7 +38,7 @@ def export_frames(
     path: str | os.PathLike[str],
     to: str,
     *,
-    quantity: Quantity | None = None,
+    quantity: RangeOrZ | None = None,
     force: bool = False,
 ) -> Path:
     """Write a frame set in a format of other programs.
@@ -72,10 +72,10 @@ def export_frames(
         As :func:`phasemark.data.write_atomically`.
     """
     if to not in EXPORTS:
-        raise UsageError(f"--to must be one of {', '.join(EXPORTS)}, got '{to}'")
+        raise UsageError(f"to=… must be one of {', '.join(EXPORTS)}, got '{to}'")
     write, is_folder, quantities = EXPORTS[to]
     if quantity is not None and quantity not in quantities:
-        raise UsageError(f"--quantity must be {' or '.join(quantities)} for {to}, got '{quantity}'")
+        raise UsageError(f"quantity=… must be {' or '.join(quantities)} for {to}, got '{quantity}'")
     path = Path(path)
     refuse_inputs([path], [frames.path])
     if is_folder:

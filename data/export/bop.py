@@ -21,7 +21,7 @@ from scipy.spatial.distance import pdist
 from phasemark.data.export.images import scale_of, to_codes
 from phasemark.data.export.samples import CAM2OPTICAL, blocks, pinhole, quantity_m
 from phasemark.data.frames.frame_set_file import FrameSet
-from phasemark.data.measured.reading import Quantity
+from phasemark.data.measured.reading import RangeOrZ
 from phasemark.render import Views
 
 IMAGES_PER_SCENE = 1000
@@ -29,7 +29,7 @@ _SPLITS = ("train", "val", "test")
 _MM = 1000.0
 
 
-def write_bop(frames: FrameSet, folder: Path, quantity: Quantity) -> None:
+def write_bop(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     """Write models, camera, and one folder of scenes for each split."""
     centres = _write_models(frames, folder / "models")
     metres_per_unit = scale_of(frames, quantity)

@@ -8,10 +8,10 @@ import numpy as np
 
 from phasemark.data.export.samples import blocks
 from phasemark.data.frames.frame_set_file import FrameSet
-from phasemark.data.measured.reading import Quantity
+from phasemark.data.measured.reading import RangeOrZ
 
 
-def write_ply(frames: FrameSet, folder: Path, quantity: Quantity) -> None:
+def write_ply(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     """Write ``NNNNNNNN.ply`` for each frame: the valid pixels in the level camera frame (x forward, y left, z up)."""
     directions = frames.sensor.pixel_directions().reshape(-1, 3)
     rows, cols = np.indices((frames.sensor.rows, frames.sensor.cols)).reshape(2, -1)

@@ -12,12 +12,12 @@ from PIL import Image, PngImagePlugin
 
 from phasemark.data.export.samples import blocks, quantity_m, truth_columns
 from phasemark.data.frames.frame_set_file import FrameSet
-from phasemark.data.measured.reading import Quantity
+from phasemark.data.measured.reading import RangeOrZ
 
 FULL_SCALE = 65535
 
 
-def encode_png16(values_m: NDArray[np.float64], metres_per_unit: float, quantity: Quantity) -> bytes:
+def encode_png16(values_m: NDArray[np.float64], metres_per_unit: float, quantity: RangeOrZ) -> bytes:
     """Return a 16-bit PNG image of values in metres; 0 where invalid, quantity and scale as text chunks."""
     told = PngImagePlugin.PngInfo()
     told.add_text("quantity", quantity)
@@ -33,7 +33,7 @@ def to_codes(values_m: NDArray[np.float64], metres_per_unit: float) -> NDArray[n
     return np.where(np.isfinite(values_m), codes, 0).astype(np.uint16)
 
 
-def scale_of(frames: FrameSet, quantity: Quantity) -> float:
+def scale_of(frames: FrameSet, quantity: RangeOrZ) -> float:
     """Return the metres per unit at which the largest value of all frames is full scale."""
     largest = 0.0
     for _, sample in blocks(frames):
@@ -42,7 +42,7 @@ def scale_of(frames: FrameSet, quantity: Quantity) -> float:
     return (largest or 1.0) / FULL_SCALE
 
 
-def write_png16(frames: FrameSet, folder: Path, quantity: Quantity) -> None:
+def write_png16(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     """Write ``NNNNNNNN.png`` for each frame, and ``frames.json`` with the scale and the truth."""
     metres_per_unit = scale_of(frames, quantity)
     listed = []

@@ -14,7 +14,7 @@ from phasemark import StorageError
 from phasemark.data.export.samples import CAM2OPTICAL, blocks, pinhole, quaternion
 from phasemark.data.frames.frame_set_file import FrameSet
 from phasemark.data.measured.bags import AMPLITUDE_TOPIC, INFO_TOPIC, RANGE_TOPIC, Z_TOPIC, ros_types
-from phasemark.data.measured.reading import Quantity
+from phasemark.data.measured.reading import RangeOrZ
 from phasemark.render import Views
 
 NAME = "frames"
@@ -24,7 +24,7 @@ _OPTICAL, _CAMERA, _LANDMARK = "camera_optical_frame", "camera_link", "landmark"
 _VIEW = ("distance_m", "delta_rad", "bearing_rad", "height_m")
 
 
-def write_rosbag(frames: FrameSet, folder: Path, quantity: Quantity) -> None:
+def write_rosbag(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     """Write a bag: a depth image is z by ROS's convention (REP 118), so radial range has a topic of its own."""
     store = ros_types()
     from rosbags.rosbag2 import Writer

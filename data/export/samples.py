@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data.frames.frame_set_file import FrameSet, Sample
-from phasemark.data.measured.reading import Quantity
+from phasemark.data.measured.reading import RangeOrZ
 
 BLOCK = 1024
 """Frames read at a time."""
@@ -32,7 +32,7 @@ def blocks(frames: FrameSet) -> Iterator[tuple[int, Sample]]:
         yield start, frames[start : start + BLOCK]
 
 
-def quantity_m(frames: FrameSet, sample: Sample, quantity: Quantity) -> NDArray[np.float64]:
+def quantity_m(frames: FrameSet, sample: Sample, quantity: RangeOrZ) -> NDArray[np.float64]:
     """Return range or z of a block, metres, NaN where invalid."""
     range_m = np.asarray(sample["range_m"], np.float64)
     return range_m * frames.sensor.axis_cosine() if quantity == "z" else range_m

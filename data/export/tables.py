@@ -10,10 +10,10 @@ import numpy as np
 
 from phasemark.data.export.samples import blocks, quantity_m, truth_columns
 from phasemark.data.frames.frame_set_file import FrameSet
-from phasemark.data.measured.reading import Quantity
+from phasemark.data.measured.reading import RangeOrZ
 
 
-def write_npz(frames: FrameSet, path: Path, quantity: Quantity) -> None:
+def write_npz(frames: FrameSet, path: Path, quantity: RangeOrZ) -> None:
     """Write one NPZ file that :func:`phasemark.data.read_frames` reads without being told anything."""
     found: dict[str, list[Any]] = {}
     for _, sample in blocks(frames):
@@ -29,7 +29,7 @@ def write_npz(frames: FrameSet, path: Path, quantity: Quantity) -> None:
         np.savez(file, **arrays, unit="m", quantity=quantity)
 
 
-def write_csv(frames: FrameSet, path: Path, quantity: Quantity) -> None:
+def write_csv(frames: FrameSet, path: Path, quantity: RangeOrZ) -> None:
     """Write one frame a line, row by row from the top left pixel, its truth as a comment in the line before."""
     rows, cols = frames.sensor.rows, frames.sensor.cols
     with path.open("w", newline="", encoding="utf-8") as file:

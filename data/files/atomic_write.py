@@ -184,7 +184,7 @@ def _move(part: Path, target: Path, *, force: bool) -> None:
     try:
         renames.rename_new(part, target)
     except FileExistsError:  # somebody else was faster still
-        raise OutputExistsError(f"{target}: exists; use --force to replace it") from None
+        raise OutputExistsError(f"{target}: exists; use force=True to replace it") from None
 
 
 def write_checksum(path: str | os.PathLike[str], *, force: bool = False) -> Path:
@@ -232,7 +232,7 @@ def refuse_unwritable(path: Path, *, force: bool) -> None:
     if not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
         raise UsageError(f"{path}: is a {'folder' if stat.S_ISDIR(mode) else 'device'}, give the name of a file")
     if not force:
-        raise OutputExistsError(f"{path}: exists; use --force to replace it")
+        raise OutputExistsError(f"{path}: exists; use force=True to replace it")
 
 
 @contextmanager

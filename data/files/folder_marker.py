@@ -134,13 +134,13 @@ class OwnedFiles:
         Raises
         ------
         OutputExistsError
-            One of them exists and is not ours; with or without ``--force`` it stays.
+            One of them exists and is not ours; with or without `force` it stays.
         """
         for name in names:
             if name not in self.names and os.path.lexists(self.folder / name):
                 raise OutputExistsError(
-                    f"{self.folder / name}: exists and was not written by 'phasemark {self._content}', so --force does"
-                    " not replace it: move it away, or give another folder"
+                    f"{self.folder / name}: exists and was not written by 'phasemark {self._content}', so force=True"
+                    " does not replace it: move it away, or give another folder"
                 )
         if set(names) <= self.names and (self.folder / MARKER).exists():
             return

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Mapping
 from typing import Any
 
 from pydantic import BaseModel
@@ -40,3 +42,8 @@ def json_text(value: Any, *, indent: int | None = None, sort_keys: bool = False,
     except UnicodeEncodeError:
         return json.dumps(value, indent=indent, sort_keys=sort_keys, allow_nan=allow_nan)
     return text
+
+
+def finite_or_none(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row with None for the numbers that JSON does not have."""
+    return {key: None if isinstance(one, float) and not math.isfinite(one) else one for key, one in row.items()}

@@ -97,14 +97,14 @@ def refuse_folder(path: Path, *, force: bool) -> None:
         stranger = foreign_entry(path, listed or set()) if marked else None
     if not marked:
         raise OutputExistsError(
-            f"{path}: exists and was not written by phasemark, so it is not replaced, even with --force: give another"
-            " folder"
+            f"{path}: exists and was not written by phasemark, so it is not replaced, even with force=True: give"
+            " another folder"
         )
     if not force:
-        raise OutputExistsError(f"{path}: exists; use --force to replace it")
+        raise OutputExistsError(f"{path}: exists; use force=True to replace it")
     if stranger is not None:
         raise OutputExistsError(
-            f"{path}: holds '{stranger}', which phasemark did not write, so it is not replaced, even with --force:"
+            f"{path}: holds '{stranger}', which phasemark did not write, so it is not replaced, even with force=True:"
             " move that away, or give another folder"
         )
 
@@ -147,7 +147,7 @@ def _rename(staging: Path, real: Path) -> None:
     try:
         renames.rename_new(staging, real)
     except FileExistsError:
-        raise OutputExistsError(f"{real}: exists; use --force to replace it") from None
+        raise OutputExistsError(f"{real}: exists; use force=True to replace it") from None
 
 
 def _recover(real: Path, staging: Path, aside: Path) -> None:

@@ -74,7 +74,7 @@ def _read(path: Path, topic: str | None, store: Any) -> tuple[dict[str, NDArray[
         if chosen is None and len(set(names)) == 1:
             chosen = names[0]
         if chosen not in names:
-            raise InputFileError(f"{path}: say with --topic which images to read: it has {', '.join(names) or 'none'}")
+            raise InputFileError(f"{path}: say with topic=… which images to read: it has {', '.join(names) or 'none'}")
         wanted = [link for link in of_images if link.topic in (chosen, AMPLITUDE_TOPIC)]
         for link, _, raw in reader.messages(connections=wanted):
             message = store.deserialize_cdr(raw, link.msgtype)

@@ -27,7 +27,7 @@ from phasemark.inputs import opened
 from phasemark.render import Frames, Sensor
 
 Unit = Literal["m", "cm", "mm"]
-Quantity = Literal["range", "z"]
+RangeOrZ = Literal["range", "z"]
 InvalidMeans = Literal["missing", "no-return"]
 
 METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -65,7 +65,7 @@ def read_frames(
     *,
     sensor: Sensor,
     unit: Unit | None = None,
-    quantity: Quantity | None = None,
+    quantity: RangeOrZ | None = None,
     invalid_means: InvalidMeans = "missing",
     valid_status: Collection[int] | None = None,
     flip_h: bool = False,
@@ -147,8 +147,8 @@ def read_frames(
     raw = _read(path, shape, untrusted, topic)
     if unit is None and quantity is None and not raw.stated:
         raise UsageError(
-            f"{path}: does not say its unit and quantity: give --unit {'|'.join(METRES_PER_UNIT)} and --quantity"
-            " range (along the ray)|z (along the optical axis)"
+            f"{path}: does not say its unit and quantity: give unit={'|'.join(METRES_PER_UNIT)} and"
+            " quantity=range (along the ray)|z (along the optical axis)"
         )
     settled_unit = _settled("unit", unit, raw, tuple(METRES_PER_UNIT), path)
     unit_scale = METRES_PER_UNIT[settled_unit]
@@ -166,7 +166,7 @@ def read_frames(
     if "status" in arrays:
         if valid_status is None:
             raise UsageError(
-                f"{path}: has 'status': say with --valid-status which of its values mark a valid pixel (5 for VL53L5CX"
+                f"{path}: has 'status': say with valid_status=… which of its values mark a valid pixel (5 for VL53L5CX"
                 " and VL53L8CX)"
             )
         valid &= np.isin(arrays["status"], list(valid_status))
@@ -233,7 +233,7 @@ def _impossible(
         )
         if 2 * count > of:
             readings_m = range_m[valid & ~empty]
-            raise InputFileError(f"{message}; is --unit right?{_fitting_units(readings_m, limit_m, unit)}")
+            raise InputFileError(f"{message}; is unit=… right?{_fitting_units(readings_m, limit_m, unit)}")
         warnings.warn(f"{message}; taken as invalid", UserWarning, stacklevel=3)
     return np.asarray(wrong | empty)
 
@@ -243,7 +243,7 @@ def _fitting_units(readings_m: NDArray[np.float64], limit_m: float, unit: str) -
     per_unit = METRES_PER_UNIT[unit]
     factors = {name: per_unit / metres for name, metres in METRES_PER_UNIT.items() if metres < per_unit}
     fitting = [
-        f"--unit {name} (dividing by {factor:g})"
+        f"unit={name} (dividing by {factor:g})"
         for name, factor in factors.items()
         if (readings_m > 0).all() and (readings_m < limit_m * factor).all()
     ]
@@ -253,18 +253,18 @@ def _fitting_units(readings_m: NDArray[np.float64], limit_m: float, unit: str) -
 def _settled(name: str, given: str | None, raw: _Raw, known: tuple[str, ...], path: Path) -> str:
     """Return unit or quantity, from the caller or the file, which must agree."""
     if given is not None and given not in known:
-        raise UsageError(f"--{name} must be one of {', '.join(known)}, got {given!r}")
+        raise UsageError(f"{name}=… must be one of {', '.join(known)}, got {given!r}")
     stated = raw.stated.get(name)
     if stated is not None and stated not in known:
         raise InputFileError(f"{path}: its {name} must be one of {', '.join(known)}, got {stated!r}")
     if given is not None and stated is not None and given != stated:
-        raise UsageError(f"--{name} is {given}, but {path} says {stated}")
+        raise UsageError(f"{name}=… is {given}, but {path} says {stated}")
     value = given or stated
     if value is None:
         # a file that says one of the two was written by a program that says both: damaged, or somebody else's;
         # but names of columns say one of the two at most
         asked = InputFileError if raw.stated and not raw.named else UsageError
-        raise asked(f"{path}: does not say its {name}: give --{name} {'|'.join(known)}")
+        raise asked(f"{path}: does not say its {name}: give {name}={'|'.join(known)}")
     return value
 
 

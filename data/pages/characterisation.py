@@ -11,7 +11,7 @@ from phasemark.data.files.json_text import json_text
 from phasemark.data.files.provenance import versions
 from phasemark.data.pages.page import embedded_png, figure_png, page_template
 from phasemark.render.bench.data_sheet.bench import ALBEDOS
-from phasemark.render.bench.data_sheet.results import Z95, Characterisation, Quantity
+from phasemark.render.bench.data_sheet.results import Z95, Characterisation, SheetQuantity
 from phasemark.render.integral.rounding import value_and_error
 from phasemark.render.sensor.range_noise import predicted_range_std
 
@@ -178,7 +178,7 @@ def _report(found: Characterisation, name: str, seed: int, pictures: dict[str, b
     )
 
 
-def _quantity_row(one: Quantity) -> dict[str, str]:
+def _quantity_row(one: SheetQuantity) -> dict[str, str]:
     simulated, half = value_and_error(one.simulated, Z95 * one.std_error)
     return {
         "title": one.title,

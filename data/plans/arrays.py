@@ -20,8 +20,7 @@ LAYOUT_GROUPS: dict[str, tuple[GroupName, ...]] = {"factored": ("lower", "upper"
 
 def group_rows(group: GroupName, sensor: Sensor) -> tuple[int, int]:
     """Return first and stop of the image rows that a group holds."""
-    half = sensor.rows // 2
-    return {"lower": (half, sensor.rows), "upper": (0, half), "full": (0, sensor.rows)}[group]
+    return {"lower": sensor.lower_rows, "upper": sensor.upper_rows, "full": (0, sensor.rows)}[group]
 
 
 FRAME_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {

@@ -35,7 +35,7 @@ from phasemark.render import Sensor, preset
 from phasemark.render.view import FARTHEST_M
 
 MOST_LANDMARKS = 256
-"""Of a plan: each takes one or two scenes of the ray caster, which can hold some hundreds."""
+"""Of a plan: each takes one or two scenes of the intersector, which can hold some hundreds."""
 DEFAULT_DISTANCE_M = "0.7:2.1:0.01"
 DEFAULT_DELTA_STEP_DEG = 1.0
 
@@ -251,7 +251,7 @@ class BankPlan(ScenePlan):
         Grids as :func:`phasemark.data.parse_grid` reads them. A last δ that repeats the first by the landmarks'
         common symmetry is dropped. Default: 0.7 m to 2.1 m in steps of 1 cm, and one period in steps of 1°.
     model : {"ray", "hard", "planar"}
-        The ray caster; the same with the centre ray of each pixel alone, so that nothing is mixed; or the paper's own
+        The exact integral; the centre ray of each pixel alone, so that nothing is mixed; or the paper's own
         generator in two dimensions.
     layout : {"factored", "full"}
         Lower and upper images apart (the paper's saving), or every class at every distance and angle.
@@ -330,7 +330,7 @@ class BankPlan(ScenePlan):
 P = TypeVar("P", bound=ScenePlan)
 
 
-def load_plan(path: str | os.PathLike[str]) -> BankPlan:
+def read_bank_plan(path: str | os.PathLike[str]) -> BankPlan:
     """Read a bank's plan from a TOML file; files it names are relative to its folder.
 
     Parameters

@@ -178,8 +178,8 @@ class FramePlan(ScenePlan):
         What stands behind; nothing if left out.
     wall_albedo, floor_albedo : float
     variants : sequence of {"hard", "mixed", "shot"}
-        What to keep beside the full frames: what the centre ray sees, the noise-free mixed range, and frames with shot
-        noise alone.
+        What to keep beside the full frames: what the centre ray sees, the range of the exact integral without noise,
+        and frames with shot noise alone.
     keep_taps : bool
         Whether to keep what each tap reported.
     splits : mapping of str to float

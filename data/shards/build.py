@@ -112,13 +112,13 @@ def refuse_difference(path: Path, old: Mapping[str, Any], new: Mapping[str, Any]
     if changes:
         shown = "; ".join(changes[:8]) + (f"; and {len(changes) - 8} more" if len(changes) > 8 else "")
         raise OutputExistsError(
-            f"{path}: was begun with another plan ({shown}): give the old plan, or --force to start over"
+            f"{path}: was begun with another plan ({shown}): give the old plan, or force=True to start over"
         )
 
 
 def refuse_unfinished(path: Path) -> NoReturn:
     """Refuse to throw an unfinished run away unasked."""
-    raise OutputExistsError(f"{path}: an unfinished run of it exists: --resume continues it, --force starts over")
+    raise OutputExistsError(f"{path}: an unfinished run of it exists: resume=True continues it, force=True starts over")
 
 
 def manifest_path(path: Path) -> Path:
@@ -314,7 +314,7 @@ class _Run:
             same = old.identity == identity and old.header_sha256 == header_sha256
             if not same and not force:
                 refuse_difference(self.path, old.identity, identity)
-                raise OutputExistsError(f"{self.path}: was begun with other mesh files: --force starts over")
+                raise OutputExistsError(f"{self.path}: was begun with other mesh files: force=True starts over")
             old = old if same else None
         elif old is not None:
             old = None

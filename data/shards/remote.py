@@ -55,12 +55,12 @@ def check_scheduler(scheduler: str) -> int | None:
         n = as_count(count)
         if n is None or not 1 <= n <= MOST_PROCESSES:
             raise UsageError(
-                f"--scheduler local:N needs a number of processes, 1 to {MOST_PROCESSES}, got '{scheduler[:40]}'"
+                f"scheduler=local:N needs a number of processes, 1 to {MOST_PROCESSES}, got '{scheduler[:40]}'"
             )
         return n
     if scheduler != "threads" and "://" not in scheduler:
         raise UsageError(
-            f"--scheduler must be threads, local:N or an address such as tcp://HOST:8786, got '{scheduler}'"
+            f"scheduler=… must be threads, local:N or an address such as tcp://HOST:8786, got '{scheduler}'"
         )
     return None
 
@@ -108,6 +108,10 @@ def _described(job: Job) -> tuple[str, str]:
 
 class ProcessMaker:
     """Makes shards in worker processes, each an ordinary program that ends when this process does.
+
+    The standard library's ProcessPoolExecutor would lose four things: its workers outlive a parent that is killed,
+    take a main guard in the script that asks, fail all at once when one dies, and cannot be ended while they work.
+    Dask's LocalCluster is in an extra, and takes the guard, too.
 
     Parameters
     ----------
@@ -244,7 +248,7 @@ class DaskMaker:
             from distributed import Client
         except ImportError:
             raise UsageError(
-                "--scheduler with an address needs Dask: pip install -e '.[dask]' in the clone of phasemark"
+                "scheduler=… with an address needs Dask: pip install -e '.[dask]' in the clone of phasemark"
             ) from None
         try:
             connect: Any = Client

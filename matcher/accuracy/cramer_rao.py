@@ -1,4 +1,4 @@
-"""What can be known at best: Fisher information, Cramér–Rao bounds, class confusion, and tests of a covariance.
+"""What can be known at best: Fisher information, Cramér–Rao bounds and class confusion.
 
 All bounds are those of PHYSICS section 7, for Gaussian residuals with the variance of the noise law: say of every
 number which pixels count, whether ranges or phasors are measured, what is free, and what stands behind the landmark.
@@ -6,7 +6,6 @@ number which pixels count, whether ranges or phasors are measured, what is free,
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,9 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from phasemark import UsageError
-from phasemark.matcher.agreement import counts
+from phasemark.matcher.agreement import counts, pixel_mask
+from phasemark.matcher.information import covariance_of, eliminated
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.systematic import (
     calibrated_covariance,
     calibrated_fields,
@@ -30,6 +30,7 @@ from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, 
 from phasemark.render.sensor.range_noise import phase_image_variance
 
 _WALL_STEP_M = 1e-4
+_WEAK_SHARE = 1e-13  # of information in metres and radians
 NUISANCES = ("albedo", "wall_m", "wall_albedo")
 """What may be unknown beside the view: the landmark's albedo, the wall's distance and albedo."""
 
@@ -58,7 +59,7 @@ class Bound:
     @property
     def covariance(self) -> NDArray[np.float64]:
         """Cramér–Rao bound and what is systematic, (n, p, p); NaN where a direction is not observed."""
-        noise = _inverse(self.information)
+        noise = covariance_of(self.information, weak_share=_WEAK_SHARE)
         return noise if self.systematic is None else noise + self.systematic
 
     def std(self, name: str) -> NDArray[np.float64]:
@@ -67,21 +68,13 @@ class Bound:
         return np.sqrt(self.covariance[:, k, k])
 
 
-def _inverse(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverses of information matrices, (n, p, p); NaN where a direction is not observed."""
-    values, vectors = np.linalg.eigh(information)
-    seen = values[:, :1] > 1e-13 * np.abs(values[:, -1:])
-    inverse = np.divide(1.0, values, out=np.full(values.shape, np.nan), where=seen)
-    return np.asarray(np.einsum("nij,nj,nkj->nik", vectors, inverse, vectors))
-
-
 def cramer_rao(
     renderer: Renderer,
     views: Views,
     *,
     free: Sequence[str] = VIEW[:2],
     n_frames: ArrayLike = 50,
-    on: Quantity = "ranges",
+    on: ResidualKind = "ranges",
     pixels: str | NDArray[np.bool_] = "all",
     background: Background | None = None,
     nuisances: Sequence[str] | None = None,
@@ -166,7 +159,7 @@ def cramer_rao(
                     for step in (_WALL_STEP_M, -_WALL_STEP_M)
                 ]
                 columns.append(((sides[0] - sides[1]) / (2 * _WALL_STEP_M))[:, None])
-    use = np.broadcast_to(_chosen(pixels, sensor), image.phasor.shape) & (image.phasor != 0)
+    use = np.broadcast_to(pixel_mask(pixels, sensor), image.phasor.shape) & (image.phasor != 0)
     if isinstance(pixels, str):
         use = use & counts(image.phasor, image.intensity, sensor)
     frames = np.broadcast_to(np.asarray(n_frames, np.float64), image.phasor.shape)
@@ -181,35 +174,11 @@ def cramer_rao(
         if "calibration" in terms and calibrated_fields(sensor):
             by_fields = calibrated_slopes(renderer, sensor, views, image, background, workers)
             calibrated = _whitened(image.phasor, image.intensity, by_fields, use, frames, on, sensor)
-            known = np.nan_to_num(_inverse(everything))  # nuisances included: they take up part of an error
+            # nuisances included: they take up part of an error
+            known = np.nan_to_num(covariance_of(everything, weak_share=_WEAK_SHARE))
             p = len(free)
             common += carried_covariance(known, rows, calibrated, calibrated_covariance(sensor))[:, :p, :p]
     return Bound(tuple(free), information, use, common)
-
-
-def eliminated(information: NDArray[np.float64], p: int) -> NDArray[np.float64]:
-    """Return the information in the first p parameters when the others are unknown (Schur complement).
-
-    Parameters
-    ----------
-    information : (n, q, q) float64
-    p : int
-    """
-    if information.shape[-1] == p:
-        return information
-    a, b, c = information[:, :p, :p], information[:, :p, p:], information[:, p:, p:]
-    return np.asarray(a - b @ np.linalg.pinv(c) @ b.transpose(0, 2, 1))
-
-
-def _chosen(pixels: str | NDArray[np.bool_], sensor: Sensor) -> NDArray[np.bool_]:
-    if not isinstance(pixels, str):
-        return np.asarray(pixels, np.bool_)
-    if pixels not in ("all", "lower"):
-        raise UsageError(f"'pixels' must be all, lower or an array, got {pixels!r}")
-    chosen = np.ones((sensor.rows, sensor.cols), np.bool_)
-    if pixels == "lower":
-        chosen[: sensor.rows // 2] = False
-    return chosen
 
 
 def _whitened(
@@ -218,7 +187,7 @@ def _whitened(
     slope: NDArray[np.complex128],
     use: NDArray[np.bool_],
     n_frames: NDArray[np.float64],
-    on: Quantity,
+    on: ResidualKind,
     sensor: Sensor,
 ) -> NDArray[np.float64]:
     """Return the whitened Jacobian, (n, q, residuals)."""
@@ -246,91 +215,3 @@ def confusion_probability(distance_squared: ArrayLike) -> NDArray[np.float64]:
     """
     d = np.sqrt(np.asarray(distance_squared, np.float64))
     return np.asarray(special.ndtr(-d / 2).sum(axis=-1))
-
-
-def nees(error: ArrayLike, covariance: ArrayLike) -> NDArray[np.float64]:
-    """Return the normalised estimation error squared, eᵀ P⁻¹ e ~ χ²(p), (n,).
-
-    Parameters
-    ----------
-    error : (n, p) array_like
-        Estimate less truth, angles wrapped.
-    covariance : (n, p, p) array_like
-    """
-    e, matrix = np.asarray(error, np.float64), np.asarray(covariance, np.float64)
-    return np.asarray(np.einsum("ni,ni->n", e, np.linalg.solve(matrix, e[:, :, None])[:, :, 0]))
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number from a Monte Carlo run with its 95 % interval.
-
-    Parameters
-    ----------
-    value, low, high : float
-    """
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
-
-
-def share(successes: int, n: int) -> Estimate:
-    """Return a share with its exact (Clopper–Pearson) 95 % interval.
-
-    Parameters
-    ----------
-    successes, n : int
-
-    Returns
-    -------
-    Estimate
-    """
-    if n == 0:
-        return Estimate(math.nan, 0.0, 1.0)
-    k, tail = int(successes), 0.025
-    low = float(special.betaincinv(k, n - k + 1, tail)) if k else 0.0
-    high = float(special.betaincinv(k + 1, n - k, 1 - tail)) if k < n else 1.0
-    return Estimate(k / n, low, high)
-
-
-def efficiency(error: ArrayLike, std: ArrayLike) -> Estimate:
-    """Return √mean(e² / CRLB²), 1 at the bound, with its 95 % interval from the scatter of the terms.
-
-    Parameters
-    ----------
-    error, std : (n,) array_like
-        Errors, and the bound at each truth.
-    """
-    squares = (np.asarray(error, np.float64) / np.asarray(std, np.float64)) ** 2
-    mean, half = float(squares.mean()), 1.96 * float(squares.std(ddof=1)) / math.sqrt(len(squares))
-    return Estimate(math.sqrt(mean), math.sqrt(max(mean - half, 0.0)), math.sqrt(mean + half))
-
-
-def mean_of(values: ArrayLike) -> Estimate:
-    """Return a mean with its 95 % interval."""
-    array = np.asarray(values, np.float64)
-    half = 1.96 * float(array.std(ddof=1)) / math.sqrt(len(array))
-    return Estimate(float(array.mean()), float(array.mean()) - half, float(array.mean()) + half)
-
-
-def covers(error: ArrayLike, covariance: ArrayLike, level: float = 0.95) -> NDArray[np.bool_]:
-    """Return whether each error lies inside its ellipsoid of a probability.
-
-    Parameters
-    ----------
-    error : (n, p) array_like
-        Estimate less truth, angles wrapped.
-    covariance : (n, p, p) array_like
-    level : float
-        The ellipsoid's probability.
-
-    Returns
-    -------
-    (n,) bool
-    """
-    e = np.asarray(error, np.float64)
-    return np.asarray(nees(e, covariance) <= special.chdtri(e.shape[1], 1 - level))

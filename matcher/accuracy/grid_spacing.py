@@ -25,7 +25,8 @@ from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.nearest.grid import closing_period
-from phasemark.render import PhasorImages, Renderer, Views
+from phasemark.matcher.statistics import error_statistics, view_errors
+from phasemark.render import PhasorImages, Renderer, Views, delta_period_rad
 from phasemark.render.sensor.range_noise import phase_image_variance
 
 N_FRAMES = 50
@@ -120,7 +121,7 @@ def grid_loss(bank: Bank, n: int, *, seed: int = 0, workers: int | None = None) 
         `n` is not positive, or the bank's grid has no spacing.
     """
     if n < 1:
-        raise UsageError(f"--population must be at least 1, got {n}")
+        raise UsageError(f"n=… must be at least 1, got {n}")
     if len(bank.distance_m) < 2 or len(bank.delta_rad) < 2:
         raise UsageError(f"{bank.path}: has one distance or one angle only: there is no spacing to test")
     methods = {"nearest": Matcher(bank, "nearest")}
@@ -160,7 +161,7 @@ def _match_part(
     bank: Bank, methods: dict[str, Matcher], renderer: Renderer, name: str, images: PhasorImages, views: Views
 ) -> _Part:
     frames = noise_free(images, N_FRAMES)
-    period = 2 * math.pi / int(bank.mesh(name).metadata["symmetry"])
+    period = delta_period_rad(int(bank.mesh(name).metadata["symmetry"]))
     # in a factored bank the nearest image is the lower pixels' choice; the maximum of the likelihood is that of all
     pixels = {"nearest": "lower" if bank.lower is not None else "all", "refined": "all"}
     error, bound, information = {}, {}, {}
@@ -177,8 +178,7 @@ def _match_part(
 
 def _errors(matches: Matches, name: str, views: Views, period: float) -> NDArray[np.float64]:
     """Return estimate less truth in D and δ, (n, 2), NaN where another class was found."""
-    turn = matches.delta_rad - views.delta_rad
-    error = np.stack([matches.distance_m - views.distance_m, turn - period * np.round(turn / period)], axis=1)
+    error = view_errors(matches, views, VIEW[:2], period)
     error[matches.class_name != name] = np.nan
     return error
 
@@ -210,13 +210,13 @@ def _summary(parts: list[_Part]) -> GridLoss:
     for method in parts[0].error:
         error = np.concatenate([part.error[method] for part in parts])
         bound = np.concatenate([part.bound[method] for part in parts])
-        rms, scaled = _rms(error), _rms(error / bound)
+        found = error_statistics(error, VIEW[:2], bound_std=bound)
         losses[method] = SpacingLoss(
             class_errors=int(np.isnan(error[:, 0]).sum()),
-            distance_rms_m=float(rms[0]),
-            delta_rms_deg=math.degrees(rms[1]),
-            distance_over_bound=float(scaled[0]),
-            delta_over_bound=float(scaled[1]),
+            distance_rms_m=found.rmse["distance_m"].value,
+            delta_rms_deg=math.degrees(found.rmse["delta_rad"].value),
+            distance_over_bound=found.ratio["distance_m"].value,
+            delta_over_bound=found.ratio["delta_rad"].value,
         )
     information = np.median(np.concatenate([part.information for part in parts]), axis=0)
     steps = [math.sqrt(2 / information[a, a]) if information[a, a] > 0 else None for a in range(2)]
@@ -230,11 +230,3 @@ def _summary(parts: list[_Part]) -> GridLoss:
         suggested_distance_m=steps[0],
         suggested_delta_deg=None if steps[1] is None else math.degrees(steps[1]),
     )
-
-
-def _rms(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the root mean square of each column, without NaN."""
-    known = np.isfinite(values)
-    total = np.sum(np.where(known, values, 0.0) ** 2, axis=0)
-    mean = np.divide(total, known.sum(axis=0), out=np.full(total.shape, np.nan), where=known.any(axis=0))
-    return np.asarray(np.sqrt(mean))

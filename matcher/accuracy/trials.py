@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from scipy import special
 
 from phasemark import UsageError
-from phasemark.matcher.accuracy.cramer_rao import Estimate, covers, cramer_rao, efficiency, mean_of, nees, share
+from phasemark.matcher.accuracy.cramer_rao import cramer_rao
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.match import Matches
-from phasemark.render import Background, Renderer, Sensor, Views, capture
+from phasemark.matcher.statistics import Interval, binomial_interval, error_statistics, nees, view_errors
+from phasemark.render import Background, Renderer, Sensor, Views, capture, delta_period_rad
 
 _VIEWS_AT_ONCE = 250
 OUTLIER_SIGMA = 5.0
@@ -27,7 +28,7 @@ MatchFrames = Callable[[FilteredFrames], Matches]
 
 
 @dataclass(frozen=True)
-class Conditions:
+class TrialSetup:
     """What is tried.
 
     Parameters
@@ -52,7 +53,7 @@ class Conditions:
     bearing_rad: float = 0.0
     n_frames: int = 50
     background: Background | None = None
-    on: Quantity = "ranges"
+    on: ResidualKind = "ranges"
     free: tuple[str, ...] = VIEW[:2]
     nuisances: tuple[str, ...] | None = None
 
@@ -103,9 +104,14 @@ class Trials:
         return len(self.error)
 
     @property
+    def bound_std(self) -> NDArray[np.float64]:
+        """Bound on the standard deviations, (n, p)."""
+        return np.asarray(np.sqrt(np.einsum("npp->np", self.bound)))
+
+    @property
     def scaled(self) -> NDArray[np.float64]:
         """Errors in units of the bound, (n, p)."""
-        return np.asarray(self.error / np.sqrt(np.einsum("npp->np", self.bound)))
+        return np.asarray(self.error / self.bound_std)
 
     @property
     def usable(self) -> NDArray[np.bool_]:
@@ -141,23 +147,22 @@ class Trials:
 
     def summary(self) -> TrialSummary:
         """Return the figures a matcher is judged by."""
-        inner = ~self.outlier
-        known = inner & np.isfinite(self.covariance).all(axis=(1, 2))
-        scaled = self.scaled[inner]
+        inner, std = ~self.outlier, self.bound_std
+        found = error_statistics(
+            self.error[inner], self.free, bound_std=std[inner], covariance=self.covariance[inner], law="normal"
+        )
+        with_outliers = error_statistics(self.error[self.usable], self.free, bound_std=std[self.usable], law="normal")
         return TrialSummary(
             n=len(self),
-            ratio={name: efficiency(scaled[:, k], np.ones(len(scaled))) for k, name in enumerate(self.free)},
-            ratio_with_outliers={
-                name: efficiency(self.scaled[self.usable, k], np.ones(self.usable.sum()))
-                for k, name in enumerate(self.free)
-            },
-            bias={name: mean_of(scaled[:, k]) for k, name in enumerate(self.free)},
-            nees=mean_of(nees(self.error[known], self.covariance[known]) / len(self.free)),
-            coverage=share(int(covers(self.error[known], self.covariance[known]).sum()), int(known.sum())),
-            outliers=share(int((~inner).sum()), len(self)),
-            astray=share(int(self.astray.sum()), len(self)),
-            class_errors=share(int((self.found != self.class_name).sum()), len(self)),
-            accepted=share(int(self.accepted.sum()), len(self)),
+            ratio=dict(found.ratio),
+            ratio_with_outliers=dict(with_outliers.ratio),
+            bias=dict(found.bias_over_bound),
+            nees=found.nees,
+            coverage=found.coverage[0.95],
+            outliers=binomial_interval(int((~inner).sum()), len(self)),
+            astray=binomial_interval(int(self.astray.sum()), len(self)),
+            class_errors=binomial_interval(int((self.found != self.class_name).sum()), len(self)),
+            accepted=binomial_interval(int(self.accepted.sum()), len(self)),
         )
 
     def bias_in_cell(self, step: tuple[float, float], bins: int = 10) -> NDArray[np.float64]:
@@ -191,29 +196,29 @@ class TrialSummary:
     Parameters
     ----------
     n : int
-    ratio : dict of str to Estimate
+    ratio : dict of str to Interval
         √mean(e²/CRLB²) without outliers, by parameter.
-    ratio_with_outliers : dict of str to Estimate
-    bias : dict of str to Estimate
+    ratio_with_outliers : dict of str to Interval
+    bias : dict of str to Interval
         Mean error in units of the bound.
-    nees : Estimate
+    nees : Interval
         Mean eᵀP⁻¹e over the number of parameters.
-    coverage : Estimate
+    coverage : Interval
         Share of errors inside the 95 % ellipsoid.
-    outliers, astray, class_errors, accepted : Estimate
+    outliers, astray, class_errors, accepted : Interval
         Shares; outliers are beyond 5 σ of the bound or of the match's own covariance, astray beyond those of the bound.
     """
 
     n: int
-    ratio: dict[str, Estimate]
-    ratio_with_outliers: dict[str, Estimate]
-    bias: dict[str, Estimate]
-    nees: Estimate
-    coverage: Estimate
-    outliers: Estimate
-    astray: Estimate
-    class_errors: Estimate
-    accepted: Estimate
+    ratio: dict[str, Interval]
+    ratio_with_outliers: dict[str, Interval]
+    bias: dict[str, Interval]
+    nees: Interval
+    coverage: Interval
+    outliers: Interval
+    astray: Interval
+    class_errors: Interval
+    accepted: Interval
 
     def rows(self) -> list[tuple[str, str]]:
         """Return label and figure, for a table."""
@@ -235,24 +240,24 @@ def noisy_frames(
     renderer: Renderer,
     sensor: Sensor,
     views: Views,
-    conditions: Conditions,
+    setup: TrialSetup,
     rng: np.random.Generator,
     *,
     workers: int = 1,
 ) -> FilteredFrames:
     """Render views, take frames and filter them."""
-    image = renderer.render_views(views, background=conditions.background, workers=workers)
-    if conditions.on == "phasors":
+    image = renderer.render_views(views, background=setup.background, workers=workers)
+    if setup.on == "phasors":
         free = sensor.with_(max_phase_std_rad=None)
-        return phasor_mean(capture(image, free, rng=rng, n_frames=conditions.n_frames, workers=workers))
-    return kalman_filter(capture(image, sensor, rng=rng, n_frames=conditions.n_frames, workers=workers))
+        return phasor_mean(capture(image, free, rng=rng, n_frames=setup.n_frames, workers=workers))
+    return kalman_filter(capture(image, sensor, rng=rng, n_frames=setup.n_frames, workers=workers))
 
 
 def run_trials(
     match: MatchFrames,
     renderer: Renderer,
     class_name: str,
-    conditions: Conditions,
+    setup: TrialSetup,
     n: int,
     rng: np.random.Generator,
     *,
@@ -270,7 +275,7 @@ def run_trials(
         What the frames are made with: the truth.
     class_name : str
         What the matcher calls it.
-    conditions : Conditions
+    setup : TrialSetup
     n : int
     rng : numpy.random.Generator
     symmetry : int
@@ -287,22 +292,22 @@ def run_trials(
     Raises
     ------
     UsageError
-        The matcher estimates other parameters than the conditions say.
+        The matcher estimates other parameters than the setup say.
     """
-    period = 2 * math.pi / symmetry
+    period = delta_period_rad(symmetry)
     sensor = renderer.sensor
     parts: list[Trials] = []
     done = 0
     while done < n:
-        views = conditions.views(min(_VIEWS_AT_ONCE, n - done), rng, period)
+        views = setup.views(min(_VIEWS_AT_ONCE, n - done), rng, period)
         bound = cramer_rao(
             renderer,
             views,
-            free=conditions.free,
-            n_frames=conditions.n_frames,
-            on=conditions.on,
-            background=conditions.background,
-            nuisances=conditions.nuisances,
+            free=setup.free,
+            n_frames=setup.n_frames,
+            on=setup.on,
+            background=setup.background,
+            nuisances=setup.nuisances,
             workers=workers,
         ).covariance
         if choose is not None:
@@ -310,8 +315,8 @@ def run_trials(
             views, bound = views[keep], bound[keep]
         if not len(views):
             continue
-        matches = match(noisy_frames(renderer, sensor, views, conditions, rng, workers=workers))
-        parts.append(_judged(matches, class_name, views, bound, conditions.free, period))
+        matches = match(noisy_frames(renderer, sensor, views, setup, rng, workers=workers))
+        parts.append(_judged(matches, class_name, views, bound, setup.free, period))
         done += len(views)
     return Trials.joined(parts)
 
@@ -324,12 +329,10 @@ def _judged(
     free: tuple[str, ...],
     period: float,
 ) -> Trials:
-    error = np.stack([getattr(matches, name) - getattr(views, name) for name in free], axis=1)
-    k = free.index("delta_rad")
-    error[:, k] -= period * np.round(error[:, k] / period)
+    error = view_errors(matches, views, free, period)
     covariance = matches.covariance
     if covariance is not None and matches.free != free:
-        raise UsageError(f"the matcher estimates {', '.join(matches.free)}, and 'free' of the conditions is {free!r}")
+        raise UsageError(f"the matcher estimates {', '.join(matches.free)}, and 'free' of the setup is {free!r}")
     return Trials(
         class_name=class_name,
         views=views,

@@ -19,14 +19,17 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.data.progress import Progress, counter
+from phasemark.matcher.agreement import MIN_RETURNS
 from phasemark.matcher.calibration.judgement import doubts_about, likely_cause
 from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
-from phasemark.matcher.calibration.mounting_fit import Fit, Knowledge, Place, inverse
+from phasemark.matcher.calibration.mounting_fit import Fit, Knowledge, Place
 from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel, Mounting
 from phasemark.matcher.calibration.notes import advice, named, observability_notes, odd_pose_notes
 from phasemark.matcher.calibration.pose_errors import estimate_pose_std
 from phasemark.matcher.calibration.pose_track import LONGEST_GAP_S, PoseTrack
 from phasemark.matcher.calibration.recording_fit import Recorded, Recording, prior_std
+from phasemark.matcher.calibration.result import Calibration
+from phasemark.matcher.chi_squared import p_values_of
 from phasemark.matcher.filters.filtered_frames import (
     FilteredFrames,
     PixelState,
@@ -35,8 +38,8 @@ from phasemark.matcher.filters.filtered_frames import (
     phasor_mean,
 )
 from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
-from phasemark.matcher.likelihood.estimator import MIN_RETURNS, p_values_of
-from phasemark.matcher.likelihood.residuals import Evidence, Quantity
+from phasemark.matcher.information import covariance_of
+from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.render import Background, Frames, Sensor, wrap_difference_m, wrap_range_m
 from phasemark.render.sensor.sensor_file import rounded
 
@@ -86,91 +89,6 @@ _UNITS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """How a camera is mounted, and how well that is known.
-
-    Parameters
-    ----------
-    sensor : Sensor
-        The camera with what was found; what was not free is as it was, or as `start` said.
-    base : Sensor
-        The camera as it was thought to be.
-    mounting, assumed : Mounting
-        What was found, and what it was thought to be.
-    free : tuple of str
-        Names of what was estimated (:data:`NAMES`); the other numbers of `mounting` are assumptions.
-    covariance : (p, p) float64
-        In the order of `free`; radians, metres.
-    covariance_from : str
-        What it was made of, in words.
-    chi2, dof, p_value : float, int, float
-        Test of the fit.
-    on : {"ranges", "phasors"}
-    poses : KnownPoses
-    pose_shift : (K, 3) float64
-        Estimated errors of the poses in D, δ and b; zero where poses are taken as exact.
-    pose_chi2, pose_residuals : (K,) float64, (K,) int64
-        Share of each pose in χ², and how many residuals it is made of.
-    residual_m, residual_before_m : (K, rows, cols) float64
-        Measured less modelled range with the mounting found and with the one assumed; NaN where a pixel does not count.
-    range_std_m : (K, rows, cols) float64
-        Standard deviation of the filtered range; NaN where a pixel does not count.
-    notes : tuple of str
-        Sentences on what is not observable, what does not fit, and what to do.
-    doubts : tuple of str
-        Why the result should not be used; empty for a calibration that can be trusted.
-    cause : str
-        What is likely wrong, if there are doubts.
-    held_out_m : (before, after)
-        Root mean square of the residuals of frames that were left out in turn: with the mounting assumed and with
-        that from the other frames. NaN where it is not known.
-    left_out : float
-        Share of the pixels that see the landmark by the model, but disagree with it and have no weight.
-    """
-
-    sensor: Sensor
-    base: Sensor
-    mounting: Mounting
-    assumed: Mounting
-    free: tuple[str, ...]
-    covariance: NDArray[np.float64]
-    covariance_from: str
-    chi2: float
-    dof: int
-    p_value: float
-    on: Quantity
-    poses: KnownPoses
-    pose_shift: NDArray[np.float64]
-    pose_chi2: NDArray[np.float64]
-    pose_residuals: NDArray[np.int64]
-    residual_m: NDArray[np.float64]
-    residual_before_m: NDArray[np.float64]
-    range_std_m: NDArray[np.float64]
-    notes: tuple[str, ...]
-    doubts: tuple[str, ...] = ()
-    cause: str = ""
-    held_out_m: tuple[float, float] = (math.nan, math.nan)
-    left_out: float = 0.0
-
-    def value(self, name: str) -> float:
-        """Return one number of the mounting, radians, metres or albedo."""
-        return float(getattr(self.mounting, PARAMETERS[name].attribute))
-
-    def std(self, name: str) -> float:
-        """Return its standard deviation; 0 if it was not free."""
-        if name not in self.free:
-            return 0.0
-        k = self.free.index(name)
-        return math.sqrt(float(self.covariance[k, k]))
-
-    @property
-    def correlation(self) -> NDArray[np.float64]:
-        """Correlation matrix of what was free, (p, p)."""
-        root = np.sqrt(np.diag(self.covariance))
-        return np.asarray(self.covariance / np.outer(root, root))
-
-
 def check_names(names: Sequence[str], what: str) -> tuple[str, ...]:
     """Return names of parameters in their order; ``fov`` stands for both half angles.
 
@@ -187,7 +105,7 @@ def check_names(names: Sequence[str], what: str) -> tuple[str, ...]:
     return tuple(name for name in ALL_NAMES if name in spelled)
 
 
-def filter_poses(frames: Sequence[Frames], on: Quantity | Literal["auto"] = "auto") -> FilteredFrames:
+def filter_poses(frames: Sequence[Frames], on: ResidualKind | Literal["auto"] = "auto") -> FilteredFrames:
     """Filter the frames of each pose: the mean phasor where phasors will be compared, else the Kalman filter.
 
     Parameters
@@ -246,7 +164,7 @@ def calibrate(
     fixed: Sequence[str] = (),
     start: Mounting | None = None,
     albedo: float = 0.8,
-    on: Quantity | Literal["auto"] = "auto",
+    on: ResidualKind | Literal["auto"] = "auto",
     background: Background | None = None,
     pose_std: PoseStd | None = None,
     reports_z: bool | None = None,
@@ -321,14 +239,14 @@ def calibrate(
         raise UsageError("'on' must be auto or ranges for a moving camera or offsets of zones, got 'phasors'")
     if zones and sensor.kind != "direct":
         raise UsageError("offsets of zones belong to sensors of 'kind' = 'direct'")
-    quantity: Quantity = ("phasors" if has_light and not recorded else "ranges") if on == "auto" else on
+    quantity: ResidualKind = ("phasors" if has_light and not recorded else "ranges") if on == "auto" else on
     names = (ALL_NAMES if moving else NAMES) if free is None else check_names(free, "'free'")
     if "delay" in names and not moving:
-        raise UsageError("the delay takes a moving camera: give --moving, and time stamps of frames and poses")
+        raise UsageError("the delay takes a moving camera: give moving=True, and time stamps of frames and poses")
     if recorded:
         if "albedo" in names and free is not None:
             raise UsageError(
-                "the albedo cannot be free for a moving camera or with offsets of zones: give --fix albedo"
+                "the albedo cannot be free for a moving camera or with offsets of zones: give fixed=albedo"
             )
         names = tuple(name for name in names if name != "albedo")
     lit = quantity == "phasors" or background is not None or poses.wall_m is not None
@@ -338,9 +256,11 @@ def calibrate(
     names = tuple(name for name in names if name not in kept)
     assumed = start or Mounting.of_sensor(sensor, albedo)
     z = sensor.quantity == "z" if reports_z is None else reports_z
+    rendered = counter(progress, _USUAL_RENDERINGS)
     if recorded:
-        whole = _Job(mesh, background, assumed, names, z, zones is not False and sensor.kind == "direct", workers)
-        return _from_recording(whole, frames, poses, moving, counter(progress, _USUAL_RENDERINGS))
+        with_zones = zones is not False and sensor.kind == "direct"
+        whole = _Job(mesh, background, assumed, names, z, with_zones, workers, rendered)
+        return _from_recording(whole, frames, poses, moving)
     frames = _without_zones(frames)
     _check(frames, poses, names, lit)
     evidence = Evidence.from_frames(frames, quantity)
@@ -352,7 +272,7 @@ def calibrate(
         background=background,
         reports_z=z,
         workers=workers,
-        rendered=counter(progress, _USUAL_RENDERINGS),
+        rendered=rendered,
     )
     _check_view(model, evidence, assumed)
     edges = model.has_background or not _returns_beside(model, evidence, assumed)
@@ -381,7 +301,7 @@ def calibrate(
     doubts = doubts_about(place.theta, assumed.vector, names, held_out)
     cause = ""
     if doubts:
-        job = _Job(mesh, background, assumed, tuple(n for n in names if n != "albedo"), z, False, workers)
+        job = _Job(mesh, background, assumed, tuple(n for n in names if n != "albedo"), z, False, workers, rendered)
         cause = _cause(job, frames, poses, edges)
     return replace(found, doubts=tuple(doubts), cause=cause, held_out_m=held_out)
 
@@ -401,7 +321,7 @@ def _leave_one_out(fit: Fit, place: Place, found: Calibration) -> tuple[float, f
     after = found.residual_m.reshape(len(by_pose), -1).copy()
     before = found.residual_before_m.reshape(after.shape)
     for k, gradient in enumerate(by_pose):
-        step = inverse(linear.information - own[k], fit.scale) @ gradient
+        step = covariance_of(linear.information - own[k], fit.scale, weak="wide") @ gradient
         after[k] += np.einsum("pr,p->r", slope_m[k], np.clip(step, -10 * fit.scale, 10 * fit.scale))
     both = np.isfinite(before) & np.isfinite(after)
     if not both.any():
@@ -420,6 +340,8 @@ class _Job:
     reports_z: bool
     zones: bool
     workers: int
+    rendered: Callable[[], None]
+    """Called each time all poses have been rendered."""
 
 
 def _without_zones(frames: FilteredFrames) -> FilteredFrames:
@@ -486,7 +408,6 @@ def _recording(
     poses: KnownPoses,
     track: PoseTrack | None,
     edges: bool | None,
-    rendered: Callable[[], None] = lambda: None,
 ) -> Recording:
     """Set up the calibration of frames, one for each pose or by time."""
     stamps = frames.time_s
@@ -499,7 +420,7 @@ def _recording(
         background=job.background,
         reports_z=job.reports_z,
         workers=job.workers,
-        rendered=rendered,
+        rendered=job.rendered,
         track=track,
         stamp_s=stamps if moving else None,
     )
@@ -521,9 +442,7 @@ def _poses_at(track: PoseTrack, times: NDArray[np.float64]) -> KnownPoses:
     return KnownPoses(distance, delta, bearing, height, place=place, time_s=times)
 
 
-def _from_recording(
-    job: _Job, frames: FilteredFrames, poses: KnownPoses, moving: bool, rendered: Callable[[], None]
-) -> Calibration:
+def _from_recording(job: _Job, frames: FilteredFrames, poses: KnownPoses, moving: bool) -> Calibration:
     """Calibrate on many poses, by time or one for each frame."""
     notes: list[str] = []
     track = None
@@ -537,7 +456,7 @@ def _from_recording(
         poses = _poses_at(track, frames.time_s + job.assumed.delay_s)
     else:
         _check(frames, poses, job.names, True)
-    recording = _recording(job, frames, poses, track, None, rendered)
+    recording = _recording(job, frames, poses, track, None)
     if not moving:
         _check_view(recording.model, recording.evidence, job.assumed)
     _check_ranges(recording, job.assumed)
@@ -548,7 +467,7 @@ def _from_recording(
     if "delay" in job.names and std[job.names.index("delay")] > _DELAY_UNKNOWN_S:
         raise UsageError(
             f"the delay cannot be told from this recording (± {1e3 * std[job.names.index('delay')]:.0f} ms): turn and"
-            " approach faster, or state it with --delay-ms and give --fix delay"
+            " approach faster, or state it with Mounting(delay_s=…) and give fixed=delay"
         )
     untold = [
         name for name, one in zip(job.names, std, strict=True)
@@ -707,7 +626,7 @@ def _cause(job: _Job, frames: FilteredFrames, poses: KnownPoses, edges: bool, tr
         other = replace(job, reports_z=not job.reports_z)
         return (
             misfit(other, replace(frames, range_m=changed), poses, track)[0],
-            f"the numbers are likely {right}, not {wrong}: give --quantity {right}",
+            f"the numbers are likely {right}, not {wrong}: give quantity={right}",
         )
 
     def free_delay() -> tuple[float, str]:
@@ -728,7 +647,7 @@ def _cause(job: _Job, frames: FilteredFrames, poses: KnownPoses, edges: bool, tr
 
     def flipped() -> tuple[float, str]:
         arrays = {name: getattr(frames, name)[:, :, ::-1] for name in ("range_m", "std_m", "state", "n_effective")}
-        return misfit(job, replace(frames, **arrays), poses, track)[0], "images are likely mirrored: give --flip-h"
+        return misfit(job, replace(frames, **arrays), poses, track)[0], "images are likely mirrored: give flip_h=True"
 
     alternatives: list[tuple[str, Callable[[], tuple[float, str]]]] = [
         ("quantity", other_quantity), ("mirror", mirrored), ("flip", flipped),
@@ -832,7 +751,7 @@ def _check_pixels(use: NDArray[np.bool_], poses: KnownPoses, evidence: Evidence)
 
 
 def _check_observable(information: NDArray[np.float64], fit: Fit, poses: KnownPoses) -> None:
-    covariance = inverse(information, fit.scale)
+    covariance = covariance_of(information, fit.scale, weak="wide")
     scaled = covariance / np.outer(fit.scale, fit.scale)
     values, vectors = np.linalg.eigh(scaled)
     if not math.sqrt(float(values[-1])) > _UNKNOWN:
@@ -871,7 +790,7 @@ def _concluded(
     pose_residuals = place.use.sum(axis=1) * evidence.per_pixel
     pose_chi2 = (place.residual**2).sum(axis=1)
     dof, p_value = _degrees_of_freedom(fit, place), _fit_probability(fit, place, frames)
-    covariance = inverse(knowledge.information, fit.scale)
+    covariance = covariance_of(knowledge.information, fit.scale, weak="wide")
     expected, source = float(max(dof, 1)), "the noise law"
     if frames.std_from_scatter:
         # weights that were estimated from ν + 1 frames are too large in the mean by ν / (ν − 2), and scatter themselves
@@ -883,13 +802,12 @@ def _concluded(
         notes.append(
             "With exact poses the residuals are more than noise. The poses were taken to be uncertain, by what the"
             f" residuals say: {1e3 * estimated.position_m:.2g} mm in place, {math.degrees(estimated.heading_rad):.2g}°"
-            f" in heading, {math.degrees(estimated.delta_rad):.2g}° in δ (state yours with --position-std,"
-            " --heading-std and --delta-std)."
+            f" in heading, {math.degrees(estimated.delta_rad):.2g}° in δ (state yours with pose_std=…)."
         )
     if dof > 0 and p_value < _FALSE_ALARM:
         excess = place.cost / expected
         if len(poses) >= _POSES_FOR_SANDWICH * len(fit.free):
-            plain = inverse(knowledge.information, fit.scale)
+            plain = covariance_of(knowledge.information, fit.scale, weak="wide")
             covariance = plain @ knowledge.scatter @ plain * len(poses) / (len(poses) - len(fit.free))
             source = "the scatter of the poses (sandwich), for the residuals are more than noise"
         else:
@@ -902,7 +820,7 @@ def _concluded(
         notes += odd_pose_notes(poses, pose_chi2 / np.maximum(pose_residuals, 1))
     if not edges:
         notes.append(
-            "Something returns beside the landmark and no --wall, --floor or wall_m says what: pixels at the landmark's"
+            "Something returns beside the landmark and no background=… or wall_m says what: pixels at the landmark's"
             " edges were left out, which tell most."
         )
     unseen = int((pose_residuals == 0).sum())

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from phasemark import InputFileError, UsageError
 from phasemark.inputs import read_text
-from phasemark.render import Frames
+from phasemark.render import Frames, wrap_delta_rad
 
 POLAR = ("distance_m", "delta_deg")
 CARTESIAN = ("x_m", "y_m", "heading_deg")
@@ -128,7 +128,7 @@ class KnownPoses:
         """
         dx, dy = landmark_xy_m[0] - np.asarray(x_m, np.float64), landmark_xy_m[1] - np.asarray(y_m, np.float64)
         azimuth = np.arctan2(dy, dx)
-        delta = (azimuth - landmark_yaw_rad) % (2 * math.pi)
+        delta = wrap_delta_rad(azimuth - landmark_yaw_rad, 2 * math.pi)
         bearing = azimuth - np.asarray(heading_rad, np.float64)
         return cls(np.hypot(dx, dy), delta, np.angle(np.exp(1j * bearing)), np.zeros_like(dx))
 

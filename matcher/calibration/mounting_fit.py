@@ -33,6 +33,7 @@ from phasemark.matcher.calibration.mounting_model import (
     clipped,
 )
 from phasemark.matcher.calibration.registration import OUTLINE, register
+from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.render import predicted_range_std
 
@@ -364,7 +365,7 @@ class Fit:
         """Take slopes over multiples of the standard deviations that slopes at the place give."""
         narrow = self._linearise(place)
         std = np.zeros(len(ALL_NAMES))
-        std[self.columns] = np.sqrt(np.diag(inverse(narrow.information, self.scale)))
+        std[self.columns] = np.sqrt(np.diag(covariance_of(narrow.information, self.scale, weak="wide")))
         std[ALL_NAMES.index("range_offset")] = 0.0  # its slope is exact
         if (max(widths) * std <= STEP).all():
             return narrow
@@ -417,7 +418,8 @@ class Fit:
         """Descend from the best places within six standard deviations along what the poses tell least."""
         wide = self._linearise_wide(place)
         _, own_gradient = wide.gradients(self._pull(place), place.u)
-        values, vectors = np.linalg.eigh(inverse(wide.information, self.scale) / np.outer(self.scale, self.scale))
+        covariance = covariance_of(wide.information, self.scale, weak="wide")
+        values, vectors = np.linalg.eigh(covariance / np.outer(self.scale, self.scale))
         ways = self.scale[:, None] * vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), _SEARCH_MOST)
         steps = (_SEARCH_STD[:, None, None] * ways[:, -_SEARCHED:].T).reshape(-1, len(self.columns))
 
@@ -438,20 +440,3 @@ def _steady(evidence: Evidence) -> NDArray[np.bool_]:
     std, limit = evidence.one_frame_std_m, one_frame_limit_m(evidence.sensor)
     usual = np.array([np.median(one[known]) if (known := np.isfinite(one)).any() else 0.0 for one in std])
     return np.asarray(std <= np.clip(_ORDINARY * usual, limit / _STEADY, limit)[:, None] * (1 + 1e-9))
-
-
-def inverse(information: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a covariance; infinite variance along what is not observed.
-
-    Parameters
-    ----------
-    information : (p, p) float64
-    scale : (p,) float64
-        Natural units, for the sake of rounding.
-    """
-    scaled = information * np.outer(scale, scale)
-    root = np.sqrt(np.maximum(np.diag(scaled), 1e-20))
-    values, vectors = np.linalg.eigh(scaled / np.outer(root, root))
-    unit = vectors / np.where(values > 1e-12, np.sqrt(np.maximum(values, 1e-300)), 1e-8)
-    covariance = (unit @ unit.T) / np.outer(root, root)
-    return np.asarray(covariance * np.outer(scale, scale))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from phasemark.matcher.calibration.known_poses import KnownPoses
 from phasemark.matcher.calibration.pose_track import PoseTrack
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 
 
@@ -300,7 +300,7 @@ class CalibrationModel:
         theta: NDArray[np.float64],
         shift: NDArray[np.float64],
         free: Sequence[str],
-        on: Quantity,
+        on: ResidualKind,
         *,
         of_poses: bool = False,
         width: NDArray[np.float64] | None = None,

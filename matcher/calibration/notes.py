@@ -60,7 +60,7 @@ def advice(names: Sequence[str], poses: KnownPoses) -> str:
         )
     if not hints:
         hints.append("add poses at other distances and sides, and with the landmark off the image's middle")
-    fixed = " or ".join(f"--fix {name}" for name in names[:2])
+    fixed = " or ".join(f"fixed={name}" for name in names[:2])
     return f"{'; '.join(hints)}; or state what is known and give {fixed}"
 
 

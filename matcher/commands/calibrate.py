@@ -15,7 +15,8 @@ import typer
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
-from phasemark.data.commands.inputs import background_of, load_class, load_sensor, note_too_far, open_any_bank
+from phasemark.data.commands.flags import in_flags
+from phasemark.data.commands.inputs import background_of, class_mesh, note_too_far, open_any_bank, read_sensor
 from phasemark.data.commands.options import (
     Floor,
     Force,
@@ -113,7 +114,7 @@ def calibrate_camera(
     reading: FrameReading,
     plot: Annotated[
         Path | None,
-        typer.Option("--plot", help="The picture of the residuals, .png; beside the sensor file otherwise."),
+        typer.Option("--plot", help="The figure of the residuals, .png; beside the sensor file otherwise."),
     ] = None,
     workers: Workers = None,
     as_json: Json = False,
@@ -127,23 +128,16 @@ def calibrate_camera(
     """
     from phasemark.data.shards.executor import processors
     from phasemark.matcher import calibrate, read_poses
-    from phasemark.matcher.calibration.report import calibration_dict
 
-    picture = _picture_beside(out, plot)
-    refuse_existing([out, picture], force)
+    figure = _figure_beside(out, plot)
+    refuse_existing([out, figure], force)
     background = background_of(wall, floor)
     mesh, base, base_name = _calibration_target(landmark, class_name, sensor)
     known = read_poses(poses, landmark_xy_m=landmark_xy, landmark_yaw_rad=math.radians(landmark_yaw))
-    furthest_m = float(known.distance_m.max()) if len(known.distance_m) else None
-    note_too_far(base, {f"{poses}: the landmark": furthest_m, "--wall": wall})
+    note_too_far(base, {f"{poses}: the landmark": max(known.distance_m.tolist(), default=None), "--wall": wall})
     filtered = _filtered([reading.read(path, base) for path in frames], known, on, moving)
-    fixed = [] if fix is None else _names(fix)
-    if delay_ms is not None:
-        if not moving:
-            raise UsageError("--delay-ms takes --moving: still poses have no delay")
-        fixed.append("delay")
-    bright = float(mesh.metadata.get("albedo", 0.8)) if albedo is None else albedo
-    start = _start(base, bright, height, bearing, delay_ms)
+    fixed = _fixed_names(fix, delay_ms, moving)
+    start = _start(base, _albedo(mesh, albedo), height, bearing, delay_ms)
     with LongWork("rendering poses") as progress:
         found = calibrate(
             mesh,
@@ -161,23 +155,24 @@ def calibrate_camera(
             workers=workers or min(processors(), 4),
             progress=progress,
         )
-    _write_calibration(found, out, picture, base_name, force)
+    found = replace(found, notes=tuple(map(in_flags, found.notes)), cause=in_flags(found.cause))
+    _write_calibration(found, out, figure, base_name, force)
     if as_json:
-        echo_json({"file": str(out), "picture": str(picture), **calibration_dict(found)})
+        echo_json({"file": str(out), "picture": str(figure), **found.as_dict()})
         return
     _echo_calibration(found)
     typer.echo(out)
-    typer.echo(picture)
+    typer.echo(figure)
 
 
-def _picture_beside(out: Path, plot: Path | None) -> Path:
-    """Return where the picture of the residuals goes; refuse names of a wrong kind."""
+def _figure_beside(out: Path, plot: Path | None) -> Path:
+    """Return where the figure of the residuals goes; refuse names of a wrong kind."""
     if out.suffix.lower() != ".toml":
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")
-    picture = plot or out.with_suffix(".png")
-    if picture.suffix.lower() != ".png":
-        raise UsageError(f"the picture must be a .png file, got '{picture}'")
-    return picture
+    figure = plot or out.with_suffix(".png")
+    if figure.suffix.lower() != ".png":
+        raise UsageError(f"the figure must be a .png file, got '{figure}'")
+    return figure
 
 
 def _pose_std(position: float | None, heading_deg: float | None, delta_deg: float | None) -> PoseStd | None:
@@ -202,14 +197,30 @@ def _filtered(
     return kalman_filter(measured[0].each_a_position())
 
 
+def _fixed_names(fix: str | None, delay_ms: float | None, moving: bool) -> list[str]:
+    """Return the names of what is not estimated; a delay that is given is one of them."""
+    fixed = [] if fix is None else _names(fix)
+    if delay_ms is None:
+        return fixed
+    if not moving:
+        raise UsageError("--delay-ms takes --moving: still poses have no delay")
+    return [*fixed, "delay"]
+
+
+def _albedo(mesh: Trimesh, stated: float | None) -> float:
+    """Return the albedo that was stated, or that of the mesh."""
+    albedo = float(mesh.metadata.get("albedo", 0.8)) if stated is None else stated
+    if not 0 < albedo <= 1:
+        raise UsageError(f"--albedo must be in (0, 1], got {albedo:g}")
+    return albedo
+
+
 def _start(
     base: Sensor, albedo: float, height: float | None, bearing_deg: float | None, delay_ms: float | None
 ) -> Mounting:
     """Return the mounting as it is thought to be."""
     from phasemark.matcher.calibration.mounting_model import Mounting
 
-    if not 0 < albedo <= 1:
-        raise UsageError(f"--albedo must be in (0, 1], got {albedo:g}")
     start = Mounting.of_sensor(base, albedo)
     if height is not None:
         start = replace(start, height_m=height)
@@ -218,10 +229,10 @@ def _start(
     return start if delay_ms is None else replace(start, delay_s=delay_ms / 1e3)
 
 
-def _write_calibration(found: Calibration, out: Path, picture: Path, base_name: str, force: bool) -> None:
-    """Write the sensor file and the picture of the residuals, unless the calibration cannot be trusted."""
+def _write_calibration(found: Calibration, out: Path, figure: Path, base_name: str, force: bool) -> None:
+    """Write the sensor file and the figure of the residuals, unless the calibration cannot be trusted."""
     from phasemark.data import write_atomically
-    from phasemark.matcher.calibration.report import calibration_toml, residual_picture
+    from phasemark.matcher.calibration.report import residual_figure
 
     if found.doubts and not force:
         raise InputFileError(
@@ -229,9 +240,9 @@ def _write_calibration(found: Calibration, out: Path, picture: Path, base_name: 
             f" {found.cause} (--force writes it all the same)"
         )
     buffer = io.BytesIO()
-    residual_picture(found).savefig(buffer, format="png", dpi=100)
-    write_atomically(picture, buffer.getvalue(), force=force)
-    write_atomically(out, calibration_toml(found, base_name=readable(base_name)).encode(), force=force)
+    residual_figure(found).savefig(buffer, format="png", dpi=100)
+    write_atomically(figure, buffer.getvalue(), force=force)
+    write_atomically(out, found.to_toml(base_name=readable(base_name)).encode(), force=force)
 
 
 def _names(text: str) -> list[str]:
@@ -248,18 +259,18 @@ def _calibration_target(landmark: str, class_name: str | None, sensor: str | Non
         if class_name is not None:
             raise UsageError("--class belongs to a bank: give the class in its place")
         name = sensor or "pmd-16x16"
-        return load_class(landmark), load_sensor(name), name
+        return class_mesh(landmark), read_sensor(name), name
     with open_any_bank(path) as bank:
         if class_name is None and len(bank.classes) > 1:
             raise UsageError(f"{landmark} has {', '.join(bank.classes)}: say with --class which one was recorded")
         mesh = bank.mesh(class_name or bank.classes[0])
-        return (mesh, bank.sensor, landmark) if sensor is None else (mesh, load_sensor(sensor), sensor)
+        return (mesh, bank.sensor, landmark) if sensor is None else (mesh, read_sensor(sensor), sensor)
 
 
 def _echo_calibration(found: Calibration) -> None:
     """Print every number with its standard deviation and use, their correlations, the test of the fit and notes."""
     from phasemark.matcher.calibration.mounting_model import PARAMETERS
-    from phasemark.matcher.calibration.report import USES, shown, shown_names, shown_std
+    from phasemark.matcher.calibration.result import USES, shown, shown_names, shown_std
 
     rows = []
     for name in shown_names(found):

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from phasemark.data.commands.console import LongWork, echo_json, echo_table, finite_or_none
+from phasemark.data.commands.console import LongWork, echo_json, echo_table
 from phasemark.data.commands.options import Force, Json, Seed, Workers
 from phasemark.data.commands.outputs import output_folder, refuse_existing
 
@@ -26,7 +26,7 @@ def demo_report(
     """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°."""
     from phasemark.data.shards.run import outputs_of
     from phasemark.matcher.demo.report import summary_rows, write_demo
-    from phasemark.matcher.demo.run import cell_rows, run_demo
+    from phasemark.matcher.demo.run import run_demo
 
     bank = out / "bank.h5"
     refuse_existing([bank], force)
@@ -37,8 +37,7 @@ def demo_report(
         with LongWork("writing the report"):
             report = write_demo(result, out, force=force)
     if as_json:
-        cells = [{key: finite_or_none(value) for key, value in row.items()} for row in cell_rows(result.cells)]
-        echo_json({"report": str(report), "seconds": result.seconds, "cells": cells})
+        echo_json({"report": str(report), **result.as_dict()})
         return
     header = ("D (cm)", "δ (°)", "class right", "|ΔD| mm", "worst", "|Δδ| °", "worst", "position mm", "worst")
     for title, shifted in (("on the bank's grid", False), ("between grid points", True)):

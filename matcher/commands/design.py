@@ -41,8 +41,8 @@ def landmark_design(
         confirm_design,
         default_design,
         example_design,
-        load_design_plan,
         output_names,
+        read_design_plan,
         run_design,
         summary,
         write_design,
@@ -51,7 +51,7 @@ def landmark_design(
     if example:
         typer.echo(example_design(), nl=False)
         return
-    plan = default_design() if plan_file is None else load_design_plan(plan_file)
+    plan = default_design() if plan_file is None else read_design_plan(plan_file)
     if seed is not None:
         plan = plan.model_copy(update={"seed": seed})
     with output_folder(out, "landmark design", output_names(plan), force, plan):

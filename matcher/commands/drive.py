@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -19,7 +20,7 @@ def drive_robot(
     plan_file: Annotated[
         Path | None, typer.Argument(metavar="[PLAN]", help="A plan (.toml); without it a tour of 20 m.")
     ] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for tables, summary, picture and animation.")] = Path(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for tables, summary, figure and animation.")] = Path(
         "out/drive"
     ),
     seed: Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")] = 2005,
@@ -35,26 +36,32 @@ def drive_robot(
         OUTPUTS,
         default_drive,
         example_drive,
-        load_drive_plan,
+        read_drive_plan,
         run_drive,
-        summary,
         write_drive,
     )
 
     if example:
         typer.echo(example_drive(), nl=False)
         return
-    plan = default_drive() if plan_file is None else load_drive_plan(plan_file)
+    plan = default_drive() if plan_file is None else read_drive_plan(plan_file)
     note_plan_too_far(plan)
     with output_folder(out, "drive", OUTPUTS, force, plan):
         with LongWork("driving, cm") as progress:
             drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
         with LongWork("drawing"):
             files = write_drive(drive, out, force=force)
-    facts = summary(drive)
+    facts = drive.as_dict()
     if as_json:
         echo_json({"files": [str(path) for path in files], **facts})
         return
+    _echo_drive(facts)
+    for path in files:
+        typer.echo(path)
+
+
+def _echo_drive(facts: Mapping[str, Any]) -> None:
+    """Print the errors of a drive with its odometry alone and with corrections."""
     echo_table(
         ("error", "at the end", "largest", "heading at the end", "largest"),
         (
@@ -69,5 +76,3 @@ def drive_robot(
         ),
     )
     typer.echo(f"{facts['way_m']:.1f} m, {facts['corrections']} corrections at {facts['stops']} stops")
-    for path in files:
-        typer.echo(path)

@@ -81,7 +81,7 @@ def match_frames(
         if results.estimates is not None:
             write_atomically(results.estimates, printed.estimated.to_csv().encode(), force=results.force)
         for k, path in plots.items():
-            _save_match_picture(path, *printed.drawn[k], opened, search.background, results.force)
+            _save_match_figure(path, *printed.drawn[k], opened, search.background, results.force)
     if not (results.as_json or results.as_jsonl):
         for path in results.files(plots):
             typer.echo(path)
@@ -104,7 +104,8 @@ class _Answers:
 
         self._search, self._place, self._results, self._landmarks = search, place, results, landmarks
         self._plots, self._moving = plots, moving
-        self._table, self.estimated = Table(), EstimateTable(search.parameters)
+        self._table: Table | None = None  # its columns are those of the first match
+        self.estimated = EstimateTable(search.parameters)
         self.answers: list[dict[str, Any]] = []  # all of them only for --json, whose answers are one list
         self.drawn: dict[int, tuple[FilteredFrames, Match]] = {}
         self._refused: tuple[int, FilteredFrames] | None = None
@@ -147,7 +148,9 @@ class _Answers:
             for k, answer in enumerate(answers, start):
                 typer.echo(json.dumps({"index": k, **answer}, ensure_ascii=False, allow_nan=False))
         else:
-            self._table.echo(match_rows(answers, start, self._moving))
+            rows = match_rows(answers, start, self._moving)
+            self._table = self._table or Table(list(rows[0]))
+            self._table.echo([list(row.values()) for row in rows])
 
     def diagnose(self, matcher: Matcher, reading: FrameReading) -> None:
         """Say which setting would make the first refused position fit."""
@@ -191,15 +194,15 @@ def _note_motion(measured: Frames, file: Path) -> None:
         )
 
 
-def _save_match_picture(
+def _save_match_figure(
     path: Path, filtered: FilteredFrames, match: Match, bank: Bank, background: Background | None, force: bool
 ) -> None:
     """Draw one position."""
     import io as bytes_io
 
     from phasemark.data import write_atomically
-    from phasemark.matcher.figures import match_picture
+    from phasemark.matcher.figures import match_figure
 
     buffer = bytes_io.BytesIO()
-    match_picture(filtered, match, bank, background).savefig(buffer, format="png", dpi=120)
+    match_figure(filtered, match, bank, background).savefig(buffer, format="png", dpi=120)
     write_atomically(path, buffer.getvalue(), force=force)

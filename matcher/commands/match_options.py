@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from phasemark.render import Background, Frames
 
 _DRAWN_ALL = 4
-"""Most positions that are drawn unless the user says which; a picture takes two seconds."""
+"""Most positions that are drawn unless the user says which; a figure takes two seconds."""
 
 _FREE = {"bearing": "bearing_rad", "height": "height_m"}
 
@@ -139,7 +139,7 @@ class Search:
     def matcher(self, bank: Bank) -> Matcher:
         """Return the matcher."""
         from phasemark.matcher import Matcher
-        from phasemark.matcher.likelihood.estimator import BEARING_STD_RAD
+        from phasemark.matcher.likelihood.likelihood_matcher import BEARING_STD_RAD
 
         return Matcher(
             bank,
@@ -191,10 +191,10 @@ class Place:
 
     def landmarks(self) -> LandmarkMap | None:
         """Return where landmarks stand; None if nothing is said of it."""
-        from phasemark.matcher import load_map
+        from phasemark.matcher import read_landmark_map
 
         if self.map_file is not None:
-            return load_map(self.map_file)
+            return read_landmark_map(self.map_file)
         return None if self.landmark_xy is None else _one_landmark(self.landmark_xy, self.landmark_yaw)
 
     def poses(self, match: Match, landmarks: LandmarkMap) -> list[dict[str, Any]]:
@@ -249,7 +249,7 @@ class Results:
     def check(self) -> None:
         """Refuse names of a wrong kind, and options that contradict each other."""
         if self.plot is not None and self.plot.suffix.lower() != ".png":
-            raise UsageError(f"the picture must be a .png file, got '{self.plot}'")
+            raise UsageError(f"the figure must be a .png file, got '{self.plot}'")
         if self.plot is None and self.plot_index is not None:
             raise UsageError("--plot-index needs --plot, the file to draw into")
         if self.estimates is not None and self.estimates.suffix.lower() != ".csv":

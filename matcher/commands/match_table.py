@@ -8,13 +8,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from phasemark.data.commands.console import finite_or_none
-
 if TYPE_CHECKING:
     from phasemark.matcher import (
         LandmarkMap,
         Match,
-        RobotPose,
     )
 
 
@@ -38,23 +35,9 @@ def pose_facts(
     if any_class:
         only = landmarks.landmark[0]
         poses = robot_poses(match, only.xy_m, only.yaw_rad, pan_rad, prior=believed, prior_covariance=covariance)
-        return [plain_pose(pose) for pose in poses]
+        return [pose.as_dict() for pose in poses]
     placements = landmarks.poses(match, pan_rad, prior=believed, prior_covariance=covariance)
-    return [{"landmark": placement.landmark.name, **plain_pose(placement.pose)} for placement in placements]
-
-
-def plain_pose(pose: RobotPose) -> dict[str, Any]:
-    """Return a robot pose as plain numbers, in degrees."""
-    covariance = pose.covariance
-    std = None if covariance is None else [math.sqrt(max(float(covariance[k, k]), 0.0)) for k in range(3)]
-    return {
-        "x_m": pose.x_m,
-        "y_m": pose.y_m,
-        "heading_deg": math.degrees(pose.heading_rad),
-        "std": None if std is None else {"x_m": std[0], "y_m": std[1], "heading_deg": math.degrees(std[2])},
-        "covariance": None if covariance is None else covariance.tolist(),
-        "mahalanobis": finite_or_none(pose.mahalanobis),
-    }
+    return [{"landmark": placement.landmark.name, **placement.pose.as_dict()} for placement in placements]
 
 
 def pose_text(pose: Mapping[str, Any]) -> str:

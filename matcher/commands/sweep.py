@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from phasemark.data.commands.console import LongWork, echo_json, echo_table, finite_or_none
+from phasemark.data.commands.console import LongWork, echo_json, echo_table
 from phasemark.data.commands.inputs import note_plan_too_far
 from phasemark.data.commands.options import Force, Json, Workers, one_of
 from phasemark.data.commands.outputs import refuse_existing, refuse_input_files
@@ -45,11 +45,11 @@ def sweep_run(
     force: Annotated[bool, typer.Option("--force", help="Start over where the folder holds a sweep.")] = False,
 ) -> None:
     """Run a sweep and write its tables and report."""
-    from phasemark.matcher.sweep.plan import Method, SweepPlan, load_sweep, refuse_programs
+    from phasemark.matcher.sweep.plan import Method, SweepPlan, read_sweep_plan, refuse_programs
     from phasemark.matcher.sweep.report import write_report
     from phasemark.matcher.sweep.run import run_sweep, sweep_outputs
 
-    loaded = load_sweep(plan)
+    loaded = read_sweep_plan(plan)
     changes: dict[str, Any] = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     if not trust_plan:
         refuse_programs(loaded, () if matcher is None else (matcher,), plan)
@@ -73,7 +73,6 @@ def sweep_report(
 ) -> None:
     """Write a sweep's tables, figures and report again."""
     from phasemark.matcher.sweep.report import summary, write_report
-    from phasemark.matcher.sweep.result_tables import json_rows
     from phasemark.matcher.sweep.run import read_sweep
 
     with LongWork("writing the report"):
@@ -81,7 +80,7 @@ def sweep_report(
     trials = read_sweep(folder)[1]
     cells = trials.cells()
     if as_json:
-        echo_json({"report": str(report), "cells": json_rows([cell.row() for cell in cells])})
+        echo_json({"report": str(report), "cells": [cell.as_dict() for cell in cells]})
         return
     for sentence in summary(trials, cells):
         typer.echo(sentence)
@@ -113,15 +112,12 @@ def sweep_compare(
     as_json: Json = False,
 ) -> None:
     """Compare two sweeps cell by cell; significant differences are marked, corrected for their number."""
-    import dataclasses
-
     from phasemark.matcher.sweep.compare import compare_cells
     from phasemark.matcher.sweep.run import read_sweep
 
     found = compare_cells(*(read_sweep(folder)[1].cells() for folder in (first, second)))
     if as_json:
-        rows = [dataclasses.asdict(one) for one in found]
-        echo_json([{key: finite_or_none(value) for key, value in row.items()} for row in rows])
+        echo_json([one.as_dict() for one in found])
         return
     shown = [one for one in found if one.significant or everything]
     echo_table(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from phasemark.data import versions, write_atomically
 from phasemark.data.pages.page import embedded_png, figure_png, page_template, short_number
-from phasemark.landmarks import mesh_picture
+from phasemark.landmarks import mesh_figure
 from phasemark.matcher.demo.run import (
     LANDMARK_XY_M,
     SHIFT_STEPS,
@@ -25,7 +25,7 @@ from phasemark.matcher.demo.run import (
     cells_csv,
     trials_csv,
 )
-from phasemark.matcher.figures import describe, match_picture
+from phasemark.matcher.figures import describe, match_figure
 from phasemark.render.figures import RANGE_COLOURS, draw_range
 
 _ANGLE_STYLES = (("#0072B2", "o", "-"), ("#D55E00", "s", "--"), ("#009E73", "^", ":"), ("#CC79A7", "D", "-."))
@@ -138,7 +138,7 @@ def _gallery(result: DemoResult) -> list[dict[str, Any]]:
                 "name": name,
                 "view": f"D = {100 * picked.cell.distance_m:g} cm, δ = {math.degrees(picked.cell.delta_rad):g}°",
                 "frame": _image(figure, f"Filtered range image of the {name}"),
-                "mesh": embedded_png(mesh_picture(result.bank.mesh(name)), f"The {name}"),
+                "mesh": embedded_png(mesh_figure(result.bank.mesh(name)), f"The {name}"),
             }
         )
     return shown
@@ -154,7 +154,7 @@ def _matches(result: DemoResult) -> list[dict[str, Any]]:
             "title": title,
             "found": f"Repetition {k}: {describe(r.matches[k])}",
             "picture": _image(
-                match_picture(r.filtered, r.matches[k], result.bank, result.background, k, title=False),
+                match_figure(r.filtered, r.matches[k], result.bank, result.background, k, title=False),
                 f"Measured, model and residual: {title}",
             ),
         }

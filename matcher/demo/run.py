@@ -18,14 +18,17 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank, BankPlan, build_bank
+from phasemark.data.files.json_text import finite_or_none
 from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.position.robot_pose import robot_poses
-from phasemark.render import Background, PhasorImages, Renderer, Views, capture
+from phasemark.matcher.statistics import view_errors
+from phasemark.render import Background, PhasorImages, Renderer, Views, capture, delta_period_rad
 
 SENSOR = "pmd-16x16"
 WALL_M = 3.0
@@ -105,6 +108,10 @@ class DemoResult:
     def select(self, *, shifted: bool) -> tuple[CellResult, ...]:
         """Return the cells on the bank's grid, or those between."""
         return tuple(result for result in self.cells if result.cell.shifted == shifted)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the times and the cells as plain numbers, for JSON; None where nothing was found."""
+        return {"seconds": self.seconds, "cells": [finite_or_none(row) for row in cell_rows(self.cells)]}
 
 
 def run_demo(
@@ -246,14 +253,14 @@ def _repeated(image: PhasorImages, n: int) -> PhasorImages:
 
 def _judge(cell: Cell, matches: Matches, filtered: FilteredFrames) -> CellResult:
     found = np.array([name is not None for name in matches.class_name])
-    period = np.array([2 * math.pi / match.symmetry for match in matches])
-    turned = matches.delta_rad - cell.delta_rad
+    period = np.array([delta_period_rad(match.symmetry) for match in matches])
+    error = np.where(found[:, None], view_errors(matches, cell, VIEW[:2], period), np.nan)
     return CellResult(
         cell=cell,
         matches=matches,
         class_right=np.array([name == cell.class_name for name in matches.class_name]),
-        distance_error_m=np.where(found, matches.distance_m - cell.distance_m, np.nan),
-        delta_error_rad=np.where(found, turned - period * np.round(turned / period), np.nan),
+        distance_error_m=error[:, 0],
+        delta_error_rad=error[:, 1],
         position_error_m=np.array([_position_error_m(cell, match) for match in matches]),
         filtered=filtered,
     )

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from phasemark.matcher.design.confirm import Confirmation, Trial, confirm, confirm_design, ratio
+from phasemark.matcher.design.confirm import Confirmation, Trial, confirm, confirm_design
 from phasemark.matcher.design.drawing import drawing_svg
 from phasemark.matcher.design.output import (
     landmarks_toml,
@@ -20,18 +20,19 @@ from phasemark.matcher.design.plan import (
     SearchPlan,
     default_design,
     example_design,
-    load_design_plan,
+    read_design_plan,
 )
 from phasemark.matcher.design.position_bound import RangeBound, range_bound
-from phasemark.matcher.design.rules import Check, Room
+from phasemark.matcher.design.rules import AllowedDimensions, Check
 from phasemark.matcher.design.run import run_design
 from phasemark.matcher.design.search import Candidate, Design, Scored
-from phasemark.matcher.design.separation import ClassDistances, most_apart, turn_distance
+from phasemark.matcher.design.separation import ClassDistances, choose_far_apart, turn_distance
 
 if TYPE_CHECKING:
-    from phasemark.matcher.design.figures import bound_picture, pareto_picture
+    from phasemark.matcher.design.figures import bound_figure, pareto_figure
 
 __all__ = [
+    "AllowedDimensions",
     "Candidate",
     "Check",
     "ClassDistances",
@@ -40,27 +41,25 @@ __all__ = [
     "DesignPlan",
     "LimitsPlan",
     "RangeBound",
-    "Room",
     "SamplingPlan",
     "Scored",
     "SearchPlan",
     "Trial",
-    "bound_picture",
+    "bound_figure",
+    "choose_far_apart",
     "confirm",
     "confirm_design",
     "default_design",
     "drawing_svg",
     "example_design",
     "landmarks_toml",
-    "load_design_plan",
     "mesh_stl",
-    "most_apart",
     "output_names",
     "pareto_csv",
-    "pareto_picture",
+    "pareto_figure",
     "pareto_rows",
     "range_bound",
-    "ratio",
+    "read_design_plan",
     "run_design",
     "summary",
     "turn_distance",
@@ -70,8 +69,8 @@ __all__ = [
 
 def __getattr__(name: str) -> object:
     """Import pictures when they are asked for: matplotlib takes half a second to load."""
-    if name in ("bound_picture", "pareto_picture"):
-        from phasemark.matcher.design import figures as picture
+    if name in ("bound_figure", "pareto_figure"):
+        from phasemark.matcher.design import figures
 
-        return getattr(picture, name)
+        return getattr(figures, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -20,12 +20,13 @@ from phasemark.data import BankPlan, build_bank, parse_grid
 from phasemark.data.progress import Progress, counter
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh
-from phasemark.matcher.accuracy.cramer_rao import Estimate, cramer_rao, efficiency, share
-from phasemark.matcher.accuracy.trials import Conditions, noisy_frames
+from phasemark.matcher.accuracy.cramer_rao import cramer_rao
+from phasemark.matcher.accuracy.trials import TrialSetup, noisy_frames
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.search import Design, Scored
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.matcher import Matcher
+from phasemark.matcher.statistics import ErrorStatistics, Interval, binomial_interval, error_statistics, view_errors
 from phasemark.render import Renderer, Sensor, Views
 
 SIDE_STEP_DEG = 3.75
@@ -58,24 +59,28 @@ class Trial:
     class_right: NDArray[np.bool_]
 
     @property
-    def class_errors(self) -> Estimate:
+    def class_errors(self) -> Interval:
         """Share of frames whose class was not found."""
-        return share(int((~self.class_right).sum()), self.class_right.size)
+        return binomial_interval(int((~self.class_right).sum()), self.class_right.size)
 
     @property
-    def missed(self) -> Estimate:
+    def missed(self) -> Interval:
         """Share of frames in which no landmark was found; they have no position error."""
-        return share(int(np.isnan(self.error_m).sum()), self.error_m.size)
+        return binomial_interval(int(np.isnan(self.error_m).sum()), self.error_m.size)
 
     @property
-    def efficiency(self) -> Estimate:
+    def efficiency(self) -> Interval:
         """√mean(error² / bound²), 1 at the bound."""
-        found = np.isfinite(self.error_m)
-        return efficiency(self.error_m[found], self.bound_m[found])
+        return _position_statistics(self.error_m, self.bound_m).ratio["position_m"]
 
-    def rmse(self, k: int) -> Estimate:
+    def rmse(self, k: int) -> Interval:
         """Return the root mean square error at one place, metres."""
-        return root_mean_square(self.error_m[k])
+        return _position_statistics(self.error_m[k], self.bound_m[k]).rmse["position_m"]
+
+
+def _position_statistics(error_m: NDArray[np.float64], bound_m: NDArray[np.float64]) -> ErrorStatistics:
+    """Judge distances of the lens from where it is; those without a landmark do not count."""
+    return error_statistics(error_m.reshape(-1, 1), ["position_m"], bound_std=bound_m.reshape(-1, 1), law="normal")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,22 +100,6 @@ class Confirmation:
     sides: Trial
     worst: Trial
     anywhere: Trial
-
-
-def root_mean_square(error: NDArray[np.float64]) -> Estimate:
-    """Return √mean(e²) of the finite errors with its 95 % interval."""
-    found = error[np.isfinite(error)]
-    return efficiency(found, np.ones(len(found))) if len(found) > 1 else Estimate(math.nan, 0.0, math.inf)
-
-
-def ratio(above: Estimate, below: Estimate) -> Estimate:
-    """Return a quotient of independent positive numbers with its 95 % interval, from their relative errors."""
-
-    def relative(one: Estimate) -> float:
-        return (one.high - one.low) / (2 * one.value)
-
-    value, spread = above.value / below.value, math.hypot(relative(above), relative(below))
-    return Estimate(value, value * math.exp(-spread), value * math.exp(spread))
 
 
 def confirm(
@@ -204,17 +193,16 @@ def _matched(
     rng: np.random.Generator,
     workers: int,
 ) -> Trial:
-    conditions = Conditions(n_frames=plan.n_frames)
+    setup = TrialSetup(n_frames=plan.n_frames)
     error, right = np.empty(len(views)), np.empty(len(views), np.bool_)
     for start in range(0, len(views), _FRAMES_AT_ONCE):
         part = slice(start, min(start + _FRAMES_AT_ONCE, len(views)))
         some = views[part]
-        matches = matcher.match(noisy_frames(renderer, renderer.sensor, some, conditions, rng, workers=workers))
-        turn = matches.delta_rad - some.delta_rad
-        turn = turn - period * np.round(turn / period)
+        matches = matcher.match(noisy_frames(renderer, renderer.sensor, some, setup, rng, workers=workers))
+        shift, turn = np.ascontiguousarray(view_errors(matches, some, VIEW[:2], period).T)
         # the lens from where it is: D and D' at an angle of the error in δ
         across = 2 * np.sqrt(matches.distance_m * some.distance_m) * np.sin(turn / 2)
-        error[part] = np.hypot(matches.distance_m - some.distance_m, across)
+        error[part] = np.hypot(shift, across)
         right[part] = matches.class_name == name
     covariance = cramer_rao(renderer, views, n_frames=plan.n_frames, pixels="lower", workers=workers).covariance
     bound = np.sqrt(covariance[:, 0, 0] + views.distance_m**2 * covariance[:, 1, 1])

@@ -16,7 +16,7 @@ _INFINITE = 1.15
 """Where a square's distance from itself turned is drawn, in units of the largest other: it has none."""
 
 
-def pareto_picture(design: Design) -> Figure:
+def pareto_figure(design: Design) -> Figure:
     """Draw every box that was tried: its worst position bound, and how well classes and sides are told apart.
 
     Parameters
@@ -84,7 +84,7 @@ def _mark(axes: Axes, scored: Scored, y: float, words: str, colour: str) -> None
     axes.scatter([1000 * scored.bound.worst_m], [y], s=130, c=colour, marker="*", label=words, zorder=3)
 
 
-def bound_picture(design: Design, confirmed: tuple[Confirmation, Confirmation] | None) -> Figure:
+def bound_figure(design: Design, confirmed: tuple[Confirmation, Confirmation] | None) -> Figure:
     """Draw the position bound over distance, and over sides at its worst distance, with the frames that were matched.
 
     Parameters

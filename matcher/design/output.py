@@ -16,12 +16,13 @@ from phasemark.data import write_atomically
 from phasemark.data.pages.page import figure_png
 from phasemark.inputs.toml_file import toml_value
 from phasemark.landmarks import LandmarkSpec, build_mesh, export_mesh
-from phasemark.matcher.accuracy.cramer_rao import Estimate, confusion_probability
-from phasemark.matcher.design.confirm import Confirmation, ratio
+from phasemark.matcher.accuracy.cramer_rao import confusion_probability
+from phasemark.matcher.design.confirm import Confirmation
 from phasemark.matcher.design.drawing import drawing_svg
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.position_bound import RangeBound
 from phasemark.matcher.design.search import Design, Scored
+from phasemark.matcher.statistics import Interval, ratio_interval
 
 Confirmed = tuple[Confirmation, Confirmation]
 """Of the result and of the catalogue."""
@@ -145,8 +146,8 @@ def summary(design: Design, confirmed: Confirmed | None) -> dict[str, Any]:
             "frames_averaged": design.plan.n_frames,
             "result": _confirmation_facts(new),
             "catalogue": _confirmation_facts(known),
-            "worst_rmse_factor": _interval(ratio(known.worst.rmse(0), new.worst.rmse(0))),
-            "rmse_factor_at_the_worst_bounds": _interval(ratio(known.sides.rmse(-1), new.sides.rmse(-1))),
+            "worst_rmse_factor": _interval(ratio_interval(known.worst.rmse(0), new.worst.rmse(0))),
+            "rmse_factor_at_the_worst_bounds": _interval(ratio_interval(known.sides.rmse(-1), new.sides.rmse(-1))),
         }
     return facts
 
@@ -212,7 +213,7 @@ def _confirmation_facts(confirmation: Confirmation) -> dict[str, Any]:
     }
 
 
-def _interval(estimate: Estimate) -> dict[str, float | None]:
+def _interval(estimate: Interval) -> dict[str, float | None]:
     return {"value": _finite(estimate.value), "low": _finite(estimate.low), "high": _finite(estimate.high)}
 
 
@@ -252,7 +253,7 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
     OutputExistsError, StorageError
         A file cannot be written.
     """
-    from phasemark.matcher.design.figures import bound_picture, pareto_picture  # matplotlib is slow to import
+    from phasemark.matcher.design.figures import bound_figure, pareto_figure  # matplotlib is slow to import
 
     near, far = design.plan.distance_m
     notes = [f"for {Path(design.plan.sensor).stem}, {near:g} … {far:g} m"]
@@ -263,8 +264,8 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
         landmarks_toml(design).encode(),
         pareto_csv(design).encode(),
         text.encode(),
-        figure_png(pareto_picture(design)),
-        figure_png(bound_picture(design, confirmed)),
+        figure_png(pareto_figure(design)),
+        figure_png(bound_figure(design, confirmed)),
     ]
     for spec in design.result.specs:
         contents += [mesh_stl(spec), drawing_svg(spec, notes).encode()]

@@ -183,7 +183,7 @@ class DesignPlan(PlanModel):
         return np.linspace(0.0, half, math.ceil(math.degrees(half) / self.sampling.delta_step_deg - 1e-9) + 1)
 
 
-def load_design_plan(path: str | os.PathLike[str]) -> DesignPlan:
+def read_design_plan(path: str | os.PathLike[str]) -> DesignPlan:
     """Read the plan of a design from a TOML file; a sensor file it names is relative to its folder.
 
     Parameters

@@ -1,6 +1,7 @@
 """The rules of the paper's section 4.1 as numbers: in view, large enough, resolvable, bright enough.
 
-What the rules leave of each dimension is :class:`Room`; if they leave nothing, it says which two contradict.
+What the rules leave of each dimension is :class:`AllowedDimensions`; if they leave nothing, it says which two
+contradict.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def upper_size(upper: Upper) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Room:
+class AllowedDimensions:
     """What the rules leave of a landmark's dimensions.
 
     Parameters

@@ -42,7 +42,7 @@ def run_design(plan: DesignPlan, *, workers: int | None = None, progress: Progre
     step = counter(progress, plan.search.boxes + plan.search.uppers + _USUAL_REFINEMENT)
     search.look_at_uppers(step)
     found: list[Candidate] = []
-    for steps in sample_boxes(plan, search.room, search.lattice):
+    for steps in sample_boxes(plan, search.allowed, search.lattice):
         found.append(search.candidate(box_of(search.lattice, steps)))
         step()
     feasible = [candidate for candidate in found if candidate.feasible]

@@ -19,11 +19,11 @@ from phasemark.landmarks import Box, LandmarkSpec
 from phasemark.landmarks.spec import Upper
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.position_bound import RangeBound, box_alone, range_bound
-from phasemark.matcher.design.rules import Check, Room
+from phasemark.matcher.design.rules import AllowedDimensions, Check
 from phasemark.matcher.design.separation import (
     Appearance,
     ClassDistances,
-    most_apart,
+    choose_far_apart,
     turn_distance,
     upper_appearance,
 )
@@ -126,8 +126,8 @@ class Search:
     def __init__(self, plan: DesignPlan, workers: int = 1) -> None:
         self.plan = plan
         self.sensor: Sensor = plan.build_sensor()
-        self.room = Room(plan, self.sensor)
-        self.room.check_possible()
+        self.allowed = AllowedDimensions(plan, self.sensor)
+        self.allowed.check_possible()
         self.lattice = Lattice(plan.search.step_mm)
         self.workers = workers
         self._bounds: dict[Box, RangeBound] = {}
@@ -153,7 +153,7 @@ class Search:
     def look_at_uppers(self, progress: Callable[[], None]) -> None:
         """Render the parts that may stand on a box, and compare them; those too dim or too small are dropped."""
         least = self.plan.limits.least_upper_px
-        for upper in sample_uppers(self.plan, self.room, self.lattice):
+        for upper in sample_uppers(self.plan, self.allowed, self.lattice):
             seen = upper_appearance(upper, self.sensor, self.plan)
             progress()
             if upper_pixels(seen) >= least:
@@ -172,18 +172,18 @@ class Search:
         distance = 0.0
         if len(carried) >= n:
             least = self._distances.least(bound.distance_information)[np.ix_(carried, carried)]
-            picked = most_apart(least, n)
+            picked = choose_far_apart(least, n)
             chosen = tuple(int(k) for k in carried[picked])
             distance = float(least[np.ix_(picked, picked)].min()) if n > 1 else math.inf
         turn = self.turn(box)
         checks = (
-            *self.room.checks(box_alone(box, self.plan)),
+            *self.allowed.checks(box_alone(box, self.plan)),
             *self._seen_checks(bound, distance, turn),
         )
         return Candidate(box, bound, chosen, distance, turn, checks, refined)
 
     def _carries(self, box: Box, upper: Upper) -> bool:
-        return all(check.passes for check in self.room.upper_checks(box, upper))
+        return all(check.passes for check in self.allowed.upper_checks(box, upper))
 
     def _seen_checks(self, bound: RangeBound, class_distance: float, turn: float) -> Iterator[Check]:
         limits = self.plan.limits
@@ -222,7 +222,7 @@ class Search:
         if min(steps) < 1 or steps[0] < steps[1]:
             return None
         moved = box_of(self.lattice, (steps[0], steps[1], steps[2]))
-        kept = all(check.passes for check in self.room.checks(box_alone(moved, self.plan)))
+        kept = all(check.passes for check in self.allowed.checks(box_alone(moved, self.plan)))
         return moved if kept else None
 
     def refine_uppers(self, candidate: Candidate, progress: Callable[[], None]) -> tuple[Upper, ...]:
@@ -272,7 +272,7 @@ class Search:
             own = distances[k].min() if len(specs) > 1 else math.inf
             least = self.plan.limits.least_upper_px
             checks[spec.name] = (
-                *self.room.checks(spec),
+                *self.allowed.checks(spec),
                 *self._seen_checks(bound, float(own), turn),
                 Check("pixels on the upper part, far end", upper_pixels(seen[spec.name]), least, "px", False),
             )

@@ -108,7 +108,7 @@ def upper_appearance(upper: Upper, sensor: Sensor, plan: DesignPlan) -> Appearan
     mesh = build_mesh(spec, part="upper", tolerance_m=SEARCH_TOLERANCE_M)
     renderer = Renderer(mesh, sensor, albedo=plan.albedo)
     views = Views.broadcast(plan.sampled_distance_m)
-    return Appearance.of(renderer, views, ("distance_m",), (0, sensor.rows // 2), plan.n_frames)
+    return Appearance.of(renderer, views, ("distance_m",), sensor.upper_rows, plan.n_frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +163,7 @@ class ClassDistances:
         return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
 
 
-def most_apart(distance: NDArray[np.float64], n: int) -> NDArray[np.int64]:
+def choose_far_apart(distance: NDArray[np.float64], n: int) -> NDArray[np.int64]:
     """Choose n items whose least mutual distance is large: the best pair, the farthest next, then exchanges.
 
     Parameters
@@ -214,7 +214,7 @@ def turn_distance(box: Box, sensor: Sensor, plan: DesignPlan) -> float:
     if box.length_m == box.width_m:
         return math.inf
     renderer = Renderer(build_mesh(box_alone(box, plan)), sensor, albedo=plan.albedo)
-    rows = (sensor.rows // 2, sensor.rows)
+    rows = sensor.lower_rows
     far = plan.distance_m[1]
     sides = np.linspace(0.0, math.pi / 2, _TURN_SIDES)
     truth = Appearance.of(renderer, Views.broadcast(far, sides), (), rows, plan.n_frames)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from phasemark.landmarks import Box, Cone, Cylinder, Revolution, Sphere
 from phasemark.landmarks.spec import Upper
 from phasemark.matcher.design.plan import DesignPlan
-from phasemark.matcher.design.rules import Room
+from phasemark.matcher.design.rules import AllowedDimensions
 
 _THINNEST_SHARE = 0.25
 """Of the widest radius: a waist or foot is not thinner, or the part breaks off."""
@@ -47,33 +47,33 @@ def box_of(lattice: Lattice, steps: tuple[int, int, int]) -> Box:
     return Box(length_m=length, width_m=width, height_m=height)
 
 
-def sample_boxes(plan: DesignPlan, room: Room, lattice: Lattice) -> list[tuple[int, int, int]]:
+def sample_boxes(plan: DesignPlan, allowed: AllowedDimensions, lattice: Lattice) -> list[tuple[int, int, int]]:
     """Return boxes in steps: squares, rectangles, or half of each; no box twice."""
-    least, most = room.side_m
+    least, most = allowed.side_m
     boxes: dict[tuple[int, int, int], None] = {}
     square, oblong = plan.symmetry != 2, plan.symmetry != 4
     share = plan.search.boxes // (square + oblong)
     if square:
         for a, b in _spread(2, share, plan.seed):
             side = _between(lattice, least, most, a)
-            boxes[(side, side, _height(room, lattice, side, side, b))] = None
+            boxes[(side, side, _height(allowed, lattice, side, side, b))] = None
     if oblong:
         for a, b, c in _spread(3, share, plan.seed + 1):
             width = _between(lattice, least, min(most, plan.limits.extents_m[1]), a)
-            length = _between(lattice, lattice.metres(width + 1), room.longest_m(lattice.metres(width)), b)
-            boxes[(length, width, _height(room, lattice, length, width, c))] = None
+            length = _between(lattice, lattice.metres(width + 1), allowed.longest_m(lattice.metres(width)), b)
+            boxes[(length, width, _height(allowed, lattice, length, width, c))] = None
     return list(boxes)
 
 
-def _height(room: Room, lattice: Lattice, length: int, width: int, share: float) -> int:
-    most = room.deepest_m(lattice.metres(length), lattice.metres(width))
-    return _between(lattice, room.box_height_m[0], most, share)
+def _height(allowed: AllowedDimensions, lattice: Lattice, length: int, width: int, share: float) -> int:
+    most = allowed.deepest_m(lattice.metres(length), lattice.metres(width))
+    return _between(lattice, allowed.box_height_m[0], most, share)
 
 
-def sample_uppers(plan: DesignPlan, room: Room, lattice: Lattice) -> list[Upper]:
+def sample_uppers(plan: DesignPlan, allowed: AllowedDimensions, lattice: Lattice) -> list[Upper]:
     """Return parts that may stand on the box: cylinders, cones, spheres and profiles of three radii; none twice."""
-    least_r, most_r = room.upper_radius_m
-    least_h, most_h = room.upper_height_m
+    least_r, most_r = allowed.upper_radius_m
+    least_h, most_h = allowed.upper_height_m
     uppers: dict[Upper, None] = {}
     for kind, width, tall, *shares in _spread(6, plan.search.uppers, plan.seed + 2):
         radius = lattice.metres(_between(lattice, least_r, most_r, width))

@@ -22,6 +22,7 @@ from phasemark.data.bank.build_bank import rebuild_bank
 from phasemark.matcher.diagnosis.search import SIZES, Fit, Search, fitted_wall, wider
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
+from phasemark.matcher.likelihood.setup import check_free
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
 from phasemark.render import Background, Sensor
@@ -209,20 +210,20 @@ class _Setup:
 
     @classmethod
     def of(cls, matcher: Matcher, background: Background | None) -> _Setup:
-        """Read the attributes of a matcher: the one place that knows them."""
-        likelihood = matcher._likelihood
-        if likelihood is None:
+        """Take what a matcher was told: the one place that knows its options."""
+        told = matcher.options
+        if matcher.method == "nearest":
             return cls(True, VIEW, background, {"false_alarm": matcher.false_alarm})
-        behind: Background | Literal["auto"] | None = "auto" if likelihood.auto else likelihood.background
+        unknown = told["background"] == "unknown"
         options = {
-            "false_alarm": likelihood.false_alarm,
-            "on": likelihood.on,
-            "pixels": "all" if likelihood._used.all() else "lower",
-            "robust": likelihood._huber is not None,
+            "false_alarm": matcher.false_alarm,
+            "on": told["on"],
+            "pixels": told["pixels"],
+            "robust": told["robust"] or unknown,
         }
         # a bearing with a prior is looked for anew without one
-        free = VIEW[:2] if likelihood._prior_std else likelihood.free
-        return cls(False, tuple(free), behind, options)
+        free = VIEW if told["free"] is None else check_free(told["free"])
+        return cls(False, free, None if unknown else told["background"], options)
 
     def matcher(self, bank: Bank, free: Sequence[str], background: Background | Literal["auto"] | None) -> Matcher:
         """Build a matcher like it by maximum likelihood."""

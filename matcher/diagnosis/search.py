@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
-from phasemark.render import Background, Renderer, Sensor, Views, predicted_range_std, wrap_difference_m
+from phasemark.render import (
+    Background,
+    Renderer,
+    Sensor,
+    Views,
+    delta_period_rad,
+    predicted_range_std,
+    wrap_delta_rad,
+    wrap_difference_m,
+)
 
 SIZES = (0.8, 0.85, 0.9, 0.95, 1.05, 1.1, 1.15, 1.2)
 """Fields of view that are tried, as ratios of the tangents of half angles."""
@@ -113,7 +122,7 @@ class Search:
             return None
         coarse = seen.with_slack(_SLACKS_M[0])
         free = [0, 1] + ([2] if bearing else []) + ([3] if len(sizes) > 1 else [])
-        rows = (self._sensor.rows // 2, self._sensor.rows) if self._shared else (0, self._sensor.rows)
+        rows = self._sensor.lower_rows if self._shared else (0, self._sensor.rows)
         starts: list[tuple[float, int, NDArray[np.float64]]] = []
         for c in range(1 if self._shared else min(len(self._names), _MOST_CLASSES)):
             views = self._grid(c, frame, sizes, bearing, mixed=background is not None)
@@ -139,7 +148,7 @@ class Search:
             return None
         least, c, view = whole[0]
         distance_m, delta_rad, bearing_rad, size = (float(value) for value in view)
-        delta_rad %= 2 * math.pi / self._symmetry[c]
+        delta_rad = float(wrap_delta_rad(delta_rad, delta_period_rad(self._symmetry[c])))
         return Fit(self._names[c], distance_m, delta_rad, bearing_rad, size, least, int(seen.returned.sum()))
 
     def _grid(
@@ -160,7 +169,7 @@ class Search:
         vertices = self._renderers[c].topology.vertices
         grid = []
         step = _DELTA_STEP_RAD if len(sizes) == 1 else _WIDE_STEP_RAD
-        for delta in np.arange(0.0, 2 * math.pi / self._symmetry[c], step):
+        for delta in np.arange(0.0, delta_period_rad(self._symmetry[c]), step):
             along = vertices[:, 0] * math.cos(delta) + vertices[:, 1] * math.sin(delta)
             for offset in _MIXED_OFFSETS_M if mixed else _DISTANCE_OFFSETS_M:
                 for size in sizes:

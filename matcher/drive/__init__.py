@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from phasemark.matcher.drive.output import OUTPUTS, path_csv, stops_csv, summary, write_drive
+from phasemark.matcher.drive.output import OUTPUTS, path_csv, stops_csv, write_drive
 from phasemark.matcher.drive.plan import (
     CameraPlan,
     DrivePlan,
@@ -11,43 +11,42 @@ from phasemark.matcher.drive.plan import (
     StopPlan,
     default_drive,
     example_drive,
-    load_drive_plan,
+    read_drive_plan,
 )
 from phasemark.matcher.drive.pose_filter import PoseFilter
-from phasemark.matcher.drive.simulate import Drive, Equipment, Stop, pose_error, run_drive
+from phasemark.matcher.drive.simulate import Drive, RobotEquipment, Stop, pose_error, run_drive
 
 if TYPE_CHECKING:
-    from phasemark.matcher.drive.figures import drive_animation, drive_picture
+    from phasemark.matcher.drive.figures import drive_animation, drive_figure
 
 __all__ = [
     "OUTPUTS",
     "CameraPlan",
     "Drive",
     "DrivePlan",
-    "Equipment",
     "OdometryPlan",
     "PathPlan",
     "PoseFilter",
+    "RobotEquipment",
     "Stop",
     "StopPlan",
     "default_drive",
     "drive_animation",
-    "drive_picture",
+    "drive_figure",
     "example_drive",
-    "load_drive_plan",
     "path_csv",
     "pose_error",
+    "read_drive_plan",
     "run_drive",
     "stops_csv",
-    "summary",
     "write_drive",
 ]
 
 
 def __getattr__(name: str) -> object:
     """Import pictures when they are asked for: matplotlib takes half a second to load."""
-    if name in ("drive_animation", "drive_picture"):
-        from phasemark.matcher.drive import figures as picture
+    if name in ("drive_animation", "drive_figure"):
+        from phasemark.matcher.drive import figures
 
-        return getattr(picture, name)
+        return getattr(figures, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""The drive seen from above: three paths, ellipses, landmarks; as a picture, and as an animation."""
+"""The drive seen from above: three paths, ellipses, landmarks; as a figure, and as an animation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _COLOURS = 64
 _COLOURS_SAY = "range: white near, blue between, black far"
 
 
-def drive_picture(drive: Drive) -> Figure:
+def drive_figure(drive: Drive) -> Figure:
     """Draw the room with the three paths, and beside it the errors over the way.
 
     Parameters

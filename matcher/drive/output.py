@@ -1,4 +1,4 @@
-"""What a drive leaves behind: tables of the path and of the stops, a summary, a picture and an animation."""
+"""What a drive leaves behind: tables of the path and of the stops, a summary, a figure and an animation."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data import write_atomically
 from phasemark.data.files.csv_cell import as_cell
-from phasemark.matcher.accuracy.cramer_rao import nees
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
 
 OUTPUTS = ("path.csv", "stops.csv", "summary.json", "drive.png", "drive.gif")
@@ -70,45 +68,6 @@ def _stop_row(stop: Stop) -> list[object]:
     ]
 
 
-def summary(drive: Drive) -> dict[str, Any]:
-    """Return the figures of a drive as plain numbers, for JSON; None where there is nothing to tell."""
-    used = drive.corrections
-    after = np.array([pose_error(stop.after, stop.true) for stop in used]).reshape(-1, 3)
-    before = np.array([pose_error(stop.before, stop.true) for stop in used]).reshape(-1, 3)
-    consistency = {}
-    for when, errors in (("before", before), ("after", after)):
-        covariances = np.array([getattr(stop, f"covariance_{when}") for stop in used]).reshape(-1, 3, 3)
-        consistency[when] = float(nees(errors, covariances).mean()) / 3 if used else None
-    return {
-        "seed": drive.seed,
-        "way_m": float(drive.way_m[-1]),
-        "time_s": float(drive.time_s[-1]),
-        "stops": len(drive.stops),
-        "corrections": len(used),
-        "position_rms_after_correction_m": _rms(after[:, :2]) if used else None,
-        "heading_rms_after_correction_deg": math.degrees(_rms(after[:, 2:])) if used else None,
-        "position_rms_before_correction_m": _rms(before[:, :2]) if used else None,
-        "heading_rms_before_correction_deg": math.degrees(_rms(before[:, 2:])) if used else None,
-        "nees_per_dimension_before_correction": consistency["before"],
-        "nees_per_dimension_after_correction": consistency["after"],
-        **_drift("dead_reckoned", drive.dead_reckoned, drive.true),
-        **_drift("corrected", drive.corrected, drive.true),
-        "plan": drive.plan.model_dump(mode="json", by_alias=True),
-    }
-
-
-def _drift(name: str, pose: NDArray[np.float64], true: NDArray[np.float64]) -> dict[str, float]:
-    """Return how far a path is off at the end, and at its worst."""
-    error = pose_error(pose, true)
-    distance, heading = np.hypot(error[:, 0], error[:, 1]), np.degrees(np.abs(error[:, 2]))
-    return {
-        f"{name}_final_position_error_m": float(distance[-1]),
-        f"{name}_final_heading_error_deg": float(heading[-1]),
-        f"{name}_largest_position_error_m": float(distance.max()),
-        f"{name}_largest_heading_error_deg": float(heading.max()),
-    }
-
-
 def write_drive(drive: Drive, folder: Path, *, force: bool = False) -> list[Path]:
     """Write :data:`OUTPUTS` into a folder that exists.
 
@@ -128,16 +87,16 @@ def write_drive(drive: Drive, folder: Path, *, force: bool = False) -> list[Path
     OutputExistsError, StorageError
         A file cannot be written.
     """
-    from phasemark.matcher.drive.figures import drive_animation, drive_picture  # matplotlib is slow to import
+    from phasemark.matcher.drive.figures import drive_animation, drive_figure  # matplotlib is slow to import
 
-    picture = io.BytesIO()
-    drive_picture(drive).savefig(picture, format="png", dpi=130)
-    text = json.dumps(summary(drive), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    figure = io.BytesIO()
+    drive_figure(drive).savefig(figure, format="png", dpi=130)
+    text = json.dumps(drive.as_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     contents = (
         path_csv(drive).encode(),
         stops_csv(drive).encode(),
         text.encode(),
-        picture.getvalue(),
+        figure.getvalue(),
         drive_animation(drive),
     )
     return [
@@ -149,10 +108,6 @@ def _flat(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the upper triangle of covariances of (x, y, heading), headings in degrees, (n, 6)."""
     scaled = covariance * np.outer(_DEGREES, _DEGREES)
     return np.stack([scaled[:, i, j] for i, j in _UPPER], axis=1)
-
-
-def _rms(errors: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
 
 def _csv(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

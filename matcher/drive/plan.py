@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from phasemark import UsageError
 from phasemark.data.plans.bank_plan import PlanModel
 from phasemark.inputs.toml_file import read_toml
-from phasemark.matcher.position.landmark_map import LandmarkMap, Point, Std, load_map
+from phasemark.matcher.position.landmark_map import LandmarkMap, Point, Std, read_landmark_map
 from phasemark.render import Sensor, preset
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -206,7 +206,7 @@ class DrivePlan(PlanModel):
         return {"stop.distance_m": self.stop.distance_m[1]}
 
 
-def load_drive_plan(path: str | os.PathLike[str]) -> DrivePlan:
+def read_drive_plan(path: str | os.PathLike[str]) -> DrivePlan:
     """Read the plan of a drive from a TOML file.
 
     Parameters
@@ -227,7 +227,7 @@ def load_drive_plan(path: str | os.PathLike[str]) -> DrivePlan:
     path = Path(path)
     table = read_toml(path)
     if isinstance(table.get("map"), str):
-        table["map"] = load_map(path.parent / table["map"])
+        table["map"] = read_landmark_map(path.parent / table["map"])
     try:
         return DrivePlan(**table)
     except UsageError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from phasemark.matcher.filters.filtered_frames import kalman_filter
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.position.landmark_map import MappedLandmark
+from phasemark.matcher.statistics import nees
 from phasemark.render import Background, Renderer, Sensor, Views, capture
 
 FREE = ("distance_m", "delta_rad", "bearing_rad")
@@ -114,6 +116,32 @@ class Drive:
         """The stops whose measurement was used."""
         return tuple(stop for stop in self.stops if stop.used)
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures of a drive as plain numbers, for JSON; None where there is nothing to tell."""
+        used = self.corrections
+        after = np.array([pose_error(stop.after, stop.true) for stop in used]).reshape(-1, 3)
+        before = np.array([pose_error(stop.before, stop.true) for stop in used]).reshape(-1, 3)
+        consistency = {}
+        for when, errors in (("before", before), ("after", after)):
+            covariances = np.array([getattr(stop, f"covariance_{when}") for stop in used]).reshape(-1, 3, 3)
+            consistency[when] = float(nees(errors, covariances).mean()) / 3 if used else None
+        return {
+            "seed": self.seed,
+            "way_m": float(self.way_m[-1]),
+            "time_s": float(self.time_s[-1]),
+            "stops": len(self.stops),
+            "corrections": len(used),
+            "position_rms_after_correction_m": _rms(after[:, :2]) if used else None,
+            "heading_rms_after_correction_deg": math.degrees(_rms(after[:, 2:])) if used else None,
+            "position_rms_before_correction_m": _rms(before[:, :2]) if used else None,
+            "heading_rms_before_correction_deg": math.degrees(_rms(before[:, 2:])) if used else None,
+            "nees_per_dimension_before_correction": consistency["before"],
+            "nees_per_dimension_after_correction": consistency["after"],
+            **_drift("dead_reckoned", self.dead_reckoned, self.true),
+            **_drift("corrected", self.corrected, self.true),
+            "plan": self.plan.model_dump(mode="json", by_alias=True),
+        }
+
 
 def pose_error(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return estimate less truth, the heading's difference wrapped; (..., 3)."""
@@ -123,7 +151,7 @@ def pose_error(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> NDA
 
 
 @dataclass(frozen=True, eq=False)
-class Equipment:
+class RobotEquipment:
     """What a robot brings along: camera, bank, matcher, and a model of each class.
 
     One set serves any number of drives with the same classes and camera.
@@ -140,7 +168,7 @@ class Equipment:
     renderers: dict[str, Renderer] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, plan: DrivePlan, workers: int | None = None) -> Equipment:
+    def of(cls, plan: DrivePlan, workers: int | None = None) -> RobotEquipment:
         """Build the bank in memory, over the distances where the robot stops and a margin.
 
         Parameters
@@ -183,7 +211,7 @@ def run_drive(
     plan: DrivePlan,
     *,
     seed: int = 2005,
-    equipment: Equipment | None = None,
+    equipment: RobotEquipment | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Drive:
@@ -202,7 +230,7 @@ def run_drive(
     plan : DrivePlan
     seed : int
         Of everything random.
-    equipment : Equipment, optional
+    equipment : RobotEquipment, optional
         From an earlier drive; built if not given.
     workers : int, optional
         Threads; None: one for each processor.
@@ -219,13 +247,13 @@ def run_drive(
         A class or the camera is unknown, or the robot lost its path.
     """
     rng = stream(seed, "drive", 0)
-    return _Driver(plan, seed, equipment or Equipment.of(plan, workers), rng).drive(progress)
+    return _Driver(plan, seed, equipment or RobotEquipment.of(plan, workers), rng).drive(progress)
 
 
 class _Driver:
     """One drive as it goes on."""
 
-    def __init__(self, plan: DrivePlan, seed: int, equipment: Equipment, rng: np.random.Generator) -> None:
+    def __init__(self, plan: DrivePlan, seed: int, equipment: RobotEquipment, rng: np.random.Generator) -> None:
         self.plan, self.seed, self.equipment, self.rng = plan, seed, equipment, rng
         self.path = Path(plan.path.waypoints_m)
         start = np.array([*plan.path.waypoints_m[0], self.path.start_heading_rad])
@@ -392,3 +420,19 @@ def _where_it_is(landmark: MappedLandmark, rng: np.random.Generator) -> tuple[tu
         rng.standard_normal(3)
     )
     return (float(x), float(y)), float(yaw)
+
+
+def _drift(name: str, pose: NDArray[np.float64], true: NDArray[np.float64]) -> dict[str, float]:
+    """Return how far a path is off at the end, and at its worst."""
+    error = pose_error(pose, true)
+    distance, heading = np.hypot(error[:, 0], error[:, 1]), np.degrees(np.abs(error[:, 2]))
+    return {
+        f"{name}_final_position_error_m": float(distance[-1]),
+        f"{name}_final_heading_error_deg": float(heading[-1]),
+        f"{name}_largest_position_error_m": float(distance.max()),
+        f"{name}_largest_heading_error_deg": float(heading.max()),
+    }
+
+
+def _rms(errors: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))

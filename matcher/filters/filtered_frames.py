@@ -150,10 +150,8 @@ def assumed_std_m(range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.fl
     return np.maximum(predicted_range_std(amplitude, amplitude, sensor), 1e-4)
 
 
-def noise_free(images: PhasorImages, n_frames: float) -> FilteredFrames:
+def noise_free(images: PhasorImages, n_frames: float, returned: NDArray[np.bool_] | None = None) -> FilteredFrames:
     """Return what filtering so many frames would give if their noise had no effect: exact ranges, honest variances.
-
-    A pixel returns where the noise law says that most single frames pass the sensor's threshold `max_phase_std_rad`.
 
     Parameters
     ----------
@@ -161,6 +159,9 @@ def noise_free(images: PhasorImages, n_frames: float) -> FilteredFrames:
         n views.
     n_frames : float
         How many frames' noise `std_m` is.
+    returned : (n, rows, cols) bool, optional
+        Which pixels return. None: where the noise law says that most single frames pass the sensor's threshold
+        `max_phase_std_rad`.
 
     Returns
     -------
@@ -170,7 +171,8 @@ def noise_free(images: PhasorImages, n_frames: float) -> FilteredFrames:
     sensor = images.sensor
     std = predicted_range_std(images.amplitude, images.intensity, sensor)
     limit = math.inf if sensor.max_phase_std_rad is None else sensor.max_phase_std_rad * sensor.metres_per_radian
-    returned = (images.amplitude > 0) & (std <= limit)
+    if returned is None:
+        returned = (images.amplitude > 0) & (std <= limit)
     return FilteredFrames(
         range_m=np.where(returned, images.range_m, np.nan),
         std_m=np.where(returned, std / math.sqrt(n_frames), np.nan),

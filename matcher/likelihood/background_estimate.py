@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
-from phasemark.matcher.likelihood.images import VIEW, RenderedModel
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.render import Background, Sensor

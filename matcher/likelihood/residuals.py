@@ -22,7 +22,7 @@ from phasemark.matcher.nearest.templates import Observation
 from phasemark.render import Sensor
 from phasemark.render.sensor.range_noise import phase_image_variance
 
-Quantity = Literal["ranges", "phasors"]
+ResidualKind = Literal["ranges", "phasors"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +48,11 @@ class Evidence:
     weight: NDArray[np.float64]
     one_frame_std_m: NDArray[np.float64]
     seen: Observation
-    on: Quantity
+    on: ResidualKind
     sensor: Sensor
 
     @classmethod
-    def from_frames(cls, frames: FilteredFrames, on: Quantity) -> Evidence:
+    def from_frames(cls, frames: FilteredFrames, on: ResidualKind) -> Evidence:
         """Take filtered frames.
 
         Raises

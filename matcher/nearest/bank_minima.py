@@ -21,7 +21,7 @@ from phasemark.data.plans.arrays import group_rows
 from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Observation, Templates
-from phasemark.render import PhasorImages
+from phasemark.render import PhasorImages, wrap_delta_difference_rad
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -159,8 +159,9 @@ class Search:
         period = closing_period(self._delta) or 4 * math.pi
         others = []
         for _ in range(_MOST_OTHER_SIDES):
-            away = np.abs(self._delta[:, None] - self._delta[None, taken])
-            away = np.minimum(away, np.abs(period - away)).min(axis=1)
+            away = np.abs(wrap_delta_difference_rad(self._delta[:, None] - self._delta[None, taken], period)).min(
+                axis=1
+            )
             open_ = np.where(away > _OTHER_SIDE_RAD, profile, np.inf)
             j = int(open_.argmin())
             if not open_[j] <= _OTHER_SIDE_COST + _OTHER_SIDE_SHARE * least:

@@ -72,7 +72,7 @@ class Observation:
         weight[returned] = 1 / std[returned] ** 2
         return cls(ranges, weight, returned, state == PixelState.NO_RETURN)
 
-    def __getitem__(self, index: slice) -> Observation:
+    def __getitem__(self, index: NDArray[np.integer] | slice) -> Observation:
         return Observation(self.range_m[index], self.weight[index], self.returned[index], self.not_returned[index])
 
 

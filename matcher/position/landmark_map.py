@@ -200,7 +200,7 @@ class Placement:
     pose: RobotPose
 
 
-def load_map(path: str | os.PathLike[str]) -> LandmarkMap:
+def read_landmark_map(path: str | os.PathLike[str]) -> LandmarkMap:
     """Read a map of landmarks from a TOML file.
 
     Parameters

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,6 +85,19 @@ class RobotPose:
     theta_rad: float
     covariance: NDArray[np.float64] | None = None
     mahalanobis: float = math.nan
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return position and heading as plain numbers, in degrees, for JSON; the covariance is in radians."""
+        covariance = self.covariance
+        std = None if covariance is None else [math.sqrt(max(float(covariance[k, k]), 0.0)) for k in range(3)]
+        return {
+            "x_m": self.x_m,
+            "y_m": self.y_m,
+            "heading_deg": math.degrees(self.heading_rad),
+            "std": None if std is None else {"x_m": std[0], "y_m": std[1], "heading_deg": math.degrees(std[2])},
+            "covariance": None if covariance is None else covariance.tolist(),
+            "mahalanobis": self.mahalanobis if math.isfinite(self.mahalanobis) else None,
+        }
 
 
 def robot_poses(

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from scipy import special
 
 from phasemark import UsageError
+from phasemark.data.files.json_text import finite_or_none
 from phasemark.matcher.sweep.plan import Condition
 from phasemark.matcher.sweep.result_tables import Cell
 
@@ -40,6 +42,10 @@ class Difference:
     second: float
     p_value: float
     significant: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain numbers and text, for JSON; None where there is no number."""
+        return finite_or_none(asdict(self))
 
 
 def compare_cells(first: Sequence[Cell], second: Sequence[Cell]) -> tuple[Difference, ...]:

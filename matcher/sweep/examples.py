@@ -106,7 +106,7 @@ def _job(plan: SweepPlan) -> SweepJob:
 
 
 def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, method: str) -> Example:
-    from phasemark.matcher.figures import match_picture  # matplotlib is slow to import
+    from phasemark.matcher.figures import match_figure  # matplotlib is slow to import
 
     number, trial = int(trials.condition[k]), int(trials.trial[k])
     condition = trials.conditions[number]
@@ -130,4 +130,4 @@ def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, method: str) ->
     else:
         text += f"{name}, off by {1e3 * error[0]:+.2f} mm and {math.degrees(error[1]):+.2f}°"
         text += f", p = {trials.p_value[k, m]:.2g}" if math.isfinite(trials.p_value[k, m]) else ""
-    return Example(method, number, trial, text, match_picture(frames, match, job.bank(m), background, title=False))
+    return Example(method, number, trial, text, match_figure(frames, match, job.bank(m), background, title=False))

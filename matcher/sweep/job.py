@@ -8,7 +8,6 @@ noise of a trial depend on the seed, its condition and its number alone, so all 
 from __future__ import annotations
 
 import importlib
-import math
 import numbers
 import signal
 import threading
@@ -31,14 +30,14 @@ from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
 from phasemark.matcher.agreement import counts
-from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState, kalman_filter, phasor_mean
-from phasemark.matcher.likelihood.estimator import LIKELY
+from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, noise_free, phasor_mean
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.residuals import Quantity
+from phasemark.matcher.likelihood.residuals import ResidualKind
+from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.sweep.plan import Method, SweepPlan
-from phasemark.render import Background, Frames, PhasorImages, Renderer, Sensor, Views, capture, predicted_range_std
+from phasemark.render import Background, Frames, PhasorImages, Renderer, Sensor, Views, capture
 
 FORMAT = "phasemark-trials"
 SCHEMA_VERSION = 1
@@ -259,7 +258,7 @@ class SweepJob:
         seen = self.raw_frames(number, image, first, on=method.on)
         return (phasor_mean if method.filter == "phasor-mean" else kalman_filter)(seen)
 
-    def raw_frames(self, number: int, image: PhasorImages, first: int, *, on: Quantity = "ranges") -> Frames:
+    def raw_frames(self, number: int, image: PhasorImages, first: int, *, on: ResidualKind = "ranges") -> Frames:
         """Return the frames of some trials, (n, n_frames, rows, cols), with the sensor that a method believes in."""
         true, believed = self.true_sensor(number), self.believed_sensor(number)
         if on == "phasors":
@@ -303,18 +302,8 @@ class SweepJob:
         plain = Views.broadcast(views.distance_m[:n], views.delta_rad[:n])
         renderer = self.renderer(number, sensor, dimension_error=0.0)
         image = renderer.render_views(plain, background=self.background(number))
-        std_m = predicted_range_std(image.amplitude, image.intensity, sensor)
-        counted = counts(image.phasor, image.intensity, sensor)
-        exact = FilteredFrames(
-            np.where(counted, image.range_m, np.nan),
-            np.where(counted, std_m / math.sqrt(condition.n_frames), np.nan),
-            None,
-            None,
-            np.where(counted, PixelState.RETURN, PixelState.NO_RETURN).astype(np.uint8),
-            np.where(counted, float(condition.n_frames), 0.0),
-            sensor,
-        )
-        squares = np.full((n, len(self.class_names)), LIKELY)
+        exact = noise_free(image, condition.n_frames, counts(image.phasor, image.intensity, sensor))
+        squares = np.full((n, len(self.class_names)), DEFAULT_POLICY.likely_cost)
         squares[:, self.class_names.index(condition.class_name)] = np.inf
         for k, match in enumerate(self._reference(condition.wall_m).match(exact)):
             for other in match.alternatives:

@@ -371,11 +371,11 @@ def refuse_programs(plan: SweepPlan, trusted: Collection[str], where: str) -> No
         if method.is_program and method.method not in trusted:
             raise UsageError(
                 f"{where}: the method '{method.name}' would run the program '{method.method}': name it with"
-                f" --matcher {method.method}, or give --trust-plan if you trust whoever wrote the plan"
+                f" trusted={method.method}, or leave refuse_programs() out if you trust whoever wrote the plan"
             )
 
 
-def load_sweep(name_or_file: str | os.PathLike[str]) -> SweepPlan:
+def read_sweep_plan(name_or_file: str | os.PathLike[str]) -> SweepPlan:
     """Return a shipped plan, or read one from a TOML file.
 
     Parameters

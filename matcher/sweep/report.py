@@ -17,7 +17,7 @@ from phasemark.data import versions, write_atomically
 from phasemark.data.files.atomic_write import storage_errors
 from phasemark.data.files.folder_marker import OwnedFiles
 from phasemark.data.pages.page import embedded_png, figure_png, page_template
-from phasemark.matcher.accuracy.cramer_rao import Estimate
+from phasemark.matcher.statistics import Interval
 from phasemark.matcher.sweep.examples import worst_examples
 from phasemark.matcher.sweep.figures.sheet import sweep_figures
 from phasemark.matcher.sweep.plan import SweepPlan
@@ -166,7 +166,7 @@ def _worst_first(cells: Sequence[Cell]) -> list[Cell]:
     return sorted(cells, key=lambda cell: -_badness(cell))
 
 
-def _with_interval(value: Estimate, scale: float = 1.0) -> str:
+def _with_interval(value: Interval, scale: float = 1.0) -> str:
     if not math.isfinite(value.value):
         return "–"
     return with_interval(value.value * scale, value.low * scale, value.high * scale)

@@ -11,21 +11,25 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from phasemark.data.files.csv_cell import as_cell
-from phasemark.matcher.accuracy.cramer_rao import Estimate, nees
+from phasemark.data.files.json_text import finite_or_none
+from phasemark.matcher.information import weak_direction
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.statistics import mean_interval, rms_interval, wilson
+from phasemark.matcher.statistics import (
+    Interval,
+    binomial_interval,
+    error_statistics,
+    wrapped_errors,
+)
 from phasemark.matcher.sweep.plan import Condition
+from phasemark.render import delta_period_rad
 
 LEVELS = (0.5, 0.9, 0.95, 0.99)
 """Probabilities of the ellipsoids whose coverage is counted."""
 _ROWS_AT_ONCE = 5000
 _HONEST_SIGMA = 5.0
 """An error within so many standard deviations of the bound is no outlier, however large it is."""
-_UNIT = np.array([0.01, math.pi / 180, math.pi / 180, 0.01])
-"""Lengths in centimetres and angles in degrees make a condition number that means something."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +108,8 @@ class SweepTrials:
         true_class = self.true_class[rows]
         error = self.estimate[rows] - self.truth[rows, None]
         error[true_class < 0] = np.nan
-        period = 2 * math.pi / np.array(self.symmetry, np.float64)[true_class][:, None]
-        error[:, :, 1] -= period * np.round(error[:, :, 1] / period)
-        return error
+        period = np.array([delta_period_rad(n) for n in self.symmetry])[true_class][:, None]
+        return wrapped_errors(error, VIEW, period)
 
     def rows_of(self, condition: int) -> slice:
         """Return where the trials of a condition lie."""
@@ -180,42 +183,36 @@ class SweepTrials:
             gross = answered & (np.abs(error) > np.fmax(limit[at], _HONEST_SIGMA * std)).any(axis=1)
         inner = answered & ~gross
         bounded = np.isfinite(std).all(axis=1)
-        honest = inner & np.isfinite(covariance).all(axis=(1, 2))
-        squared = nees(error[honest], covariance[honest]) if honest.any() else np.empty(0)
-        limits = [float(special.chdtri(len(at), 1 - level)) for level in LEVELS]
+        kept = error_statistics(
+            error[inner], self.free[m], bound_std=std[inner], covariance=covariance[inner], levels=LEVELS
+        )
         typical = np.median(bound[bounded], axis=0) if bounded.any() else np.full(bound.shape[1:], np.nan)
-        condition_number, weak = _observability(typical, at)
+        condition_number, weak = weak_direction(self.free[m], covariance=typical)
         return Cell(
             number=number,
             condition=condition,
             method=self.methods[m],
             free=self.free[m],
             n=n,
-            answered=wilson(int(answered.sum()), n),
-            accepted=wilson(int(accepted.sum()), n),
-            outliers=wilson(int(gross.sum()), int(answered.sum())),
+            answered=binomial_interval(int(answered.sum()), n, law="student"),
+            accepted=binomial_interval(int(accepted.sum()), n, law="student"),
+            outliers=binomial_interval(int(gross.sum()), int(answered.sum()), law="student"),
             stranger=stranger,
-            class_right=wilson(int(right.sum()), n),
+            class_right=binomial_interval(int(right.sum()), n, law="student"),
             confusion_bound=float(confusion.mean()) if len(confusion) else math.nan,
             found={
                 name: int((found == k).sum()) for k, name in [*enumerate(self.classes), (-1, "none")]
             },
-            bias={name: mean_interval(error[inner, k]) for k, name in enumerate(self.free[m])},
-            rmse={name: rms_interval(error[inner, k]) for k, name in enumerate(self.free[m])},
-            rmse_with_outliers={name: rms_interval(error[answered, k]) for k, name in enumerate(self.free[m])},
+            bias=dict(kept.bias),
+            rmse=dict(kept.rmse),
+            rmse_with_outliers=dict(error_statistics(error[answered], self.free[m]).rmse),
             bound={
                 name: float(np.sqrt(np.mean(std[bounded, k] ** 2))) if bounded.any() else math.nan
                 for k, name in enumerate(self.free[m])
             },
-            ratio={
-                name: rms_interval(error[inner & bounded, k] / std[inner & bounded, k])
-                for k, name in enumerate(self.free[m])
-            },
-            nees=mean_interval(squared / len(at)),
-            coverage={
-                level: wilson(int((squared <= edge).sum()), len(squared))
-                for level, edge in zip(LEVELS, limits, strict=True)
-            },
+            ratio=dict(kept.ratio),
+            nees=kept.nees,
+            coverage=dict(kept.coverage),
             condition_number=condition_number,
             weak_direction=weak,
             seconds=float(np.median(self.seconds[rows, m])) if n else math.nan,
@@ -240,26 +237,26 @@ class Cell:
         Trials.
     stranger : bool
         Whether the condition shows an object that stands in no bank; it has no errors and no bound.
-    answered, accepted : Estimate
+    answered, accepted : Interval
         Shares of all trials.
-    class_right : Estimate
+    class_right : Interval
         Share of all trials whose class was found; of a stranger's, those that were refused.
     confusion_bound : float
         Mean bound on the probability of a wrong class, for a matcher that knows the world.
-    outliers : Estimate
+    outliers : Interval
         Share of the answered trials whose error is beyond the plan's limits, and beyond 5 σ of the bound.
     found : dict of str to int
         How often each class was found, "none" included.
-    bias, rmse : dict of str to Estimate
+    bias, rmse : dict of str to Interval
         Of the answered trials that are no outliers.
-    rmse_with_outliers : dict of str to Estimate
+    rmse_with_outliers : dict of str to Interval
     bound : dict of str to float
         Cramér–Rao bound on the standard deviation, root mean square over the true views.
-    ratio : dict of str to Estimate
+    ratio : dict of str to Interval
         √mean(e² / bound²), outliers left out.
-    nees : Estimate
+    nees : Interval
         Mean of eᵀP⁻¹e over the number of parameters.
-    coverage : dict of float to Estimate
+    coverage : dict of float to Interval
         Share of errors within the ellipsoids of :data:`LEVELS`.
     condition_number : float
         Of the bound, lengths in centimetres and angles in degrees.
@@ -275,19 +272,19 @@ class Cell:
     free: tuple[str, ...]
     n: int
     stranger: bool
-    answered: Estimate
-    accepted: Estimate
-    outliers: Estimate
-    class_right: Estimate
+    answered: Interval
+    accepted: Interval
+    outliers: Interval
+    class_right: Interval
     confusion_bound: float
     found: dict[str, int]
-    bias: dict[str, Estimate]
-    rmse: dict[str, Estimate]
-    rmse_with_outliers: dict[str, Estimate]
+    bias: dict[str, Interval]
+    rmse: dict[str, Interval]
+    rmse_with_outliers: dict[str, Interval]
     bound: dict[str, float]
-    ratio: dict[str, Estimate]
-    nees: Estimate
-    coverage: dict[float, Estimate]
+    ratio: dict[str, Interval]
+    nees: Interval
+    coverage: dict[float, Interval]
     condition_number: float
     weak_direction: dict[str, float]
     seconds: float
@@ -308,8 +305,12 @@ class Cell:
         out |= {f"found_{name}": count for name, count in self.found.items()}
         return {**out, "condition_number": self.condition_number, "seconds": self.seconds}
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return :meth:`row` for JSON: None for what is not finite."""
+        return finite_or_none(self.row())
 
-_UNKNOWN = Estimate(math.nan, math.nan, math.nan)
+
+_UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
 
 def csv_bytes(table: Mapping[str, Sequence[Any]], *, header: bool = True) -> bytes:
@@ -328,32 +329,15 @@ def trials_csv(trials: SweepTrials) -> Iterator[bytes]:
         yield csv_bytes(trials.trial_table(slice(start, start + _ROWS_AT_ONCE)), header=start == 0)
 
 
-def json_rows(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows for JSON: None for what is not finite."""
-    return [{k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()} for row in rows]
-
-
 def condition_axes(conditions: Sequence[Condition]) -> tuple[str, ...]:
     """Return the fields that differ between conditions."""
     return tuple(field.name for field in fields(Condition) if len({getattr(one, field.name) for one in conditions}) > 1)
 
 
-def _flat(name: str, value: Estimate) -> dict[str, float]:
+def _flat(name: str, value: Interval) -> dict[str, float]:
     return {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
 
 
 def _root(variance: NDArray[np.float64]) -> NDArray[np.float64]:
     with np.errstate(invalid="ignore"):
         return np.sqrt(variance)
-
-
-def _observability(covariance: NDArray[np.float64], at: NDArray[np.int64]) -> tuple[float, dict[str, float]]:
-    if not np.isfinite(covariance).all():
-        return math.nan, {}
-    unit = _UNIT[at]
-    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
-    if values[0] <= 0:
-        return math.inf, {}
-    weak = vectors[:, -1] * math.sqrt(values[-1]) * unit
-    weak = weak * np.sign(weak[np.argmax(np.abs(weak / unit))])  # one sign for one direction
-    return float(values[-1] / values[0]), {VIEW[i]: float(v) for i, v in zip(at, weak, strict=True)}

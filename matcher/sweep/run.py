@@ -27,7 +27,7 @@ from phasemark.data.shards.run import outputs_of, produce
 from phasemark.inputs import MOST_TOML_BYTES, read_text
 from phasemark.matcher.sweep.job import FORMAT, SCHEMA_VERSION, Round, SweepJob, check_matcher
 from phasemark.matcher.sweep.plan import SweepPlan
-from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, csv_bytes, json_rows, trials_csv
+from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, csv_bytes, trials_csv
 
 TRIALS_AT_ONCE = 50
 """Trials of a shard: of one batch of a method, whatever the number of workers, so that no rounding depends on it."""
@@ -163,7 +163,7 @@ def read_sweep(folder: str | os.PathLike[str]) -> tuple[SweepPlan, SweepTrials]:
     while _round_path(folder, n).is_file():
         n += 1
     if n == 0:
-        raise InputFileError(f"{folder}: its sweep is not finished: 'phasemark sweep run --resume' goes on")
+        raise InputFileError(f"{folder}: its sweep is not finished: run_sweep(resume=True) goes on")
     return plan, _read(plan, folder, n)
 
 
@@ -174,7 +174,7 @@ def write_cells(plan: SweepPlan, trials: SweepTrials, folder: Path) -> tuple[Cel
     write_atomically(
         folder / "cells.csv", csv_bytes({name: [row[name] for row in rows] for name in rows[0]}), force=True
     )
-    table = {"plan": plan.model_dump(mode="json"), "versions": versions(), "cells": json_rows(rows)}
+    table = {"plan": plan.model_dump(mode="json"), "versions": versions(), "cells": [cell.as_dict() for cell in cells]}
     text = json_text(table, indent=1, allow_nan=False)
     write_atomically(folder / "sweep.json", text.encode(), force=True)
     return cells
@@ -227,11 +227,11 @@ def _begin(plan: SweepPlan, ours: OwnedFiles, *, resume: bool, force: bool) -> N
     old = _stored_plan(folder) if _PLAN in ours.names else None
     if old is not None:
         if not resume:
-            raise OutputExistsError(f"{folder}: holds a sweep: --resume goes on with it, --force starts over")
+            raise OutputExistsError(f"{folder}: holds a sweep: resume=True goes on with it, force=True starts over")
         changes = difference(old.model_dump(mode="json"), plan.model_dump(mode="json"))
         if changes:
             raise OutputExistsError(
-                f"{folder}: was begun with another plan ({'; '.join(changes[:4])}): --force starts over"
+                f"{folder}: was begun with another plan ({'; '.join(changes[:4])}): force=True starts over"
             )
     ours.claim(*(path.name for path in sweep_outputs(folder)))
     if old is None:

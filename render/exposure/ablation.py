@@ -19,7 +19,7 @@ class Ablation(NamedTuple):
     ----------
     hard : Frames
         The ray through each pixel's centre alone, no noise.
-    mixed : Frames
+    exact : Frames
         The integral over each pixel, no noise: mixed edge pixels.
     shot : Frames
         Shot noise beside.
@@ -28,7 +28,7 @@ class Ablation(NamedTuple):
     """
 
     hard: Frames
-    mixed: Frames
+    exact: Frames
     shot: Frames
     full: Frames
 
@@ -73,10 +73,10 @@ def ablate(
     def take(images: PhasorImages, camera: Sensor) -> Frames:
         return capture(images, camera, rng=np.random.default_rng(seed), n_frames=n_frames)
 
-    exact = sensor.without_errors()
+    faultless = sensor.without_errors()
     return Ablation(
-        hard=take(hard, exact),
-        mixed=take(image, exact),
+        hard=take(hard, faultless),
+        exact=take(image, faultless),
         shot=take(image, sensor.without_errors(shot_noise=True)),
         full=take(image, sensor),
     )

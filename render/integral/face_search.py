@@ -112,7 +112,7 @@ def plane_hit(search, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def
     return (face[3] - face[0] * ox - face[1] * oy - face[2] * oz) / facing if facing != 0.0 else 0.0
 
 
-@kernel
+@inlined
 def find_face(search, grid, start, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the face of a smooth patch that a ray meets, and the multiple of the ray there; (−1, 0) if none is found.
 

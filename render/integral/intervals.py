@@ -130,7 +130,7 @@ def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
     return t
 
 
-@kernel
+@inlined
 def _gauss_rule(lo, hi, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     """Return the Gauss rule for the width of an interval from `lo` to `hi` as weight.
 
@@ -188,7 +188,7 @@ def _bounds(s, slab, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     return a, b
 
 
-@kernel
+@inlined
 def _interval(  # type: ignore[no-untyped-def]
     s, i, strip, box, scratch, seek_left, seek_right
 ):

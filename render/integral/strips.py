@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from phasemark.render.integral.intervals import EMPTY, Strip, sample_strip
 from phasemark.render.integral.pixel_clipping import MAX_SEGMENTS, edge_at
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inlined, kernel
 
 MAX_EVENTS = 4 * MAX_SEGMENTS + 64
 MAX_SLABS = 256
@@ -64,7 +64,7 @@ def find_events(box, m, scratch):  # type: ignore[no-untyped-def]
     return n
 
 
-@kernel
+@inlined
 def _activate(lo, hi, m, started, n_active, scratch):  # type: ignore[no-untyped-def]
     """Update the list of edges that span the slab [lo, hi], ordered along its middle line.
 
@@ -94,7 +94,7 @@ def _activate(lo, hi, m, started, n_active, scratch):  # type: ignore[no-untyped
     return started, n_active
 
 
-@kernel
+@inlined
 def _continues(m, last, n, stop, lo, scratch):  # type: ignore[no-untyped-def]
     """Tell whether the edges of two neighbouring slabs are the same, or links of the same smooth curves.
 

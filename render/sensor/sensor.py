@@ -174,6 +174,10 @@ class Sensor(SensorQuantities):
             max_phase_std_rad=threshold,
         )
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return every field, and the unambiguous range, as plain numbers and text, for JSON."""
+        return {**self.model_dump(mode="json"), "unambiguous_range_m": self.unambiguous_range_m}
+
     @classmethod
     def from_intrinsics(
         cls, fx: float, fy: float, cx: float, cy: float, *, rows: int, cols: int, **fields: Any

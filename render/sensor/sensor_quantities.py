@@ -28,6 +28,16 @@ class SensorQuantities(SensorFields):
         return self.principal_point_px or (self.cols / 2, self.rows / 2)
 
     @property
+    def upper_rows(self) -> tuple[int, int]:
+        """First and stop of the image rows above the middle line, which see the upper part of a landmark."""
+        return 0, self.rows // 2
+
+    @property
+    def lower_rows(self) -> tuple[int, int]:
+        """First and stop of the image rows below the middle line; of an odd number the middle row is among them."""
+        return self.rows // 2, self.rows
+
+    @property
     def cam2level(self) -> NDArray[np.float64]:
         """Rotation Ry(pitch) · Rx(roll) from the tilted camera to the level one, (3, 3)."""
         pitch, roll = math.radians(self.pitch_deg), math.radians(self.roll_deg)

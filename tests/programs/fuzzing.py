@@ -28,7 +28,7 @@ from phasemark.data import BankPlan, FramePlan, open_bank, open_frames, read_fra
 from phasemark.data.shards.build import _Manifest
 from phasemark.inputs import checksum_path, read_checksum
 from phasemark.landmarks import build_mesh, catalog, export_mesh, read_mesh
-from phasemark.matcher import load_map
+from phasemark.matcher import read_landmark_map
 from phasemark.matcher.calibration.known_poses import read_poses
 from phasemark.matcher.plan_kinds import KINDS as PLANS
 from phasemark.matcher.plan_kinds import check_plan, plan_example
@@ -100,7 +100,7 @@ def checksum(path):
 KINDS = {
     "npy": (".npy", frames), "npz": (".npz", stated_frames), "png": (".png", stated_frames), "csv": (".csv", frames),
     **{f"{kind}-plan": (".toml", plan(kind)) for kind in PLANS},
-    "sensor": (".toml", Sensor.from_toml), "map": (".toml", load_map),
+    "sensor": (".toml", Sensor.from_toml), "map": (".toml", read_landmark_map),
     "poses": (".csv", read_poses), "manifest": (".manifest", _Manifest.read),
     "checksum": (".sha256", checksum), "stl": (".stl", mesh), "ply": (".ply", mesh), "obj": (".obj", mesh),
     "off": (".off", mesh), "bag": ("", stated_frames), "h5": (".h5", stated_frames), "bank": (".h5", whole_bank),

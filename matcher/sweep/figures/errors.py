@@ -11,8 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
-from phasemark.matcher.accuracy.cramer_rao import Estimate
-from phasemark.matcher.statistics import mean_interval, rms_interval
+from phasemark.matcher.statistics import Interval, mean_interval, rms_interval
 from phasemark.matcher.sweep.figures.style import (
     AXIS_LABEL,
     NOMINAL,
@@ -256,21 +255,21 @@ def _along(cells: Sequence[Cell], method: str, axis: str, axes: Sequence[str]) -
     return dict(sorted(groups.items()))
 
 
-def _typical(estimates: Sequence[Estimate], scale: float) -> Estimate:
-    return Estimate(*(median([getattr(one, end) * scale for one in estimates]) for end in ("value", "low", "high")))
+def _typical(estimates: Sequence[Interval], scale: float) -> Interval:
+    return Interval(*(median([getattr(one, end) * scale for one in estimates]) for end in ("value", "low", "high")))
 
 
-def _mean(estimates: Sequence[Estimate], scale: float) -> Estimate:
+def _mean(estimates: Sequence[Interval], scale: float) -> Interval:
     """Return the mean of independent estimates with its interval."""
     known = [one for one in estimates if math.isfinite(one.high)]
     if not known:
-        return Estimate(math.nan, math.nan, math.nan)
+        return Interval(math.nan, math.nan, math.nan)
     middle = scale * float(np.mean([one.value for one in known]))
     half = scale * math.sqrt(sum((one.high - one.value) ** 2 for one in known)) / len(known)
-    return Estimate(middle, middle - half, middle + half)
+    return Interval(middle, middle - half, middle + half)
 
 
-def _with_bars(panel: Axes, x: Sequence[float], estimates: Sequence[Estimate], look: dict[str, object]) -> None:
+def _with_bars(panel: Axes, x: Sequence[float], estimates: Sequence[Interval], look: dict[str, object]) -> None:
     y = np.array([one.value for one in estimates])
     bars = np.abs([y - [one.low for one in estimates], [one.high for one in estimates] - y])
     panel.errorbar(x, y, np.where(np.isfinite(bars), bars, 0.0), **look)  # type: ignore[arg-type]

@@ -77,7 +77,7 @@ def _error_figures(plan: SweepPlan, trials: SweepTrials, cells: Sequence[Cell]) 
         yield SweepFigure(
             "models",
             "The nearest image by the bank's model",
-            "Ray-cast images with mixed pixels, the same without them (each pixel as its centre ray sees it), and the "
+            "Exact images with mixed pixels, the same without them (each pixel as its centre ray sees it), and the "
             "paper's planar generator; outliers are left out and counted.",
             errors.model_comparison(trials, plan.methods),
         )

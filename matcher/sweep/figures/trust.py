@@ -9,9 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-from phasemark.matcher.accuracy.cramer_rao import nees
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.statistics import wilson
+from phasemark.matcher.statistics import binomial_interval, nees
 from phasemark.matcher.sweep.figures.style import as_written, logarithmic, methods_of, panels, style
 from phasemark.matcher.sweep.result_tables import LEVELS, Cell, SweepTrials
 
@@ -110,7 +109,8 @@ def confusion_bound(cells: Sequence[Cell]) -> Figure:
         mine = [cell for cell in cells if cell.method == method and math.isfinite(cell.confusion_bound)]
         aside = _ASIDE ** (k - (len(methods) - 1) / 2)  # or methods that are right alike hide one another
         x = aside * np.array([max(cell.confusion_bound, _LEAST_BOUND) for cell in mine])
-        wrong = [wilson(cell.n - round(cell.class_right.value * cell.n), cell.n) for cell in mine]
+        n_wrong = [cell.n - round(cell.class_right.value * cell.n) for cell in mine]
+        wrong = [binomial_interval(k, cell.n, law="student") for k, cell in zip(n_wrong, mine, strict=True)]
         high = np.array([one.high for one in wrong])
         # a cell without a wrong class has a mark at its interval's upper end, pointing down
         never = np.array([one.value == 0 for one in wrong], np.bool_)
@@ -172,7 +172,10 @@ def roc(trials: SweepTrials) -> Figure:
             100 * strangers[keep], 100 * landmarks[keep], color=colour, linestyle=stroke,
             label=f"{as_written(method)}, area {area:.3f}",
         )  # fmt: skip
-        accepted = [wilson(int(trials.accepted[rows, m].sum()), int(rows.sum())) for rows in (strange, ~strange)]
+        accepted = [
+            binomial_interval(int(trials.accepted[rows, m].sum()), int(rows.sum()), law="student")
+            for rows in (strange, ~strange)
+        ]
         at = [100 * one.value for one in accepted]
         bars = [[[100 * (one.value - one.low)], [100 * (one.high - one.value)]] for one in accepted]
         panel.errorbar(at[0], at[1], bars[1], bars[0], marker=mark, color=colour, markersize=5, capsize=2)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from phasemark import UsageError
-from phasemark.render.bench.data_sheet.results import Comparison, Floats, Quantity
+from phasemark.render.bench.data_sheet.results import Comparison, Floats, SheetQuantity
 from phasemark.render.bench.flat_field import expected_flat_field, flat_field
 from phasemark.render.exposure.capture import capture
 from phasemark.render.frames import Frames
@@ -25,7 +25,7 @@ class Part:
     """What one measurement adds to the whole."""
 
     comparisons: tuple[Comparison, ...] = ()
-    quantities: tuple[Quantity, ...] = ()
+    quantities: tuple[SheetQuantity, ...] = ()
     maps: dict[str, Floats] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from phasemark.render.bench.data_sheet.bench import ALBEDOS, NEAREST_M, Bench, Part
 from phasemark.render.bench.data_sheet.flagged_shares import found_beside
-from phasemark.render.bench.data_sheet.results import Comparison, Quantity
+from phasemark.render.bench.data_sheet.results import Comparison, SheetQuantity
 from phasemark.render.frames import Flag
 from phasemark.render.sensor.range_noise import direct_range_std
 from phasemark.render.sensor.sensor import Sensor
@@ -76,4 +76,4 @@ def _dropout(bench: Bench, albedo: float) -> Part:
     found, found_error = found_beside(points, 0.5, edge)
     name = f"threshold_distance_albedo_{albedo:g}_m"
     title = f"distance at which it drops out, albedo {albedo:g} (m)"
-    return Part((points,), (Quantity(name, title, edge, found, found_error, bench.samples * len(distances)),))
+    return Part((points,), (SheetQuantity(name, title, edge, found, found_error, bench.samples * len(distances)),))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from phasemark.render.bench.data_sheet.bench import Bench, Part
-from phasemark.render.bench.data_sheet.results import Comparison, Floats, Quantity
+from phasemark.render.bench.data_sheet.results import Comparison, Floats, SheetQuantity
 from phasemark.render.bench.flat_field import expected_flat_field
 from phasemark.render.phasor_images import wrap_difference_m
 
@@ -41,13 +41,13 @@ def patterns(bench: Bench) -> Part:
     prnu, prnu_error = _spatial_std((bright_image - dark_image) / step, (bright_noise + dark_noise) / step**2)
     range_std, range_std_error = _spatial_std(offset, float((error**2).mean()))
     quantities = (
-        Quantity("fixed_pattern_range_std_m", "range offset from pixel to pixel, standard deviation (m)",
-                 _spatial_std(truth, 0.0)[0], range_std, range_std_error, bench.samples),
-        Quantity("prnu_percent", "PRNU with the shading of stray light, standard deviation over taps (%)",
-                 100 * _spatial_std((true_bright - true_dark) / true_step, 0.0)[0], 100 * prnu, 100 * prnu_error,
-                 16 * bench.samples),
-        Quantity("dsnu_e", "DSNU, standard deviation over taps (e-)",
-                 _spatial_std(true_dark, 0.0)[0], dsnu, dsnu_error, 8 * bench.samples),
+        SheetQuantity("fixed_pattern_range_std_m", "range offset from pixel to pixel, standard deviation (m)",
+                      _spatial_std(truth, 0.0)[0], range_std, range_std_error, bench.samples),
+        SheetQuantity("prnu_percent", "PRNU with the shading of stray light, standard deviation over taps (%)",
+                      100 * _spatial_std((true_bright - true_dark) / true_step, 0.0)[0], 100 * prnu, 100 * prnu_error,
+                      16 * bench.samples),
+        SheetQuantity("dsnu_e", "DSNU, standard deviation over taps (e-)",
+                      _spatial_std(true_dark, 0.0)[0], dsnu, dsnu_error, 8 * bench.samples),
     )  # fmt: skip
     maps = {
         "range_offset_m": _image(offset, bench),

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 
 from phasemark.render.bench.data_sheet.bench import ALBEDOS, FURTHEST_M, NEAREST_M, Bench, Part
-from phasemark.render.bench.data_sheet.results import Comparison, Floats, Quantity
+from phasemark.render.bench.data_sheet.results import Comparison, Floats, SheetQuantity
 from phasemark.render.bench.flat_field import ExpectedFlatField, expected_flat_field
 from phasemark.render.frames import Flag
 
@@ -54,8 +54,8 @@ def saturation(bench: Bench) -> Part:
         true_signal = crossing(predicted_share, at, 0.0, top)
         signal, signal_error = found_beside(points, at, true_signal)
         quantities.append(
-            Quantity(f"saturation_flags_{name}_e", f"signal at which {words} flagged as saturated (e-)",
-                     true_signal, signal, signal_error, bench.samples * len(signals))
+            SheetQuantity(f"saturation_flags_{name}_e", f"signal at which {words} flagged as saturated (e-)",
+                          true_signal, signal, signal_error, bench.samples * len(signals))
         )  # fmt: skip
     return Part((points,), tuple(quantities))
 
@@ -94,7 +94,7 @@ def threshold(bench: Bench, albedo: float) -> Part:
         np.zeros(len(distances), np.bool_), distances, np.array(predicted),
     )  # fmt: skip
     found, found_error = found_beside(points, 0.5, middle)
-    return Part((points,), (Quantity(name, title, middle, found, found_error, bench.samples * len(distances)),))
+    return Part((points,), (SheetQuantity(name, title, middle, found, found_error, bench.samples * len(distances)),))
 
 
 def _return_probability(expected: ExpectedFlatField) -> Floats:

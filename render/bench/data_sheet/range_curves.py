@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from phasemark.render.bench.data_sheet.bench import FURTHEST_M, NEAREST_M, Bench, Part
-from phasemark.render.bench.data_sheet.results import Comparison, Quantity
+from phasemark.render.bench.data_sheet.results import Comparison, SheetQuantity
 from phasemark.render.bench.flat_field import ExpectedFlatField, expected_flat_field
 from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.sensor.range_noise import exact_phase_moments, predicted_range_std
@@ -81,7 +81,7 @@ def linearity(bench: Bench) -> Part:
     )  # fmt: skip
     # Between the points where the prediction is extreme: the noise's own extremes would always add to it.
     top, bottom = int(points.predicted.argmax()), int(points.predicted.argmin())
-    wiggling = Quantity(
+    wiggling = SheetQuantity(
         "wiggling_peak_to_peak_m", "error of the mean range, largest less smallest predicted point (m)",
         float(points.predicted[top] - points.predicted[bottom]),
         float(points.simulated[top] - points.simulated[bottom]),

@@ -108,7 +108,7 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class SheetQuantity:
     """One number of a data sheet.
 
     Parameters
@@ -156,7 +156,7 @@ class Characterisation:
     reference_range_m : float
         Range of the flat fields whose range is of no account.
     comparisons : tuple of Comparison
-    quantities : tuple of Quantity
+    quantities : tuple of SheetQuantity
     maps : mapping of str to (rows, cols) float64
         Simulated patterns by name with unit; NaN where a pixel is dead or hot.
     defects : mapping of str to (rows, cols) bool
@@ -169,7 +169,7 @@ class Characterisation:
     n_frames: int
     reference_range_m: float
     comparisons: tuple[Comparison, ...]
-    quantities: tuple[Quantity, ...]
+    quantities: tuple[SheetQuantity, ...]
     maps: dict[str, Floats] = field(default_factory=dict)
     defects: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -178,7 +178,7 @@ class Characterisation:
         """Return the series of a figure; none if the sensor does not have it."""
         return tuple(one for one in self.comparisons if one.figure == figure)
 
-    def quantity(self, name: str) -> Quantity | None:
+    def quantity(self, name: str) -> SheetQuantity | None:
         """Return a number of the data sheet, or None if the sensor does not have it."""
         return next((one for one in self.quantities if one.name == name), None)
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from phasemark.render.bench.data_sheet.bench import Bench, Part
-from phasemark.render.bench.data_sheet.results import Comparison, Floats, Quantity
+from phasemark.render.bench.data_sheet.results import Comparison, Floats, SheetQuantity
 from phasemark.render.bench.flat_field import expected_flat_field
 
 _EMVA_LINEAR_SHARE = 0.7  # of saturation: EMVA 1288's range for the photon-transfer fit
@@ -44,14 +44,14 @@ def photon_transfer(bench: Bench) -> Part:
         mean, np.array(predicted), variance, error, np.full(len(mean), 8 * bench.samples),
         compared, line, shot * line + floor * per_e**2,
     )  # fmt: skip
-    quantities: list[Quantity] = []
+    quantities: list[SheetQuantity] = []
     linear = compared & (mean <= _EMVA_LINEAR_SHARE * full * per_e)
     if linear.sum() >= 3:
         slope, offset, slope_error, offset_error = fit_line(mean[linear], variance[linear], error[linear])
         used_samples = int(points.samples[linear].sum())
         quantities.append(
-            Quantity(f"photon_transfer_slope_{unit}", f"photon-transfer slope ({unit}²/{unit})", shot, slope,
-                     slope_error, used_samples)
+            SheetQuantity(f"photon_transfer_slope_{unit}", f"photon-transfer slope ({unit}²/{unit})", shot, slope,
+                          slope_error, used_samples)
         )  # fmt: skip
         # the root of a variance that is compatible with 0 has the error of √(its error)
         noise = math.sqrt(max(offset, 0.0)) / per_e
@@ -59,8 +59,8 @@ def photon_transfer(bench: Bench) -> Part:
             offset_error / (2 * noise * per_e**2) if noise > 0 else math.inf, math.sqrt(offset_error) / per_e
         )
         quantities.append(
-            Quantity("dark_noise_e", "noise floor of a tap, read noise and quantisation (e-)", math.sqrt(floor), noise,
-                     noise_error, used_samples)
+            SheetQuantity("dark_noise_e", "noise floor of a tap, read noise and quantisation (e-)", math.sqrt(floor),
+                          noise, noise_error, used_samples)
         )  # fmt: skip
     notes = () if linear.sum() >= 3 else ("Without noise that a converter can see there is no photon transfer to fit.",)
     return Part((points,), tuple(quantities), notes=notes)

@@ -10,7 +10,7 @@ import numpy as np
 
 from phasemark import UsageError
 from phasemark.render.bench.fit.boards import BoardData
-from phasemark.render.bench.fit.fitted_sensor import AmplitudeUnit, Estimate, Floats
+from phasemark.render.bench.fit.fitted_sensor import AmplitudeUnit, FittedField, Floats
 from phasemark.render.bench.fit.photon_transfer import NOISE_LEVELS_RATIO, NoiseData, solve_scaled
 from phasemark.render.integral.rounding import with_error
 from phasemark.render.sensor.correlation import Harmonic, correlation_peak
@@ -20,7 +20,7 @@ _DISTANCE_STEP = 1e-4  # of the distance, for derivatives of the noise's numbers
 
 
 def fit_noise(
-    data: BoardData, base: Sensor, amplitude_unit: AmplitudeUnit, estimates: dict[str, Estimate], notes: list[str]
+    data: BoardData, base: Sensor, amplitude_unit: AmplitudeUnit, estimates: dict[str, FittedField], notes: list[str]
 ) -> dict[str, Any]:
     """Return the fields that the noise of single frames tells, the errors of the distances in their standard errors."""
     good = data.good
@@ -28,9 +28,9 @@ def fit_noise(
         variance = data.variance_m2[:, good]
         degrees = float((data.n[:, good] - 1).sum())
         std = math.sqrt(float(variance.mean()))
-        estimates["range_std_m"] = Estimate(std, std / math.sqrt(2 * degrees), "noise of single frames")
+        estimates["range_std_m"] = FittedField(std, std / math.sqrt(2 * degrees), "noise of single frames")
         return {"range_std_m": std}
-    found: dict[str, Estimate] = {}
+    found: dict[str, FittedField] = {}
     changes = _fit_light(data, base, amplitude_unit, found, notes)
     variance_of = dict.fromkeys(found, 0.0)
     for board, (distance, std) in enumerate(zip(data.distance_m, data.distance_std_m, strict=True)):
@@ -54,9 +54,9 @@ def fit_noise(
     return changes
 
 
-def _refitted(data: BoardData, base: Sensor, amplitude_unit: AmplitudeUnit) -> dict[str, Estimate]:
+def _refitted(data: BoardData, base: Sensor, amplitude_unit: AmplitudeUnit) -> dict[str, FittedField]:
     """Return the estimates of other data; none if these do not show the signal."""
-    found: dict[str, Estimate] = {}
+    found: dict[str, FittedField] = {}
     try:
         _fit_light(data, base, amplitude_unit, found, [])
     except UsageError:
@@ -65,7 +65,7 @@ def _refitted(data: BoardData, base: Sensor, amplitude_unit: AmplitudeUnit) -> d
 
 
 def _fit_light(
-    data: BoardData, base: Sensor, amplitude_unit: AmplitudeUnit, estimates: dict[str, Estimate], notes: list[str]
+    data: BoardData, base: Sensor, amplitude_unit: AmplitudeUnit, estimates: dict[str, FittedField], notes: list[str]
 ) -> dict[str, Any]:
     """Fit signal, contrast, ambient light and read noise to given distances; ambient light may come out negative."""
     good = data.good
@@ -94,10 +94,12 @@ def _fit_light(
     return _noise_of_electrons(law, base, amplitude, intensity, scale_error, estimates, notes)
 
 
-def _noise_of_ranges(law: NoiseData, base: Sensor, estimates: dict[str, Estimate], notes: list[str]) -> dict[str, Any]:
+def _noise_of_ranges(
+    law: NoiseData, base: Sensor, estimates: dict[str, FittedField], notes: list[str]
+) -> dict[str, Any]:
     """Turn σ_φ² = a/S + b/S² into signal and constant noise, the contrast assumed."""
     contrast = base.contrast
-    estimates["contrast"] = Estimate(contrast, None, "ranges alone do not tell it from signal_e")
+    estimates["contrast"] = FittedField(contrast, None, "ranges alone do not tell it from signal_e")
     constant_e2 = base.ambient_e + base.dark_e + base.read_variance_e2
     if law.levels_differ:
         (a, b), covariance = law.two_terms(law.phase_variance, 1 / law.light, 1 / law.light**2)
@@ -113,8 +115,8 @@ def _noise_of_ranges(law: NoiseData, base: Sensor, estimates: dict[str, Estimate
                 "Ranges alone tell signal_e · contrast² and the noise that does not follow the light; the latter is "
                 "put down to ambient light, beside the assumed dark current and read noise."
             )
-            estimates["signal_e"] = Estimate(signal, signal_error, "noise against light, for the assumed contrast")
-            estimates["ambient_e"] = Estimate(
+            estimates["signal_e"] = FittedField(signal, signal_error, "noise against light, for the assumed contrast")
+            estimates["ambient_e"] = FittedField(
                 ambient, noise_error, "noise that does not follow the light: read noise may be in it"
             )
             return {"signal_e": signal, "ambient_e": ambient}
@@ -128,7 +130,9 @@ def _noise_of_ranges(law: NoiseData, base: Sensor, estimates: dict[str, Estimate
         f"light differs by {NOISE_LEVELS_RATIO:g} times and more, or amplitudes. signal_e is that for the assumed "
         "contrast, ambient light and read noise."
     )
-    estimates["signal_e"] = Estimate(signal, y_error / slope, "range noise, for the assumed contrast and ambient light")
+    estimates["signal_e"] = FittedField(
+        signal, y_error / slope, "range noise, for the assumed contrast and ambient light"
+    )
     return {"signal_e": signal}
 
 
@@ -138,7 +142,7 @@ def _noise_of_electrons(
     amplitude_e: Floats,
     intensity_e: Floats | None,
     scale_error: float,
-    estimates: dict[str, Estimate],
+    estimates: dict[str, FittedField],
     notes: list[str],
 ) -> dict[str, Any]:
     """Turn amplitudes, and intensities if there are any, in electrons into signal, contrast and noise.
@@ -161,7 +165,7 @@ def _noise_of_electrons(
         signal_error, offset_error = np.sqrt(np.diag(covariance))
         ambient = offset - (constant - base.ambient_e)
         note = f"{what} without light, less the assumed dark current"
-        estimates["ambient_e"] = Estimate(
+        estimates["ambient_e"] = FittedField(
             float(ambient),
             math.hypot(offset_error, scale_error * offset),
             note if intensity_e is not None else f"{note} and read noise",
@@ -180,16 +184,16 @@ def _noise_of_electrons(
     if signal <= 2 * signal_error:
         raise UsageError(
             f"the frames do not show the signal: {what} rises by {with_error(signal, signal_error)} electrons a "
-            "unit of light; are amplitude and intensity in electrons (--amplitude-unit)?"
+            "unit of light; are amplitude and intensity in electrons (amplitude_unit=…)?"
         )
     contrast = modulated / signal
     contrast_error = contrast * math.hypot(modulated_error / modulated, signal_error / signal)
-    estimates["signal_e"] = Estimate(
+    estimates["signal_e"] = FittedField(
         float(signal),
         math.hypot(signal_error, scale_error * signal),
         f"{what} against light at {boards} distance{'s' if boards > 1 else ''}",
     )
-    estimates["contrast"] = Estimate(
+    estimates["contrast"] = FittedField(
         float(contrast), float(contrast_error), f"amplitude, {modulated:.5g} electrons at |S| = 1, over signal_e"
     )
     changes |= {"signal_e": float(signal), "contrast": float(contrast)}
@@ -198,12 +202,14 @@ def _noise_of_electrons(
         per_tap = (extra - base.code_e**2 / 6) / 2
         read_noise = math.sqrt(max(per_tap, 0.0))
         error = min(extra_error / (4 * read_noise) if read_noise > 0 else math.inf, math.sqrt(extra_error / 2))
-        estimates["read_noise_e"] = Estimate(
+        estimates["read_noise_e"] = FittedField(
             read_noise, error, "noise over that of the electrons counted" + ("" if per_tap > 0 else "; none was seen")
         )
         changes["read_noise_e"] = read_noise
     else:
-        estimates["read_noise_e"] = Estimate(base.read_noise_e, None, "without intensities it looks like ambient light")
+        estimates["read_noise_e"] = FittedField(
+            base.read_noise_e, None, "without intensities it looks like ambient light"
+        )
     return changes
 
 
@@ -258,7 +264,7 @@ def _excess(variance_e2: Floats, intensity_e: Floats, law: NoiseData, scale_erro
     return mean, math.hypot(chance, scale_error * lever)
 
 
-def possible_contrast(fields: dict[str, Any], estimates: dict[str, Estimate], notes: list[str]) -> float:
+def possible_contrast(fields: dict[str, Any], estimates: dict[str, FittedField], notes: list[str]) -> float:
     """Return the contrast, at most what lets no tap count less than nothing."""
     harmonics = tuple(Harmonic(*entry) for entry in fields["harmonics"])
     peak = correlation_peak(harmonics) if fields["modulation"] == "harmonics" else 1.0
@@ -270,7 +276,7 @@ def possible_contrast(fields: dict[str, Any], estimates: dict[str, Estimate], no
             "the unit of the amplitudes right?"
         )
         estimate = estimates["contrast"]
-        estimates["contrast"] = Estimate(
+        estimates["contrast"] = FittedField(
             limit, estimate.std_error, f"{estimate.note}; lowered to the most there can be"
         )
         return limit

@@ -1,4 +1,4 @@
-"""Estimate a sensor from measured flat-field frames: a board, square to the camera, at known distances.
+"""FittedField a sensor from measured flat-field frames: a board, square to the camera, at known distances.
 
 What can be told depends on what was measured. Ranges alone at one distance show one number of noise; several
 distances or albedos tell shot noise, which follows the light, from noise that does not; amplitude and intensity add the
@@ -21,7 +21,7 @@ from phasemark.render.bench.fit.boards import (
     say_of_distances,
 )
 from phasemark.render.bench.fit.electron_noise import fit_noise, possible_contrast
-from phasemark.render.bench.fit.fitted_sensor import AmplitudeUnit, Estimate, SensorFit
+from phasemark.render.bench.fit.fitted_sensor import AmplitudeUnit, FittedField, SensorFit
 from phasemark.render.bench.fit.offsets import fit_offsets
 from phasemark.render.bench.fit.pixel_pattern import odd_pixels, pattern, pattern_fields, pattern_moved
 from phasemark.render.frames import Frames
@@ -103,7 +103,7 @@ def fit_sensor(
                 f"pixel's noise to {100 * PIXEL_STD_ERROR:.0f} %"
             )
     notes: list[str] = []
-    estimates: dict[str, Estimate] = {}
+    estimates: dict[str, FittedField] = {}
     distance_std = known_distance_std(distance_m, distance_std_m)
     data = BoardData.of(frames, distance_m, distance_std, albedos, base).of_usable_boards(distance_m, notes)
     if assumed_albedo and base.kind == "phase":

@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Estimate:
+class FittedField:
     """One field of a fitted sensor.
 
     Parameters
@@ -51,7 +51,7 @@ class SensorFit:
     ----------
     sensor : Sensor
         The fitted camera.
-    estimates : dict of str to Estimate
+    estimates : dict of str to FittedField
         By the name of the sensor's field, in the order of its fields.
     notes : tuple of str
         Sentences on what could not be told apart, and on what is odd.
@@ -70,7 +70,7 @@ class SensorFit:
     """
 
     sensor: Sensor
-    estimates: dict[str, Estimate]
+    estimates: dict[str, FittedField]
     notes: tuple[str, ...]
     pixel_offset_m: Floats
     pixel_offset_std_error_m: Floats

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import optimize
 
 from phasemark.render.bench.fit.boards import BoardData
-from phasemark.render.bench.fit.fitted_sensor import Estimate, Floats
+from phasemark.render.bench.fit.fitted_sensor import FittedField, Floats
 from phasemark.render.bench.fit.range_error import circular_mean, range_error_m
 from phasemark.render.bench.fit.wiggling import SINE, fit_wiggling, jacobian_of
 from phasemark.render.phasor_images import wrap_difference_m
@@ -20,7 +20,7 @@ _WORST_CONDITION = 20.0  # of the wiggling's design: beyond, the distances cover
 
 
 def fit_offsets(
-    data: BoardData, base: Sensor, estimates: dict[str, Estimate], notes: list[str], widening: float
+    data: BoardData, base: Sensor, estimates: dict[str, FittedField], notes: list[str], widening: float
 ) -> dict[str, Any]:
     """Fit the global offset, and wiggling if the distances allow it, to the mean error of each board."""
     good = data.good
@@ -61,7 +61,7 @@ def fit_offsets(
     text = f"mean error of {int(good.sum())} pixels at {where}"
     if base.kind == "phase" and m == 1:
         text += "; wiggling at that distance is in it"
-    estimates["range_offset_m"] = Estimate(float(found.x[0]), error, text)
+    estimates["range_offset_m"] = FittedField(float(found.x[0]), error, text)
     changes = {"range_offset_m": float(found.x[0])}
     if none_seen:
         return {**changes, **SINE}

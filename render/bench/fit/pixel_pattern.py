@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from phasemark.render.bench.fit.boards import DEAD_SHARE, BoardData
-from phasemark.render.bench.fit.fitted_sensor import Estimate, Floats
+from phasemark.render.bench.fit.fitted_sensor import FittedField, Floats
 from phasemark.render.bench.fit.range_error import harmonics_of, range_error_m
 from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.sensor.sensor import Sensor
@@ -78,7 +78,7 @@ def pattern_fields(
     offset_error_m: Floats,
     moved_m: Floats,
     odd: NDArray[np.bool_],
-    estimates: dict[str, Estimate],
+    estimates: dict[str, FittedField],
 ) -> dict[str, Any]:
     """Return the fields about single pixels."""
     good = data.good
@@ -87,7 +87,7 @@ def pattern_fields(
         "dead_pixels": tuple((int(row), int(col)) for row, col in np.argwhere(dead)),
         "dead_share": 0.0,
     }
-    estimates["dead_pixels"] = Estimate(
+    estimates["dead_pixels"] = FittedField(
         float(dead.sum()), 0.0, f"valid in less than {100 * DEAD_SHARE:.0f} % of the frames at every distance"
     )
     if base.kind == "direct":
@@ -95,7 +95,7 @@ def pattern_fields(
         return changes
     changes["hot_pixels"] = tuple((int(row), int(col)) for row, col in np.argwhere(odd))
     changes["hot_share"] = 0.0
-    estimates["hot_pixels"] = Estimate(
+    estimates["hot_pixels"] = FittedField(
         float(odd.sum()), 0.0, f"stuck, noisier than {_NOISY_FACTOR:g} times the median or {_OUTLIER_SIGMAS:g} σ off"
     )
     count = int(good.sum())
@@ -112,7 +112,7 @@ def pattern_fields(
     std_m = math.sqrt(variance)
     error_m = of_variance / (2 * std_m) if variance > of_variance else math.sqrt(of_variance)
     scale = base.metres_per_radian
-    estimates["phase_offset_std_rad"] = Estimate(
+    estimates["phase_offset_std_rad"] = FittedField(
         std_m / scale, error_m / scale,
         f"spread of {count} pixels' offsets less noise, {1e3 * std_m:.3g} mm; a tilt of the board is in it",
     )  # fmt: skip

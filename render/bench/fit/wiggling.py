@@ -9,7 +9,7 @@ import numpy as np
 from scipy import optimize
 
 from phasemark.render.bench.fit.boards import BoardData
-from phasemark.render.bench.fit.fitted_sensor import Estimate, Floats
+from phasemark.render.bench.fit.fitted_sensor import FittedField, Floats
 from phasemark.render.bench.fit.range_error import circular_mean, range_error_m
 from phasemark.render.integral.rounding import with_error
 from phasemark.render.phasor_images import wrap_difference_m
@@ -30,7 +30,7 @@ def fit_wiggling(
     orders: tuple[int, ...],
     mean: Floats,
     std: Floats,
-    estimates: dict[str, Estimate],
+    estimates: dict[str, FittedField],
     notes: list[str],
 ) -> dict[str, Any] | None:
     """Fit offset and orders of the correlation to the mean errors.
@@ -68,10 +68,10 @@ def fit_wiggling(
     if all(h.amplitude < _SEEN_SIGMAS * e for h, e in zip(found_harmonics, parts, strict=True)):
         notes.append(f"No wiggling is seen at {m} distances: {described}.")
         return None
-    estimates["range_offset_m"] = Estimate(
+    estimates["range_offset_m"] = FittedField(
         offset_m, math.sqrt(covariance[0, 0]) * sensor.metres_per_radian, f"mean error at {m} distances, less wiggling"
     )
-    estimates["harmonics"] = Estimate(
+    estimates["harmonics"] = FittedField(
         found_harmonics[0].amplitude,
         parts[0],
         f"wiggling at {m} distances ({described}); orders 3 and 5, 7 and 9 move ranges alike: all put down to 3, 7",

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from phasemark.landmarks import build_mesh, catalog, mesh_html, mesh_picture
+from phasemark.landmarks import build_mesh, catalog, mesh_figure, mesh_html
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 BOX = trimesh.creation.box((0.2, 0.1, 0.3))
@@ -76,25 +76,25 @@ def arrays_of(page):
 
 
 def test_the_picture_is_a_whole_png(mesh):
-    kinds = chunk_kinds(mesh_picture(mesh))
+    kinds = chunk_kinds(mesh_figure(mesh))
     assert (kinds[0], kinds[-1]) == (b"IHDR", b"IEND")
 
 
 def test_the_same_mesh_gives_the_same_picture():
-    assert mesh_picture(BOX) == mesh_picture(BOX)
+    assert mesh_figure(BOX) == mesh_figure(BOX)
 
 
 def test_the_picture_shows_the_mesh_from_where_it_is_asked():
     # a box 0.3 m tall is 0.2 m wide from the front, 0.1 m from the end
     for azimuth_deg, ratio in ((-90.0, 1.5), (0.0, 3.0)):
-        rows, cols = np.nonzero(blue(mesh_picture(BOX, azimuth_deg=azimuth_deg, elevation_deg=0.0)))
+        rows, cols = np.nonzero(blue(mesh_figure(BOX, azimuth_deg=azimuth_deg, elevation_deg=0.0)))
         # perspective enlarges the near face in both directions alike; the ink of the outline costs a pixel or two
         assert np.ptp(rows) / np.ptp(cols) == pytest.approx(ratio, rel=0.05)
 
 
 def test_an_open_mesh_shows_its_inside():
     # without its lid one sees the far walls through the opening: no less surface than the lid had
-    assert blue(mesh_picture(OPEN_BOX)).sum() > 0.8 * blue(mesh_picture(BOX)).sum()
+    assert blue(mesh_figure(OPEN_BOX)).sum() > 0.8 * blue(mesh_figure(BOX)).sum()
 
 
 def test_the_page_is_whole_and_loads_nothing(mesh):

@@ -1,0 +1,54 @@
+"""Messages of the library in the words of the command line: parameters become flags."""
+
+from __future__ import annotations
+
+import re
+
+FLAGS = {
+    "amplitude_unit": "--amplitude-unit",
+    "background": "--wall, --floor",
+    "fixed": "--fix",
+    "flip_h": "--flip-h",
+    "force": "--force",
+    "moving": "--moving",
+    "n": "--population",
+    "part": "--shard",
+    "pose_std": "--position-std, --heading-std and --delta-std",
+    "quantity": "--quantity",
+    "resume": "--resume",
+    "scheduler": "--scheduler",
+    "to": "--to",
+    "topic": "--topic",
+    "trusted": "--matcher",
+    "unit": "--unit",
+    "valid_status": "--valid-status",
+}
+"""Parameters that messages name, as ``name=value``, ``name=True`` or ``name=…``, and their flags."""
+PHRASES = {
+    "Mounting(delay_s=…)": "--delay-ms",
+    "layout='full'": "--full, layout = 'full'",
+    "leave refuse_programs() out": "give --trust-plan",
+    "run_sweep(resume=True)": "'phasemark sweep run --resume'",
+    "unverified()": "--no-verify",
+}
+"""What messages name that is no parameter of the call, and what the command line has for it."""
+_PARAMETER = re.compile(rf"(?<![\w'/.-])({'|'.join(FLAGS)})=(?:…|True\b|(?=\w))")
+
+
+def in_flags(message: str) -> str:
+    """Return a message that names flags where the library names parameters; names in quotes stay.
+
+    Examples
+    --------
+    >>> in_flags("b.h5: exists; use force=True to replace it")
+    'b.h5: exists; use --force to replace it'
+    >>> in_flags("say with topic=… which images to read, or give unit=mm")
+    'say with --topic which images to read, or give --unit mm'
+    """
+    for phrase, words in PHRASES.items():
+        message = message.replace(phrase, words)
+    return _PARAMETER.sub(_flag, message)
+
+
+def _flag(match: re.Match[str]) -> str:
+    return FLAGS[match[1]] + (" " if match[0].endswith("=") else "")

@@ -1,0 +1,229 @@
+"""What a calibration gives: the mounting with its covariance, as plain numbers and as a sensor file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.calibration.known_poses import POSE_UNITS, KnownPoses
+from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, Mounting
+from phasemark.matcher.likelihood.residuals import ResidualKind
+from phasemark.render import Sensor
+from phasemark.render.integral.rounding import error_text, value_and_error
+from phasemark.render.sensor.sensor_file import sensor_toml
+
+USES = {"albedo": "of the landmark: phasemark bank build --albedo, or 'albedo' in a plan"}
+"""Where the numbers go that a sensor file has no place for."""
+_COMMON = {
+    "range_std_m": "calibrated: noise law of the residuals",
+    "range_shot_std_m": "calibrated: noise law of the residuals",
+    "range_ambient_std_m": "calibrated: noise law of the residuals",
+    "zone_offset_m": "calibrated",
+    "calibration_fields": "what was estimated",
+    "calibration_covariance": "its covariance, in the units of the fields",
+    "systematic_distance_m": "calibrated: what noise does not explain",
+    "systematic_delta_deg": "calibrated: what noise does not explain",
+    "systematic_bearing_deg": "calibrated: what noise does not explain",
+    "systematic_height_m": "calibrated: what noise does not explain",
+    "systematic_time_s": "calibrated: jitter of the stamps",
+}
+"""What stands behind the fields that no parameter of the mounting has."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """How a camera is mounted, and how well that is known.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        The camera with what was found; what was not free is as it was, or as `start` said.
+    base : Sensor
+        The camera as it was thought to be.
+    mounting, assumed : Mounting
+        What was found, and what it was thought to be.
+    free : tuple of str
+        Names of what was estimated (:data:`NAMES`); the other numbers of `mounting` are assumptions.
+    covariance : (p, p) float64
+        In the order of `free`; radians, metres.
+    covariance_from : str
+        What it was made of, in words.
+    chi2, dof, p_value : float, int, float
+        Test of the fit.
+    on : {"ranges", "phasors"}
+    poses : KnownPoses
+    pose_shift : (K, 3) float64
+        Estimated errors of the poses in D, δ and b; zero where poses are taken as exact.
+    pose_chi2, pose_residuals : (K,) float64, (K,) int64
+        Share of each pose in χ², and how many residuals it is made of.
+    residual_m, residual_before_m : (K, rows, cols) float64
+        Measured less modelled range with the mounting found and with the one assumed; NaN where a pixel does not count.
+    range_std_m : (K, rows, cols) float64
+        Standard deviation of the filtered range; NaN where a pixel does not count.
+    notes : tuple of str
+        Sentences on what is not observable, what does not fit, and what to do.
+    doubts : tuple of str
+        Why the result should not be used; empty for a calibration that can be trusted.
+    cause : str
+        What is likely wrong, if there are doubts.
+    held_out_m : (before, after)
+        Root mean square of the residuals of frames that were left out in turn: with the mounting assumed and with
+        that from the other frames. NaN where it is not known.
+    left_out : float
+        Share of the pixels that see the landmark by the model, but disagree with it and have no weight.
+    """
+
+    sensor: Sensor
+    base: Sensor
+    mounting: Mounting
+    assumed: Mounting
+    free: tuple[str, ...]
+    covariance: NDArray[np.float64]
+    covariance_from: str
+    chi2: float
+    dof: int
+    p_value: float
+    on: ResidualKind
+    poses: KnownPoses
+    pose_shift: NDArray[np.float64]
+    pose_chi2: NDArray[np.float64]
+    pose_residuals: NDArray[np.int64]
+    residual_m: NDArray[np.float64]
+    residual_before_m: NDArray[np.float64]
+    range_std_m: NDArray[np.float64]
+    notes: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
+    cause: str = ""
+    held_out_m: tuple[float, float] = (math.nan, math.nan)
+    left_out: float = 0.0
+
+    def value(self, name: str) -> float:
+        """Return one number of the mounting, radians, metres or albedo."""
+        return float(getattr(self.mounting, PARAMETERS[name].attribute))
+
+    def std(self, name: str) -> float:
+        """Return its standard deviation; 0 if it was not free."""
+        if name not in self.free:
+            return 0.0
+        k = self.free.index(name)
+        return math.sqrt(float(self.covariance[k, k]))
+
+    @property
+    def correlation(self) -> NDArray[np.float64]:
+        """Correlation matrix of what was free, (p, p)."""
+        root = np.sqrt(np.diag(self.covariance))
+        return np.asarray(self.covariance / np.outer(root, root))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain numbers, lists and strings, for JSON; None where there is no number."""
+        unit = np.array([PARAMETERS[name].shown for name in self.free])
+        return {
+            "parameters": {
+                name: {
+                    "value": PARAMETERS[name].shown * self.value(name),
+                    "std": PARAMETERS[name].shown * self.std(name) if name in self.free else None,
+                    "unit": {"°": "deg"}.get(PARAMETERS[name].unit, PARAMETERS[name].unit) or None,
+                    "assumed": PARAMETERS[name].shown * float(getattr(self.assumed, PARAMETERS[name].attribute)),
+                    "sensor_field": PARAMETERS[name].field,
+                }
+                for name in shown_names(self)
+            },
+            "free": list(self.free),
+            "covariance": (self.covariance * np.outer(unit, unit)).tolist(),
+            "correlation": self.correlation.tolist(),
+            "covariance_from": self.covariance_from,
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "p_value": self.p_value,
+            "on": self.on,
+            "held_out_rms_mm": dict(zip(("before", "after"), map(_mm, self.held_out_m), strict=True)),
+            "left_out": self.left_out,
+            "doubts": list(self.doubts),
+            "likely_cause": self.cause or None,
+            "residual_rms_mm": {"before": _rms_mm(self.residual_before_m), "after": _rms_mm(self.residual_m)},
+            "poses": [
+                {
+                    "distance_m": float(self.poses.distance_m[k]),
+                    "delta_deg": math.degrees(self.poses.delta_rad[k]),
+                    "bearing_deg": math.degrees(self.poses.bearing_rad[k]),
+                    "chi2": float(self.pose_chi2[k]),
+                    "residuals": int(self.pose_residuals[k]),
+                    "error": {key: factor * float(self.pose_shift[k, i]) for i, (key, factor) in enumerate(POSE_UNITS)},
+                }
+                for k in range(len(self.poses))
+            ],
+            "notes": list(self.notes),
+            "sensor": self.sensor.model_dump(mode="json"),
+        }
+
+    def to_toml(self, *, base_name: str) -> str:
+        """Return the calibrated sensor as a file, its header with everything that is no field of a sensor.
+
+        Parameters
+        ----------
+        base_name : str
+            What the camera is called that gave all that was not estimated.
+        """
+        comments = {}
+        for name in self.free:
+            parameter = PARAMETERS[name]
+            if parameter.field is not None:
+                comments[parameter.field] = f"calibrated, ± {error_text(_file_std(self, name))} (standard deviation)"
+        for field, what in _COMMON.items():
+            if field not in comments and getattr(self.sensor, field) != getattr(self.base, field):
+                comments[field] = what
+        header = [
+            f"Calibrated by phasemark calibrate from {len(self.poses)} known poses, on {self.on}; covariance from"
+            f" {self.covariance_from}.",
+            f"chi2 = {self.chi2:.6g}, {self.dof} degrees of freedom, p = {self.p_value:.3g}.",
+        ]
+        for name, use in USES.items():
+            if name in self.free:
+                unit = f" {PARAMETERS[name].unit}" if PARAMETERS[name].unit else ""
+                header.append(f"{name} = {shown(self, name)} ± {shown_std(self, name)}{unit}: {use}")
+        before, after = self.held_out_m
+        if math.isfinite(after):
+            header.append(f"Held-out residuals, r.m.s.: {1e3 * before:.3g} mm before, {1e3 * after:.3g} mm after.")
+        header += [f"Not to be trusted: {doubt}." for doubt in self.doubts]
+        header += self.notes
+        return sensor_toml(self.sensor, comments, header=header, otherwise=f"assumed: as in {base_name}")
+
+
+def shown_names(found: Calibration) -> tuple[str, ...]:
+    """Return the names of the numbers to show: the delay only where it was estimated or is stated."""
+    return ALL_NAMES if "delay" in found.free or found.mounting.delay_s else NAMES
+
+
+def shown(found: Calibration, name: str) -> str:
+    """Return one number of a mounting as people read it, to the digits of its standard deviation."""
+    return _value_and_std(found, name)[0]
+
+
+def shown_std(found: Calibration, name: str) -> str:
+    """Return its standard deviation."""
+    return _value_and_std(found, name)[1] if name in found.free else "fixed"
+
+
+def _value_and_std(found: Calibration, name: str) -> tuple[str, str]:
+    value, std = PARAMETERS[name].shown * found.value(name), PARAMETERS[name].shown * found.std(name)
+    text, error = value_and_error(value, std)
+    return (text, error) if error else (f"{value:.3f}", error_text(std))
+
+
+def _mm(value_m: float) -> float | None:
+    return 1e3 * value_m if math.isfinite(value_m) else None
+
+
+def _rms_mm(residual_m: NDArray[np.float64]) -> float | None:
+    values = residual_m[np.isfinite(residual_m)]
+    return 1e3 * math.sqrt(float((values**2).mean())) if values.size else None
+
+
+def _file_std(found: Calibration, name: str) -> float:
+    """Return a standard deviation in the unit of the sensor's field: degrees or metres."""
+    parameter = PARAMETERS[name]
+    return found.std(name) * (parameter.shown if parameter.unit == "°" else 1.0)

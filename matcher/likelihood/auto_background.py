@@ -1,0 +1,148 @@
+"""Frames before a wall and floor that are estimated from the frames themselves, one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.likelihood.background_estimate import (
+    estimate_surroundings,
+    fit_background,
+    without_background,
+)
+from phasemark.matcher.likelihood.candidates import fit_other_classes
+from phasemark.matcher.likelihood.fits import Fits
+from phasemark.matcher.likelihood.look_alikes import fit_look_alikes
+from phasemark.matcher.likelihood.refine import refine
+from phasemark.matcher.likelihood.rendered_images import RenderedModel
+from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.likelihood.search import is_doubtful, search_views
+from phasemark.matcher.likelihood.setup import Scene, Setup
+from phasemark.render import Background, delta_period_rad
+
+__all__ = ["AutoBackground"]
+
+
+class AutoBackground:
+    """Searches single frames, each before the background that it shows.
+
+    Parameters
+    ----------
+    setup : Setup
+    rendered : RenderedModel
+        Renders the landmarks before any background.
+    scene : callable
+        Returns the scene of a background (None: none). The second argument says whether background and landmark are
+        searched together, over all bearings, since what was taken for background may be landmark.
+    """
+
+    def __init__(
+        self, setup: Setup, rendered: RenderedModel, scene: Callable[[Background | None, bool], Scene]
+    ) -> None:
+        self._setup, self._rendered, self._scene = setup, rendered, scene
+
+    def search(self, one: FilteredFrames, evidence: Evidence, bare: np.ndarray) -> tuple[Background | None, Fits]:
+        """Return the background of one frame, and what explains the frame before it.
+
+        Parameters
+        ----------
+        one : FilteredFrames
+        evidence : Evidence
+            Of that frame.
+        bare : (1,) float64
+            Cost of a scene without a landmark.
+        """
+        setup = self._setup
+        known = not setup.bearing_is_free or bool(setup.prior_std)
+        around = estimate_surroundings(one, bearing_known=known)
+        background, seen = around.background, evidence.seen
+        if background is not None:
+            seen = without_background(seen, around)
+        fits = search_views(setup, self._scene(background, False), evidence, seen, bare)
+        if is_doubtful(setup, fits):
+            background, fits = self._with_better_background(background, evidence, fits)
+        if background is not None and is_doubtful(setup, fits):
+            again = search_views(setup, self._scene(background, True), evidence, evidence.seen, bare)
+            fits = Fits.joined([fits, again])
+            if is_doubtful(setup, fits):
+                background, fits = self._with_better_background(background, evidence, fits)
+        if background is not None and is_doubtful(setup, fits):
+            fits = Fits.joined([fits, self._other_angles(background, evidence, fits)])
+            background, fits = self._with_better_background(background, evidence, fits)
+        return background, fits
+
+    def _with_better_background(
+        self, background: Background | None, evidence: Evidence, fits: Fits
+    ) -> tuple[Background | None, Fits]:
+        """Fit the background behind the best view of one frame, then the views before it, in turn while that helps.
+
+        Where no pixel sees a background alone, walls at some distances behind the landmark are tried.
+        """
+        if background is not None:
+            return self._background_and_views(background, evidence, fits)
+        best = fits.view[fits.cost.argmin()]
+        found: tuple[Background | None, Fits] = (None, fits)
+        for beyond in self._setup.policy.walls_beyond_m:
+            there = self._background_and_views(Background(wall_m=float(best[0]) + beyond), evidence, fits)
+            if there[1].cost.min() < found[1].cost.min():
+                found = there
+            if not is_doubtful(self._setup, found[1]):
+                break
+        return found
+
+    def _other_angles(self, background: Background, evidence: Evidence, fits: Fits) -> Fits:
+        """Fit one frame from its best view turned to other angles; distance and bearing are found more easily."""
+        if not np.isfinite(fits.cost).any():
+            return fits[:0]
+        best = int(fits.cost.argmin())
+        n = self._setup.policy.other_angles
+        period = delta_period_rad(self._setup.shapes.symmetry[fits.class_index[best]])
+        angles = np.arange(1, n) * period / n
+        view = np.tile(fits.view[best], (len(angles), 1))
+        view[:, 1] += angles
+        frame, class_index = (np.full(len(angles), values[best]) for values in (fits.frame, fits.class_index))
+        scene = self._scene(background, False)
+        return refine(
+            self._rendered.with_background(background),
+            evidence,
+            frame,
+            class_index,
+            view,
+            scene.settings(self._setup),
+        )
+
+    def _background_and_views(self, background: Background, evidence: Evidence, fits: Fits) -> tuple[Background, Fits]:
+        """Fit a background behind the best view of one frame, then the views before it, in turn while that helps."""
+        setup, policy = self._setup, self._setup.policy
+        for _ in range(policy.background_rounds):
+            finite = np.flatnonzero(np.isfinite(fits.cost))
+            if not finite.size:
+                break
+            best = finite[np.argsort(fits.cost[finite], kind="stable")][: policy.most_refined]
+            found, view = fit_background(
+                self._rendered,
+                evidence,
+                int(fits.class_index[best[0]]),
+                fits.view[best[0]],
+                setup.free,
+                background,
+            )
+            if found == background:
+                break
+            scene = self._scene(found, False)
+            settings = replace(scene.settings(setup), look_beside_rad=policy.close_by_rad)
+            some = fits[best]
+            some.view[0] = view
+            again = refine(scene.final, evidence, some.frame, some.class_index, some.view, settings)
+            others = fit_other_classes(setup, scene.final, evidence, again, settings)
+            again = Fits.joined([again, others, fit_look_alikes(setup, scene, evidence, again)])
+            if not again.cost.min() < fits.cost[best[0]]:
+                break
+            settled = again.cost.min() > fits.cost[best[0]] - 1
+            background, fits = found, again
+            if settled:
+                break
+        return background, fits

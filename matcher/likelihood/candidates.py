@@ -1,0 +1,165 @@
+"""Steps 1 to 4 of the search: minima of the bank, refined on interpolated and rendered images; other classes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.likelihood.fits import Fits, best_of_frame, distinct, distinct_of_frames, least_of_frame
+from phasemark.matcher.likelihood.images import VIEW, ImageModel
+from phasemark.matcher.likelihood.problem import Settings
+from phasemark.matcher.likelihood.refine import refine
+from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.likelihood.setup import Scene, Setup
+from phasemark.matcher.nearest.bank_minima import Starts
+
+__all__ = ["fit_modes", "fit_other_classes", "fit_starts"]
+
+
+def fit_starts(
+    setup: Setup,
+    scene: Scene,
+    evidence: Evidence,
+    which: NDArray[np.int64],
+    starts: Starts,
+    sides_rad: tuple[float, ...],
+    *,
+    patient: bool = False,
+) -> Fits:
+    """Refine the minima of some frames, then let the other classes explain each frame from its best view.
+
+    Parameters
+    ----------
+    setup : Setup
+    scene : Scene
+        Its scout, if there is one, refines first; what is likely then is refined again on the final images.
+    evidence : Evidence
+    which : (k,) int64
+        The frames that `starts` counts.
+    starts : Starts
+        Minima of the bank.
+    sides_rad : tuple of float
+        Offsets of δ at which the best minimum of each frame is tried too.
+    patient : bool
+        Whether to refine minima however bad they look at first, and the surroundings of what the scout found.
+    """
+    policy, settings = setup.policy, scene.settings(setup)
+    frame, class_index, view = _with_sides(which[starts.frame], starts, sides_rad)
+    leading = settings
+    if scene.scout is not None and setup.prior_std:  # a scout knows no bearing
+        leading = replace(settings, free=VIEW[:2], prior_std=())
+    lead = scene.scout or scene.final
+    margin = np.inf if patient else policy.margin_cost
+    fits = fit_modes(setup, lead, evidence, frame, class_index, view, leading, margin)
+    fits = Fits.joined([fits, fit_other_classes(setup, lead, evidence, fits, leading)])
+    if scene.scout is None:
+        return fits
+    return _polished(setup, scene, evidence, fits, settings, patient=patient)
+
+
+def fit_modes(
+    setup: Setup,
+    model: ImageModel,
+    evidence: Evidence,
+    frame: NDArray[np.int64],
+    class_index: NDArray[np.int64],
+    view: NDArray[np.float64],
+    settings: Settings,
+    margin: float,
+) -> Fits:
+    """Refine the first candidate of every frame, the others while they can still win, and at last what is likely."""
+    n = len(evidence.weight)
+    first = np.isin(np.arange(len(frame)), np.unique(frame, return_index=True)[1])
+    fits = refine(model, evidence, frame[first], class_index[first], view[first], settings, roughly=True)
+    limit = least_of_frame(fits, n)[frame[~first]] + margin
+    more = refine(model, evidence, frame[~first], class_index[~first], view[~first], settings, limit, roughly=True)
+    fits = Fits.joined([fits, more])
+    likely = fits.cost < least_of_frame(fits, n)[fits.frame] + margin
+    policy = setup.policy
+    better = distinct_of_frames(fits, np.flatnonzero(likely), setup.shapes.symmetry, policy.same_m, policy.same_rad)
+    again = fits[better]
+    return Fits.joined([refine(model, evidence, again.frame, again.class_index, again.view, settings), fits[~likely]])
+
+
+def fit_other_classes(setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits, settings: Settings) -> Fits:
+    """Let every class but the best explain each frame, from the view of the best."""
+    best = best_of_frame(fits)
+    n_class = len(setup.shapes.names)
+    others = np.array([(k, c) for k in best for c in range(n_class) if c != fits.class_index[k]], np.int64)
+    others = others.reshape(-1, 2)
+    source = others[:, 0]
+    limit = fits.cost[source] + setup.policy.likely_cost
+    return refine(
+        model, evidence, fits.frame[source], others[:, 1], fits.view[source], settings, limit, at_first_sight=True
+    )
+
+
+def _with_sides(
+    frame: NDArray[np.int64], starts: Starts, sides_rad: tuple[float, ...]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Return frames, classes and views of starts, and of the best one of each frame with δ moved to some sides."""
+    class_index, view = starts.class_index, starts.view
+    if not sides_rad:
+        return frame, class_index, view
+    first = np.flatnonzero(np.diff(starts.frame, prepend=-1))
+    beside = [view[first] + [[0.0, side, 0.0, 0.0]] for side in sides_rad]
+    return (
+        np.concatenate([frame, np.tile(frame[first], len(sides_rad))]),
+        np.concatenate([class_index, np.tile(class_index[first], len(sides_rad))]),
+        np.concatenate([view, *beside]),
+    )
+
+
+def _polished(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, settings: Settings, *, patient: bool) -> Fits:
+    """Refine on the final images what is likely after the scout; the other fits keep their distance from the best."""
+    policy, n = setup.policy, len(evidence.weight)
+    order = np.lexsort((fits.cost, fits.frame))
+    least = least_of_frame(fits, n)
+    likely = [k for k in order if fits.cost[k] < least[fits.frame[k]] + policy.likely_cost]
+    again = fits[_most_likely(setup, fits, likely)]
+    if patient:
+        again = _surrounded(again)
+    side_peaks = evidence.on == "phasors" or scene.behind is not None
+    close = replace(
+        settings,
+        longest_step=policy.step_after_scout_aside if setup.prior_std else policy.step_after_scout,
+        look_beside_rad=policy.close_by_rad if side_peaks else (),
+    )
+    final = refine(scene.final, evidence, again.frame, again.class_index, again.view, close)
+    others = fits[np.setdiff1d(order, likely)]
+    gap = others.cost - least[others.frame]
+    others.cost[:] = least_of_frame(final, n)[others.frame] + gap
+    return Fits.joined([final, others.with_free(len(setup.free))])
+
+
+def _most_likely(setup: Setup, fits: Fits, likely: list[int]) -> NDArray[np.int64]:
+    """Return the few fits of each frame that are refined again: of places of their own, best first."""
+    policy = setup.policy
+    chosen: list[int] = []
+    for k in likely:
+        same = [j for j in chosen if fits.frame[j] == fits.frame[k]]
+        if len(same) < policy.most_refined:
+            own = distinct(fits, np.array([*same, k]), setup.shapes.symmetry, policy.same_m, policy.same_rad)
+            if len(own) > len(same):
+                chosen.append(int(k))
+    return np.array(chosen, np.int64)
+
+
+def _surrounded(fits: Fits) -> Fits:
+    """Return fits and others two and four standard deviations away along the axes of their covariance.
+
+    Where an edge has just left a pixel, its slope is 0, and nothing leads back.
+    """
+    p = fits.covariance.shape[1]
+    columns = np.arange(p)
+    values, vectors = np.linalg.eigh(np.where(np.isfinite(fits.covariance), fits.covariance, 0.0))
+    axes = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    parts = [fits]
+    for k in range(p):
+        for size in (-4.0, -2.0, 2.0, 4.0):
+            view = fits.view.copy()
+            view[:, columns] += size * axes[:, :, k]
+            parts.append(replace(fits, view=view))
+    return Fits.joined(parts)

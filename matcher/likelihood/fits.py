@@ -1,0 +1,152 @@
+"""Candidates for the answer, each at its best view, with its cost and its uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.agreement import DISAGREEMENT
+from phasemark.render import delta_period_rad, wrap_delta_difference_rad
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Candidates, each at its best view; arrays of one length m.
+
+    Parameters
+    ----------
+    frame, class_index : int64
+    view : (m, 4) float64
+    albedo : float64
+        Factor on the landmark's brightness; 1 on ranges.
+    cost : float64
+        Whitened squared residual of all pixels that count, and
+        :data:`~phasemark.matcher.nearest.templates.DISAGREEMENT` for each pixel whose return or lack of it no view
+        nearby explains.
+    capped : float64
+        The same with no residual adding more than that: what to compare with a scene that explains nothing.
+    dof : int64
+        Residuals in it, less the parameters fitted.
+    unexplained : int64
+        Returns that are left to unknown things in view; in `cost` each is a disagreement, in `dof` it is none.
+    explained : int64
+        Returns that are compared and not left to unknown things.
+    agreeing, elsewhere : int64
+        Returns where the landmark stands in the model: those that agree with it, compared or not, and those that see
+        something else.
+    prior : float64
+        What the prior adds to the cost; no test of the fit counts it.
+    covariance : (m, p, p) float64
+        Of the free parameters of the view, nuisances taken into account; NaN where some direction is not observed.
+    information : (m, p, p) float64
+        Its inverse.
+    std_without_one : (m, p) float64
+        Largest standard deviations that any single pixel's absence leaves: what a fit is sure of although one pixel at
+        an edge may claim to know more than it does. Infinite where that is not looked at.
+    """
+
+    frame: NDArray[np.int64]
+    class_index: NDArray[np.int64]
+    view: NDArray[np.float64]
+    albedo: NDArray[np.float64]
+    cost: NDArray[np.float64]
+    capped: NDArray[np.float64]
+    dof: NDArray[np.int64]
+    unexplained: NDArray[np.int64]
+    explained: NDArray[np.int64]
+    agreeing: NDArray[np.int64]
+    elsewhere: NDArray[np.int64]
+    prior: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    information: NDArray[np.float64]
+    std_without_one: NDArray[np.float64]
+
+    @property
+    def tested(self) -> NDArray[np.float64]:
+        """The part of the cost that a χ² test judges: neither prior nor what is left to unknown things; (m,)."""
+        return np.asarray(self.cost - self.prior - DISAGREEMENT * self.unexplained)
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, index: NDArray[Any] | slice) -> Fits:
+        return Fits(**{name: values[index] for name, values in vars(self).items()})
+
+    def with_scale(self, scale: NDArray[np.float64]) -> Fits:
+        """Return the fits with covariances scaled, each by a number (m,)."""
+        return replace(
+            self,
+            covariance=self.covariance * scale[:, None, None],
+            information=self.information / scale[:, None, None],
+            std_without_one=self.std_without_one * np.sqrt(scale)[:, None],
+        )
+
+    def with_free(self, p: int) -> Fits:
+        """Return the fits as those of more free parameters, which were not moved and of which nothing is known."""
+        more = p - self.covariance.shape[1]
+        square = ((0, 0), (0, more), (0, more))
+        return replace(
+            self,
+            covariance=np.pad(self.covariance, square, constant_values=np.nan),
+            information=np.pad(self.information, square, constant_values=np.nan),
+            std_without_one=np.pad(self.std_without_one, ((0, 0), (0, more)), constant_values=np.inf),
+        )
+
+    @classmethod
+    def joined(cls, parts: list[Fits]) -> Fits:
+        """Put batches behind one another."""
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+
+
+def least_of_frame(fits: Fits, n: int) -> NDArray[np.float64]:
+    """Return the lowest cost of every frame, (n,); infinite without a fit."""
+    least = np.full(n, np.inf)
+    np.minimum.at(least, fits.frame, fits.cost)
+    return least
+
+
+def best_of_frame(fits: Fits) -> NDArray[np.int64]:
+    """Return the index of the best fit of every frame that has one."""
+    order = np.lexsort((fits.cost, fits.frame))
+    first = np.r_[True, np.diff(fits.frame[order]) > 0] if len(order) else np.empty(0, np.bool_)
+    return order[first]
+
+
+def distinct(fits: Fits, own: NDArray[np.int64], symmetry: Sequence[int], same_m: float, same_rad: float) -> list[int]:
+    """Return some fits of one frame, best first, without those that came to the same place.
+
+    Parameters
+    ----------
+    fits : Fits
+    own : (k,) int64
+        Which of them, best first.
+    symmetry : sequence of int
+        Of each class.
+    same_m, same_rad : float
+        Fits nearer to each other are one.
+    """
+    kept: list[int] = []
+    for k in own:
+        period = delta_period_rad(symmetry[fits.class_index[k]])
+        for other in kept:
+            turned = wrap_delta_difference_rad(fits.view[k, 1] - fits.view[other, 1], period)
+            near = abs(fits.view[k, 0] - fits.view[other, 0]) < same_m and abs(turned) < same_rad
+            if near and fits.class_index[k] == fits.class_index[other]:
+                break
+        else:
+            kept.append(int(k))
+    return kept
+
+
+def distinct_of_frames(
+    fits: Fits, which: NDArray[np.int64], symmetry: Sequence[int], same_m: float, same_rad: float
+) -> NDArray[np.int64]:
+    """Return those of some fits that came to places of their own, the best at each."""
+    which = which[np.lexsort((fits.cost[which], fits.frame[which]))]
+    borders = np.flatnonzero(np.diff(fits.frame[which])) + 1
+    groups = np.split(which, borders)
+    return np.array([k for own in groups for k in distinct(fits, own, symmetry, same_m, same_rad)], np.int64)

@@ -1,0 +1,103 @@
+"""Lower minima that no slope leads to: behind kinks in δ, and where other pixels return.
+
+Where an edge of the landmark crosses a pixel's border, slopes jump, and whether the pixel returns changes in a step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.information import covariance_of
+from phasemark.matcher.likelihood.contradictions import whole_cost
+from phasemark.matcher.likelihood.descent import descend
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.problem import Problem, State, picked
+from phasemark.matcher.likelihood.residuals import Sums
+from phasemark.matcher.likelihood.uncertainty import view_covariance
+
+
+def look_beside(problem: Problem, state: State) -> State:
+    """Try δ a little to either side, the other parameters following, and descend from where that is promising."""
+    sides = np.array(problem.settings.look_beside_rad)
+    near = problem.near_best(state, 0.0)
+    if not near.size:
+        return state
+    source = np.repeat(near, len(sides))
+    theta = state.theta[source]
+    turn = VIEW.index("delta_rad")
+    theta[:, turn] += np.tile(sides, len(near))
+    there = problem.some(source).turned(state, source, theta)
+    d = int(np.flatnonzero(problem.columns == turn)[0])
+    others = np.flatnonzero(problem.columns != turn)
+    unit = problem.scale[others]
+    information = there.sums.information[:, others[:, None], others] * np.outer(unit, unit)
+    gradient = there.sums.gradient[:, others] * unit
+    step = np.einsum("mpq,mq->mp", np.linalg.pinv(information, hermitian=True), gradient)
+    more = (there.sums.cost - np.einsum("mp,mp->m", gradient, step)).reshape(len(near), -1)
+    more -= state.sums.cost[near, None]
+    # one minimum alone would cost so much more at the sides; what is far below that has another one near it
+    alone = sides**2 / np.einsum("mpp->mp", view_covariance(problem, state.sums))[near, d][:, None]
+    best = np.argmin(more - problem.policy.parabola_share * alone, axis=1)
+    parabola = np.take_along_axis(alone, best[:, None], axis=1)[:, 0]
+    most = np.minimum(problem.policy.promising_cost, problem.policy.parabola_share * parabola)
+    chosen = np.flatnonzero(np.take_along_axis(more, best[:, None], axis=1)[:, 0] < most)
+    if not chosen.size:
+        return state
+    which, at = near[chosen], chosen * len(sides) + best[chosen]
+    theta = theta[at]
+    theta[:, problem.columns[others]] += step[at] * unit
+    theta[:, :4] = problem.clipped(theta[:, :4])
+    some = problem.some(which)
+    found = descend(some, some.state(theta, state.use[which]), problem.policy.settled_cost)
+    better = np.flatnonzero(found.sums.cost < state.sums.cost[which])
+    state.update(which[better], picked(found, better))
+    return state
+
+
+def settle(problem: Problem, state: State) -> State:
+    """Leave views that contradict some pixels for better ones nearby.
+
+    Whether a pixel returns changes in a step where an edge enters it, which no slope shows. So views up to five
+    standard deviations away along the axes of the covariance are tried, with the whole cost of PHYSICS section 7.
+    """
+    cost, contradicted = whole_cost(problem, state)
+    near = problem.near_best(state, problem.policy.close_cost)
+    for _ in range(problem.policy.settling_rounds):
+        near = near[np.flatnonzero(contradicted[near])]
+        if not near.size:
+            break
+        moves = _moves(problem, state.sums, near)
+        source = np.repeat(near, moves.shape[1])
+        theta = state.theta[source]
+        theta[:, problem.columns] += moves.reshape(len(source), -1)
+        theta[:, :4] = problem.clipped(theta[:, :4])
+        tried = problem.some(source).at(theta)
+        total = whole_cost(problem.some(source), tried)[0].reshape(len(near), -1)
+        best = total.argmin(axis=1)
+        chosen = np.flatnonzero(total[np.arange(len(near)), best] < cost[near] - 1)
+        if not chosen.size:
+            break
+        at = chosen * moves.shape[1] + best[chosen]
+        near = near[chosen]
+        there = problem.some(near)
+        found = descend(there, there.at(theta[at], with_slopes=True), problem.policy.settled_cost)
+        news, still = whole_cost(there, found)
+        wins = np.flatnonzero(news < cost[near])
+        state.update(near[wins], picked(found, wins))
+        cost[near[wins]], contradicted[near[wins]] = news[wins], still[wins]
+        near = near[wins]
+    return state
+
+
+def _moves(problem: Problem, sums: Sums, which: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Return steps along the axes of the covariance, (k, moves, p); where there is none, natural units."""
+    p = len(problem.columns)
+    matrix = covariance_of(sums.information[which] * np.outer(problem.scale, problem.scale))
+    known = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
+    values, vectors = np.linalg.eigh(np.where(known[:, None, None], matrix, np.eye(p)))
+    axes = vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), 1.0)[:, None, :]
+    sizes = np.array(problem.policy.settling_sigma)
+    moves = np.einsum("kpa,s->kasp", axes, sizes).reshape(len(which), -1, p)
+    longest = np.abs(moves).max(axis=2, keepdims=True)
+    return np.asarray(moves * np.minimum(1.0, 2.0 / np.maximum(longest, 1e-30)) * problem.scale)

@@ -1,0 +1,237 @@
+"""Maximum-likelihood pose and class: seed from the bank, refine, rank, report covariance."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data import Bank
+from phasemark.matcher.agreement import DISAGREEMENT, counts, pixel_mask
+from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.likelihood.auto_background import AutoBackground
+from phasemark.matcher.likelihood.background_estimate import NEAREST_WALL_M
+from phasemark.matcher.likelihood.bank_images import BankModel
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.ranking import rank
+from phasemark.matcher.likelihood.rendered_images import RenderedModel
+from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
+from phasemark.matcher.likelihood.search import search_views
+from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
+from phasemark.matcher.likelihood.setup import Scene, Setup, Shapes, check_free
+from phasemark.matcher.likelihood.shared_errors import with_motion, with_shared_errors
+from phasemark.matcher.likelihood.systematic import Systematic
+from phasemark.matcher.likelihood.unknown_things import fit_without_borders
+from phasemark.matcher.match import Match
+from phasemark.matcher.nearest.bank_minima import Search
+from phasemark.matcher.nearest.templates import Observation
+from phasemark.render import Background, PhasorImages, background_image, wrap_difference_m
+
+__all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TOLERANCE_M", "TOLERANCE_RAD", "LikelihoodMatcher", "Pixels"]
+
+Pixels = Literal["all", "lower"]
+ROBUST_FROM = 3.0
+"""Residual, in σ, from which Huber's loss is linear: far enough out to cost an honest frame nothing."""
+TOLERANCE_M, TOLERANCE_RAD = 0.03, math.radians(6.0)
+"""An accepted answer is right to within these at three standard deviations."""
+BEARING_STD_RAD = math.radians(1.5)
+"""Standard deviation of the bearing before a frame is seen, unless the matcher is told."""
+
+
+class LikelihoodMatcher:
+    """Estimates class and continuous view of a landmark; see :class:`~phasemark.matcher.Matcher` for the parameters."""
+
+    def __init__(
+        self,
+        bank: Bank,
+        *,
+        free: Sequence[str] | None = None,
+        background: Background | Literal["auto", "unknown"] | None = None,
+        false_alarm: float = 0.01,
+        on: ResidualKind = "ranges",
+        pixels: Pixels = "all",
+        robust: bool = False,
+        bearing_std_rad: float = BEARING_STD_RAD,
+        systematic: Sequence[Systematic] = (),
+        tolerance_m: float = TOLERANCE_M,
+        tolerance_rad: float = TOLERANCE_RAD,
+        workers: int | None = None,
+        policy: SearchPolicy = DEFAULT_POLICY,
+    ) -> None:
+        _check_choices(bank, background, on, pixels)
+        near = free is None
+        unknown = background == "unknown"
+        self._bank = bank
+        self._systematic = systematic
+        self._workers = workers or _usual_workers()
+        self._stated = background if isinstance(background, Background) else None
+        self._setup = Setup(
+            bank=bank,
+            shapes=Shapes.of_bank(bank),
+            free=check_free((*VIEW[:2], "bearing_rad") if free is None else free),
+            prior_std=(math.inf, math.inf, bearing_std_rad) if near else (),
+            on=on,
+            background_is_known=self._stated is not None,
+            unknown=unknown,
+            used=pixel_mask(pixels, bank.sensor).ravel(),
+            huber=ROBUST_FROM if robust or unknown else None,
+            false_alarm=false_alarm,
+            tolerance={name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW},
+            widest_rad=policy.prior_sigma * bearing_std_rad if near else math.inf,
+            policy=policy,
+        )
+        behind = None if self._stated is None else background_image(self._stated, bank.sensor)
+        self._exact, self._scout = self._bank_models(behind)
+        self._stride = self._search_stride()
+        search = self._new_search(behind, 0.0 if near else self._setup.widest_rad)
+        wide = self._new_search(behind, self._setup.widest_rad) if near else search
+        self._auto = background == "auto"
+        if self._auto or self._exact is None:
+            self._check_distances()
+        final = self._exact or self._rendered
+        self._scene = Scene(self._stated, behind, final, None if self._exact else self._scout, search, wide)
+
+    def match(self, frames: FilteredFrames) -> list[Match]:
+        """Match filtered frames."""
+        answers: list[Match] = []
+        for start in range(0, len(frames), self._setup.policy.frames_at_once):
+            some = frames[start : start + self._setup.policy.frames_at_once]
+            answers.extend(self._match_auto(some) if self._auto else self._match_before(some))
+        return with_motion(self._setup, self._systematic, frames, answers)
+
+    def _match_before(self, frames: FilteredFrames) -> list[Match]:
+        """Match frames before the background that was stated, or none."""
+        evidence = Evidence.from_frames(frames, self._setup.on)
+        bare = bare_cost(evidence.seen, self._scene.behind)
+        fits = search_views(self._setup, self._scene, evidence, evidence.seen, bare)
+        if self._setup.unknown:
+            fits = fit_without_borders(self._setup, self._scene, evidence, fits)
+        answers = rank(self._setup, frames, fits, bare, self._stated)
+        return self._with_shared_errors(frames, evidence, answers)
+
+    def _match_auto(self, frames: FilteredFrames) -> list[Match]:
+        """Match frames one by one, each before what stands behind it."""
+        auto = AutoBackground(self._setup, self._rendered, self._scene_before)
+        answers: list[Match] = []
+        for k in range(len(frames)):
+            one = frames[k : k + 1]
+            evidence = Evidence.from_frames(one, self._setup.on)
+            bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(evidence))
+            background, fits = auto.search(one, evidence, bare)
+            found = rank(self._setup, one, fits, bare, background)
+            answers.extend(self._with_shared_errors(one, evidence, found))
+        return answers
+
+    def _with_shared_errors(self, frames: FilteredFrames, evidence: Evidence, answers: list[Match]) -> list[Match]:
+        """Add to covariances what all frames of a camera share."""
+        return with_shared_errors(
+            self._setup, lambda: self._rendered, self._systematic, frames.sensor, evidence, answers
+        )
+
+    @cached_property
+    def _rendered(self) -> RenderedModel:
+        """What renders the landmarks of the bank, made when it is first needed."""
+        return RenderedModel(self._bank, self._stated, self._workers)
+
+    def _bank_models(self, behind: PhasorImages | None) -> tuple[BankModel | None, BankModel | None]:
+        """Return the interpolated images that the answer is taken from, and those of a scout; None where unfit."""
+        setup, policy = self._setup, self._setup.policy
+        fixed = setup.free == VIEW[:2]
+        is_exact = fixed and setup.on == "ranges" and self._stated is None
+        is_exact = is_exact and BankModel.fits(self._bank, *policy.fine_grid)
+        scouts = (fixed or bool(setup.prior_std)) and BankModel.fits(self._bank, *policy.coarse_grid)
+        return (
+            BankModel(self._bank) if is_exact else None,
+            BankModel(self._bank, behind, smooth_only=True) if scouts else None,
+        )
+
+    def _check_distances(self) -> None:
+        """Check that the bank has distances at which views are rendered."""
+        nearest, (step_m, step_rad) = self._rendered.limits()[0], self._setup.policy.fine_grid
+        if self._bank.distance_m[-1] < nearest:
+            raise UsageError(
+                f"the bank ends at {self._bank.distance_m[-1]:g} m, and views nearer than {nearest:.3g} m, half the"
+                " landmark's width, are not rendered: build it in steps of at most"
+                f" {step_m:g} m and {math.degrees(step_rad):.2g}°, and free"
+                " distance_m and delta_rad alone without a background"
+            )
+
+    def _search_stride(self) -> tuple[int, int]:
+        """Return every how many distances and angles of the bank are searched."""
+        fine = (1, 1) if self._stated is not None and not self._setup.bearing_is_free else (2, 3)
+        along, around = (
+            max(1, min(step, (len(grid) - 1) // 4))
+            for step, grid in zip(fine, (self._bank.distance_m, self._bank.delta_rad), strict=True)
+        )
+        return along, around
+
+    def _new_search(self, behind: PhasorImages | None, widest_rad: float) -> Search:
+        """Return a search before some background, over bearings up to a widest where they are free."""
+        widest = widest_rad if self._setup.bearing_is_free else 0.0
+        return Search(self._bank, behind, self._stride, widest, capped=self._setup.unknown)
+
+    def _scene_before(self, background: Background | None, together: bool) -> Scene:
+        """Return the scene of an estimated background; see :class:`AutoBackground`."""
+        if background is None:
+            return self._scene
+        behind = background_image(background, self._bank.sensor)
+        scene = replace(
+            self._scene,
+            background=background,
+            behind=behind,
+            final=self._rendered.with_background(background),
+            scout=None if self._scout is None else self._scout.before(behind),
+        )
+        if not together:
+            return scene
+        search = self._new_search(behind, self._setup.widest_rad)
+        return replace(scene, search=search, wide_search=search)
+
+    def _bare_wall_cost(self, evidence: Evidence) -> NDArray[np.float64]:
+        """Return how badly a wall at its best distance explains all of one frame, (1,)."""
+        seen = evidence.seen
+        forward = self._bank.sensor.axis_cosine().ravel() * seen.range_m[0]
+        returned = seen.returned[0]
+        if returned.sum() < self._setup.policy.min_returns:
+            return np.array([np.inf])
+        wall_m = float(np.average(forward[returned], weights=seen.weight[0, returned]))
+        if wall_m < NEAREST_WALL_M:
+            return np.array([np.inf])
+        return bare_cost(seen, background_image(Background(wall_m=wall_m), self._bank.sensor))
+
+
+def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.float64]:
+    """Return the whitened squared distance of frames from a scene without a landmark, (n,)."""
+    if behind is None:
+        return np.asarray(DISAGREEMENT * seen.returned.sum(axis=1), np.float64)
+    sensor = behind.sensor
+    model = behind.range_m.reshape(-1)
+    lit = np.isfinite(model)
+    sure = counts(behind.phasor, behind.intensity, sensor).reshape(-1)
+    residual = wrap_difference_m(np.where(lit & seen.returned, seen.range_m - np.where(lit, model, 0.0), 0.0), sensor)
+    wrong = (seen.returned & ~lit) | (seen.not_returned & sure)
+    squared = np.minimum(seen.weight * residual**2, DISAGREEMENT)
+    return np.asarray(squared.sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
+
+
+def _check_choices(bank: Bank, background: object, on: str, pixels: str) -> None:
+    """Check the choices of a matcher."""
+    if on not in ("ranges", "phasors"):
+        raise UsageError(f"'on' must be ranges or phasors, got {on!r}")
+    if pixels not in ("all", "lower"):
+        raise UsageError(f"'pixels' must be all or lower, got {pixels!r}")
+    if bank.plan.model != "ray":
+        raise UsageError(f"the bank's model is '{bank.plan.model}', which knows no mixed pixels: refine needs 'ray'")
+    if background == "unknown" and on != "ranges":
+        raise UsageError('background="unknown" takes on="ranges": the brightness of unknown things tells nothing')
+
+
+def _usual_workers() -> int:
+    return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8)

@@ -1,0 +1,255 @@
+"""Candidates with the frames they explain: what their images cost at some views, and how that changes.
+
+The sums are those of :mod:`phasemark.matcher.likelihood.residuals`. Which pixels count is decided by the model at the
+start (PHYSICS section 7) and held while a view moves, so that the sum stays comparable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.agreement import MUST_RETURN_COVERAGE, counts
+from phasemark.matcher.information import NATURAL_UNITS
+from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
+from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
+from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
+
+ALBEDO = "albedo"
+"""Name of the factor on the landmark's brightness, profiled out on phasors."""
+SCALE = {**NATURAL_UNITS, ALBEDO: 0.1}
+"""Natural units of the parameters: 1 cm, 1°. Condition numbers and the longest step are stated in them."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is estimated, and from what.
+
+    Parameters
+    ----------
+    free : tuple of str
+        Parameters of the view.
+    pixels : (pixels,) bool
+        Which pixels place the landmark; all of them tell its class.
+    huber : float, optional
+        Residual, in σ, from which the loss grows linearly, and soon no more.
+    background : PhasorImages' phasor (pixels,) complex128, optional
+        What stands behind, without the landmark; on phasors the albedo does not scale it.
+    look_beside_rad : tuple of float
+        How far to either side of a solution δ is tried once more; there may be a lower minimum behind a kink.
+    prior_std : tuple of float
+        Standard deviation of each free parameter about 0 before the frame was seen; infinite where nothing is known.
+        Empty: nothing is known of any.
+    returns_behind : (pixels,) bool, optional
+        Where the background alone returns light that one frame measures; None without a background.
+    unknown_around : bool
+        Whether unknown things may stand in view: what the landmark does not explain is then left out of the test.
+    longest_step : float
+        No step is longer, in natural units of 1 cm and 1°. Near a solution it should be short: where an edge crosses
+        a pixel's border, slopes jump, and those of one side may lead far away on the other.
+    policy : SearchPolicy
+    """
+
+    free: tuple[str, ...]
+    pixels: NDArray[np.bool_]
+    huber: float | None = None
+    background: NDArray[np.complex128] | None = None
+    look_beside_rad: tuple[float, ...] = ()
+    prior_std: tuple[float, ...] = ()
+    returns_behind: NDArray[np.bool_] | None = None
+    unknown_around: bool = False
+    longest_step: float = DEFAULT_POLICY.longest_step
+    policy: SearchPolicy = DEFAULT_POLICY
+
+
+@dataclass(eq=False)
+class State:
+    """Where m candidates are: parameters (view and albedo, (m, 5)), pixels in use, images and sums there."""
+
+    theta: NDArray[np.float64]
+    use: NDArray[np.bool_]
+    images: ModelImages
+    sums: Sums
+
+    def update(self, where: NDArray[np.integer], news: State) -> None:
+        """Replace some candidates by others, in place."""
+        for own, new in ((self.images, news.images), (self.sums, news.sums)):
+            for name, values in vars(own).items():
+                values[where] = getattr(new, name)
+        self.theta[where], self.use[where] = news.theta, news.use
+
+
+class Problem:
+    """m candidates with their frames.
+
+    Parameters
+    ----------
+    model : ImageModel
+    evidence : Evidence
+    frame, class_index : (m,) int64
+        Which frame each candidate explains, and by which class.
+    settings : Settings
+    limit : (m,) float64
+        Cost above which a candidate is given up.
+    """
+
+    def __init__(
+        self,
+        model: ImageModel,
+        evidence: Evidence,
+        frame: NDArray[np.int64],
+        class_index: NDArray[np.int64],
+        settings: Settings,
+        limit: NDArray[np.float64],
+    ) -> None:
+        self.limit = limit
+        self.model, self.evidence, self.settings = model, evidence, settings
+        self.policy = settings.policy
+        self.frame, self.class_index = frame, class_index
+        self.with_albedo = evidence.on == "phasors"
+        names = (*settings.free, ALBEDO) if self.with_albedo else settings.free
+        self.columns = np.array([(*VIEW, ALBEDO).index(name) for name in names])
+        self.scale = np.array([SCALE[name] for name in names])
+        known = np.array(settings.prior_std) if settings.prior_std else np.full(len(settings.free), np.inf)
+        self.prior_weight = np.concatenate([known**-2.0, np.zeros(len(names) - len(known))])
+
+    def some(self, which: NDArray[np.integer]) -> Problem:
+        """Return the problem of some of the candidates."""
+        return Problem(
+            self.model, self.evidence, self.frame[which], self.class_index[which], self.settings, self.limit[which]
+        )
+
+    def start(self, view: NDArray[np.float64], at_first_sight: bool) -> State:
+        """Look at the first views: which pixels count, and how bright the landmark is."""
+        theta = np.column_stack([self.clipped(view.copy()), np.ones(len(view))])
+        view, free = np.ascontiguousarray(theta[:, :4]), self.settings.free
+        if at_first_sight and not self.with_albedo and not self.model.slopes_are_free:
+            images = self._images_at_first_sight(theta)
+        else:
+            images = self.model.images(self.class_index, view, free)
+        if self.with_albedo:
+            theta[:, 4] = self._brightness(images)
+        return self.summed(theta, self.pixels_at(images, theta), self.scaled(images, theta))
+
+    def _images_at_first_sight(self, theta: NDArray[np.float64]) -> ModelImages:
+        """Return first images; slopes are 0 where no step is likely to lead below the limit."""
+        view, free = np.ascontiguousarray(theta[:, :4]), self.settings.free
+        images = self.model.images(self.class_index, view, ())
+        images = replace(images, slope=np.zeros((len(view), len(free), images.phasor.shape[1]), np.complex128))
+        cost = self.summed(theta, self.pixels_at(images, theta), images).sums.cost
+        hopeful = np.flatnonzero(cost < self.limit + self.policy.first_sight_cost)
+        if hopeful.size:
+            with_slopes = self.model.images(self.class_index[hopeful], np.ascontiguousarray(view[hopeful]), free)
+            images.slope[hopeful] = with_slopes.slope
+        return images
+
+    def state(
+        self, theta: NDArray[np.float64], use: NDArray[np.bool_], slope: NDArray[np.complex128] | None = None
+    ) -> State:
+        """Render and compare; with known slopes, only the images are new."""
+        free = self.settings.free if slope is None else ()
+        images = self.model.images(self.class_index, np.ascontiguousarray(theta[:, :4]), free)
+        images = self.scaled(images, theta)
+        return self.summed(theta, use, images if slope is None else replace(images, slope=slope))
+
+    def at(self, theta: NDArray[np.float64], *, with_slopes: bool = False) -> State:
+        """Return states at some parameters, each with the pixels that count there."""
+        view, free = np.ascontiguousarray(theta[:, :4]), self.settings.free
+        images = self.model.images(self.class_index, view, free if with_slopes else ())
+        if not with_slopes:
+            images = replace(images, slope=np.zeros((len(view), len(free), images.phasor.shape[1]), np.complex128))
+        scaled = self.scaled(images, theta)
+        return self.summed(theta, self.pixels_at(scaled, theta), scaled)
+
+    def turned(self, states: State, source: NDArray[np.integer], theta: NDArray[np.float64]) -> State:
+        """Return states that differ from `source` in δ alone, with the slopes from there."""
+        before = ModelImages(**{name: values[source] for name, values in vars(states.images).items()})
+        if self.with_albedo:  # what the model makes is as bright as the bank has it
+            before = replace(before, phasor=before.phasor - (theta[:, 4:] - 1) * before.slope[:, -1])
+        images = self.model.turned(self.class_index, np.ascontiguousarray(theta[:, :4]), before)
+        if self.with_albedo:
+            images = replace(self.scaled(replace(images, slope=images.slope[:, :-1]), theta), slope=before.slope)
+        return self.summed(theta, states.use[source], images)
+
+    def summed(self, theta: NDArray[np.float64], use: NDArray[np.bool_], images: ModelImages) -> State:
+        """Return the state of images that were rendered: compare them with the frames."""
+        sums = gauss_newton_sums(
+            images.phasor, images.slope, self.evidence, self.frame, use & self.settings.pixels, self.settings.huber
+        )
+        return State(theta, use, images, self.with_prior(sums, theta))
+
+    def prior_cost(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the whitened squared distance of parameters from what was known before, (m,)."""
+        return np.asarray((self.prior_weight * theta[:, self.columns] ** 2).sum(axis=1))
+
+    def with_prior(self, sums: Sums, theta: NDArray[np.float64]) -> Sums:
+        """Add what was known of the parameters before the frame was seen."""
+        if not self.prior_weight.any():
+            return sums
+        cost, square = self.prior_cost(theta), np.diag(self.prior_weight)
+        if sums.gradient.shape[1] < len(square):  # images without slopes
+            return replace(sums, cost=sums.cost + cost, capped=sums.capped + cost)
+        return Sums(
+            sums.cost + cost,
+            sums.capped + cost,
+            sums.gradient - self.prior_weight * theta[:, self.columns],
+            sums.information + square,
+            sums.scatter + square,
+        )
+
+    def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which pixels count at some views, (m, pixels)."""
+        trusted = self.model.trusted(self.class_index, theta[:, :4])
+        phasor = images.phasor
+        if self.with_albedo and images.slope.shape[1] == len(self.columns):
+            # a landmark made dim must not make its pixels disappear: the bank's albedo decides
+            phasor = phasor - (theta[:, 4:] - 1) * images.slope[:, -1]
+        return counts(phasor, images.intensity, self.evidence.sensor) & trusted
+
+    def near_best(self, state: State, margin: float) -> NDArray[np.intp]:
+        """Return the candidates that may be their frame's best, up to some cost above it; with none the best alone."""
+        cost = state.sums.cost
+        order = np.lexsort((cost, self.frame))
+        first = order[np.flatnonzero(np.diff(self.frame[order], prepend=-1))]
+        if margin == 0:
+            return np.sort(first[cost[first] <= self.limit[first]])
+        least = np.full(len(self.evidence.weight), np.inf)
+        least[self.frame[first]] = cost[first]
+        return np.flatnonzero((cost <= self.limit) & (cost <= least[self.frame] + margin))
+
+    def scaled(self, images: ModelImages, theta: NDArray[np.float64]) -> ModelImages:
+        """Make the landmark as bright as the parameters have it, and append the slope by that."""
+        if not self.with_albedo:
+            return images
+        own = self._landmark_alone(images)
+        factor = theta[:, 4:]
+        slope = np.concatenate([images.slope * factor[:, :, None], own[:, None]], axis=1)
+        return replace(images, phasor=images.phasor + (factor - 1) * own, slope=slope)
+
+    def _landmark_alone(self, images: ModelImages) -> NDArray[np.complex128]:
+        behind = self.settings.background
+        return images.phasor if behind is None else images.phasor - (1 - images.coverage) * behind
+
+    def _brightness(self, images: ModelImages) -> NDArray[np.float64]:
+        """Return the factor by which frames are brighter than their models, (m,)."""
+        own = self._landmark_alone(images)
+        value, weight = self.evidence.value[self.frame], self.evidence.weight[self.frame]
+        weight = weight * (images.coverage > MUST_RETURN_COVERAGE)
+        power = np.sum(weight * np.abs(own) ** 2, axis=1)
+        along = np.sum(weight * (own.conj() * (value - (images.phasor - own))).real, axis=1)
+        factor = np.divide(along, power, out=np.ones_like(power), where=power > 0)
+        return np.asarray(np.clip(factor, 0.01, 100.0))
+
+    def clipped(self, view: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Move views, in place, to the distances that the model can show; return them."""
+        view[:, 0] = np.clip(view[:, 0], *self.model.limits())
+        return view
+
+
+def picked(state: State, which: NDArray[np.integer]) -> State:
+    """Return the state of some of the candidates."""
+    images = ModelImages(**{name: values[which] for name, values in vars(state.images).items()})
+    sums = Sums(**{name: values[which] for name, values in vars(state.sums).items()})
+    return State(state.theta[which], state.use[which], images, sums)

@@ -1,0 +1,171 @@
+"""The last step: from the fits of each frame to an answer, accepted or refused for a stated reason."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from phasemark.matcher.agreement import DISAGREEMENT
+from phasemark.matcher.chi_squared import p_values_of
+from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.information import weak_direction
+from phasemark.matcher.likelihood.fits import Fits, distinct
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.setup import Setup
+from phasemark.matcher.match import Candidate, Match, Reason
+from phasemark.render import Background, delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
+
+__all__ = ["is_determined", "rank"]
+
+
+def rank(
+    setup: Setup,
+    frames: FilteredFrames,
+    fits: Fits,
+    bare: NDArray[np.float64],
+    background: Background | None,
+) -> list[Match]:
+    """Return the answer for each frame: the best fit, the others as alternatives, and whether it is accepted.
+
+    Parameters
+    ----------
+    setup : Setup
+    frames : FilteredFrames
+        n frames.
+    fits : Fits
+    bare : (n,) float64
+        Cost of a scene without a landmark.
+    background : Background, optional
+        What the fits assume behind the landmark.
+    """
+    tolerated = setup.policy.largest_scale**2 if setup.unknown else 1.0
+    p_values = p_values_of(fits.tested / tolerated, fits.dof, frames, fits.frame)
+    order = np.lexsort((fits.cost, fits.frame))
+    first = np.searchsorted(fits.frame[order], np.arange(len(frames) + 1))
+    doubt = np.asarray(special.chdtri(np.maximum(fits.dof, 1), setup.false_alarm), np.float64)
+    answers = []
+    for k in range(len(frames)):
+        own = order[first[k] : first[k + 1]]
+        own = own[np.isfinite(fits.cost[own])]
+        answers.append(_answer(setup, fits, own, p_values, doubt, float(bare[k]), background))
+    return answers
+
+
+def is_determined(setup: Setup, std: NDArray[np.float64], symmetry: int) -> bool:
+    """Return whether every free parameter is known to within its tolerance, three standard deviations.
+
+    The error of δ is at most half a period of the landmark, which no tolerance is below for a body of revolution.
+    """
+    tolerance = np.array([setup.tolerance[name] for name in setup.free])
+    error = setup.policy.tolerated_sigma * std
+    turn = setup.free.index("delta_rad")
+    error[turn] = min(error[turn], math.pi / symmetry)
+    return bool((error <= tolerance).all())
+
+
+def _answer(
+    setup: Setup,
+    fits: Fits,
+    own: NDArray[np.int64],
+    p_values: NDArray[np.float64],
+    doubt: NDArray[np.float64],
+    bare: float,
+    background: Background | None,
+) -> Match:
+    """Turn the fits of one frame, best first, into an answer."""
+    names = setup.shapes.names
+    if not len(own):
+        nothing = {**dict.fromkeys(names, 0.0), "none": 1.0}
+        return Match(class_name=None, accepted=False, free=setup.free, class_probability=nothing, reason="no landmark")
+    kept = distinct(fits, own, setup.shapes.symmetry, setup.policy.same_m, setup.policy.same_rad)
+    best = kept[0]
+    left = DISAGREEMENT * float(fits.unexplained[best])
+    weight = _weights(np.append(fits.cost[kept], min(bare, float(doubt[best]) + left)))
+    reason = _reason(setup, fits, kept, weight[:-1], float(p_values[best]), bare)
+    candidates = tuple(_candidate(setup, fits, k, w) for k, w in zip(kept, weight, strict=False))
+    condition, weak = weak_direction(setup.free, information=fits.information[best])
+    covariance = fits.covariance[best]
+    is_landmark = reason != "no landmark"
+    return Match(
+        class_name=candidates[0].class_name if is_landmark else None,
+        accepted=not reason,
+        distance_m=candidates[0].distance_m,
+        delta_rad=candidates[0].delta_rad,
+        bearing_rad=candidates[0].bearing_rad,
+        height_m=candidates[0].height_m,
+        free=setup.free,
+        covariance=covariance.copy() if np.isfinite(covariance).all() else None,
+        chi2=float(fits.tested[best]),
+        dof=int(fits.dof[best]),
+        p_value=float(p_values[best]),
+        class_probability=_class_probability(names, candidates, float(weight[-1])),
+        alternatives=candidates[1:] if is_landmark else candidates,
+        symmetry=setup.shapes.symmetry[fits.class_index[best]],
+        condition_number=condition,
+        weak_direction=weak,
+        background=background,
+        reason=reason,
+    )
+
+
+def _weights(costs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the probabilities of explanations, by exp(−cost / 2)."""
+    weight = np.exp(-0.5 * np.minimum(costs - costs.min(), 1400.0))
+    return np.asarray(weight / weight.sum())
+
+
+def _candidate(setup: Setup, fits: Fits, k: int, weight: float) -> Candidate:
+    """Return one fit as an explanation, δ within the landmark's period."""
+    c = int(fits.class_index[k])
+    distance, delta, bearing, height = (float(value) for value in fits.view[k])
+    turn = delta_period_rad(setup.shapes.symmetry[c])
+    cost = float(fits.cost[k])
+    return Candidate(
+        setup.shapes.names[c], distance, float(wrap_delta_rad(delta, turn)), cost, float(weight), bearing, height
+    )
+
+
+def _class_probability(names: Sequence[str], candidates: Sequence[Candidate], none: float) -> dict[str, float]:
+    """Return the probability of each class, in the order of the bank, and of "none"."""
+    of_class = {candidate.class_name: 0.0 for candidate in candidates}
+    for candidate in candidates:
+        of_class[candidate.class_name] += candidate.weight
+    return {**dict.fromkeys(names, 0.0), **of_class, "none": none}
+
+
+def _reason(
+    setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float64], p_value: float, bare: float
+) -> Reason:
+    """Return why the best fit of a frame is refused; empty where it is accepted."""
+    best = kept[0]
+    if not fits.capped[best] < bare:
+        return "no landmark"
+    if p_value < setup.false_alarm or (setup.unknown and fits.agreeing[best] < fits.elsewhere[best]):
+        return "poor fit"
+    if setup.unknown and fits.explained[best] < setup.fewest_explained:
+        return "undetermined"
+    symmetry = setup.shapes.symmetry[fits.class_index[best]]
+    if not is_determined(setup, fits.std_without_one[best], symmetry):
+        return "undetermined"
+    return "ambiguous" if _is_ambiguous(setup, fits, kept, weight) else ""
+
+
+def _is_ambiguous(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float64]) -> bool:
+    """Return whether other classes, or views beyond the tolerance, are too probable; `kept` is best first."""
+    policy, best = setup.policy, kept[0]
+    period = delta_period_rad(setup.shapes.symmetry[fits.class_index[best]])
+    apart = np.abs(fits.view[kept] - fits.view[best])
+    apart[:, 1] = np.abs(wrap_delta_difference_rad(apart[:, 1], period))
+    own = [VIEW.index(name) for name in setup.free]
+    std = np.sqrt(np.nan_to_num(np.einsum("kpp->kp", fits.covariance[kept]), posinf=0.0))
+    apart[1:, own] += policy.tolerated_sigma * std[1:]  # the truth may be on the far side of the other view
+    far = (apart > [setup.tolerance[name] for name in VIEW]).any(axis=1)
+    other = fits.class_index[kept] != fits.class_index[best]
+    # where a landmark looks alike from two sides, a single pixel at an edge must not decide between them
+    enough = DISAGREEMENT * (policy.pixels_against_far_view if setup.unknown else 1)
+    alike = far & ~other & (fits.cost[kept] < fits.cost[best] + enough)
+    return bool(weight[other].sum() > policy.ambiguity * weight.sum() or alike.any())

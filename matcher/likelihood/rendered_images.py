@@ -1,0 +1,166 @@
+"""Model images rendered where they are needed, from the meshes of a bank: any view, and anything behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.data import Bank
+from phasemark.matcher.likelihood.images import VIEW, ModelImages
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
+
+STEP = 1e-5
+"""Width of a difference, metres or radians: see :meth:`~phasemark.render.Renderer.jacobian`."""
+_BEFORE_LENS_M, _BEFORE_WALL_M = 5e-3, 1e-3
+"""Smallest gaps between the circle around a landmark and the lens, and the wall."""
+_BEYOND_BANK = 1.25
+"""Without a wall a view may be this many times as far as the bank's last distance."""
+
+
+class RenderedModel:
+    """Model images rendered where they are needed, from the meshes of a bank.
+
+    Parameters
+    ----------
+    bank : Bank
+    background : Background, optional
+        What stands behind the landmark.
+    workers : int
+        Threads that render.
+    """
+
+    slopes_are_free = False
+
+    def __init__(self, bank: Bank, background: Background | None = None, workers: int = 1) -> None:
+        self.sensor: Sensor = bank.sensor
+        self.background = background
+        self.workers = workers
+        self._renderers = []
+        self._factored = bank.lower is not None
+        self._radius_m = 0.0
+        for name in bank.classes:
+            mesh = bank.mesh(name)
+            self._renderers.append(Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"])))
+            self._radius_m = max(self._radius_m, float(np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max()))
+        self._bank_end_m = float(bank.distance_m[-1])
+        self._limits = self._limits_before(background)
+
+    def _limits_before(self, background: Background | None) -> tuple[float, float]:
+        """Return the limits of distance: the lens outside the landmark, and the landmark before the wall."""
+        wall = None if background is None else background.wall_m
+        far = _BEYOND_BANK * self._bank_end_m if wall is None else wall - self._radius_m - _BEFORE_WALL_M
+        return self._radius_m + _BEFORE_LENS_M, far
+
+    def renderer(self, class_index: int) -> Renderer:
+        """Return what renders one class of the bank."""
+        return self._renderers[class_index]
+
+    def with_background(self, background: Background | None) -> RenderedModel:
+        """Return the same model before another background."""
+        other = object.__new__(RenderedModel)
+        other.__dict__.update(self.__dict__)
+        other.background = background
+        other._limits = self._limits_before(background)
+        return other
+
+    def limits(self) -> tuple[float, float]:
+        """Return how near the lens may come, and how far the landmark may be."""
+        return self._limits
+
+    def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
+        """Render the views, and once more a step of 1e-5 m or rad along each parameter."""
+        m, pixels, p = len(view), self.sensor.rows * self.sensor.cols, len(free)
+        phasor, slope = np.empty((m, pixels), np.complex128), np.zeros((m, p, pixels), np.complex128)
+        intensity, coverage = np.empty((m, pixels)), np.empty((m, pixels))
+        for c in np.unique(class_index):
+            of = np.flatnonzero(class_index == c)
+            image = self._render(c, view[of])
+            phasor[of] = image.phasor.reshape(len(of), -1)
+            intensity[of] = image.intensity.reshape(len(of), -1)
+            coverage[of] = image.coverage.reshape(len(of), -1)
+            for k, name in enumerate(free):
+                axis = VIEW.index(name)
+                moved = view[of]
+                moved[:, axis] += STEP
+                width = (moved - view[of])[:, axis]
+                rows, first = self._changing_rows(name, view[of])
+                there = self._render(c, moved, rows).phasor.reshape(len(of), -1)
+                slope[of, k, first:] = (there - phasor[of, first:]) / width[:, None]
+        return ModelImages(phasor, slope, intensity, coverage)
+
+    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
+        """Render the rows that δ changes."""
+        phasor, intensity, coverage = before.phasor.copy(), before.intensity.copy(), before.coverage.copy()
+        rows, first = self._changing_rows("delta_rad", view)
+        for c in np.unique(class_index):
+            of = np.flatnonzero(class_index == c)
+            image = self._render(c, view[of], rows)
+            for values, new in ((phasor, image.phasor), (intensity, image.intensity), (coverage, image.coverage)):
+                values[of, first:] = new.reshape(len(of), -1)
+        return ModelImages(phasor, before.slope, intensity, coverage)
+
+    def wide_slopes(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        step: NDArray[np.float64],
+    ) -> NDArray[np.complex128]:
+        """Render both ends."""
+        slope = np.zeros((len(view), len(free), self.sensor.rows * self.sensor.cols), np.complex128)
+        for c in np.unique(class_index):
+            of = np.flatnonzero(class_index == c)
+            for k, name in enumerate(free):
+                rows, first = self._changing_rows(name, view[of])
+                axis = VIEW.index(name)
+                ends = []
+                for side in (1.0, -1.0):
+                    moved = view[of]
+                    moved[:, axis] += side * np.maximum(step[of, k], STEP)
+                    moved[:, 0] = np.clip(moved[:, 0], *self._limits)
+                    ends.append((moved[:, axis], self._render(c, moved, rows).phasor.reshape(len(of), -1)))
+                width = np.maximum(ends[0][0] - ends[1][0], STEP)
+                slope[of, k, first:] = (ends[0][1] - ends[1][1]) / width[:, None]
+        return slope
+
+    def _changing_rows(self, name: str, view: NDArray[np.float64]) -> tuple[tuple[int, int] | None, int]:
+        """Return the rows that a parameter changes, None for all, and their first pixel.
+
+        A body of revolution looks the same from every side.
+        """
+        if self._factored and name == "delta_rad" and not view[:, 3].any():
+            return self.sensor.lower_rows, self.sensor.lower_rows[0] * self.sensor.cols
+        return None, 0
+
+    def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return that every pixel may be relied on."""
+        return np.ones((len(view), self.sensor.rows * self.sensor.cols), np.bool_)
+
+    def reach(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        std: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the least and greatest coverage three standard deviations away along each parameter."""
+        low = np.full((len(view), self.sensor.rows * self.sensor.cols), np.inf)
+        high = np.zeros(low.shape)
+        for k, name in enumerate(free):
+            for side in (-3.0, 3.0):
+                moved = view.copy()
+                moved[:, VIEW.index(name)] += side * std[:, k]
+                moved[:, 0] = np.clip(moved[:, 0], *self._limits)
+                for c in np.unique(class_index):
+                    of = np.flatnonzero(class_index == c)
+                    coverage = self._render(c, moved[of]).coverage.reshape(len(of), -1)
+                    low[of], high[of] = np.minimum(low[of], coverage), np.maximum(high[of], coverage)
+        return low, high
+
+    def _render(self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None) -> PhasorImages:
+        renderer = self._renderers[class_index]
+        return renderer.render_views(
+            Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows, workers=self.workers
+        )

@@ -1,0 +1,162 @@
+"""The search for the most likely views of a batch of frames before one background, in five steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from phasemark.matcher.likelihood.candidates import fit_modes, fit_other_classes, fit_starts
+from phasemark.matcher.likelihood.fits import Fits, best_of_frame
+from phasemark.matcher.likelihood.look_alikes import fit_look_alikes
+from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.likelihood.setup import Scene, Setup
+from phasemark.matcher.nearest.templates import Observation
+from phasemark.render import phasor_to_range_m, wrap_difference_m
+
+__all__ = ["is_doubtful", "search_views"]
+
+
+def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observation, bare: NDArray[np.float64]) -> Fits:
+    """Return what explains each frame, the best views among them.
+
+    Parameters
+    ----------
+    setup : Setup
+    scene : Scene
+    evidence : Evidence
+        n frames.
+    seen : Observation
+        What the search in the bank sees of them.
+    bare : (n,) float64
+        Cost of a scene without a landmark.
+    """
+    which = _worth_a_search(setup, evidence, bare)
+    policy = setup.policy
+    n_modes = policy.modes if scene.background is None else policy.modes_before_background
+    sides = () if scene.background is None else policy.beside_rad
+    starts = scene.search.starts(seen[which], n_modes, all_classes=evidence.on == "phasors")
+    fits = fit_starts(setup, scene, evidence, which, starts, sides)
+    fits = _retry_unexplained(setup, scene, evidence, seen, bare, fits)
+    if setup.huber is not None and not setup.unknown:
+        fits = _retry_trimmed(setup, scene, evidence, seen, bare, fits)
+    return Fits.joined([fits, fit_look_alikes(setup, scene, evidence, fits)])
+
+
+def is_doubtful(setup: Setup, fits: Fits) -> bool:
+    """Return whether the best fit of one frame is worse than good ones are."""
+    if not np.isfinite(fits.cost).any():
+        return False
+    best = fits.cost.argmin()
+    return bool(fits.tested[best] > special.chdtri(max(int(fits.dof[best]), 1), setup.policy.doubtful_p))
+
+
+def _worth_a_search(setup: Setup, evidence: Evidence, bare: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return which frames have enough returns to place a landmark, and are not explained without one."""
+    returned = evidence.seen.returned
+    enough = (returned & setup.used).sum(axis=1) >= setup.policy.min_returns
+    explained = bare <= special.chdtri(np.maximum(returned.sum(axis=1), 1), setup.false_alarm)
+    return np.flatnonzero(enough & ~explained)
+
+
+def _unexplained(
+    setup: Setup, scene: Scene, evidence: Evidence, bare: NDArray[np.float64], fits: Fits, *, hopeless: bool = False
+) -> NDArray[np.int64]:
+    """Return the frames whose best fit is worse than good ones are, but not beyond hope.
+
+    On ranges, that is where it costs more than returns that nothing explains; before a known background every fit may
+    be a side peak.
+    """
+    best = best_of_frame(fits)
+    side_peaks = evidence.on == "phasors" or scene.background is not None
+    p = setup.policy.doubtful_p if side_peaks else setup.policy.hopeless_p
+    limit = special.chdtri(np.maximum(fits.dof[best], 1), p)
+    cost, frame = fits.tested[best], fits.frame[best]
+    certain = evidence.on == "phasors" or setup.background_is_known or hopeless
+    hope = True if certain else cost < bare[frame]
+    return np.asarray(frame[(cost > limit) & hope])
+
+
+def _retry_unexplained(
+    setup: Setup, scene: Scene, evidence: Evidence, seen: Observation, bare: NDArray[np.float64], fits: Fits
+) -> Fits:
+    """Search again, from many more places, where nothing fits."""
+    policy = setup.policy
+    poor = _unexplained(setup, scene, evidence, bare, fits)
+    if not poor.size:
+        return fits
+    n_modes = policy.modes if scene.background is None else policy.modes_before_background
+    all_classes = evidence.on == "phasors"
+    direct = replace(scene, scout=None)
+    parts = [fits]
+    if setup.prior_std:
+        # a scout knows no bearing: turn its best views, heading kept, and look at shifted images
+        parts.append(_fit_turned(setup, direct, evidence, poor, fits))
+        poor = _unexplained(setup, scene, evidence, bare, Fits.joined(parts))
+        if poor.size:
+            starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=all_classes)
+            parts.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
+        return Fits.joined(parts)
+    starts = scene.wide_search.starts(seen[poor], policy.modes_again, all_classes=all_classes)
+    parts.append(fit_starts(setup, scene, evidence, poor, starts, policy.beside_again_rad, patient=True))
+    poor = _unexplained(setup, scene, evidence, bare, parts[-1])
+    if poor.size and scene.scout is not None:
+        # too little may be smooth for the scout to see the way
+        starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=all_classes)
+        parts.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
+    return Fits.joined(parts)
+
+
+def _fit_turned(setup: Setup, scene: Scene, evidence: Evidence, which: NDArray[np.int64], fits: Fits) -> Fits:
+    """Fit some frames from their best views seen under several bearings, as far apart as their prior is wide.
+
+    A frame tells the heading δ − b before it tells δ and b: a view fitted without a bearing has the right heading.
+    """
+    best = best_of_frame(fits)
+    best = best[np.isin(fits.frame[best], which)]
+    turns = np.array([-2.0, -1.0, 1.0, 2.0]) * min(setup.widest_rad / 2, scene.search.column_rad / 2)
+    view = np.tile(fits.view[best], (len(turns), 1))
+    view[:, 1] += np.repeat(turns, len(best))
+    view[:, 2] += np.repeat(turns, len(best))
+    order = np.argsort(np.tile(fits.frame[best], len(turns)), kind="stable")
+    frame, class_index = np.tile(fits.frame[best], len(turns)), np.tile(fits.class_index[best], len(turns))
+    settings, margin = scene.settings(setup), setup.policy.margin_cost
+    model = scene.final
+    found = fit_modes(setup, model, evidence, frame[order], class_index[order], view[order], settings, margin)
+    return Fits.joined([found, fit_other_classes(setup, model, evidence, found, settings)])
+
+
+def _retry_trimmed(
+    setup: Setup, scene: Scene, evidence: Evidence, seen: Observation, bare: NDArray[np.float64], fits: Fits
+) -> Fits:
+    """Search again without the returns that fit worst, as a robust matcher does where nothing fits."""
+    policy = setup.policy
+    n_modes = policy.modes if scene.background is None else policy.modes_before_background
+    sides = () if scene.background is None else policy.beside_rad
+    for _ in range(policy.trimmings):
+        poor = _unexplained(setup, scene, evidence, bare, fits, hopeless=True)
+        if not poor.size:
+            break
+        kept = _trimmed(setup, scene, evidence, fits, poor, seen)
+        starts = scene.search.starts(kept, n_modes, all_classes=evidence.on == "phasors")
+        fits = Fits.joined([fits, fit_starts(setup, scene, evidence, poor, starts, sides)])
+    return fits
+
+
+def _trimmed(
+    setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, which: NDArray[np.int64], seen: Observation
+) -> Observation:
+    """Return some frames without the returns that are farthest from their best fits, and from the bulk of them."""
+    best = best_of_frame(fits)
+    best = best[np.searchsorted(fits.frame[best], which)]
+    phasor = scene.final.images(fits.class_index[best], np.ascontiguousarray(fits.view[best]), ()).phasor
+    few = seen[which]
+    size = np.sqrt(few.weight) * np.abs(
+        wrap_difference_m(few.range_m - phasor_to_range_m(phasor, evidence.sensor), evidence.sensor)
+    )
+    compared = few.returned & np.isfinite(size)
+    middle = np.nanmedian(np.where(compared, size, np.nan), axis=1, keepdims=True)
+    odd = compared & (size > np.maximum(setup.policy.odd_ratio * middle, setup.policy.odd_sigma))
+    return Observation(few.range_m, np.where(odd, 0.0, few.weight), few.returned & ~odd, few.not_returned & ~odd)

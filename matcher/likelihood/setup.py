@@ -1,0 +1,164 @@
+"""What a likelihood matcher estimates, from what, and before which background; fixed while frames are matched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data import Bank
+from phasemark.landmarks.symmetry import mesh_symmetry
+from phasemark.matcher.agreement import counts
+from phasemark.matcher.likelihood.images import VIEW, ImageModel
+from phasemark.matcher.likelihood.problem import Settings
+from phasemark.matcher.likelihood.residuals import ResidualKind
+from phasemark.matcher.likelihood.search_policy import SearchPolicy
+from phasemark.matcher.nearest.bank_minima import Search
+from phasemark.render import Background, PhasorImages
+
+__all__ = ["Scene", "Setup", "Shapes", "check_free"]
+
+
+def check_free(free: Sequence[str]) -> tuple[str, ...]:
+    """Return names of free parameters in the order of the view.
+
+    Raises
+    ------
+    UsageError
+        A name is unknown or repeated, or distance is not among them.
+    """
+    names = tuple(free)
+    for name in names:
+        if name not in VIEW:
+            raise UsageError(f"'free' must be among {', '.join(VIEW)}, got {name!r}")
+    if len(set(names)) < len(names) or "distance_m" not in names or "delta_rad" not in names:
+        raise UsageError(f"'free' must name distance_m and delta_rad, and others once each, got {names!r}")
+    return tuple(name for name in VIEW if name in names)
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """What the search knows of the landmarks of a bank, in the order of its classes.
+
+    Parameters
+    ----------
+    names : tuple of str
+    symmetry : tuple of int
+        Rotations within a turn that the bank takes for one.
+    own_symmetry : tuple of int
+        Rotations that look the same: a mesh that is said to have no symmetry may have one all the same.
+    middle_m : (classes, 3) float64
+        Centroids.
+    """
+
+    names: tuple[str, ...]
+    symmetry: tuple[int, ...]
+    own_symmetry: tuple[int, ...]
+    middle_m: NDArray[np.float64]
+
+    @classmethod
+    def of_bank(cls, bank: Bank) -> Shapes:
+        """Look at the meshes of a bank."""
+        meshes = [bank.mesh(name) for name in bank.classes]
+        symmetry = tuple(int(mesh.metadata["symmetry"]) for mesh in meshes)
+        own = tuple(mesh_symmetry(mesh) if n == 1 else n for mesh, n in zip(meshes, symmetry, strict=True))
+        return cls(tuple(bank.classes), symmetry, own, np.array([mesh.centroid for mesh in meshes]))
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What is estimated, and by which rules.
+
+    Parameters
+    ----------
+    bank : Bank
+    shapes : Shapes
+    free : tuple of str
+        Parameters of the view.
+    prior_std : tuple of float
+        Standard deviation of each before the frame is seen, infinite where nothing is known; empty without a prior.
+    on : {"ranges", "phasors"}
+    background_is_known : bool
+        Whether a wall or floor was stated.
+    unknown : bool
+        Whether unknown things may stand in view.
+    used : (pixels,) bool
+        Which pixels give the view.
+    huber : float, optional
+        Residual, in σ, beyond which the loss is linear.
+    false_alarm : float
+    tolerance : dict of str to float
+        How far off an accepted answer may be, by parameter.
+    widest_rad : float
+        Widest bearing that is searched.
+    policy : SearchPolicy
+    """
+
+    bank: Bank
+    shapes: Shapes
+    free: tuple[str, ...]
+    prior_std: tuple[float, ...]
+    on: ResidualKind
+    background_is_known: bool
+    unknown: bool
+    used: NDArray[np.bool_]
+    huber: float | None
+    false_alarm: float
+    tolerance: dict[str, float]
+    widest_rad: float
+    policy: SearchPolicy
+
+    @property
+    def bearing_is_free(self) -> bool:
+        """Whether the bearing is estimated."""
+        return "bearing_rad" in self.free
+
+    @property
+    def fewest_explained(self) -> int:
+        """Returns that an answer takes where unknown things stand in view."""
+        return self.policy.explained_per_parameter * len(self.free)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What stands behind the landmark, with the models and searches that know it.
+
+    Parameters
+    ----------
+    background : Background, optional
+    behind : PhasorImages, optional
+        Its image, without a landmark.
+    final : ImageModel
+        What the answer is taken from.
+    scout : ImageModel, optional
+        What finds the way to it where that is slow.
+    search, wide_search : Search
+        Minima of the bank: at the bearings that are likely, and at all that are possible.
+    """
+
+    background: Background | None
+    behind: PhasorImages | None
+    final: ImageModel
+    scout: ImageModel | None
+    search: Search
+    wide_search: Search
+
+    def settings(self, setup: Setup) -> Settings:
+        """Return how a descent runs before this background."""
+        behind = self.behind
+        return Settings(
+            setup.free,
+            setup.used,
+            setup.huber,
+            None if behind is None else behind.phasor.reshape(-1),
+            prior_std=setup.prior_std,
+            unknown_around=setup.unknown,
+            returns_behind=None
+            if behind is None
+            else counts(behind.phasor, behind.intensity, behind.sensor).reshape(-1),
+            longest_step=setup.policy.longest_step,
+            policy=setup.policy,
+        )

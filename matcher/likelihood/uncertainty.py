@@ -1,0 +1,80 @@
+"""How well a solution is known: its covariance, the slopes that make it, and what single pixels contribute."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.information import covariance_of
+from phasemark.matcher.likelihood.problem import Problem, State
+from phasemark.matcher.likelihood.residuals import Sums, robust_weight
+
+
+def view_covariance(problem: Problem, sums: Sums) -> NDArray[np.float64]:
+    """Return the covariance of the view, (m, p, p): inverse information, or the sandwich."""
+    p = len(problem.settings.free)
+    covariance = covariance_of(sums.information, problem.scale)
+    if problem.settings.huber is not None:
+        covariance = covariance @ sums.scatter @ covariance
+    return np.ascontiguousarray(covariance[:, :p, :p])
+
+
+def capped_std(problem: Problem, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return standard deviations, (m, p), one natural unit where they are larger or unknown."""
+    p = covariance.shape[1]
+    variance = np.einsum("mpp->mp", covariance)
+    std = np.sqrt(np.where(np.isfinite(variance), variance, np.inf))
+    return np.asarray(np.minimum(std, problem.scale[:p]))
+
+
+def slopes_around(
+    problem: Problem, state: State, which: NDArray[np.integer], std: NDArray[np.float64]
+) -> NDArray[np.complex128] | None:
+    """Return slopes over half a standard deviation to either side, (m, p, pixels): what a kink nearby averages to.
+
+    None where the model is smooth.
+    """
+    view = np.ascontiguousarray(state.theta[which, :4])
+    step = np.maximum(0.5 * std, problem.policy.slope_width * problem.scale[: std.shape[1]])
+    slope = problem.model.wide_slopes(problem.class_index, view, problem.settings.free, step)
+    if slope is None:
+        return None
+    if not problem.with_albedo:
+        # light that comes and goes within the step has no phase whose slope could tell anything
+        phasor = np.abs(state.images.phasor[which])[:, None]
+        return np.where(np.abs(slope) * step[:, :, None] > phasor, 0.0, slope)
+    return np.concatenate([slope * state.theta[which, 4:, None], state.images.slope[which, -1:]], axis=1)
+
+
+def std_without_one_pixel(
+    problem: Problem,
+    state: State,
+    which: NDArray[np.integer],
+    slope: NDArray[np.complex128],
+    information: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the largest standard deviations without any one pixel, (k, p), by the Woodbury formula.
+
+    The formula holds for the inverse information. A sandwich covariance grows by the same ratio.
+    """
+    p = covariance.shape[1]
+    phasor, weight = state.images.phasor[which], problem.evidence.weight[problem.frame]
+    use = state.use[which] & problem.settings.pixels & (weight > 0) & (phasor != 0)
+    turn = np.divide(1.0, phasor, out=np.zeros_like(phasor), where=use)
+    value = problem.evidence.value[problem.frame]
+    if problem.evidence.on == "ranges":
+        rows = problem.evidence.sensor.metres_per_radian * (slope * turn[:, None]).imag[..., None]
+        residual = problem.evidence.sensor.metres_per_radian * np.angle(value * phasor.conj())[..., None]
+    else:
+        rows = np.stack([slope.real, slope.imag], axis=-1)
+        residual = np.stack([(value - phasor).real, (value - phasor).imag], axis=-1)
+    root = np.sqrt(robust_weight(residual, (weight * use)[..., None], problem.settings.huber))
+    rows = rows * root[:, None]  # (k, p, pixels, 1 or 2)
+    inverse = covariance_of(information, problem.scale)
+    moved = np.einsum("kab,kbqr->kaqr", inverse, rows)
+    kept = (1 + 1e-12) * np.eye(rows.shape[3]) - np.einsum("kaqr,kaqs->kqrs", rows, moved)
+    moved = moved[:, :p]
+    more = np.einsum("kaqr,kqrs,kaqs->kaq", moved, np.linalg.inv(kept), moved).max(axis=2)
+    own = np.einsum("kaa->ka", inverse)[:, :p]
+    return np.asarray(np.sqrt(np.einsum("kaa->ka", covariance) * (own + more) / own))

@@ -1,0 +1,99 @@
+"""The last fit where unknown things stand in view: without the pixels at their borders."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.likelihood.fits import Fits, distinct_of_frames, least_of_frame
+from phasemark.matcher.likelihood.images import ImageModel
+from phasemark.matcher.likelihood.refine import refine
+from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.likelihood.setup import Scene, Setup
+
+__all__ = ["fit_without_borders"]
+
+
+def fit_without_borders(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
+    """Fit the best views again without the pixels beside one that sees something else.
+
+    They may see a little of it too, at the sides of the landmark, where a wrong range turns the view most. Views of
+    one frame are compared on the same pixels: those that are beside something else in none of them. How pixels scatter
+    among unknown things is known less well than otherwise: covariances grow with the χ² found.
+    """
+    policy, model = setup.policy, scene.final
+    least = least_of_frame(fits, len(evidence.weight))
+    close = np.isfinite(fits.cost) & (fits.cost < least[fits.frame] + policy.margin_cost)
+    close &= fits.explained >= setup.fewest_explained
+    modes = distinct_of_frames(fits, np.flatnonzero(close), setup.shapes.symmetry, policy.same_m, policy.same_rad)
+    some = fits[modes]
+    kept = np.ones_like(evidence.seen.returned)
+    np.logical_and.at(kept, some.frame, _inside(setup, model, evidence, some))
+    inside_evidence = replace(evidence, weight=evidence.weight * kept)
+    again = refine(model, inside_evidence, some.frame, some.class_index, some.view, scene.settings(setup))
+    again = again.with_scale(_scatter_of_columns(setup, model, inside_evidence, again))
+    others = fits[np.setdiff1d(np.arange(len(fits)), modes)]
+    less = np.zeros(len(evidence.weight))  # what the pixels left out cost the best no longer
+    refitted = np.unique(some.frame)
+    less[refitted] = least_of_frame(again, len(less))[refitted] - least[refitted]
+    others.cost[:] += less[others.frame]
+    return Fits.joined([again, others])
+
+
+def _inside(setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits) -> NDArray[np.bool_]:
+    """Return which pixels are not beside one that sees something else than some views, (m, pixels)."""
+    frame = fits.frame
+    phasor = model.images(fits.class_index, np.ascontiguousarray(fits.view), ()).phasor
+    size = np.sqrt(evidence.weight[frame]) * np.abs(
+        evidence.sensor.metres_per_radian * np.angle(evidence.value[frame] * phasor.conj())
+    )
+    returned = evidence.seen.returned[frame]
+    other = returned & ((phasor == 0) | (size > setup.policy.strange_sigma))
+    shape = (-1, evidence.sensor.rows, evidence.sensor.cols)
+    kept = np.ones(other.shape, np.bool_)
+    for strange in (other, other | ~returned):  # beside pixels without a return too, where enough are left
+        inside = ~_beside(strange.reshape(shape)).reshape(other.shape) | other
+        enough = (inside & returned & ~other).sum(axis=1) >= setup.fewest_explained
+        kept[enough] = inside[enough]
+    return kept
+
+
+def _beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which pixels have a neighbour in a mask, left, right, above or below; (n, rows, cols)."""
+    out = np.zeros_like(mask)
+    out[:, 1:] |= mask[:, :-1]
+    out[:, :-1] |= mask[:, 1:]
+    out[:, :, 1:] |= mask[:, :, :-1]
+    out[:, :, :-1] |= mask[:, :, 1:]
+    return out
+
+
+def _scatter_of_columns(setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits) -> NDArray[np.float64]:
+    """Return by how much covariances of views are too small, (m,): from χ², and from leaving out columns of pixels.
+
+    Errors at the sides of a landmark are common to a column of pixels. The view changes by δθ_c without column c;
+    the jackknife's covariance (C − 1) / C · Σ δθ_c δθ_cᵀ over C columns is compared with that of independent noise.
+    """
+    rows, cols = evidence.sensor.rows, evidence.sensor.cols
+    m, p = len(fits), len(setup.free)
+    strange2 = setup.policy.strange_sigma**2
+    image = model.images(fits.class_index, np.ascontiguousarray(fits.view), setup.free)
+    turn = np.divide(1.0, image.phasor, out=np.zeros_like(image.phasor), where=image.phasor != 0)
+    slope = evidence.sensor.metres_per_radian * (image.slope * turn[:, None]).imag
+    residual = evidence.sensor.metres_per_radian * np.angle(evidence.value[fits.frame] * image.phasor.conj())
+    weight = np.where(image.phasor != 0, evidence.weight[fits.frame], 0.0)
+    weight = np.where(weight * residual**2 > strange2, 0.0, weight)
+    by_column = (m, p, rows, cols)
+    weighted = (slope * weight[:, None]).reshape(by_column)
+    gradient = np.einsum("mprc,mrc->mcp", weighted, residual.reshape(m, rows, cols))
+    information = np.einsum("mprc,mqrc->mcpq", weighted, slope.reshape(by_column))
+    whole = information.sum(axis=1)
+    used = (weight.reshape(m, rows, cols) > 0).any(axis=1)
+    shift = np.einsum("mcpq,mcq->mcp", np.linalg.pinv(whole[:, None] - information, hermitian=True), gradient)
+    n = np.maximum(used.sum(axis=1), 2)
+    jackknife = np.einsum("mcp,mcq,mc->mpq", shift, shift, used) * ((n - 1) / n)[:, None, None]
+    by_columns = np.einsum("mpq,mqp->m", whole, jackknife) / p
+    by_chi2 = fits.tested / np.maximum(fits.dof, 1)
+    return np.asarray(np.maximum(1.0, np.maximum(by_columns, by_chi2)))

@@ -1,0 +1,33 @@
+"""The tuning numbers of the likelihood search: their ranges, and that they reach the search."""
+
+from dataclasses import fields, replace
+
+import pytest
+
+from phasemark import UsageError
+from phasemark.matcher import SearchPolicy
+
+
+@pytest.mark.parametrize("field", [field.name for field in fields(SearchPolicy)])
+def test_a_value_out_of_range_names_its_field(field):
+    for bad in (-1, float("nan"), "2", None, True, (float("inf"),)):
+        with pytest.raises(UsageError, match=f"'policy': '{field}' must be "):
+            replace(SearchPolicy(), **{field: bad})
+
+
+@pytest.mark.parametrize("field", ["doubtful_p", "hopeless_p", "ambiguity"])
+def test_a_probability_of_one_is_refused(field):
+    with pytest.raises(UsageError, match=rf"'policy': '{field}' must be in \(0, 1\), got 1.0"):
+        replace(SearchPolicy(), **{field: 1.0})
+
+
+def test_a_grid_takes_two_positive_steps():
+    with pytest.raises(UsageError, match="two positive numbers, metres and radians"):
+        SearchPolicy(fine_grid=(0.01, 0.0))
+    with pytest.raises(UsageError, match="two positive numbers"):
+        SearchPolicy(coarse_grid=(0.01,))
+
+
+def test_a_policy_is_frozen():
+    with pytest.raises(AttributeError):
+        SearchPolicy().modes = 3
