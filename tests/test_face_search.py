@@ -9,7 +9,7 @@ import trimesh
 
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Renderer, preset
-from phasemark.render.integral.face_search import find_face, plane_hit, turns_smoothly
+from phasemark.render.integral.face_search import FaceGrid, find_face, plane_hit, turns_smoothly
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.mesh_topology import MeshTopology
 from phasemark.render.kernel import kernel
@@ -29,6 +29,13 @@ def smooth(search, f, g, o, d, e):  # type: ignore[no-untyped-def]
     return turns_smoothly(search, f, g, u * e[0] - t * d[0], u * e[1] - t * d[1], u * e[2] - t * d[2])
 
 
+def searchable(mesh):
+    """Return the topology of a mesh with all its curved faces in the grid."""
+    topology = MeshTopology.from_mesh(mesh)
+    grid = FaceGrid.of_faces(topology.vertices[topology.faces], ~topology.plain)
+    return topology._replace(grid=grid)
+
+
 def rays(topology, n, rng):
     """Return pairs of rays half a pixel apart at most, and the faces they meet first: origins, ray, ray, face, face."""
     azimuth, height = rng.uniform(0, 2 * np.pi, n), rng.uniform(-0.1, 0.3, n)
@@ -44,7 +51,7 @@ def rays(topology, n, rng):
 
 @pytest.mark.parametrize("name", sorted(catalog()))
 def test_the_search_from_a_neighbouring_sample_finds_the_face_that_an_intersector_finds(name):
-    topology = MeshTopology.from_mesh(build_mesh(catalog()[name]))
+    topology = searchable(build_mesh(catalog()[name]))
     origins, first, second, start, met = rays(topology, 3000, np.random.default_rng(3))
     tried, missed = 0, 0
     for o, d, e, f, g in zip(origins, first, second, start, met, strict=True):
@@ -64,7 +71,7 @@ def test_the_search_from_a_neighbouring_sample_finds_the_face_that_an_intersecto
 
 
 def test_beyond_the_limb_nothing_is_found():
-    topology = MeshTopology.from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=0.1))
+    topology = searchable(trimesh.creation.icosphere(subdivisions=4, radius=0.1))
     lens = np.array([1.0, 0.0, 0.0])
     intersector = make_intersector(topology.vertices, topology.faces, "float64")
     inside = np.array([-1.0, 0.05, 0.0])
@@ -78,7 +85,7 @@ def test_a_sheet_behind_the_one_that_is_seen_is_not_taken_for_its_neighbour():
     z = np.linspace(-0.1, 0.1, 61)
     radius = 0.05 + 0.02 * np.cos(2 * np.pi * z / 0.1)
     profile = np.column_stack([np.r_[0, radius, 0], np.r_[z[0], z, z[-1]]])
-    topology = MeshTopology.from_mesh(trimesh.creation.revolve(profile, sections=128))
+    topology = searchable(trimesh.creation.revolve(profile, sections=128))
     lens = np.array([0.15, 0.0, 0.2])
     target = np.array([0.07, 0.0, 0.0])
     intersector = make_intersector(topology.vertices, topology.faces, "float64")

@@ -1,5 +1,8 @@
 """Faces of a curved patch found without an intersector: by a step across edges, or by a look into a grid.
 
+It is for patches with an apex. Slivers that fan out from one point lie in boxes that all meet there, so that a
+hierarchy of boxes separates them badly: on a cone a cast ray takes three times as long as on a cylinder.
+
 Neighbouring samples of an interval see the same smooth patch, so the face of one is near that of the other. From a face
 the plane of which a ray meets outside it, the search goes on to the neighbour on that side. Where the plane is met far
 outside, a grid over the patches says which face lies about there.
@@ -16,7 +19,7 @@ from numpy.typing import NDArray
 from phasemark.render.kernel import inlined, kernel
 
 _CELLS = 48
-"""Cells of the grid along the longest side of the box around all curved faces."""
+"""Cells of the grid along the longest side of the box around all faces of the grid."""
 _MOST_STEPS = 16
 _MOST_LOOKS = 6
 """Into the grid, for one ray."""
@@ -31,12 +34,12 @@ _SMOOTH = 0.1
 
 
 class FaceGrid(NamedTuple):
-    """A face for every cell of the box around all curved faces.
+    """A face for every cell of the box around all faces of the grid.
 
     Parameters
     ----------
     low : (3,) float64
-        Lower corner of the box around all curved faces, metres.
+        Lower corner of the box around all faces of the grid, metres.
     per_metre : float
         Cells per metre.
     faces : (nx, ny, nz) int32
@@ -48,22 +51,22 @@ class FaceGrid(NamedTuple):
     faces: NDArray[np.int32]
 
     @classmethod
-    def of_faces(cls, corners: NDArray[np.float64], curved: NDArray[np.bool_]) -> FaceGrid:
-        """Lay a grid over faces, given their corners (f, 3, 3) and which of them are curved.
+    def of_faces(cls, corners: NDArray[np.float64], wanted: NDArray[np.bool_]) -> FaceGrid:
+        """Lay a grid over faces, given their corners (f, 3, 3) and which of them are wanted.
 
         A cell gets the face that runs nearest to its middle, judged by points no further apart than half a cell; a cell
         without any gets that of the nearest cell.
         """
         from scipy.ndimage import distance_transform_edt
 
-        if not curved.any():
+        if not wanted.any():
             return cls(np.zeros(3), 1.0, np.full((1, 1, 1), -1, np.int32))
-        own = corners[curved]
+        own = corners[wanted]
         low, high = own.min(axis=(0, 1)), own.max(axis=(0, 1))
         per_metre = _CELLS / float((high - low).max())
         shape = np.floor((high - low) * per_metre).astype(np.int64) + 1
         faces, distance = np.full(shape, -1, np.int32), np.full(shape, np.inf)
-        _fill_grid(np.ascontiguousarray(own), np.flatnonzero(curved), low, per_metre, faces, distance)
+        _fill_grid(np.ascontiguousarray(own), np.flatnonzero(wanted), low, per_metre, faces, distance)
         nearest = distance_transform_edt(faces < 0, return_distances=False, return_indices=True)
         return cls(low, per_metre, np.ascontiguousarray(faces[tuple(nearest)]))
 

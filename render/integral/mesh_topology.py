@@ -44,11 +44,13 @@ class MeshTopology(NamedTuple):
         Whether all faces of the face's smooth patch are flat, which makes the patch a plane.
     patch : (f,) int32
         Number of the smooth patch, faces joined without a crease between them.
+    fanned : (f,) bool
+        Whether the face's smooth patch has an apex, from which slivers fan out.
     search : (f, 16) float32
         What the search of a face asks: plane (4), corner shares (8), the face of the same patch beyond the edge from
         each corner to the next (3; −1: there is none), and the patch.
     grid : FaceGrid
-        Where the faces of curved patches are.
+        Where the faces of fanned patches are.
     part : (f,) int8
         0 for the landmark's lower part, 1 for the upper one.
     concave : (e,) bool
@@ -81,6 +83,7 @@ class MeshTopology(NamedTuple):
     flat: NDArray[np.bool_]
     plain: NDArray[np.bool_]
     patch: NDArray[np.int32]
+    fanned: NDArray[np.bool_]
     search: NDArray[np.float32]
     grid: FaceGrid
     part: NDArray[np.int8]
@@ -134,6 +137,8 @@ class MeshTopology(NamedTuple):
         concave = np.einsum("ij,ij->i", planes[first, :3], off_edge) > planes[first, 3]
         plain = np.bincount(patch, ~flat)[patch] == 0
         shares = _corner_shares(vertices[faces])
+        apex = (corners == 0).all(axis=2).any(axis=1)
+        fanned = np.bincount(patch, apex)[patch] > 0
         face_folds, fold_reach = _folds_of_faces(edges[fold], normals)
         smooth_faces, clusters = _cluster_faces(vertices[faces].mean(axis=1), planes, fold_reach)
         shell = _components(len(faces), edges[other >= 0][:, 2:])
@@ -149,10 +154,11 @@ class MeshTopology(NamedTuple):
             flat=np.ascontiguousarray(flat),
             plain=plain,
             patch=patch,
+            fanned=fanned,
             search=np.ascontiguousarray(
                 np.column_stack([planes, shares.reshape(-1, 8), _neighbours(faces, edges[~crease]), patch]), np.float32
             ),
-            grid=FaceGrid.of_faces(vertices[faces], ~plain),
+            grid=FaceGrid.of_faces(vertices[faces], fanned),
             part=np.ascontiguousarray(part),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
             concave=np.ascontiguousarray(concave[crease]),
@@ -179,6 +185,7 @@ class MeshTopology(NamedTuple):
             flat=np.zeros(0, np.bool_),
             plain=np.zeros(0, np.bool_),
             patch=np.zeros(0, np.int32),
+            fanned=np.zeros(0, np.bool_),
             search=np.zeros((0, 16), np.float32),
             grid=FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_)),
             part=np.zeros(0, np.int8),

@@ -1,8 +1,8 @@
 """Which face each sample sees: one ray an interval scouts, the other samples are found on its patch or cast.
 
 One ray an interval scouts what is seen there (:func:`pick_scouts`). On a plane patch that is all there is to know. On a
-curved one the faces of the other samples are looked for (:func:`share_faces`), and what is not found is cast too
-(:func:`aim`).
+curved one each of the other samples has a face of its own (:func:`share_faces`). On a patch with an apex the face is
+looked for; elsewhere, and where it is not found, the ray of the sample is cast too (:func:`aim`).
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ def pick_scouts(n, samples):  # type: ignore[no-untyped-def]
 def share_faces(n, mesh, share, scout_face, samples, poses, camera, state):  # type: ignore[no-untyped-def]
     """Hand the face a scout met to its interval where that is all there is to know, and list the samples left to cast.
 
-    On a plain patch the plane is the same for all samples, and where the scout met nothing nothing is met. On a curved
-    patch each sample's face is looked for from that of its neighbour. Pixels that could not be split are cast
-    throughout, as is everything without `share`.
+    On a plain patch the plane is the same for all samples, and where the scout met nothing nothing is met. On a patch
+    with an apex each sample's face is looked for from that of its neighbour, and on any other curved patch it is cast.
+    Pixels that could not be split are cast throughout, as is everything without `share`.
 
     Returns how many indices were written to ``samples.chosen``.
     """
@@ -52,7 +52,7 @@ def share_faces(n, mesh, share, scout_face, samples, poses, camera, state):  # t
         if known and (found < 0 or mesh.plain[found]):
             for i in range(start, k):
                 face[i] = found
-        elif known:
+        elif known and mesh.fanned[found]:
             count = _search(scout, -1, start - 1, count, mesh, samples, poses, camera)
             count = _search(scout, 1, k, count, mesh, samples, poses, camera)
         else:
