@@ -7,10 +7,14 @@ more where threads share a mesh. A function that makes an array must not be a ke
 
 from __future__ import annotations
 
+from typing import Any
+
 from numba import njit
 
-kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+_BORROWING: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+
+kernel = njit(**_BORROWING)
 """Compile a function that allocates nothing; floats divide as numpy's do."""
 
-inlined = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, inline="always")
+inlined = njit(**_BORROWING, inline="always")
 """Compile a small function that is copied into its callers."""

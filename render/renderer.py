@@ -420,9 +420,18 @@ def _camera(sensor: Sensor, rows: tuple[int, int]) -> Camera:
     """Return a camera as the kernels take it, and which rows to render."""
     tan_h, tan_v = sensor.tan_half_angles
     return Camera(
-        sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v), *map(float, sensor.centre_px), sensor.rows, sensor.cols,
-        *rows, *map(float, sensor.fill_factor), np.ascontiguousarray(sensor.cam2level),
-    )  # fmt: skip
+        scale_u=sensor.cols / (2 * tan_h),
+        scale_v=sensor.rows / (2 * tan_v),
+        centre_u=float(sensor.centre_px[0]),
+        centre_v=float(sensor.centre_px[1]),
+        rows=sensor.rows,
+        cols=sensor.cols,
+        first_row=rows[0],
+        stop_row=rows[1],
+        fill_u=float(sensor.fill_factor[0]),
+        fill_v=float(sensor.fill_factor[1]),
+        level=np.ascontiguousarray(sensor.cam2level),
+    )
 
 
 def _poses(views: Views, camera: Camera) -> Poses:
@@ -451,5 +460,10 @@ def _of_views(sums: Sums, views: slice) -> Sums:
     """Return the part of the sums that belongs to some views."""
     per_view = math.prod(sums.state.shape[1:])
     pixels = slice(views.start * per_view, views.stop * per_view)
-    *of_pixels, state = sums
-    return Sums(*(values[pixels] for values in of_pixels), state=state[views])
+    return Sums(
+        phasor=sums.phasor[pixels],
+        intensity=sums.intensity[pixels],
+        coverage=sums.coverage[pixels],
+        upper=sums.upper[pixels],
+        state=sums.state[views],
+    )

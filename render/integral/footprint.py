@@ -118,8 +118,8 @@ def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, n, region)
         count = 3 if bent else 2
         if n + (splits * count) ** 2 > len(weights):
             return -1, region, True
-        for box in range(splits * splits):
-            row, col = divmod(box, splits)
+        for part in range(splits * splits):
+            row, col = divmod(part, splits)
             for a in range(count):
                 for b in range(count):
                     points[n, 0] = u0 + width / splits * (col + (G3X[b] if bent else G2X[b]))
