@@ -40,8 +40,7 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
         How many segments were written.
     """
     vertices, planes, creases, concave, folds = mesh.vertices, mesh.planes, mesh.creases, mesh.concave, mesh.folds
-    face_folds, smooth_faces, smooth_planes = mesh.face_folds, mesh.smooth_faces, mesh.smooth_planes
-    clusters = mesh.clusters
+    smooth_planes, clusters = mesh.smooth_planes, mesh.clusters
     lens, matrix, offset, limb = poses.lens[view], poses.matrix[view], poses.offset[view], edges.limb
     n = 0
     for e in range(len(creases)):
@@ -61,16 +60,13 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
         away = math.sqrt(dx * dx + dy * dy + dz * dz)
         if abs(nx * dx + ny * dy + nz * dz - d) > turn * away + slack + reach * farthest:
             continue
-        for i in range(c * CLUSTER, min((c + 1) * CLUSTER, len(smooth_faces))):
+        for i in range(c * CLUSTER, min((c + 1) * CLUSTER, len(smooth_planes))):
             height = _height(smooth_planes, i, lens)
             if abs(height) > smooth_planes[i, 4] * farthest:
                 continue
-            f, before = smooth_faces[i], height > 0.0
-            for k in range(3):
-                e = face_folds[f, k]
-                if e < 0:
-                    break
-                if before == (_height(planes, folds[e, 3], lens) > 0.0):
+            before = height > 0.0
+            for e in range(mesh.first_fold[i], mesh.first_fold[i + 1]):
+                if before == (_height(smooth_planes, folds[e, 2], lens) > 0.0):
                     continue
                 a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
                 if _project(vertices, a, b, matrix, offset, camera, edges.segments, n):

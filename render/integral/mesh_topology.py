@@ -55,15 +55,17 @@ class MeshTopology(NamedTuple):
         0 for the landmark's lower part, 1 for the upper one.
     concave : (e,) bool
         Whether a crease is the bottom of a valley; then it is seen only from before both of its faces.
-    creases, folds : (e, 4) int32
-        Edges (start, end, face, other face): the creases, −1 where there is no other face, and the edges of smooth
-        regions, which matter where they are silhouettes. An edge runs along the winding of its first face.
-    face_folds : (f, 3) int32
-        The folds whose first face this is, −1: fewer than three.
-    smooth_faces : (g,) int32
-        Faces with folds, neighbours near one another; each :data:`CLUSTER` of them are a cluster.
+    creases : (e, 4) int32
+        Edges (start, end, face, other face); −1 where there is no other face. An edge runs along the winding of its
+        first face.
+    folds : (e, 3) int32
+        Edges of smooth regions, which matter where they are silhouettes: start, end, and the other face's place among
+        the smooth faces. Those of a first face follow one another, in the order of the smooth faces.
+    first_fold : (g + 1,) int32
+        Where the folds begin whose first face is a smooth face.
     smooth_planes : (g, 5) float64
-        Their planes, and their reach: how far the normal turns, |n − n'|, over the face's folds at most.
+        Planes of the smooth faces, those with folds, and their reach: how far the normal turns, |n − n'|, over the
+        face's folds at most. Faces near one another stand near one another; each :data:`CLUSTER` are a cluster.
     clusters : (c, 10) float64
         Per cluster a point, a mean normal, its offset from the point's plane, how far the faces' normals and offsets
         differ from those at most, and the largest reach.
@@ -90,8 +92,7 @@ class MeshTopology(NamedTuple):
     creases: NDArray[np.int32]
     concave: NDArray[np.bool_]
     folds: NDArray[np.int32]
-    face_folds: NDArray[np.int32]
-    smooth_faces: NDArray[np.int32]
+    first_fold: NDArray[np.int32]
     smooth_planes: NDArray[np.float64]
     clusters: NDArray[np.float64]
     low: NDArray[np.float64]
@@ -139,8 +140,9 @@ class MeshTopology(NamedTuple):
         shares = _corner_shares(vertices[faces])
         apex = (corners == 0).all(axis=2).any(axis=1)
         fanned = np.bincount(patch, apex)[patch] > 0
-        face_folds, fold_reach = _folds_of_faces(edges[fold], normals)
+        fold_reach = _fold_reach(edges[fold], normals)
         smooth_faces, clusters = _cluster_faces(vertices[faces].mean(axis=1), planes, fold_reach)
+        folds, first_fold = _folds_in_order(edges[fold], smooth_faces)
         shell = _components(len(faces), edges[other >= 0][:, 2:])
         six_volumes = np.bincount(
             shell, np.einsum("ij,ij->i", a, np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
@@ -162,9 +164,8 @@ class MeshTopology(NamedTuple):
             part=np.ascontiguousarray(part),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
             concave=np.ascontiguousarray(concave[crease]),
-            folds=np.ascontiguousarray(edges[fold], dtype=np.int32),
-            face_folds=face_folds,
-            smooth_faces=smooth_faces,
+            folds=folds,
+            first_fold=first_fold,
             smooth_planes=np.ascontiguousarray(np.column_stack([planes, fold_reach])[smooth_faces]),
             clusters=clusters,
             low=vertices.min(axis=0),
@@ -191,9 +192,8 @@ class MeshTopology(NamedTuple):
             part=np.zeros(0, np.int8),
             creases=np.zeros((0, 4), np.int32),
             concave=np.zeros(0, np.bool_),
-            folds=np.zeros((0, 4), np.int32),
-            face_folds=np.zeros((0, 3), np.int32),
-            smooth_faces=np.zeros(0, np.int32),
+            folds=np.zeros((0, 3), np.int32),
+            first_fold=np.zeros(1, np.int32),
             smooth_planes=np.zeros((0, 5)),
             clusters=np.zeros((0, 10)),
             low=np.zeros(3),
@@ -246,20 +246,26 @@ def _neighbours(faces: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[n
     return table
 
 
-def _folds_of_faces(
-    folds: NDArray[np.int64], normals: NDArray[np.float64]
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Return the folds that each face comes first in, (f, 3), and its reach (−1: it has no fold)."""
-    table = np.full((len(normals), 3), -1, np.int32)
+def _fold_reach(folds: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far the normal turns over each face's folds at most, −1: the face has none."""
     reach = np.full(len(normals), -1.0)
-    order = np.argsort(folds[:, 2], kind="stable")
-    first = folds[order, 2]
-    rank = np.arange(len(first)) - np.searchsorted(first, first)
-    table[first, rank] = order
     turn = np.linalg.norm(normals[folds[:, 2]] - normals[folds[:, 3]], axis=1)
     for side in (2, 3):
         np.maximum.at(reach, folds[:, side], turn)
-    return table, reach
+    return reach
+
+
+def _folds_in_order(
+    folds: NDArray[np.int64], smooth_faces: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return ``folds`` and ``first_fold`` of :class:`MeshTopology`."""
+    place = np.zeros(int(smooth_faces.max(initial=-1)) + 1, np.int64)
+    place[smooth_faces] = np.arange(len(smooth_faces))
+    first = place[folds[:, 2]]
+    order = np.argsort(first, kind="stable")
+    table = np.column_stack([folds[:, :2], place[folds[:, 3]]])[order]
+    begins = np.searchsorted(first[order], np.arange(len(smooth_faces) + 1))
+    return np.ascontiguousarray(table, np.int32), begins.astype(np.int32)
 
 
 def _cluster_faces(
