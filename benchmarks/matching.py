@@ -13,9 +13,9 @@ import numpy as np
 
 from phasemark.data import Bank, BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import FilteredFrames, Matcher, cramer_rao, kalman_filter, rms_interval
+from phasemark.matcher import FilteredFrames, Matcher, cramer_rao, kalman_filter
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.statistics import wrapped_errors
+from phasemark.matcher.statistics import rms_interval, wrapped_errors
 from phasemark.render import Background, Renderer, Sensor, Views, capture
 
 N_VIEWS = 1000

@@ -30,7 +30,8 @@ from tolerance import tolerance
 
 from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import FilteredFrames, Matcher, TrialSetup, kalman_filter, phasor_mean
+from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, phasor_mean
+from phasemark.matcher.accuracy import TrialSetup
 from phasemark.matcher.accuracy.trials import noisy_frames
 from phasemark.matcher.nearest.search import ExactSearch, nearest_search
 from phasemark.matcher.nearest.templates import Observation
@@ -38,7 +39,7 @@ from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, 
 
 ROOT = Path(__file__).resolve().parent.parent
 SENSOR = preset("pmd-16x16")
-WRONG_IN_THE_REFERENCE = (5, 4, 6)  # frame, row, column: tests/test_reference.py has the proof
+WRONG_IN_THE_REFERENCE = (5, 4, 6)  # frame, row, column: tests/test_reference_frames.py has the proof
 SEED = 2005
 Table = dict[str, Any]
 

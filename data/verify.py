@@ -19,7 +19,7 @@ from phasemark.data.frames.build_frames import FrameJob
 from phasemark.data.frames.frame_set_file import FrameSet, open_frames
 from phasemark.data.seeds import stream
 from phasemark.inputs import verify_checksum
-from phasemark.render import wrap_difference_m
+from phasemark.render.phasor_images import wrap_difference_m
 
 TOLERANCE_M = 1e-5
 """Embree and the C library differ by instruction set; ranges made elsewhere agree to this."""

@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from phasemark.data import write_atomically
+from phasemark.data.files import write_atomically
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh, catalog, mesh_figure
 from phasemark.matcher import kalman_filter

@@ -15,7 +15,9 @@ import numpy as np
 import trimesh
 
 from phasemark import PhasemarkError, UsageError
-from phasemark.data import BankPlan, MeshPlan, build_bank, parse_grid, write_atomically
+from phasemark.data import BankPlan, build_bank
+from phasemark.data.files import write_atomically
+from phasemark.data.plans import MeshPlan, parse_grid
 from phasemark.landmarks import check_mesh, export_mesh, mesh_figure, read_mesh
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.render import Renderer, capture, preset

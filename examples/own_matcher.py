@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from phasemark import PhasemarkError, UsageError
-from phasemark.matcher import FilteredFrames, Match, Method, SweepPlan, read_sweep, read_sweep_plan, run_sweep
+from phasemark.matcher import FilteredFrames, Match, run_sweep
+from phasemark.matcher.sweep import Method, SweepPlan, read_sweep, read_sweep_plan
 from phasemark.matcher.sweep.report import write_report
 
 AXIS_BEHIND_FACE_M = 0.10

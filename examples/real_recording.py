@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from phasemark import PhasemarkError
-from phasemark.data import BankPlan, MeshPlan, build_bank, read_frames
+from phasemark.data import BankPlan, build_bank, read_frames
+from phasemark.data.plans import MeshPlan
 from phasemark.matcher import Matcher, Matches, kalman_filter
 from phasemark.matcher.filters.stamps import spread_stamps
 from phasemark.render import Frames, Sensor, preset

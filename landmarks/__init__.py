@@ -2,39 +2,25 @@
 
 from typing import TYPE_CHECKING
 
+from phasemark.inputs import on_use
 from phasemark.landmarks.catalog import catalog
-from phasemark.landmarks.mesh import DEFAULT_TOLERANCE_M, LOWER, MAX_FACES, UPPER, build_mesh
-from phasemark.landmarks.mesh_files import MeshReport, MeshWarning, check_mesh, export_mesh, read_mesh
-from phasemark.landmarks.spec import Box, Cone, Cylinder, LandmarkSpec, Revolution, Sphere
-from phasemark.landmarks.symmetry import MAX_SYMMETRY, has_symmetry, mesh_symmetry, symmetry_tolerance_m
+from phasemark.landmarks.mesh import build_mesh
+from phasemark.landmarks.mesh_files import check_mesh, export_mesh, read_mesh
+from phasemark.landmarks.spec import LandmarkSpec
+from phasemark.landmarks.symmetry import mesh_symmetry
 
 if TYPE_CHECKING:
-    from phasemark.landmarks.figures import mesh_figure, mesh_html
+    from phasemark.landmarks.figures import mesh_figure
 
 __all__ = [
-    "DEFAULT_TOLERANCE_M",
-    "LOWER",
-    "MAX_FACES",
-    "MAX_SYMMETRY",
-    "UPPER",
-    "Box",
-    "Cone",
-    "Cylinder",
     "LandmarkSpec",
-    "MeshReport",
-    "MeshWarning",
-    "Revolution",
-    "Sphere",
     "build_mesh",
     "catalog",
     "check_mesh",
     "export_mesh",
-    "has_symmetry",
     "mesh_figure",
-    "mesh_html",
     "mesh_symmetry",
     "read_mesh",
-    "symmetry_tolerance_m",
 ]
 
 
@@ -49,9 +35,9 @@ LandmarkSpec.figure = staticmethod(_figure)
 
 
 def __getattr__(name: str) -> object:
-    """Import figures when they are asked for: matplotlib takes half a second to load."""
-    if name in ("mesh_html", "mesh_figure"):
-        from phasemark.landmarks import figures
+    """Import figures when they are asked for, since matplotlib takes half a second to load; find names that moved."""
+    if name == "mesh_figure":
+        from phasemark.landmarks.figures import mesh_figure
 
-        return getattr(figures, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return mesh_figure
+    return on_use.moved_name(__name__, name)

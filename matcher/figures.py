@@ -12,17 +12,10 @@ from phasemark.data import Bank
 from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match
-from phasemark.render import (
-    Background,
-    Renderer,
-    background_image,
-    delta_period_rad,
-    phasor_to_range_m,
-    predicted_range_std,
-    wrap_delta_difference_rad,
-    wrap_difference_m,
-)
+from phasemark.render import Background, Renderer, background_image, phasor_to_range_m, predicted_range_std
 from phasemark.render.figures import draw_difference, draw_range
+from phasemark.render.phasor_images import wrap_difference_m
+from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
 
 
 def model_range_m(bank: Bank, match: Match, background: Background | None) -> NDArray[np.float64]:

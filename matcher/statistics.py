@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from phasemark.render import wrap_delta_difference_rad
+from phasemark.render.view import wrap_delta_difference_rad
 
 Law = Literal["student", "normal"]
 """How an interval is made; see the table above."""

@@ -136,7 +136,8 @@ def planar_images(
 
     Examples
     --------
-    >>> from phasemark.render import PlanarLandmark, Views, planar_images, preset
+    >>> from phasemark.render import Views, preset
+    >>> from phasemark.render.planar import PlanarLandmark, planar_images
     >>> post = PlanarLandmark(0.24, 0.16, profile_m=[(0.035, 0.0), (0.035, 0.15)])
     >>> image = planar_images(post, preset("pmd-16x16"), Views.broadcast(1.0))
     >>> image.range_m[0, [7, 8], 7].round(3).tolist()

@@ -4,10 +4,13 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike, NDArray
 
 from phasemark.render import PhasorImages, Sensor, Views
 
@@ -20,12 +23,12 @@ PROGRESS_LINE = re.compile(r"[a-z ,]+:( \d+/\d+,)?( \d+ (h|min|s))+ elapsed")
 """What long work writes to a standard error that is no terminal."""
 
 
-def error_lines(stderr):
+def error_lines(stderr: str) -> list[str]:
     """Return the lines of standard error that are neither notes nor progress."""
     return [line for line in stderr.splitlines() if not line.startswith("note: ") and not PROGRESS_LINE.fullmatch(line)]
 
 
-def run_program(name, *arguments):
+def run_program(name: str, *arguments: object) -> str:
     """Run a program of tests/programs in a process of its own; return what it prints."""
     command = [sys.executable, "-m", f"programs.{name}", *map(str, arguments)]
     done = subprocess.run(command, env=HELPERS_IN_PATH, capture_output=True, text=True, check=False)
@@ -33,20 +36,24 @@ def run_program(name, *arguments):
     return done.stdout
 
 
-def one_pixel(**fields):
+def one_pixel(**fields: Any) -> Sensor:
     return Sensor(**{"rows": 1, "cols": 1, "half_angle_h_deg": 1, "half_angle_v_deg": 1, **fields})
 
 
-def images_of(phasor, intensity, sensor, harmonics=None):
+def images_of(
+    phasor: ArrayLike, intensity: ArrayLike, sensor: Sensor, harmonics: dict[int, NDArray[Any]] | None = None
+) -> PhasorImages:
     """PhasorImages of given pixels, (n, rows, cols)."""
-    phasor = np.asarray(phasor, complex)
-    views = Views.broadcast(np.ones(len(phasor)))
+    values = np.asarray(phasor, complex)
+    views = Views.broadcast(np.ones(len(values)))
     return PhasorImages(
-        phasor, np.asarray(intensity, float), np.ones(phasor.shape), sensor, views, harmonics=harmonics or {}
+        values, np.asarray(intensity, float), np.ones(values.shape), sensor, views, harmonics=harmonics or {}
     )
 
 
-def pure_image(range_m, sensor, amplitude=1.0, intensity=None):
+def pure_image(
+    range_m: ArrayLike, sensor: Sensor, amplitude: float = 1.0, intensity: float | None = None
+) -> PhasorImages:
     """PhasorImages (n, rows, cols) of unmixed pixels at given ranges, every harmonic that the sensor needs included."""
     phase = np.asarray(range_m, float) / sensor.metres_per_radian
     phase = np.broadcast_to(phase.reshape(-1, 1, 1), (phase.size, sensor.rows, sensor.cols))
@@ -55,18 +62,25 @@ def pure_image(range_m, sensor, amplitude=1.0, intensity=None):
     return images_of(amplitude * np.exp(1j * phase), light, sensor, harmonics)
 
 
-def wrapped(difference_m, sensor):
+def wrapped(difference_m: NDArray[Any], sensor: Sensor) -> NDArray[Any]:
     period = sensor.unambiguous_range_m
     return (difference_m + period / 2) % period - period / 2
 
 
-def strangers():
+def joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Return several meshes as one, which may run through one another."""
+    together = trimesh.util.concatenate(meshes)
+    assert isinstance(together, trimesh.Trimesh)
+    return together
+
+
+def strangers() -> dict[str, trimesh.Trimesh]:
     """Return meshes of upper parts that are in no catalogue, on the catalogue's box."""
     box = trimesh.creation.box((0.24, 0.16, 0.15))
     box.apply_translation((0, 0, -0.075))
 
-    def block(x, y, bottom, top):
-        mesh = trimesh.creation.box((x, y, top - bottom))
+    def block(x: float, y: float, bottom: float, top: float) -> trimesh.Trimesh:
+        mesh: trimesh.Trimesh = trimesh.creation.box((x, y, top - bottom))
         mesh.apply_translation((0, 0, (top + bottom) / 2))
         return mesh
 
@@ -80,18 +94,18 @@ def strangers():
     return {name: trimesh.boolean.union([box, upper], engine="manifold") for name, upper in uppers.items()}
 
 
-def bowl(rings=128):
+def bowl(rings: int = 128) -> trimesh.Trimesh:
     """Half a spherical shell without thickness, open at the top."""
     angle = np.linspace(-np.pi / 2, 0, rings)
     return trimesh.creation.revolve(0.12 * np.c_[np.cos(angle), np.sin(angle)].round(15), sections=4 * rings)
 
 
-def coarse_bowl():
+def coarse_bowl() -> trimesh.Trimesh:
     """A bowl with facets a quarter of a pixel wide."""
     return bowl(rings=32)
 
 
-def star_prism():
+def star_prism() -> trimesh.Trimesh:
     """A seven-pointed star, extruded."""
     turn = np.linspace(0, 2 * np.pi, 15)[:-1]
     rim = np.where(np.arange(14) % 2, 0.06, 0.14)[:, None] * np.c_[np.cos(turn), np.sin(turn)]
@@ -104,7 +118,7 @@ def star_prism():
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def l_bracket():
+def l_bracket() -> trimesh.Trimesh:
     """Two legs at a right angle, as one concave solid."""
     outline = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, -0.05], [-0.05, -0.05], [-0.05, 0.1], [-0.1, 0.1]])
     low, high = np.c_[outline, np.full(6, -0.08)], np.c_[outline, np.full(6, 0.08)]
@@ -114,13 +128,14 @@ def l_bracket():
     return trimesh.Trimesh(np.vstack([low, high]), faces, process=False)
 
 
-def hidden_box():
+def hidden_box() -> trimesh.Trimesh:
     """A box half hidden by a smaller one before it."""
-    near = trimesh.creation.box((0.05, 0.1, 0.1)).apply_translation((-0.15, 0.03, -0.02))
-    return trimesh.util.concatenate([near, trimesh.creation.box((0.1, 0.25, 0.2))])
+    near = trimesh.creation.box((0.05, 0.1, 0.1))
+    near.apply_translation((-0.15, 0.03, -0.02))
+    return joined([near, trimesh.creation.box((0.1, 0.25, 0.2))])
 
 
-def blob():
+def blob() -> trimesh.Trimesh:
     """A ball whose surface waves gently, with a little noise."""
     ball = trimesh.creation.icosphere(subdivisions=5)
     x, y, _ = ball.vertices.T
@@ -129,21 +144,22 @@ def blob():
     return trimesh.Trimesh(ball.vertices * radius[:, None], ball.faces, process=False)
 
 
-def _bumpy(unit, noise_m):
+def _bumpy(unit: trimesh.Trimesh, noise_m: float) -> NDArray[Any]:
     """Return a lump of 10 cm with bumps of a few centimetres, from the vertices and faces of a unit ball."""
     x, y, z = unit.vertices.T
     bumps = 0.08 * np.sin(3 * x + 1) * np.cos(2 * y) + 0.04 * np.sin(5 * z) * np.cos(4 * x)
     noise = noise_m * np.random.default_rng(4).normal(size=len(x))
-    return unit.vertices * (0.1 * (1 + bumps) + noise)[:, None]
+    radius: NDArray[np.float64] = 0.1 * (1 + bumps) + noise
+    return np.asarray(unit.vertices * radius[:, None])
 
 
-def lump(subdivisions=7):
+def lump(subdivisions: int = 7) -> trimesh.Trimesh:
     """A bumpy ball of 330 000 faces, its bumps finer than a pixel from 2 m away."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     return trimesh.Trimesh(_bumpy(ball, 0.0), ball.faces, process=False)
 
 
-def scan():
+def scan() -> trimesh.Trimesh:
     """Return what a laser scanner makes of a lump: 200 000 faces, noise on every vertex, and no floor."""
     ball = trimesh.creation.uv_sphere(radius=1.0, count=(256, 256))
     vertices = _bumpy(ball, 2e-6)
@@ -151,7 +167,7 @@ def scan():
     return trimesh.Trimesh(vertices, ball.faces[kept], process=False)
 
 
-ODD = {
+ODD: dict[str, Callable[[], trimesh.Trimesh]] = {
     "bowl": bowl,
     "coarse bowl": coarse_bowl,
     "star prism": star_prism,

@@ -6,7 +6,9 @@ import shutil
 import numpy as np
 
 from phasemark.cli import main
-from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, build_part, export_frames
+from phasemark.data import BankPlan, FramePlan, build_bank, build_frames
+from phasemark.data.export import export_frames
+from phasemark.data.partial_outputs import build_part
 
 SENSOR_OPTIONS = ["--unit", "m", "--quantity", "range"]
 EXPORTS = ("npz", "csv", "png16", "ply", "bop", "rosbag")

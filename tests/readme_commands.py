@@ -29,6 +29,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from phasemark.cli import main
 
@@ -177,6 +178,7 @@ def _run_here(
         stack.enter_context(contextlib.redirect_stderr(printed))
         out = stack.enter_context(open(printed_to, "w", encoding="utf-8")) if printed_to else printed
         stack.enter_context(contextlib.redirect_stdout(out))
+        code: object
         try:
             code = function()
         except SystemExit as end:
@@ -236,7 +238,7 @@ def _write_board(path: Path) -> None:
     sensor, distance_m = preset("pmd-16x16"), float(path.stem.removeprefix("board_").removesuffix("m"))
     board = Renderer(None, sensor).render(0.5, background=Background(wall_m=distance_m, wall_albedo=0.8))
     frames = capture(board, sensor, rng=np.random.default_rng(1), n_frames=50)
-    arrays = {"range": frames.range_m, "amplitude": frames.amplitude_e, "intensity": frames.intensity_e}
+    arrays: dict[str, Any] = {"range": frames.range_m, "amplitude": frames.amplitude_e, "intensity": frames.intensity_e}
     np.savez(path, **arrays, unit="m", quantity="range")
 
 

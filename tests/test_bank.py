@@ -15,9 +15,10 @@ import trimesh
 import xarray
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
-from phasemark.data import BankPlan, build_bank, mesh_sha256, open_bank, verify_checksum, versions
+from phasemark.data import BankPlan, build_bank, open_bank
+from phasemark.data.files import mesh_sha256, versions
 from phasemark.data.files.hdf5_layout import Layout, SparseMemory
-from phasemark.inputs import checksum_path
+from phasemark.inputs import checksum_path, verify_checksum
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import PhasorImages, Renderer, preset
 
@@ -107,7 +108,7 @@ def test_every_image_lies_where_its_coordinates_say(painted, tmp_path, plan, sha
                     assert image.views.delta_rad.tolist() == [bank.delta_rad[j]]
 
 
-def test_whole_arrays_for_a_matcher(painted):
+def test_a_matcher_gets_whole_arrays_that_are_read_once(painted):
     with build_bank(PLAN) as bank:
         lower, upper = bank.lower, bank.upper
         assert bank.full is None
@@ -158,7 +159,7 @@ def test_the_bank_holds_what_the_renderer_renders():
 
 
 @pytest.mark.parametrize("plan", [PLAN, FULL], ids=["factored", "full"])
-def test_same_plan_same_bytes_for_any_number_of_workers(tmp_path, plan):
+def test_the_same_plan_gives_the_same_bytes_for_any_number_of_workers(tmp_path, plan):
     build_bank(plan, tmp_path / "a.h5", workers=1).close()
     build_bank(plan, tmp_path / "b.h5", workers=3).close()
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
@@ -499,13 +500,13 @@ def test_sparse_memory_is_a_file(tmp_path):
             data = rng.bytes(int(size))
             for target in (memory, file):
                 target.seek(int(at))
-                assert target.write(data) == size
+                assert target.write(memoryview(data)) == size
         for at, size in zip(rng.integers(0, 700_000, 50), rng.integers(0, 200_000, 50), strict=True):
             answers = []
             for target in (memory, file):
                 buffer = bytearray(int(size))
                 target.seek(int(at))
-                answers.append((target.readinto(buffer), bytes(buffer)))
+                answers.append((target.readinto(memoryview(buffer)), bytes(buffer)))
             assert answers[0] == answers[1]
         for target in (memory, file):
             target.truncate(300_000)

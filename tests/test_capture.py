@@ -158,7 +158,7 @@ def test_taps_and_phase_images_have_independent_noise_of_the_right_size():
     low, high = variance_interval(n, n_cells)
     ratio = taps.var(axis=0, ddof=1) / variance
     assert ((low < ratio) & (ratio < high)).all()
-    correlation = np.corrcoef(taps.T)[np.triu_indices(8, 1)]
+    correlation = np.asarray(np.corrcoef(taps.T))[np.triu_indices(8, 1)]
     assert (np.abs(correlation) < z / math.sqrt(n)).all()
 
 

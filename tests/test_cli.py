@@ -178,7 +178,7 @@ def test_a_terminal_without_the_signs_still_gets_the_table() -> None:
     assert r"16 \xd7 16  22° \xd7 22°" in done.stdout.decode("cp1251")
 
 
-@pytest.mark.parametrize(("arguments", "code"), [(["--version"], 0), (["sensor", "show", "pmd-17x17"], 2)])
+@pytest.mark.parametrize(("arguments", "code"), [(["--version"], 0), (["snesor"], 2)])
 def test_the_package_runs_as_a_module(arguments: list[str], code: int, tmp_path: Path) -> None:
     as_module = [sys.executable, "-m", "phasemark", *arguments]
     done = subprocess.run(as_module, cwd=tmp_path, capture_output=True, text=True)
@@ -241,7 +241,7 @@ def test_long_work_writes_lines_where_stderr_is_no_terminal(
         assert two.wait(60)
         raise StorageError("enough")
 
-    monkeypatch.setattr(cli.typer, "echo", echo)
+    monkeypatch.setattr("phasemark.cli.typer.echo", echo)
     for name in (
         "data.build_bank", "data.build_frames", "matcher.sweep.run.run_sweep", "matcher.design.run_design",
         "matcher.demo.run.run_demo", "matcher.drive.run_drive", "render.characterise",

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from phasemark.cli import main
-from phasemark.data import verify_checksum, write_checksum
+from phasemark.data.files import write_checksum
+from phasemark.inputs import verify_checksum
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, capture, preset
 

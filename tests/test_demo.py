@@ -4,6 +4,7 @@ import csv
 import io
 import math
 from html.parser import HTMLParser
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from phasemark.data.seeds import stream
 from phasemark.matcher.demo.report import summary_rows, write_demo
 from phasemark.matcher.demo.run import LANDMARK_XY_M, cells_csv, run_demo, trials_csv
 
-SMALL = {
+SMALL: dict[str, Any] = {
     "classes": ("cone", "post"),
     "distances_m": (1.0,),
     "deltas_deg": (0.0, 45.0),

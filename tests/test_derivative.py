@@ -1,6 +1,7 @@
 """Derivatives of the phasors against complex steps through closed forms, and against finer differences."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,7 +57,7 @@ def facing_plane(distance, delta, bearing):
 @pytest.mark.parametrize("view", [(1.0, 0.0, 0.0), (1.4, 0.5, 0.02), (0.9, -0.3, -0.04)])
 def test_a_plane_has_the_derivatives_of_the_closed_form(view):
     plate = trimesh.creation.box((0.01, 9, 9)).apply_translation((0.005, 0, 0))
-    jacobian = Renderer(plate, PMD).jacobian(*view, 0.03)
+    jacobian = Renderer(plate, PMD).jacobian(*view, height_m=0.03)
     assert jacobian.shape == (1, 4, 16, 16)
     for k in range(3):
 
@@ -119,7 +120,12 @@ def test_the_derivatives_of_a_sphere_are_those_of_its_closed_form():
 @pytest.mark.parametrize("name", list(catalog()))
 def test_derivatives_agree_with_those_of_finer_pixels(name):
     mesh = build_mesh(catalog()[name])
-    view = {"distance_m": [0.87, 1.31, 1.9], "delta_rad": [0.3, 1.2, 2.4], "bearing_rad": 0.013, "height_m": 0.021}
+    view: dict[str, Any] = {
+        "distance_m": [0.87, 1.31, 1.9],
+        "delta_rad": [0.3, 1.2, 2.4],
+        "bearing_rad": 0.013,
+        "height_m": 0.021,
+    }
     background = Background(wall_m=4.0, floor_m=0.2)
     coarse = Renderer(mesh, PMD).jacobian(**view, background=background)
     fine = Renderer(mesh, PMD.with_(rows=64, cols=64)).jacobian(**view, background=background)
@@ -134,7 +140,7 @@ def test_derivatives_agree_with_those_of_finer_pixels(name):
 def test_height_has_the_slope_towards_the_hidden_top_at_the_interface():
     mesh = build_mesh(catalog()["cylinder"])
     renderer = Renderer(mesh, PMD)
-    view = {"distance_m": 1.0, "delta_rad": 0.4, "bearing_rad": 0.003}
+    view: dict[str, Any] = {"distance_m": 1.0, "delta_rad": 0.4, "bearing_rad": 0.003}
     at_zero = renderer.jacobian(**view, height_m=[0.0, 3e-6, -3e-6], parameters=("height_m",))[:, 0]
     above = renderer.jacobian(**view, height_m=5e-5, parameters=("height_m",))[0, 0]
     below = renderer.jacobian(**view, height_m=-5e-5, parameters=("height_m",))[0, 0]
@@ -153,7 +159,7 @@ def test_a_landmark_that_stands_on_the_floor_has_derivatives():
 
 def test_parameters_come_in_the_order_asked_for_and_views_broadcast():
     renderer = Renderer(build_mesh(catalog()["cone"]), PMD)
-    view = {"distance_m": np.array([[0.9], [1.3]]), "delta_rad": np.array([0.2, 0.8, 1.4])}
+    view: dict[str, Any] = {"distance_m": np.array([[0.9], [1.3]]), "delta_rad": np.array([0.2, 0.8, 1.4])}
     all_four = renderer.jacobian(**view, workers=2)
     some = renderer.jacobian(**view, parameters=("height_m", "distance_m"))
     assert all_four.shape == (6, 4, 16, 16)

@@ -5,15 +5,17 @@ import io
 import json
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.GifImagePlugin import GifImageFile
 from scipy import stats
 
 from phasemark import UsageError
 from phasemark.cli import main
-from phasemark.matcher import Match, Placement, RobotPose, robot_poses
+from phasemark.matcher import Match, RobotPose, robot_poses
 from phasemark.matcher.drive import (
     OUTPUTS,
     DrivePlan,
@@ -33,6 +35,7 @@ from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
 from phasemark.matcher.drive.odometry import OdometryModel, Reading, World, motion_jacobian, motion_noise, moved
 from phasemark.matcher.filters.filtered_frames import kalman_filter
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
+from phasemark.matcher.position import Placement
 from phasemark.matcher.statistics import nees
 from phasemark.render import Background, capture
 
@@ -167,7 +170,8 @@ def test_the_wall_is_found_by_a_camera_that_hangs_askew(equipment):
 def placement_at(pose, covariance):
     """A placement at a pose; its landmark and the paper's angles do not matter to the filter."""
     where = RobotPose(*pose, (0.0, 0.0), 0.0, 0.0, 0.0, covariance)
-    return Placement(SimpleNamespace(name="any"), where)
+    landmark: Any = SimpleNamespace(name="any")
+    return Placement(landmark, where)
 
 
 def test_a_correction_weighs_belief_and_measurement_by_their_information():
@@ -339,6 +343,7 @@ def test_tables_and_summary_hold_the_drive(drives):
 
 def test_the_animation_moves(drives):
     with Image.open(io.BytesIO(drive_animation(drives[0]))) as gif:
+        assert isinstance(gif, GifImageFile)
         first = np.asarray(gif.convert("RGB"))
         assert gif.n_frames > 50
         gif.seek(gif.n_frames - 1)

@@ -310,19 +310,19 @@ def test_labelled_frames_go_through_a_data_loader_with_worker_processes(tmp_path
     for package in ("torch", "torch/utils"):
         (tmp_path / package / "__init__.py").touch()
     (tmp_path / "torch" / "utils" / "data.py").write_text(DATA_LOADER)
-    program = [sys.executable, "-W", "error", EXAMPLE.with_name("labelled_frames.py"), "--views", "40"]
+    program = [sys.executable, "-W", "error", str(EXAMPLE.with_name("labelled_frames.py")), "--views", "40"]
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run(program, capture_output=True, text=True, cwd=tmp_path, env=environment)
     assert done.returncode == 0, done.stderr
     assert "PyTorch: a batch of (32, 2, 16, 16), 4 classes in it" in done.stdout
 
 
-def test_without_xarray_the_example_says_what_to_install(tmp_path):
+def test_without_xarray_the_example_says_what_to_install(tmp_path, monkeypatch):
     for name in ("xarray", "torch"):  # as if they were not there
         (tmp_path / f"{name}.py").write_text("raise ImportError")
-    program = [sys.executable, "-W", "error", EXAMPLE.with_name("labelled_frames.py"), "--views", "8"]
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run(program, capture_output=True, text=True, cwd=tmp_path, env=environment)
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    done = run_example("labelled_frames.py", "--views", 8, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[:2] == [
         "xarray: not installed (pip install xarray h5netcdf)",
@@ -335,6 +335,7 @@ def test_too_few_views_are_refused_in_one_line(tmp_path):
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
 
 
+@pytest.mark.usefixtures("one_example_of_each_method")
 def test_an_own_matcher_is_judged_beside_the_papers(tmp_path):
     done = run_example("own_matcher.py", "--trials", 3, folder=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -1,15 +1,18 @@
 """Exports hold the frames' own values, say what they are, and come back as they were."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 
 from phasemark import OutputExistsError, UsageError
 from phasemark.cli import main
-from phasemark.data import FramePlan, build_frames, export_frames, read_frames
+from phasemark.data import FramePlan, build_frames, read_frames
+from phasemark.data.export import export_frames
 from phasemark.render import Views, preset
 
 MOUNT = {"bearing_offset_deg": 3.0, "height_offset_m": -0.03}  # two pixels aside and one down
@@ -72,7 +75,8 @@ def test_range_and_z_are_told_apart(frames, tmp_path):
     with pytest.raises(UsageError, match=r"but .* says z"):
         read_frames(tmp_path / "z", sensor=SENSOR, quantity="range")
     table = exported(frames, tmp_path, "csv", "z")
-    for wrong in ({"quantity": "range"}, {"unit": "cm"}):
+    contradicting: tuple[dict[str, Any], ...] = ({"quantity": "range"}, {"unit": "cm"})
+    for wrong in contradicting:
         with pytest.raises(UsageError, match=rf"--{next(iter(wrong))} is .*, but .* says (z|m)"):
             read_frames(table, sensor=SENSOR, **wrong)
 
@@ -81,6 +85,7 @@ def test_an_image_states_its_quantity_and_scale(frames, tmp_path):
     folder = exported(frames, tmp_path, "png16", "z")
     facts = json.loads((folder / "frames.json").read_text())
     with Image.open(folder / "00000005.png") as image:
+        assert isinstance(image, PngImageFile)
         assert image.text["quantity"] == facts["quantity"] == "z"
         assert float(image.text["metres_per_unit"]) == facts["metres_per_unit"]
         codes = np.asarray(image)
@@ -97,7 +102,7 @@ def test_an_image_states_its_quantity_and_scale(frames, tmp_path):
 
 
 def test_a_point_cloud_lies_on_the_pixels_rays(frames, tmp_path):
-    cloud = trimesh.load(exported(frames, tmp_path, "ply") / "00000003.ply")
+    cloud: Any = trimesh.load(exported(frames, tmp_path, "ply") / "00000003.ply")
     range_m = frames[3]["range_m"]
     seen = np.isfinite(range_m)
     np.testing.assert_allclose(np.linalg.norm(cloud.vertices, axis=1), range_m[seen], rtol=1e-6)
@@ -121,7 +126,9 @@ def bop_images(folder):
 def test_bop_depth_and_masks_fit_the_projected_model(frames, tmp_path):
     folder = exported(frames, tmp_path, "bop")
     infos = json.loads((folder / "models" / "models_info.json").read_text())
-    models = {int(k): trimesh.load(folder / "models" / f"obj_{int(k):06d}.ply", process=False) for k in infos}
+    models: dict[int, Any] = {
+        int(k): trimesh.load(folder / "models" / f"obj_{int(k):06d}.ply", process=False) for k in infos
+    }
     count = 0
     for kind, scene, key, camera, truth, info in bop_images(folder):
         numbers = frames.split(kind)
@@ -158,7 +165,7 @@ def test_bop_depth_and_masks_fit_the_projected_model(frames, tmp_path):
 def test_a_bop_model_is_in_millimetres_about_its_centre_and_knows_its_symmetry(frames, tmp_path):
     folder = exported(frames, tmp_path, "bop") / "models"
     info = json.loads((folder / "models_info.json").read_text())["1"]
-    model = trimesh.load(folder / "obj_000001.ply", process=False)
+    model: Any = trimesh.load(folder / "obj_000001.ply", process=False)
     np.testing.assert_allclose(model.bounds.mean(axis=0), 0, atol=1e-3)
     np.testing.assert_allclose([info["size_x"], info["size_y"], info["size_z"]], [240, 160, 300], atol=1e-3)
     # the tip of the cone is nearer to the box's corners than these are to each other: 3D diagonal of the box

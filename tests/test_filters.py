@@ -5,15 +5,8 @@ import pytest
 from scipy import stats
 
 from phasemark import UsageError
-from phasemark.matcher import (
-    FilteredFrames,
-    PixelKalman,
-    PixelState,
-    kalman,
-    kalman_filter,
-    kalman_step,
-    phasor_mean,
-)
+from phasemark.matcher import FilteredFrames, PixelKalman, kalman_filter, phasor_mean
+from phasemark.matcher.filters import PixelState, kalman, kalman_step
 from phasemark.render import Flag, Frames, PhasorImages, Sensor, Views, capture, predicted_range_std, preset
 
 FALSE_ALARM = 1e-3  # of a whole test, whatever the number of cells

@@ -107,7 +107,8 @@ def test_an_error_or_interrupt_leaves_the_old_folder_and_nothing_else(tmp_path):
 
 
 def test_every_file_and_folder_is_on_disk_before_the_name_and_the_name_after(tmp_path, monkeypatch):
-    events, fsync, rename = [], os.fsync, renames.rename_new
+    events: list[int | str] = []
+    fsync, rename = os.fsync, renames.rename_new
     monkeypatch.setattr(os, "fsync", lambda fd: events.append(os.fstat(fd).st_ino) or fsync(fd))
     monkeypatch.setattr(renames, "rename_new", lambda a, b: events.append("rename") or rename(a, b))
     folder = write(tmp_path / "out", "one")

@@ -11,25 +11,12 @@ import pytest
 import xarray
 
 from phasemark import InputFileError, OutputExistsError, UsageError
-from phasemark.data import (
-    BankPlan,
-    Distribution,
-    FramePlan,
-    build_bank,
-    build_frames,
-    build_part,
-    estimate_build,
-    merge_parts,
-    open_frames,
-    parse_part,
-    planned_size,
-    read_frames,
-    verify_bank,
-    verify_frames,
-    write_checksum,
-)
-from phasemark.data.partial_outputs import job_for
+from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_frames, read_frames
+from phasemark.data.files import write_checksum
+from phasemark.data.partial_outputs import build_part, estimate_build, job_for, merge_parts, parse_part
+from phasemark.data.plans import Distribution, planned_size
 from phasemark.data.seeds import stream
+from phasemark.data.verify import verify_bank, verify_frames
 from phasemark.inputs import checksum_path
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, capture, preset
@@ -164,7 +151,7 @@ def test_quantities_are_independent_of_one_another():
     [{"workers": 1}, {"workers": 3, "shard_items": 7}, {"workers": 8, "shard_items": 1}, {"scheduler": "local:2"}],
     ids=str,
 )
-def test_the_same_bytes_for_any_workers_shards_and_processes(frames_file, tmp_path, options):
+def test_workers_shards_and_processes_do_not_change_the_bytes(frames_file, tmp_path, options):
     build_frames(PLAN, tmp_path / "again.h5", **options).close()
     assert sha256(tmp_path / "again.h5") == sha256(frames_file)
 

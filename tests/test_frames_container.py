@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from phasemark import UsageError
-from phasemark.render import Flag, Frames, preset, wrap_difference_m, wrap_range_m
+from phasemark.render import Flag, Frames, preset
+from phasemark.render.phasor_images import wrap_difference_m, wrap_range_m
 
 SENSOR = preset("ideal").with_(rows=1, cols=2)
 

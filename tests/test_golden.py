@@ -1,4 +1,4 @@
-"""Golden frames of the four classes: unintended change shows here, correctness in test_reference.py."""
+"""Golden frames of the four classes: unintended change shows here, correctness in test_reference_frames.py."""
 
 import numpy as np
 import pytest

@@ -9,8 +9,9 @@ import pytest
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank
-from phasemark.matcher import LandmarkMap, Match, read_landmark_map, robot_poses
+from phasemark.matcher import Match, robot_poses
 from phasemark.matcher.commands.match_table import pose_text
+from phasemark.matcher.position import LandmarkMap, read_landmark_map
 from phasemark.render import Renderer, capture
 
 DOOR = {"name": "door", "class": "cone", "x_m": 2.0, "y_m": 1.0, "yaw_deg": 30.0}

@@ -7,20 +7,10 @@ import pytest
 from oracles.outline_coverage import coverage_of_hull, coverage_of_mesh, project
 
 from phasemark import UsageError
-from phasemark.landmarks import (
-    LOWER,
-    UPPER,
-    Box,
-    Cone,
-    Cylinder,
-    LandmarkSpec,
-    Revolution,
-    Sphere,
-    build_mesh,
-    catalog,
-    mesh_figure,
-    mesh_html,
-)
+from phasemark.landmarks import LandmarkSpec, build_mesh, catalog, mesh_figure
+from phasemark.landmarks.figures import mesh_html
+from phasemark.landmarks.mesh import LOWER, UPPER
+from phasemark.landmarks.spec import Box, Cone, Cylinder, Revolution, Sphere
 
 BOX = Box(length_m=0.24, width_m=0.16, height_m=0.15)
 

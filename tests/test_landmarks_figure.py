@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from phasemark.landmarks import build_mesh, catalog, mesh_figure, mesh_html
+from phasemark.landmarks import build_mesh, catalog, mesh_figure
+from phasemark.landmarks.figures import mesh_html
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 BOX = trimesh.creation.box((0.2, 0.1, 0.3))

@@ -2,19 +2,21 @@
 
 import math
 import time
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
 from phasemark import InputFileError, UsageError
-from phasemark.data import read_frames, write_measured
+from phasemark.data import read_frames
+from phasemark.data.measured import write_measured
 from phasemark.render import Flag, Sensor, preset
 
 PMD = preset("pmd-16x16")
 SMALL = Sensor(rows=2, cols=3, half_angle_h_deg=30, half_angle_v_deg=20)
 IMAGE = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-STATED = {"unit": "m", "quantity": "range"}
+STATED: dict[str, Any] = {"unit": "m", "quantity": "range"}
 
 
 def csv_file(tmp_path, text):
@@ -50,7 +52,7 @@ def hdf5_file(tmp_path, datasets, attributes=None):
         "1e0,2e0,3e0,4e0,5e0,6e0\n",
     ],
 )
-def test_spellings_of_one_csv_frame(tmp_path, text):
+def test_every_spelling_of_a_csv_frame_gives_the_same_frame(tmp_path, text):
     frames = read_frames(csv_file(tmp_path, text), sensor=SMALL, **STATED)
     assert frames.range_m.tolist() == [[IMAGE.tolist()]]
     assert frames.valid.all()
@@ -107,7 +109,7 @@ def test_units_become_metres(tmp_path, unit, metres):
 
 
 @pytest.mark.parametrize(("shape", "result"), [((2, 3), (1, 1)), ((5, 2, 3), (1, 5)), ((4, 5, 2, 3), (4, 5))])
-def test_npy_shapes(tmp_path, shape, result):
+def test_the_shape_of_an_npy_file_says_positions_and_frames(tmp_path, shape, result):
     values = 1 + np.arange(math.prod(shape)).reshape(shape) / 100
     np.save(tmp_path / "a.npy", values)
     frames = read_frames(tmp_path / "a.npy", sensor=SMALL, **STATED)
@@ -195,7 +197,7 @@ def test_a_file_that_states_unit_and_quantity_needs_no_options(tmp_path, kind):
         read_frames(path, sensor=SMALL, quantity="z")
 
 
-def test_hdf5_frames_with_amplitudes(tmp_path):
+def test_hdf5_frames_are_read_with_their_amplitudes(tmp_path):
     path = hdf5_file(tmp_path, {"range": IMAGE[None], "amplitude": 7 * IMAGE[None]}, {"amplitude": {"units": "e-"}})
     frames = read_frames(path, sensor=SMALL, **STATED)
     assert frames.amplitude_e[0, 0].tolist() == (7 * IMAGE).tolist()

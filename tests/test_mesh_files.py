@@ -9,7 +9,8 @@ import pytest
 import trimesh
 
 from phasemark import InputFileError, UsageError
-from phasemark.landmarks import MeshWarning, build_mesh, catalog, check_mesh, export_mesh, read_mesh
+from phasemark.landmarks import build_mesh, catalog, check_mesh, export_mesh, read_mesh
+from phasemark.landmarks.mesh_files import MeshWarning
 
 BOX = trimesh.creation.box((0.2, 0.1, 0.3))
 FORMATS = ("stl", "ply", "obj", "off")

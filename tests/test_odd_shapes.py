@@ -63,7 +63,7 @@ def test_splits_leave_flat_faces_as_they_are_and_are_limited():
     assert np.abs(one.coverage - four.coverage).max() < 1e-9  # exact, whatever the pieces
     for splits in (0, 5, 1.5):
         with pytest.raises(UsageError, match="whole number from 1 to 4"):
-            Renderer(mesh, PMD, splits=splits)
+            Renderer(mesh, PMD, splits=splits)  # type: ignore[arg-type]
 
 
 @pytest.mark.soak

@@ -10,11 +10,13 @@ import pytest
 
 from phasemark import UsageError
 from phasemark.cli import main
-from phasemark.data import BankPlan, FramePlan, planned_size
+from phasemark.data import BankPlan, FramePlan
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.data.measured.csv_frames import parse_csv
 from phasemark.data.partial_outputs import estimate_build
-from phasemark.landmarks import build_mesh, catalog, export_mesh, mesh_html, read_mesh
+from phasemark.data.plans import planned_size
+from phasemark.landmarks import build_mesh, catalog, export_mesh, read_mesh
+from phasemark.landmarks.figures import mesh_html
 from phasemark.render import Background, Renderer, Views, preset
 from phasemark.render.integral.intersect import MOST_SCENES, EmbreeIntersector
 

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from phasemark import UsageError
-from phasemark.landmarks import Cone, Cylinder, LandmarkSpec, Sphere, build_mesh, catalog
-from phasemark.render import PlanarLandmark, Renderer, Sensor, Views, planar_images, preset
+from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
+from phasemark.landmarks.spec import Cone, Cylinder, Sphere
+from phasemark.render import Renderer, Sensor, Views, preset
+from phasemark.render.planar import PlanarLandmark, planar_images
 
 LENGTH, WIDTH = 0.24, 0.16
 SENSOR = preset("pmd-16x16")

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
+from rich.style import Style
 
 from phasemark import UsageError
-from phasemark.render import PAPER_CMAP, Flag, Frames, PhasorImages, Views, preset, range_figure, terminal_figure
-from phasemark.render.figures import RANGE_COLOURS
+from phasemark.render import Flag, Frames, PhasorImages, Views, preset
+from phasemark.render.figures import PAPER_CMAP, RANGE_COLOURS, range_figure, terminal_figure
 
 SENSOR = preset("ideal")
 
@@ -119,12 +120,15 @@ def test_terminal_picture_draws_two_pixels_in_a_character():
     lines = text.plain.split("\n")
     assert lines[:2] == ["▀▀", "▀▀"]
     assert lines[2].endswith("1.00 … 3.00 m  █ no range")
-    corner, beside = text.spans[0].style, text.spans[1].style
+    corner, beside, last = (span.style for span in text.spans[:3])
+    assert isinstance(corner, Style)
+    assert isinstance(beside, Style)
+    assert isinstance(last, Style)
     assert tuple(corner.color.triplet) == (255, 255, 255)
     assert tuple(corner.bgcolor.triplet) == (0, 0, 0)
     assert beside.color.triplet.blue > beside.color.triplet.red
     assert beside.bgcolor.triplet.red > beside.bgcolor.triplet.blue  # no range: warm
-    assert text.spans[2].style.bgcolor is None  # an odd row count leaves the last half line as it is
+    assert last.bgcolor is None  # an odd row count leaves the last half line as it is
 
 
 def test_terminal_picture_fills_the_width_by_whole_pixels():

@@ -18,6 +18,7 @@ from types import FunctionType, ModuleType
 import pytest
 
 import phasemark
+from phasemark.inputs.moved_names import MOVED
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("inputs", "data", "landmarks", "matcher", "render")
@@ -91,7 +92,7 @@ def test_imports_point_one_way() -> None:
 @pytest.mark.parametrize("name", [*ROOMS, "cli"])
 @pytest.mark.parametrize("statement", ["import {}", "from {} import x", "from {}.y import x"])
 def test_a_bare_import_of_a_room_is_refused(name: str, statement: str) -> None:
-    command = [BIN / "ruff", "check", "--select", "TID251", "--stdin-filename", ROOT / "data" / "x.py", "-"]
+    command = [str(BIN / "ruff"), "check", "--select", "TID251", "--stdin-filename", str(ROOT / "data" / "x.py"), "-"]
     done = subprocess.run(command, cwd=ROOT, input=statement.format(name) + "\n", capture_output=True, text=True)
     assert done.returncode == 1
     assert f"import phasemark.{name}" in done.stdout
@@ -123,6 +124,25 @@ print("numpy" in sys.modules)
     command = [sys.executable, "-c", program.format(first)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout.split()) == (0, ["False", "True", "True"]), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("room", "place", "name"),
+    [(room, place, name) for room, places in MOVED.items() for place, names in places.items() for name in names],
+)
+def test_a_name_that_moved_is_found_with_a_warning(room: str, place: str, name: str) -> None:
+    assert name not in importlib.import_module(room).__all__
+    with pytest.warns(DeprecationWarning, match=rf"{room}\.{name} moved: import it from {place}$"):
+        found = getattr(importlib.import_module(room), name)
+    assert found is getattr(importlib.import_module(place), name)
+
+
+def test_the_rooms_export_what_a_newcomer_needs_and_no_more() -> None:
+    counts = {
+        room: len(importlib.import_module(f"phasemark.{room}").__all__)
+        for room in ("landmarks", "render", "data", "matcher")
+    }
+    assert sum(counts.values()) <= 50, counts
 
 
 def test_an_unknown_name_of_a_room_is_an_attribute_error() -> None:

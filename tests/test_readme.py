@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("**/*.md")])
 
 
+@pytest.mark.usefixtures("one_example_of_each_method")
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_printed_command_runs(page: Path, tmp_path: Path) -> None:
     run = list(run_page(page, tmp_path))

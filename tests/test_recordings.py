@@ -151,9 +151,9 @@ def test_a_single_frame_of_a_direct_sensor_has_the_noise_that_the_sensor_states(
         (batch,) = match_in_batches(Matcher(bank), frames.each_a_position(), kalman_filter)
     returned = np.isfinite(batch.filtered.range_m)
     assert returned.any()
-    frames = batch.filtered.with_pooled_noise()
-    assert (frames.std_m[returned] == ZONES.range_std_m).all()
-    assert not frames.std_from_scatter
+    filtered = batch.filtered.with_pooled_noise()
+    assert (filtered.std_m[returned] == ZONES.range_std_m).all()
+    assert not filtered.std_from_scatter
 
 
 def test_the_fit_of_frames_at_rest_passes_its_test_as_often_as_stated(run, folder, tmp_path):

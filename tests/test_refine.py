@@ -13,8 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, noise_free
+from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
 from phasemark.matcher.accuracy.trials import TrialSetup, noisy_frames, run_trials
+from phasemark.matcher.filters import noise_free
 from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import Problem, Settings
@@ -26,6 +27,7 @@ from phasemark.render import Background, Frames, Renderer, Views, capture, predi
 SENSOR = preset("pmd-16x16")
 WALL = Background(wall_m=4.0)
 NAMES = ("cylinder", "cone", "sphere", "post")
+STRANGERS = ("cube", "slab", "table", "pyramid")
 
 
 @pytest.fixture(scope="module")
@@ -222,8 +224,14 @@ def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, ren
         assert match.delta_rad == pytest.approx(delta, abs=math.radians(0.3))
 
 
-@pytest.mark.parametrize(("free", "n"), [(VIEW[:2], 40), (None, 3)])
-@pytest.mark.parametrize("name", ["cube", "slab", "table", "pyramid"])
+@pytest.mark.parametrize(
+    ("name", "free", "n"),
+    [
+        *((name, VIEW[:2], 40) for name in STRANGERS),
+        ("cube", None, 3),
+        *(pytest.param(name, None, 3, marks=pytest.mark.soak) for name in STRANGERS if name != "cube"),
+    ],
+)
 def test_a_stranger_on_the_same_box_is_refused(bank, name, free, n):
     rng = np.random.default_rng(8)
     renderer = Renderer(strangers()[name], SENSOR, albedo=0.8)
@@ -382,6 +390,6 @@ def two_matchers():
 
 
 @given(**DAMAGE)
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damaged_frames_get_an_answer_and_never_a_view_that_is_not_a_number(two_matchers, renderers, **damage):
     check_damaged(two_matchers, renderers["post"], **damage)

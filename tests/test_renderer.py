@@ -1,11 +1,12 @@
 """The area integral against closed forms, against dense sampling, and against itself where it must not depend."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from builders import ODD, l_bracket, star_prism
+from builders import ODD, joined, l_bracket, star_prism
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.images import (
@@ -106,7 +107,7 @@ def test_harmonics_are_the_amplitude_times_powers_of_the_phase():
 def test_two_surfaces_in_one_pixel_measure_what_the_physics_page_says(near_m, far_m, share, range_m, ratio):
     sensor = PMD.with_(rows=1, cols=1, half_angle_h_deg=0.01, half_angle_v_deg=0.01)
     edge = near_m * math.tan(math.radians(0.01)) * (1 - 2 * share)
-    plates = trimesh.util.concatenate([sheet((edge, 1), (-1, 1), near_m - 0.5), sheet((-9, 9), (-9, 9), far_m - 0.5)])
+    plates = joined([sheet((edge, 1), (-1, 1), near_m - 0.5), sheet((-9, 9), (-9, 9), far_m - 0.5)])
     image = Renderer(plates, sensor).render(0.5)
     assert image.range_m[0, 0, 0] == pytest.approx(range_m, abs=5.1e-4)  # the table's digits
     assert image.amplitude[0, 0, 0] / image.intensity[0, 0, 0] == pytest.approx(ratio, abs=5.1e-4)
@@ -124,7 +125,7 @@ def test_an_edge_shares_a_pixel_where_it_cuts_it():
     other = Renderer(sheet((-2, y), (-2, 2)), PMD).render(1.0).coverage[0, 8]
     np.testing.assert_allclose(other[6:9], [0, 0.7, 1], atol=1e-9)
     corner = Renderer(sheet((y, 2), (z, 2)), PMD).render(1.0).coverage[0]
-    np.testing.assert_allclose(corner[3:6, 6:9], [[1, 0.3, 0], [0.6, 0.18, 0], [0, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(corner[3:6, 6:9], np.array([[1, 0.3, 0], [0.6, 0.18, 0], [0, 0, 0]]), atol=1e-9)
 
 
 def test_a_slanted_edge_cuts_off_the_polygons_area():
@@ -219,7 +220,7 @@ def test_the_line_between_wall_and_floor_follows_bearing_pitch_and_roll():
 
 
 def test_what_stands_behind_does_not_change_the_landmark():
-    view = {"distance_m": 1.0, "delta_rad": 0.5}
+    view: dict[str, Any] = {"distance_m": 1.0, "delta_rad": 0.5}
     bare = Renderer(CYLINDER, PMD).render(**view)
     walled = Renderer(CYLINDER, PMD).render(**view, background=Background(wall_m=3.0))
     wall = Renderer(None, PMD).render(**view, background=Background(wall_m=3.0))
@@ -303,7 +304,11 @@ def test_close_to_the_box_its_face_fills_the_image():
 
 def test_rendering_some_rows_gives_those_rows_bit_for_bit():
     renderer = Renderer(CYLINDER, PMD, harmonics=(3,))
-    view = {"distance_m": [0.9, 1.4], "delta_rad": 0.4, "background": Background(wall_m=3.0, floor_m=0.2)}
+    view: dict[str, Any] = {
+        "distance_m": [0.9, 1.4],
+        "delta_rad": 0.4,
+        "background": Background(wall_m=3.0, floor_m=0.2),
+    }
     whole, part = renderer.render(**view), renderer.render(**view, rows=(8, 16))
     for name in ("phasor", "intensity", "coverage"):
         np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[:, 8:])
@@ -332,7 +337,7 @@ def test_workers_and_batches_do_not_change_a_bit():
 def test_an_inverted_mesh_gives_the_same_image(mesh):
     inverted = mesh.copy()
     inverted.invert()
-    view = {"distance_m": [1.0, 0.8], "delta_rad": [0.3, 2.0], "height_m": -0.05}
+    view: dict[str, Any] = {"distance_m": [1.0, 0.8], "delta_rad": [0.3, 2.0], "height_m": -0.05}
     right, wrong = Renderer(mesh, PMD).render(**view), Renderer(inverted, PMD).render(**view)
     # a closed mesh drops the edges it cannot show, so that its pixels are split less finely: the budget of the integral
     assert epsilon(wrong.phasor, right.phasor) < 1e-4
@@ -341,9 +346,9 @@ def test_an_inverted_mesh_gives_the_same_image(mesh):
 
 def test_one_inverted_shell_among_two_gives_the_same_image():
     shells = [CYLINDER, trimesh.creation.box((0.05, 0.05, 0.05)).apply_translation((-0.2, 0, 0))]
-    right = Renderer(trimesh.util.concatenate(shells), PMD).render(1.0, 0.3)
+    right = Renderer(joined(shells), PMD).render(1.0, 0.3)
     shells[1].invert()
-    wrong = Renderer(trimesh.util.concatenate(shells), PMD).render(1.0, 0.3)
+    wrong = Renderer(joined(shells), PMD).render(1.0, 0.3)
     assert epsilon(wrong.phasor, right.phasor) < 1e-4  # as above
 
 
@@ -375,7 +380,7 @@ def test_shells_that_coincide_look_like_one():
 
 @pytest.mark.parametrize("name", ["cylinder", "cone", "sphere", "post"])
 def test_both_intersectors_give_the_same_image(name):
-    view = {"distance_m": [0.9, 1.7], "delta_rad": 0.4, "bearing_rad": 0.01, "height_m": -0.02}
+    view: dict[str, Any] = {"distance_m": [0.9, 1.7], "delta_rad": 0.4, "bearing_rad": 0.01, "height_m": -0.02}
     embree, own = (Renderer(MESHES[name], PMD, intersector=kind).render(**view) for kind in ("auto", "float64"))
     assert epsilon(own.phasor, embree.phasor) < 1e-6  # float32 edges inside Embree
     np.testing.assert_allclose(own.coverage, embree.coverage, atol=1e-6)
@@ -396,7 +401,12 @@ def test_a_shift_of_the_principal_point_by_whole_pixels_shifts_the_image():
 
 @pytest.mark.parametrize("name", ["cylinder", "cone", "sphere", "post"])
 def test_finer_pixels_average_to_the_same_image(name):
-    view = {"distance_m": [0.75, 1.3, 2.0], "delta_rad": [0.1, 0.9, 2.2], "bearing_rad": 0.01, "height_m": -0.02}
+    view: dict[str, Any] = {
+        "distance_m": [0.75, 1.3, 2.0],
+        "delta_rad": [0.1, 0.9, 2.2],
+        "bearing_rad": 0.01,
+        "height_m": -0.02,
+    }
     image = Renderer(MESHES[name], PMD).render(**view)
     fine = Renderer(MESHES[name], PMD.with_(rows=64, cols=64)).render(**view)
     np.testing.assert_allclose(mean_of_blocks(fine.coverage, 4), image.coverage, atol=1e-6)  # float32 rays at edges
@@ -410,7 +420,12 @@ def test_finer_pixels_average_to_the_same_image(name):
     [(1.5, 0.0, -0.03), (2.5, 0.0, -0.03), (3.0, 0.0, -0.03), (3.0, 0.02, 0.03)],
 )
 def test_the_slanted_limb_of_a_cone_keeps_to_the_budget(distance_m, bearing_rad, height_m):
-    view = {"distance_m": distance_m, "delta_rad": 0.3, "bearing_rad": bearing_rad, "height_m": height_m}
+    view: dict[str, Any] = {
+        "distance_m": distance_m,
+        "delta_rad": 0.3,
+        "bearing_rad": bearing_rad,
+        "height_m": height_m,
+    }
     image = Renderer(MESHES["cone"], PMD).render(**view)
     fine = Renderer(MESHES["cone"], PMD.with_(rows=192, cols=192)).render(**view)
     assert epsilon(image.phasor, mean_of_blocks(fine.phasor, 12)) < 1e-4  # the budget
@@ -451,7 +466,7 @@ def mixed_and_brightest(image, n=6):
 @pytest.mark.parametrize("name", ["bowl", "coarse bowl", "star prism", "L bracket", "hidden box", "blob"])
 @pytest.mark.parametrize("wall_m", [None, 2.0])
 def test_odd_meshes_agree_with_dense_sampling(name, wall_m):
-    view = {"distance_m": 1.0, "delta_rad": 0.4, "bearing_rad": 0.01, "height_m": -0.1}
+    view: dict[str, Any] = {"distance_m": 1.0, "delta_rad": 0.4, "bearing_rad": 0.01, "height_m": -0.1}
     renderer = Renderer(ODD[name](), PMD)
     image = renderer.render(**view, background=Background(wall_m=wall_m) if wall_m else None)
     pixels = mixed_and_brightest(image)
@@ -475,7 +490,7 @@ def test_odd_meshes_agree_with_dense_sampling(name, wall_m):
     ids=["24x32", "one pixel", "mounted"],
 )
 def test_other_cameras_agree_with_dense_sampling(sensor):
-    view = {"distance_m": 0.9, "delta_rad": 0.4, "bearing_rad": -0.03, "height_m": 0.02}
+    view: dict[str, Any] = {"distance_m": 0.9, "delta_rad": 0.4, "bearing_rad": -0.03, "height_m": 0.02}
     renderer = Renderer(CYLINDER, sensor)
     image = renderer.render(**view)
     pixels = mixed_and_brightest(image)
@@ -488,7 +503,7 @@ def test_other_cameras_agree_with_dense_sampling(sensor):
 def test_hidden_parts_do_not_shine_through():
     near = block((-0.5, -0.4), (-0.2, 0.2), (-0.2, 0.2))
     alone = Renderer(near, PMD).render(1.2)
-    both = Renderer(trimesh.util.concatenate([near, block((0, 0.1), (-0.1, 0.1), (-0.1, 0.1))]), PMD).render(1.2)
+    both = Renderer(joined([near, block((0, 0.1), (-0.1, 0.1), (-0.1, 0.1))]), PMD).render(1.2)
     np.testing.assert_array_equal(both.coverage > 0, alone.coverage > 0)
     assert epsilon(both.phasor, alone.phasor) < 1e-6  # pixels are split along edges that turn out to be hidden
 
@@ -569,9 +584,9 @@ def test_shells_that_run_through_one_another_look_like_their_union():
     left, right = trimesh.creation.box((0.15, 0.1, 0.1)), trimesh.creation.box((0.15, 0.1, 0.1))
     left.apply_translation((-0.025, 0, 0))
     right.apply_translation((0.025, 0, 0))
-    both = trimesh.util.concatenate([left, right])
+    both = joined([left, right])
     whole = trimesh.creation.box((0.2, 0.1, 0.1))
-    views = {"distance_m": [0.8, 1.1], "delta_rad": [0.4, 1.9], "height_m": [0.03, -0.02]}
+    views: dict[str, Any] = {"distance_m": [0.8, 1.1], "delta_rad": [0.4, 1.9], "height_m": [0.03, -0.02]}
     crossed, single = (Renderer(mesh, preset("pmd-16x16")).render(**views) for mesh in (both, whole))
     # the seams of the union cut some pixels in more pieces: another quadrature of the same light
     np.testing.assert_allclose(crossed.phasor, single.phasor, atol=1e-7)
@@ -583,7 +598,7 @@ def test_a_hole_in_one_of_two_shells_stays_a_hole():
     front = cut.face_normals[:, 0] < -0.5
     cut.update_faces(~front)
     inside = trimesh.creation.box((0.25, 0.02, 0.02)).apply_translation((0.02, 0, 0))  # pierces the back
-    both = trimesh.util.concatenate([cut, inside])
+    both = joined([cut, inside])
     image = Renderer(both, PMD).render(1.0)
     # through the open front the inner face of the back is seen, 1.1 m away, and not the front, 0.9 m away
     assert image.range_m[0, 6, 6] == pytest.approx(1.1, abs=0.01)
@@ -592,7 +607,7 @@ def test_a_hole_in_one_of_two_shells_stays_a_hole():
 def test_crossed_boxes_agree_with_finer_pixels():
     beam, post = trimesh.creation.box((0.3, 0.05, 0.05)), trimesh.creation.box((0.06, 0.06, 0.25))
     post.apply_transform(trimesh.transformations.rotation_matrix(0.8, (1, 0.3, 0.2)))
-    mesh, fine = trimesh.util.concatenate([beam, post]), 8
+    mesh, fine = joined([beam, post]), 8
     sensor = preset("pmd-16x16")
     image = Renderer(mesh, sensor).render(0.9, 0.7).phasor[0]
     finer = Renderer(mesh, sensor.with_(rows=16 * fine, cols=16 * fine)).render(0.9, 0.7).phasor[0]

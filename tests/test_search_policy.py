@@ -12,20 +12,20 @@ from phasemark.matcher import SearchPolicy
 def test_a_value_out_of_range_names_its_field(field):
     for bad in (-1, float("nan"), "2", None, True, (float("inf"),)):
         with pytest.raises(UsageError, match=f"'policy': '{field}' must be "):
-            replace(SearchPolicy(), **{field: bad})
+            replace(SearchPolicy(), **{field: bad})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("field", ["doubtful_p", "hopeless_p", "ambiguity"])
 def test_a_probability_of_one_is_refused(field):
     with pytest.raises(UsageError, match=rf"'policy': '{field}' must be in \(0, 1\), got 1.0"):
-        replace(SearchPolicy(), **{field: 1.0})
+        replace(SearchPolicy(), **{field: 1.0})  # type: ignore[arg-type]
 
 
 def test_a_grid_takes_two_positive_steps():
     with pytest.raises(UsageError, match="two positive numbers, metres and radians"):
         SearchPolicy(fine_grid=(0.01, 0.0))
     with pytest.raises(UsageError, match="two positive numbers"):
-        SearchPolicy(coarse_grid=(0.01,))
+        SearchPolicy(coarse_grid=(0.01,))  # type: ignore[arg-type]
 
 
 def test_a_policy_is_frozen():

@@ -15,19 +15,19 @@ from phasemark import UsageError
 from phasemark.inputs.toml_file import toml_value
 from phasemark.matcher import kalman_filter
 from phasemark.matcher.agreement import counts
-from phasemark.matcher.nearest.templates import assumed_std_m
+from phasemark.matcher.filters.filtered_frames import assumed_std_m
 from phasemark.render import (
     Background,
     Flag,
     Renderer,
     Sensor,
-    ablate,
     capture,
     measured_range_std,
     predicted_range_std,
     preset,
     preset_names,
 )
+from phasemark.render.exposure import ablate
 from phasemark.render.sensor.sensor_file import sensor_toml
 
 PMD = preset("pmd-16x16")

@@ -13,9 +13,9 @@ from builders import HELPERS_IN_PATH, run_program
 from programs.toy_job import ToyJob, check_toy_file
 
 from phasemark import OutputExistsError, StorageError, UsageError
-from phasemark.data import verify_checksum
 from phasemark.data.shards.build import build, difference, manifest_path, partial_path
 from phasemark.data.shards.remote import open_maker
+from phasemark.inputs import verify_checksum
 
 
 def names(folder):

@@ -1,6 +1,7 @@
 """The long tables, run by ``make soak`` before a release."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ FINER = 8
 def test_the_area_integral_agrees_with_pixels_eight_times_finer(name):
     rng = np.random.default_rng(77)
     n = 150
-    view = {
+    view: dict[str, Any] = {
         "distance_m": rng.uniform(0.75, 2.0, n),
         "delta_rad": rng.uniform(0, math.pi, n),
         "bearing_rad": np.radians(rng.uniform(-3, 3, n)),

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -143,7 +144,7 @@ def inputs(tmp_path_factory):
     image = Renderer(build_mesh(catalog()["cone"]), sensor).render_views(views)
     taken = capture(image, sensor, rng=rng, n_frames=5)
     shape = (-1, sensor.rows, sensor.cols)
-    arrays = {"range": taken.range_m, "amplitude": taken.amplitude_e, "intensity": taken.intensity_e}
+    arrays: dict[str, Any] = {"range": taken.range_m, "amplitude": taken.amplitude_e, "intensity": taken.intensity_e}
     arrays = {name: values.reshape(shape) for name, values in arrays.items()}
     np.savez(folder / "poses.npz", unit="m", quantity="range", **arrays)
     grid = "--class cone --distance 1 --delta 0:80:10"

@@ -46,7 +46,9 @@ def test_low_signal_has_the_exact_phase_density(s):
     frames = capture(image, sensor, rng=np.random.default_rng(8), n_frames=n)
     psi = wrapped(frames.range_m.ravel() - 5.0, sensor) / sensor.metres_per_radian
     edges = np.linspace(-np.pi, np.pi, 42)
-    expected = n * np.array([integrate.quad(phase_density, a, b, args=(s,))[0] for a, b in itertools.pairwise(edges)])
+    expected = n * np.array(
+        [integrate.quad(lambda psi: float(phase_density(psi, s)), a, b)[0] for a, b in itertools.pairwise(edges)]
+    )
     counts, _ = np.histogram(psi[np.isfinite(psi)], edges)
     keep = expected > 5
     chi2 = ((counts - expected)[keep] ** 2 / expected[keep]).sum()

@@ -16,7 +16,8 @@ from phasemark.matcher.statistics import (
     rms_interval,
     view_errors,
 )
-from phasemark.render import Views, delta_period_rad, preset, wrap_delta_difference_rad, wrap_delta_rad
+from phasemark.render import Views, preset
+from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
 
 
 @pytest.mark.parametrize("symmetry", [1, 2, 4])
@@ -103,7 +104,8 @@ def test_information_and_its_inverse_name_the_same_weak_direction():
     unit = np.array([0.01, math.radians(1)])
     information = np.array([[4.0, 1.5], [1.5, 1.0]]) / np.outer(unit, unit)
     condition, direction = weak_direction(names, information=information)
-    other, same = weak_direction(names, covariance=np.linalg.inv(information))
+    inverse = np.asarray(np.linalg.inv(information), np.float64)
+    other, same = weak_direction(names, covariance=inverse)
     assert condition == pytest.approx(other)
     assert direction == pytest.approx(same)
     assert weak_direction(names, information=np.zeros((2, 2))) == (math.inf, {})

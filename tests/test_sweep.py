@@ -4,6 +4,7 @@ import os
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -296,7 +297,8 @@ def test_a_sweep_in_progress_is_left_alone_with_force_too(tmp_path):
     run_sweep(plan(), tmp_path, workers=1)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     with sweep_folder(tmp_path):
-        for options in ({"force": True}, {"resume": True}, {}):
+        ways: tuple[dict[str, Any], ...] = ({"force": True}, {"resume": True}, {})
+        for options in ways:
             with pytest.raises(OutputExistsError, match="another run is writing it"):
                 run_sweep(plan(), tmp_path, **options)
         with pytest.raises(OutputExistsError, match="another run is writing it"):
@@ -326,7 +328,7 @@ def test_frames_of_a_trial_do_not_replace_a_file_of_the_sweep(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("action", "step"),
-    [("kill", 5), *(pytest.param(action, 1, marks=pytest.mark.soak) for action in ("kill", "ENOSPC", "EIO"))],
+    [("kill", 11), *(pytest.param(action, 1, marks=pytest.mark.soak) for action in ("kill", "ENOSPC", "EIO"))],
 )
 def test_a_sweep_ended_at_any_call_to_the_system_goes_on_or_starts_over(action, step):
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None

@@ -15,7 +15,8 @@ from test_sweep_tables import linear_sweep
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.data import build_bank, read_frames
-from phasemark.landmarks import Box, Cylinder, LandmarkSpec, build_mesh, catalog
+from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
+from phasemark.landmarks.spec import Box, Cylinder
 from phasemark.matcher.filters.filtered_frames import kalman_filter
 from phasemark.matcher.sweep.compare import compare_cells
 from phasemark.matcher.sweep.examples import sweep_frames
@@ -171,7 +172,7 @@ def test_the_bound_on_class_confusion_is_that_of_a_distance_that_grows_with_the_
     job = SweepJob(plan, Round(0, (0, 1, 2), 0, 2))
     bounds = [job.confusion(number, job.views(number, 0, 2), 0) for number in range(3)]
     # Σ Q(d/2) over one other class, d² proportional to the frames
-    half_distance = stats.norm.isf([bound[0] for bound in bounds])
+    half_distance = np.asarray(stats.norm.isf([bound[0] for bound in bounds]))
     # ranges change by the 2 mm that the radii differ, some 2/3 of them over 28 pixels, each known to 20 mm / √10
     assert half_distance[0] == pytest.approx(0.5 * math.sqrt(28 * 10) * 2 / 20, rel=0.5)
     # the other class's nearest view hardly moves, and where it lies its distance is at its minimum

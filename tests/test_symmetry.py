@@ -9,16 +9,9 @@ import trimesh
 
 from phasemark.cli import main
 from phasemark.data import BankPlan, FramePlan, build_bank
-from phasemark.landmarks import (
-    MeshWarning,
-    build_mesh,
-    catalog,
-    check_mesh,
-    export_mesh,
-    has_symmetry,
-    mesh_symmetry,
-    symmetry_tolerance_m,
-)
+from phasemark.landmarks import build_mesh, catalog, check_mesh, export_mesh, mesh_symmetry
+from phasemark.landmarks.mesh_files import MeshWarning
+from phasemark.landmarks.symmetry import has_symmetry, symmetry_tolerance_m
 from phasemark.matcher import Matcher, kalman_filter, robot_poses
 from phasemark.render import Renderer, capture
 

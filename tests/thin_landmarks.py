@@ -2,19 +2,21 @@
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
 
 from phasemark.cli import main
-from phasemark.data import open_bank
-from phasemark.matcher import Matcher, kalman_filter
+from phasemark.data import Bank, open_bank
+from phasemark.matcher import Match, Matcher, kalman_filter
 from phasemark.render import Background, Renderer, Views, capture
 
 PRESETS = ("vl53l5cx-8x8", "pmd-16x16")
 WALL = Background(wall_m=2.5)
 FIXED = ("distance_m", "delta_rad")
-SETTINGS = {
+SETTINGS: dict[str, dict[str, Any]] = {
     "fixed": {"free": FIXED},
     "plain": {},
     "wall": {"free": FIXED, "background": WALL},
@@ -27,14 +29,14 @@ SETTINGS = {
 GROSS_M, GROSS_RAD = 0.03, math.radians(6.0)
 
 
-def box(size, at=(0.0, 0.0, 0.0)):
+def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> trimesh.Trimesh:
     """Return a box somewhere."""
-    mesh = trimesh.creation.box(size)
+    mesh: trimesh.Trimesh = trimesh.creation.box(size)
     mesh.apply_translation(at)
     return mesh
 
 
-def meshes():
+def meshes() -> dict[str, tuple[trimesh.Trimesh, int]]:
     """Return landmarks by name, each with its rotational symmetry."""
     plate = box((0.01, 0.4, 0.3))
     return {
@@ -58,10 +60,10 @@ class Counts:
     wrong_accepted: int = 0
     right: int = 0
     right_accepted: int = 0
-    answers: tuple = ()
+    answers: tuple[Match, ...] = ()
 
 
-def bank_of(name, sensor, folder):
+def bank_of(name: str, sensor: str, folder: Path) -> Bank:
     """Build the bank of a thin landmark from its file, as a user does."""
     mesh, symmetry = meshes()[name]
     mesh.export(folder / f"{name}.stl")
@@ -72,7 +74,7 @@ def bank_of(name, sensor, folder):
     return open_bank(path)
 
 
-def count(bank, setting, n, n_frames, rng):
+def count(bank: Bank, setting: str, n: int, n_frames: int, rng: np.random.Generator) -> Counts:
     """Match n frames of the bank's own landmark at 0.5 to 1.2 m and up to 30° aside, and count."""
     options = dict(SETTINGS[setting])
     name = bank.classes[0]

@@ -29,17 +29,12 @@ from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
 from phasemark.data.shards.build import Place
 from phasemark.data.shards.run import produce, refuse_unwritable_output
-from phasemark.landmarks import (
-    LandmarkSpec,
-    MeshWarning,
-    Revolution,
-    build_mesh,
-    has_symmetry,
-    mesh_symmetry,
-    read_mesh,
-    symmetry_tolerance_m,
-)
-from phasemark.render import PhasorImages, PlanarLandmark, Renderer, Sensor, Views, planar_images
+from phasemark.landmarks import LandmarkSpec, build_mesh, mesh_symmetry, read_mesh
+from phasemark.landmarks.mesh_files import MeshWarning
+from phasemark.landmarks.spec import Revolution
+from phasemark.landmarks.symmetry import has_symmetry, symmetry_tolerance_m
+from phasemark.render import PhasorImages, Renderer, Sensor, Views
+from phasemark.render.planar import PlanarLandmark, planar_images
 from phasemark.render.renderer import Variant
 
 ImagesOf = Callable[[Views], PhasorImages]

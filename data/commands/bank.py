@@ -26,7 +26,8 @@ from phasemark.data.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from phasemark.data import BankPlan, MeshPlan
+    from phasemark.data import BankPlan
+    from phasemark.data.plans.bank_plan import MeshPlan
 
 
 def bank_build(
@@ -64,7 +65,8 @@ def bank_build(
     building: Building,
 ) -> None:
     """Build a bank of noise-free model images."""
-    from phasemark.data import BankPlan, build_bank, read_bank_plan
+    from phasemark.data import BankPlan, build_bank
+    from phasemark.data.plans.bank_plan import read_bank_plan
     from phasemark.landmarks import catalog
 
     if plan_file is not None and str(plan_file) in catalog():
@@ -85,7 +87,7 @@ def bank_build(
 
 def _mesh_plan(name_and_path: str, reading: MeshReading, symmetry: int | None) -> MeshPlan:
     """Return what a plan says of a mesh that an option names."""
-    from phasemark.data import MeshPlan
+    from phasemark.data.plans.bank_plan import MeshPlan
 
     name, path = name_and_file(name_and_path)
     unit = _stated_unit(path, reading.unit)
@@ -130,7 +132,7 @@ def bank_merge(
 
 def _with_symmetry(meshes: Sequence[MeshPlan], found: Sequence[MeshPlan]) -> tuple[MeshPlan, ...]:
     """Return the meshes of a plan with the symmetry found for each, and say it where none was stated."""
-    from phasemark.landmarks import MAX_SYMMETRY
+    from phasemark.landmarks.symmetry import MAX_SYMMETRY
 
     for before, after in zip(meshes, found, strict=True):
         if before.symmetry is not None or after.symmetry is None:

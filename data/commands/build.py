@@ -29,8 +29,8 @@ _TRIAL_SECONDS = 2.0
 
 def build_or_estimate(build: Callable[..., Any], plan: BankPlan | FramePlan, out: Path, building: Building) -> None:
     """Build a bank or frame set, whole or in part; or say what that would take."""
-    from phasemark.data import build_part, parse_part, planned_size
-    from phasemark.data.plans.size import parse_size
+    from phasemark.data.partial_outputs import build_part, parse_part
+    from phasemark.data.plans.size import parse_size, planned_size
     from phasemark.data.shards.run import outputs_of
 
     limit = parse_size(building.max_size, "--max-size")
@@ -59,7 +59,7 @@ def build_or_estimate(build: Callable[..., Any], plan: BankPlan | FramePlan, out
 
 def _echo_estimate(plan: BankPlan | FramePlan, size: Mapping[str, int], fits: bool, building: Building) -> None:
     """Print how large a build would be, and about how long it would take if it is not too large to be tried."""
-    from phasemark.data import estimate_build
+    from phasemark.data.partial_outputs import estimate_build
     from phasemark.data.plans.size import too_many
     from phasemark.data.shards.executor import processors
 
@@ -79,7 +79,7 @@ def _note_large(
     plan: BankPlan | FramePlan, out: Path, size: Mapping[str, int], parts: int, limit: int, building: Building
 ) -> None:
     """Refuse a file above the limit; say of a large one how large it is and about how long it takes."""
-    from phasemark.data import estimate_build
+    from phasemark.data.partial_outputs import estimate_build
     from phasemark.data.plans.size import format_size, refuse_too_many
     from phasemark.data.shards.executor import processors
     from phasemark.data.shards.run import refuse_unwritable_output
@@ -103,7 +103,7 @@ def _note_large(
 
 def merge_shards(shards: Sequence[Path], out: Path, resume: bool, force: bool) -> None:
     """Put parts of a bank or a frame set together."""
-    from phasemark.data import merge_parts
+    from phasemark.data.partial_outputs import merge_parts
     from phasemark.data.shards.run import outputs_of
 
     refuse_input_files(outputs_of(out))

@@ -83,7 +83,7 @@ def frames_verify(
     as_json: Json = False,
 ) -> None:
     """Check a frame set: checksum, schema, values, and random views rendered and captured again."""
-    from phasemark.data import verify_frames
+    from phasemark.data.verify import verify_frames
 
     with LongWork("verifying"):
         report = verify_frames(frames, sample=sample, seed=seed)
@@ -116,7 +116,7 @@ def frames_export(
     """Write a frame set for other programs."""
     refuse_input_files([out])
     with open_frame_set(frames) as opened:
-        from phasemark.data import export_frames
+        from phasemark.data.export import export_frames
 
         typer.echo(export_frames(opened, out, to, quantity=quantity, force=force))
 
@@ -131,7 +131,7 @@ def frames_import(
     force: Force = False,
 ) -> None:
     """Bring measured frames into one form: range along the ray, in metres, upright."""
-    from phasemark.data import write_measured
+    from phasemark.data.measured.reading import write_measured
 
     if out.suffix.lower() != ".npz":
         raise UsageError(f"the output must be a .npz file, got '{out}'")
@@ -178,8 +178,7 @@ def frames_simulate(
     The file says that it is simulated. A direct sensor writes z in millimetres and status codes (5: valid), another one
     ranges in metres with amplitudes. The truth of each frame stands in columns truth_..., which other commands ignore.
     """
-    from phasemark.data import simulate_recording, write_recording
-    from phasemark.data.measured.simulated import recording_format
+    from phasemark.data.measured.simulated import recording_format, simulate_recording, write_recording
 
     refuse_unless_one(class_name, mesh_file, mesh_reading, "record")
     for option, value in (("--to-distance", to_distance), ("--to-delta", to_delta)):
@@ -245,7 +244,8 @@ def frames_show(
     """Draw one frame."""
     import io as bytes_io
 
-    from phasemark.data import is_frame_set, write_atomically
+    from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.data.frames.frame_set_file import is_frame_set
 
     if out.suffix.lower() != ".png":
         raise UsageError(f"the figure must be a .png file, got '{out}'")

@@ -52,8 +52,9 @@ def landmark_show(
     force: Force = False,
 ) -> None:
     """Draw a landmark: a shaded figure, and a page to turn it in 3D."""
-    from phasemark.data import write_atomically
-    from phasemark.landmarks import mesh_figure, mesh_html
+    from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.landmarks import mesh_figure
+    from phasemark.landmarks.figures import mesh_html
 
     name, mesh = read_landmark(name_or_file, mesh_reading)
     folder = out or Path()
@@ -72,7 +73,7 @@ def landmark_export(
     force: Force = False,
 ) -> None:
     """Write a landmark of the catalogue as a mesh, in metres."""
-    from phasemark.data import write_atomically
+    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.landmarks import export_mesh
 
     refuse_input_files([out])
@@ -87,7 +88,8 @@ def landmark_check(
     as_json: Json = False,
 ) -> None:
     """Check a mesh file and say what it holds."""
-    from phasemark.landmarks import MAX_SYMMETRY, check_mesh
+    from phasemark.landmarks import check_mesh
+    from phasemark.landmarks.symmetry import MAX_SYMMETRY
 
     _, mesh = read_landmark(str(file), mesh_reading)
     checked = check_mesh(mesh)

@@ -53,7 +53,8 @@ def render_frame(
     force: Force = False,
 ) -> None:
     """Render one noise-free frame: a figure, the phasors, and a sketch in the terminal."""
-    from phasemark.render import Renderer, terminal_figure
+    from phasemark.render import Renderer
+    from phasemark.render.figures import terminal_figure
 
     refuse_unless_one(class_name, mesh_file, mesh_reading, "render")
     if out.suffix.lower() != ".png":
@@ -86,7 +87,7 @@ def _write_image(image: PhasorImages, out: Path, data: Path, force: bool) -> Non
 
     import numpy as np
 
-    from phasemark.data import write_atomically
+    from phasemark.data.files.atomic_write import write_atomically
 
     arrays = {
         "phasor": image.phasor[0],

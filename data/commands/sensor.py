@@ -25,7 +25,7 @@ from phasemark.data.commands.options import (
 from phasemark.data.commands.outputs import output_folder, refuse_existing
 
 if TYPE_CHECKING:
-    from phasemark.render import FittedField
+    from phasemark.render.bench.fit.fitted_sensor import FittedField
 
 
 def sensor_list(as_json: Json = False) -> None:
@@ -89,8 +89,7 @@ def sensor_characterise(
     force: Force = False,
 ) -> None:
     """Measure a sensor before flat fields, as EMVA 1288 would, and compare it with what its numbers predict."""
-    from phasemark.data import summary_sentences, write_characterisation
-    from phasemark.data.pages.characterisation import NAMES
+    from phasemark.data.pages.characterisation import NAMES, summary_sentences, write_characterisation
     from phasemark.data.seeds import stream
     from phasemark.render import characterise
 
@@ -143,8 +142,8 @@ def sensor_fit(
     Give the board's distance for each file, in order: FRAMES FRAMES --distance 1.0 --distance 2.0. Geometry and
     whatever the frames do not tell come from --sensor; the file says of each number whether it is measured or assumed.
     """
-    from phasemark.data import write_atomically
-    from phasemark.render import fit_sensor
+    from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.render.bench.fit.fit_sensor import fit_sensor
 
     if out.suffix.lower() != ".toml":
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")

@@ -30,7 +30,9 @@ from phasemark import PhasemarkError, UsageError
 from phasemark.data.plans.grid_axis import drop_repeated_stop, format_grid, parse_grid
 from phasemark.inputs import refuse_truth_values
 from phasemark.inputs.toml_file import read_toml
-from phasemark.landmarks import MAX_SYMMETRY, LandmarkSpec, MeshWarning, catalog, mesh_symmetry, read_mesh
+from phasemark.landmarks import LandmarkSpec, catalog, mesh_symmetry, read_mesh
+from phasemark.landmarks.mesh_files import MeshWarning
+from phasemark.landmarks.symmetry import MAX_SYMMETRY
 from phasemark.render import Sensor, preset
 from phasemark.render.view import FARTHEST_M
 

@@ -1,1 +1,24 @@
 """Bounds, Monte-Carlo trials and the cost of a bank's grid."""
+
+from typing import TYPE_CHECKING
+
+from phasemark.inputs import on_use
+
+if TYPE_CHECKING:
+    from phasemark.matcher.accuracy.cramer_rao import Bound, confusion_probability
+    from phasemark.matcher.accuracy.grid_spacing import GridLoss, SpacingLoss, grid_loss
+    from phasemark.matcher.accuracy.trials import Trials, TrialSetup, TrialSummary, run_trials
+else:
+    __getattr__, __dir__ = on_use.imported_on_use(__name__)
+
+__all__ = [
+    "Bound",
+    "GridLoss",
+    "SpacingLoss",
+    "TrialSetup",
+    "TrialSummary",
+    "Trials",
+    "confusion_probability",
+    "grid_loss",
+    "run_trials",
+]

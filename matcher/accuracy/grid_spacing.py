@@ -26,8 +26,9 @@ from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.statistics import error_statistics, view_errors
-from phasemark.render import PhasorImages, Renderer, Views, delta_period_rad
+from phasemark.render import PhasorImages, Renderer, Views
 from phasemark.render.sensor.range_noise import phase_image_variance
+from phasemark.render.view import delta_period_rad
 
 N_FRAMES = 50
 """Frames that are averaged before matching (PHYSICS section 6)."""

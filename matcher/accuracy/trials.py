@@ -18,7 +18,8 @@ from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.match import Matches
 from phasemark.matcher.statistics import Interval, binomial_interval, error_statistics, nees, view_errors
-from phasemark.render import Background, Renderer, Sensor, Views, capture, delta_period_rad
+from phasemark.render import Background, Renderer, Sensor, Views, capture
+from phasemark.render.view import delta_period_rad
 
 _VIEWS_AT_ONCE = 250
 OUTLIER_SIGMA = 5.0

@@ -40,7 +40,8 @@ from phasemark.matcher.filters.filtered_frames import (
 from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
-from phasemark.render import Background, Frames, Sensor, wrap_difference_m, wrap_range_m
+from phasemark.render import Background, Frames, Sensor
+from phasemark.render.phasor_images import wrap_difference_m, wrap_range_m
 from phasemark.render.sensor.sensor_file import rounded
 
 FEWEST_POSES = 3

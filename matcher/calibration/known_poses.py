@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from phasemark import InputFileError, UsageError
 from phasemark.inputs import read_text
-from phasemark.render import Frames, wrap_delta_rad
+from phasemark.render import Frames
+from phasemark.render.view import wrap_delta_rad
 
 POLAR = ("distance_m", "delta_deg")
 CARTESIAN = ("x_m", "y_m", "heading_deg")
@@ -99,10 +100,10 @@ class KnownPoses:
     @classmethod
     def polar(
         cls,
-        distance_m: NDArray[np.float64] | Sequence[float],
-        delta_rad: NDArray[np.float64] | Sequence[float],
-        bearing_rad: NDArray[np.float64] | Sequence[float] | float = 0.0,
-        height_m: NDArray[np.float64] | Sequence[float] | float = 0.0,
+        distance_m: ArrayLike,
+        delta_rad: ArrayLike,
+        bearing_rad: ArrayLike = 0.0,
+        height_m: ArrayLike = 0.0,
     ) -> KnownPoses:
         """Take distances and angles; scalars hold for all poses."""
         arrays = np.broadcast_arrays(

@@ -32,7 +32,10 @@ from phasemark.data.commands.outputs import refuse_existing
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-    from phasemark.matcher import Calibration, FilteredFrames, KnownPoses, Mounting, PoseStd
+    from phasemark.matcher import FilteredFrames
+    from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
+    from phasemark.matcher.calibration.mounting_model import Mounting
+    from phasemark.matcher.calibration.result import Calibration
     from phasemark.render import Frames, Sensor
 
 
@@ -127,7 +130,8 @@ def calibrate_camera(
     range_offset, albedo and delay. A result that cannot be trusted is not written without --force (exit code 3).
     """
     from phasemark.data.shards.executor import processors
-    from phasemark.matcher import calibrate, read_poses
+    from phasemark.matcher import calibrate
+    from phasemark.matcher.calibration.known_poses import read_poses
 
     figure = _figure_beside(out, plot)
     refuse_existing([out, figure], force)
@@ -177,7 +181,7 @@ def _figure_beside(out: Path, plot: Path | None) -> Path:
 
 def _pose_std(position: float | None, heading_deg: float | None, delta_deg: float | None) -> PoseStd | None:
     """Return how well the poses are known; None if nothing is said of it."""
-    from phasemark.matcher import PoseStd
+    from phasemark.matcher.calibration.known_poses import PoseStd
 
     if (position, heading_deg, delta_deg) == (None, None, None):
         return None
@@ -188,7 +192,9 @@ def _filtered(
     measured: Sequence[Frames], known: KnownPoses, on: Literal["auto", "ranges", "phasors"], moving: bool
 ) -> FilteredFrames:
     """Return the frames of a moving camera one by one, and those of a still one averaged at each pose."""
-    from phasemark.matcher import filter_poses, frames_of_poses, kalman_filter
+    from phasemark.matcher import kalman_filter
+    from phasemark.matcher.calibration.calibration import filter_poses
+    from phasemark.matcher.calibration.known_poses import frames_of_poses
 
     if not moving:
         return filter_poses(frames_of_poses(measured, known), on)
@@ -231,7 +237,7 @@ def _start(
 
 def _write_calibration(found: Calibration, out: Path, figure: Path, base_name: str, force: bool) -> None:
     """Write the sensor file and the figure of the residuals, unless the calibration cannot be trusted."""
-    from phasemark.data import write_atomically
+    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.matcher.calibration.report import residual_figure
 
     if found.doubts and not force:

@@ -11,10 +11,7 @@ from typing import TYPE_CHECKING
 from phasemark.data.commands.options import FrameReading
 
 if TYPE_CHECKING:
-    from phasemark.matcher import (
-        Change,
-        Diagnosis,
-    )
+    from phasemark.matcher.diagnosis.diagnose import Change, Diagnosis
 
 
 @dataclass(frozen=True)

@@ -26,12 +26,8 @@ from phasemark.matcher.commands.match_table import match_rows
 
 if TYPE_CHECKING:
     from phasemark.data import Bank
-    from phasemark.matcher import (
-        FilteredFrames,
-        LandmarkMap,
-        Match,
-        Matcher,
-    )
+    from phasemark.matcher import FilteredFrames, Match, Matcher
+    from phasemark.matcher.position.landmark_map import LandmarkMap
     from phasemark.matcher.recordings.estimates_table import MatchedBatch
     from phasemark.render import Background, Frames
 
@@ -58,7 +54,7 @@ def match_frames(
     With --moving every frame is a position of its own. A CSV file may have a header that names its columns: t_ms or
     t_s, mm_0 ... (or range_0 ..., z_0 ...), status_0 ...; for a VL53L5CX or VL53L8CX give --valid-status 5.
     """
-    from phasemark.data import write_atomically
+    from phasemark.data.files.atomic_write import write_atomically
 
     place.check()
     landmarks = place.landmarks()
@@ -182,7 +178,7 @@ def _note_motion(measured: Frames, file: Path) -> None:
     """Say that frames which are about to be averaged were not taken at rest."""
     import numpy as np
 
-    from phasemark.matcher import motion_test
+    from phasemark.matcher.recordings.stillness import motion_test
 
     moved = np.flatnonzero(motion_test(measured).moved())
     if moved.size:
@@ -200,7 +196,7 @@ def _save_match_figure(
     """Draw one position."""
     import io as bytes_io
 
-    from phasemark.data import write_atomically
+    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.matcher.figures import match_figure
 
     buffer = bytes_io.BytesIO()

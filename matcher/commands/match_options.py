@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from phasemark.data import Bank
-    from phasemark.matcher import FilteredFrames, LandmarkMap, Match, Matcher
+    from phasemark.matcher import FilteredFrames, Match, Matcher
+    from phasemark.matcher.position.landmark_map import LandmarkMap
     from phasemark.render import Background, Frames
 
 _DRAWN_ALL = 4
@@ -191,7 +192,7 @@ class Place:
 
     def landmarks(self) -> LandmarkMap | None:
         """Return where landmarks stand; None if nothing is said of it."""
-        from phasemark.matcher import read_landmark_map
+        from phasemark.matcher.position.landmark_map import read_landmark_map
 
         if self.map_file is not None:
             return read_landmark_map(self.map_file)
@@ -205,7 +206,7 @@ class Place:
 
 def _one_landmark(xy: tuple[float, float], yaw_deg: float) -> LandmarkMap:
     """Return the map of a landmark of any class."""
-    from phasemark.matcher import LandmarkMap, MappedLandmark
+    from phasemark.matcher.position.landmark_map import LandmarkMap, MappedLandmark
 
     if not all(map(math.isfinite, (*xy, yaw_deg))):
         raise UsageError(

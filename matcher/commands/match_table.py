@@ -9,10 +9,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from phasemark.matcher import (
-        LandmarkMap,
-        Match,
-    )
+    from phasemark.matcher import Match
+    from phasemark.matcher.position.landmark_map import LandmarkMap
 
 
 def pose_facts(

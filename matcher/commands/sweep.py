@@ -95,9 +95,9 @@ def sweep_frames_again(
     force: Force = False,
 ) -> None:
     """Take the frames of one trial of a sweep again, bit for bit."""
-    from phasemark.data import write_measured
     from phasemark.data.files.folder_marker import read_marker
     from phasemark.data.files.same_file import refuse_inputs
+    from phasemark.data.measured.reading import write_measured
     from phasemark.matcher.sweep.examples import sweep_frames
 
     refuse_inputs([out], map(folder.joinpath, read_marker(folder)[1] or ()))

@@ -24,12 +24,12 @@ def bank_verify(
     as_json: Json = False,
 ) -> None:
     """Check a bank: checksum, schema, values, random images rendered again; and what its grid's spacing costs."""
-    from phasemark.data import verify_bank
+    from phasemark.data.verify import verify_bank
 
     with LongWork("verifying"):
         report = verify_bank(bank, sample=sample, seed=seed)
     if population is not None:
-        from phasemark.matcher import grid_loss
+        from phasemark.matcher.accuracy.grid_spacing import grid_loss
 
         with open_any_bank(bank) as opened, LongWork("matching random views"):
             loss = grid_loss(opened, population, seed=seed).as_dict()

@@ -12,7 +12,8 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from phasemark.data import versions, write_atomically
+from phasemark.data.files.atomic_write import write_atomically
+from phasemark.data.files.provenance import versions
 from phasemark.data.pages.page import embedded_png, figure_png, page_template, short_number
 from phasemark.landmarks import mesh_figure
 from phasemark.matcher.demo.run import (

@@ -28,7 +28,8 @@ from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.position.robot_pose import robot_poses
 from phasemark.matcher.statistics import view_errors
-from phasemark.render import Background, PhasorImages, Renderer, Views, capture, delta_period_rad
+from phasemark.render import Background, PhasorImages, Renderer, Views, capture
+from phasemark.render.view import delta_period_rad
 
 SENSOR = "pmd-16x16"
 WALL_M = 3.0

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.data import BankPlan, build_bank, parse_grid
+from phasemark.data import BankPlan, build_bank
+from phasemark.data.plans.grid_axis import parse_grid
 from phasemark.data.progress import Progress, counter
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.landmarks import LandmarkSpec, Sphere
+from phasemark.landmarks import LandmarkSpec
+from phasemark.landmarks.spec import Sphere
 from phasemark.matcher.design.rules import upper_outline, upper_size
 
 PAGE_MM = (297.0, 210.0)

@@ -12,7 +12,7 @@ from typing import Any
 
 import trimesh
 
-from phasemark.data import write_atomically
+from phasemark.data.files.atomic_write import write_atomically
 from phasemark.data.pages.page import figure_png
 from phasemark.inputs.toml_file import toml_value
 from phasemark.landmarks import LandmarkSpec, build_mesh, export_mesh

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.landmarks import Box, LandmarkSpec, build_mesh
+from phasemark.landmarks import LandmarkSpec, build_mesh
+from phasemark.landmarks.spec import Box
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.render import Renderer, Sensor, Views

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.landmarks import Box, LandmarkSpec, Sphere
+from phasemark.landmarks import LandmarkSpec
 from phasemark.landmarks.revolve import outline
-from phasemark.landmarks.spec import Upper
+from phasemark.landmarks.spec import Box, Sphere, Upper
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.render import Sensor, predicted_range_std
 

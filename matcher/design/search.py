@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.landmarks import Box, LandmarkSpec
-from phasemark.landmarks.spec import Upper
+from phasemark.landmarks import LandmarkSpec
+from phasemark.landmarks.spec import Box, Upper
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.position_bound import RangeBound, box_alone, range_bound
 from phasemark.matcher.design.rules import AllowedDimensions, Check

@@ -15,12 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.landmarks import Box, LandmarkSpec, build_mesh
-from phasemark.landmarks.spec import Upper
+from phasemark.landmarks import LandmarkSpec, build_mesh
+from phasemark.landmarks.spec import Box, Upper
 from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.position_bound import SEARCH_TOLERANCE_M, box_alone
-from phasemark.render import Renderer, Sensor, Views, phasor_to_range_m, predicted_range_std, wrap_difference_m
+from phasemark.render import Renderer, Sensor, Views, phasor_to_range_m, predicted_range_std
+from phasemark.render.phasor_images import wrap_difference_m
 
 _STEP_M = 1e-4
 _TURN_BIAS_RAD = np.radians(np.arange(-30.0, 31.0, 6.0))

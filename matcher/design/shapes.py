@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.landmarks import Box, Cone, Cylinder, Revolution, Sphere
-from phasemark.landmarks.spec import Upper
+from phasemark.landmarks.spec import Box, Cone, Cylinder, Revolution, Sphere, Upper
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.rules import AllowedDimensions
 

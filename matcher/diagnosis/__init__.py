@@ -1,1 +1,12 @@
 """Why a frame is refused, and which change of a setting would make it fit."""
+
+from typing import TYPE_CHECKING
+
+from phasemark.inputs import on_use
+
+if TYPE_CHECKING:
+    from phasemark.matcher.diagnosis.diagnose import Change, Diagnosis
+else:
+    __getattr__, __dir__ = on_use.imported_on_use(__name__)
+
+__all__ = ["Change", "Diagnosis"]

@@ -16,16 +16,9 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
-from phasemark.render import (
-    Background,
-    Renderer,
-    Sensor,
-    Views,
-    delta_period_rad,
-    predicted_range_std,
-    wrap_delta_rad,
-    wrap_difference_m,
-)
+from phasemark.render import Background, Renderer, Sensor, Views, predicted_range_std
+from phasemark.render.phasor_images import wrap_difference_m
+from phasemark.render.view import delta_period_rad, wrap_delta_rad
 
 SIZES = (0.8, 0.85, 0.9, 0.95, 1.05, 1.1, 1.15, 1.2)
 """Fields of view that are tried, as ratios of the tangents of half angles."""

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.data import write_atomically
+from phasemark.data.files.atomic_write import write_atomically
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
 

@@ -7,7 +7,7 @@ deviation. Neither removes mixing at edges: averaging converges to the mixed ran
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -93,7 +93,9 @@ class FilteredFrames:
     def __len__(self) -> int:
         return len(self.range_m)
 
-    def __getitem__(self, index: int | slice | NDArray[np.integer] | NDArray[np.bool_]) -> FilteredFrames:
+    def __getitem__(
+        self, index: int | slice | Sequence[int] | NDArray[np.integer] | NDArray[np.bool_]
+    ) -> FilteredFrames:
         """Return some of the positions; one position is still a batch, of one."""
         rows = index if isinstance(index, slice) else np.atleast_1d(index)
         return FilteredFrames(
@@ -107,6 +109,10 @@ class FilteredFrames:
             self.std_from_scatter,
             None if self.time_s is None else self.time_s[rows],
         )
+
+    def __iter__(self) -> Iterator[FilteredFrames]:
+        """Go through the positions, each a batch of one."""
+        return (self[k] for k in range(len(self)))
 
     def without_offset(self) -> FilteredFrames:
         """Return the frames with the sensor's offsets of range and zones taken off, of the same sensor without them."""

@@ -21,7 +21,8 @@ from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.search import is_doubtful, search_views
 from phasemark.matcher.likelihood.setup import Scene, Setup
-from phasemark.render import Background, delta_period_rad
+from phasemark.render import Background
+from phasemark.render.view import delta_period_rad
 
 __all__ = ["AutoBackground"]
 

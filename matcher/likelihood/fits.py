@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.agreement import DISAGREEMENT
-from phasemark.render import delta_period_rad, wrap_delta_difference_rad
+from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,8 @@ from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import Match
 from phasemark.matcher.nearest.bank_minima import Search
 from phasemark.matcher.nearest.templates import Observation
-from phasemark.render import Background, PhasorImages, background_image, wrap_difference_m
+from phasemark.render import Background, PhasorImages, background_image
+from phasemark.render.phasor_images import wrap_difference_m
 
 __all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TOLERANCE_M", "TOLERANCE_RAD", "LikelihoodMatcher", "Pixels"]
 

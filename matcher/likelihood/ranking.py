@@ -17,7 +17,8 @@ from phasemark.matcher.likelihood.fits import Fits, distinct
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.setup import Setup
 from phasemark.matcher.match import Candidate, Match, Reason
-from phasemark.render import Background, delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
+from phasemark.render import Background
+from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
 
 __all__ = ["is_determined", "rank"]
 

@@ -6,6 +6,8 @@ count, it is decided again there, once, and the view moves again. Then lower min
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +19,7 @@ from phasemark.matcher.likelihood.fits import Fits
 from phasemark.matcher.likelihood.images import ImageModel, ModelImages
 from phasemark.matcher.likelihood.kinks import look_beside, settle
 from phasemark.matcher.likelihood.problem import Problem, Settings, State
-from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
+from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import (
     capped_std,
     slopes_around,
@@ -81,70 +83,115 @@ def refine(
 
 
 def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fits:
-    """Take stock of the solutions."""
-    settings, evidence = problem.settings, problem.evidence
-    p = len(settings.free)
-    covariance = view_covariance(problem, state.sums)
-    # where it does not matter any more, what is nearby is not looked at
+    """Return the solutions with their costs and their uncertainties.
+
+    Parameters
+    ----------
+    problem : Problem
+    state : State
+    look_around : bool
+        Whether to look at what is near solutions that may be the best of their frame.
+    """
+    policy, settings = problem.policy, problem.settings
     # before a background the cost is final here; otherwise pixels that nothing explains may still change it
-    margin = problem.policy.close_cost if settings.background is None else 0.0
+    margin = policy.close_cost if settings.background is None else 0.0
     near = problem.near_best(state, margin) if look_around else np.empty(0, np.intp)
-    without_one = np.full((len(state.theta), p), np.inf)
-    if near.size:
-        there = problem.some(near)
-        slope = slopes_around(there, state, near, capped_std(problem, covariance[near]))
-        sums = there.summed(
-            state.theta[near],
-            state.use[near],
-            ModelImages(
-                **{name: values[near] for name, values in vars(state.images).items() if name != "slope"},
-                slope=state.images.slope[near] if slope is None else slope,
-            ),
-        ).sums
-        if slope is not None:
-            covariance[near] = view_covariance(problem, sums)
-        rows = state.images.slope[near] if slope is None else slope
-        without_one[near] = std_without_one_pixel(there, state, near, rows, sums.information, covariance[near])
-    scale = problem.scale[:p]
-    # the inverse of a covariance is information
-    information = covariance_of(covariance / np.outer(scale, scale)) * np.outer(1 / scale, 1 / scale)
-    all_pixels = np.ones_like(settings.pixels)
-    sums = state.sums
-    if not settings.pixels.all():
-        sums = gauss_newton_sums(
-            state.images.phasor, state.images.slope, evidence, problem.frame, state.use & all_pixels, settings.huber
-        )
-        sums = problem.with_prior(sums, state.theta)
-    fitted = state.use & (evidence.weight[problem.frame] > 0)
-    wrong = contradicted_pixels(problem, state, near, covariance, ~fitted)
-    returned = evidence.seen.returned[problem.frame]
+    covariance, without_one = _uncertainty(problem, state, near)
+    pixels, sums = _judged_pixels(problem, state, near, covariance), _sums_of_all_pixels(problem, state)
     # a return that is neither compared nor wrong costs what a pixel costs on average: a model that counts fewer
     # pixels is not better for it
-    open_ = returned & ~fitted & ~wrong
-    unexplained, agreeing, elsewhere = (np.zeros(len(state.theta), np.int64) for _ in range(3))
-    if settings.unknown_around:
-        outlying, here = outlying_pixels(problem, state), state.use & returned
-        wrong, open_ = wrong | (open_ & outlying), open_ & ~outlying
-        agreeing, elsewhere = (here & ~outlying).sum(axis=1), (here & outlying).sum(axis=1)
-        unexplained = (fitted & outlying).sum(axis=1) + (wrong & returned).sum(axis=1)
-    n_wrong, n_open = wrong.sum(axis=1), open_.sum(axis=1)
-    n_residuals = fitted.sum(axis=1) * evidence.per_pixel + n_wrong + n_open
-    if settings.unknown_around:
-        fitted = fitted & ~outlying
+    further = DISAGREEMENT * pixels.wrong + pixels.undecided
+    n_residuals = pixels.compared * problem.evidence.per_pixel + pixels.wrong + pixels.undecided
+    n_fitted = int((problem.prior_weight == 0).sum())
+    scale = problem.scale[: len(settings.free)]
     return Fits(
         frame=problem.frame,
         class_index=problem.class_index,
         view=state.theta[:, :4],
         albedo=state.theta[:, 4],
-        cost=sums.cost + DISAGREEMENT * n_wrong + n_open,
-        capped=sums.capped + DISAGREEMENT * n_wrong + n_open,
-        dof=np.maximum(n_residuals - unexplained - int((problem.prior_weight == 0).sum()), 0),
-        unexplained=unexplained,
-        explained=fitted.sum(axis=1),
-        agreeing=agreeing,
-        elsewhere=elsewhere,
+        cost=sums.cost + further,
+        capped=sums.capped + further,
+        dof=np.maximum(n_residuals - pixels.unexplained - n_fitted, 0),
+        unexplained=pixels.unexplained,
+        explained=pixels.explained,
+        agreeing=pixels.agreeing,
+        elsewhere=pixels.elsewhere,
         prior=problem.prior_cost(state.theta),
         covariance=covariance,
-        information=information,
+        # the inverse of a covariance is information
+        information=covariance_of(covariance / np.outer(scale, scale)) * np.outer(1 / scale, 1 / scale),
         std_without_one=without_one,
+    )
+
+
+def _uncertainty(
+    problem: Problem, state: State, near: NDArray[np.intp]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return covariances, (m, p, p), and the largest deviations without any one pixel, (m, p).
+
+    For the solutions in `near`, slopes are differenced over half a standard deviation; for the others the deviations
+    are infinite.
+    """
+    covariance = view_covariance(problem, state.sums)
+    without_one = np.full((len(state.theta), len(problem.settings.free)), np.inf)
+    if near.size:
+        there = problem.some(near)
+        wide = slopes_around(there, state, near, capped_std(problem, covariance[near]))
+        slope = state.images.slope[near] if wide is None else wide
+        images = ModelImages(
+            **{name: values[near] for name, values in vars(state.images).items() if name != "slope"}, slope=slope
+        )
+        sums = there.summed(state.theta[near], state.use[near], images).sums
+        if wide is not None:
+            covariance[near] = view_covariance(problem, sums)
+        without_one[near] = std_without_one_pixel(there, state, near, slope, sums.information, covariance[near])
+    return covariance, without_one
+
+
+def _sums_of_all_pixels(problem: Problem, state: State) -> Sums:
+    """Return the sums of solutions over all pixels, also those that do not give the view."""
+    settings = problem.settings
+    if settings.pixels.all():
+        return state.sums
+    sums = gauss_newton_sums(
+        state.images.phasor, state.images.slope, problem.evidence, problem.frame, state.use, settings.huber
+    )
+    return problem.with_prior(sums, state.theta)
+
+
+class _PixelCounts(NamedTuple):
+    """Pixels of each solution by what they say, (m,) int64; see :class:`Fits` for the last four."""
+
+    compared: NDArray[np.int64]
+    wrong: NDArray[np.int64]
+    undecided: NDArray[np.int64]
+    unexplained: NDArray[np.int64]
+    explained: NDArray[np.int64]
+    agreeing: NDArray[np.int64]
+    elsewhere: NDArray[np.int64]
+
+
+def _judged_pixels(
+    problem: Problem, state: State, near: NDArray[np.intp], covariance: NDArray[np.float64]
+) -> _PixelCounts:
+    """Count the pixels of each solution that are compared, contradicted, or neither."""
+    evidence = problem.evidence
+    returned = evidence.seen.returned[problem.frame]
+    fitted = state.use & (evidence.weight[problem.frame] > 0)
+    wrong = contradicted_pixels(problem, state, near, covariance, ~fitted)
+    undecided = returned & ~fitted & ~wrong
+    n_fitted = fitted.sum(axis=1)
+    if not problem.settings.unknown_around:
+        none = np.zeros(len(state.theta), np.int64)
+        return _PixelCounts(n_fitted, wrong.sum(axis=1), undecided.sum(axis=1), none, n_fitted, none, none)
+    outlying, here = outlying_pixels(problem, state), state.use & returned
+    wrong, undecided = wrong | (undecided & outlying), undecided & ~outlying
+    return _PixelCounts(
+        compared=n_fitted,
+        wrong=wrong.sum(axis=1),
+        undecided=undecided.sum(axis=1),
+        unexplained=(fitted & outlying).sum(axis=1) + (wrong & returned).sum(axis=1),
+        explained=(fitted & ~outlying).sum(axis=1),
+        agreeing=(here & ~outlying).sum(axis=1),
+        elsewhere=(here & outlying).sum(axis=1),
     )

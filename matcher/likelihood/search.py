@@ -14,7 +14,8 @@ from phasemark.matcher.likelihood.look_alikes import fit_look_alikes
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.nearest.templates import Observation
-from phasemark.render import phasor_to_range_m, wrap_difference_m
+from phasemark.render import phasor_to_range_m
+from phasemark.render.phasor_images import wrap_difference_m
 
 __all__ = ["is_doubtful", "search_views"]
 

@@ -27,7 +27,8 @@ from phasemark.matcher.likelihood.systematic import (
     rates_of_views,
 )
 from phasemark.matcher.match import Match
-from phasemark.render import Sensor, Views, delta_period_rad
+from phasemark.render import Sensor, Views
+from phasemark.render.view import delta_period_rad
 
 __all__ = ["with_motion", "with_shared_errors"]
 

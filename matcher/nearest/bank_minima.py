@@ -21,7 +21,8 @@ from phasemark.data.plans.arrays import group_rows
 from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Observation, Templates
-from phasemark.render import PhasorImages, wrap_delta_difference_rad
+from phasemark.render import PhasorImages
+from phasemark.render.view import wrap_delta_difference_rad
 
 _T = TypeVar("_T", bound=np.generic)
 

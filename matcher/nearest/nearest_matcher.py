@@ -18,7 +18,8 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Candidate, Match, Reason
 from phasemark.matcher.nearest.search import nearest_search
 from phasemark.matcher.nearest.templates import Observation, Templates
-from phasemark.render import Background, background_image, wrap_difference_m
+from phasemark.render import Background, background_image
+from phasemark.render.phasor_images import wrap_difference_m
 
 __all__ = ["NearestMatcher"]
 

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from phasemark.render import Frames, measured_range_std, predicted_range_std, wrap_difference_m
+from phasemark.render import Frames, measured_range_std, predicted_range_std
+from phasemark.render.phasor_images import wrap_difference_m
 
 FEWEST_FOR_ORDER = 4
 """Valid frames of a pixel below which its order says next to nothing."""

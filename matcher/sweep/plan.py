@@ -15,8 +15,9 @@ import numpy as np
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
 from phasemark import UsageError
-from phasemark.data import BankPlan, parse_grid
+from phasemark.data import BankPlan
 from phasemark.data.plans.bank_plan import MeshPlan, PlanModel, ScenePlan, common_symmetry, factored_refusal, read_plan
+from phasemark.data.plans.grid_axis import parse_grid
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec
 

@@ -13,9 +13,9 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from phasemark.data import versions, write_atomically
-from phasemark.data.files.atomic_write import storage_errors
+from phasemark.data.files.atomic_write import storage_errors, write_atomically
 from phasemark.data.files.folder_marker import OwnedFiles
+from phasemark.data.files.provenance import versions
 from phasemark.data.pages.page import embedded_png, figure_png, page_template
 from phasemark.matcher.statistics import Interval
 from phasemark.matcher.sweep.examples import worst_examples

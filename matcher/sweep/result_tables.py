@@ -23,7 +23,7 @@ from phasemark.matcher.statistics import (
     wrapped_errors,
 )
 from phasemark.matcher.sweep.plan import Condition
-from phasemark.render import delta_period_rad
+from phasemark.render.view import delta_period_rad
 
 LEVELS = (0.5, 0.9, 0.95, 0.99)
 """Probabilities of the ellipsoids whose coverage is counted."""

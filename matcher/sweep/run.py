@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, OutputExistsError
-from phasemark.data import versions, write_atomically
+from phasemark.data.files.atomic_write import write_atomically
 from phasemark.data.files.folder_marker import OwnedFiles, adding_to_folder
 from phasemark.data.files.hdf5_reading import check_format, open_hdf5, reading
 from phasemark.data.files.json_text import json_text
+from phasemark.data.files.provenance import versions
 from phasemark.data.files.same_file import named_files, refuse_inputs
 from phasemark.data.progress import Progress
 from phasemark.data.shards.build import difference

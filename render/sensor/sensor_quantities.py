@@ -141,12 +141,12 @@ class SensorQuantities(SensorFields):
         shown = f"it shows at about {distance_m % period_m:.3g} m"
         return f"{name} at {distance_m:g} m is beyond c / 2f = {period_m:.4g} m, where ranges wrap: {shown}"
 
-    def ray_directions(self, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    def ray_directions(self, u: NDArray[np.float64] | float, v: NDArray[np.float64] | float) -> NDArray[np.float64]:
         """Return unit ray directions of image points, level camera frame (PHYSICS section 2).
 
         Parameters
         ----------
-        u, v : ndarray
+        u, v : float or ndarray
             Image coordinates, pixels; they broadcast against each other.
 
         Returns

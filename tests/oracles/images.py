@@ -2,14 +2,20 @@
 
 import itertools
 import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from phasemark.render import Views
+from phasemark.render import Renderer, Sensor, Views
 from phasemark.render.integral.intersect import make_intersector
 
+Light = Callable[[NDArray[Any]], tuple[NDArray[Any], NDArray[Any]]]
+"""From unit vectors (..., 3) to the amplitude and the range of what they meet."""
 
-def image_points(sensor, row, col, n):
+
+def image_points(sensor: Sensor, row: int, col: int, n: int) -> NDArray[Any]:
     """Return n evenly scattered points (n, 2) in a pixel's active area: a Kronecker sequence on 1/φ₂, 1/φ₂².
 
     φ₂ = 1.3247… is the real root of x³ = x + 1. No row or column of points lines up with an edge, so that the area
@@ -17,10 +23,19 @@ def image_points(sensor, row, col, n):
     """
     k = np.arange(1, n + 1)
     unit = np.column_stack([k * 0.7548776662466927, k * 0.5698402909980532]) % 1.0
-    return np.array([col + 0.5, row + 0.5]) + (unit - 0.5) * sensor.fill_factor
+    points: NDArray[np.float64] = np.array([col + 0.5, row + 0.5]) + (unit - 0.5) * sensor.fill_factor
+    return points
 
 
-def brute_force(renderer, pixels, *, n=160_000, kind="auto", wall_m=None, **view):
+def brute_force(
+    renderer: Renderer,
+    pixels: Sequence[tuple[int, int]],
+    *,
+    n: int = 160_000,
+    kind: str = "auto",
+    wall_m: float | None = None,
+    **view: Any,
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return (phasor, intensity, coverage) of some pixels by shading n rays in each.
 
     Shares with the renderer the mesh with its corner normals, and the intersector; neither the placing of the rays,
@@ -67,26 +82,28 @@ def brute_force(renderer, pixels, *, n=160_000, kind="auto", wall_m=None, **view
     return np.array(phasor), np.array(intensity), np.array(coverage)
 
 
-def shading_normals(mesh, face, point):
+def shading_normals(mesh: Any, face: NDArray[Any], point: NDArray[Any]) -> NDArray[Any]:
     """Interpolate the corner normals of faces at points on them, by ratios of areas."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces[face]], 1, 0)
 
-    def area(p, q, r):
-        return np.einsum("ij,ij->i", np.cross(q - p, r - p), mesh.planes[face, :3])
+    def area(p: NDArray[Any], q: NDArray[Any], r: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(np.einsum("ij,ij->i", np.cross(q - p, r - p), mesh.planes[face, :3]))
 
     share = np.column_stack([area(point, b, c), area(point, c, a), area(point, a, b)])
     normal = np.einsum("ik,ikx->ix", share / share.sum(axis=1, keepdims=True), mesh.corner_normals[face])
     size = np.linalg.norm(normal, axis=1, keepdims=True)
-    return np.where(size > 0, normal / np.where(size > 0, size, 1), mesh.planes[face, :3])
+    return np.asarray(np.where(size > 0, normal / np.where(size > 0, size, 1), mesh.planes[face, :3]))
 
 
-def pixel_nodes(low, high, n):
+def pixel_nodes(low: float, high: float, n: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return Gauss-Legendre nodes and weights between bounds."""
     x, w = np.polynomial.legendre.leggauss(n)
     return low + (high - low) * (x + 1) / 2, (high - low) * w / 2
 
 
-def integrate_pixels(sensor, light, cuts_v=(), n=16, orders=(1,)):
+def integrate_pixels(
+    sensor: Sensor, light: Light, cuts_v: Sequence[float] = (), n: int = 16, orders: Sequence[int] = (1,)
+) -> tuple[dict[int, NDArray[Any]], NDArray[Any]]:
     """Integrate a smooth scene over all pixels of a sensor.
 
     Parameters
@@ -118,10 +135,10 @@ def integrate_pixels(sensor, light, cuts_v=(), n=16, orders=(1,)):
     return phasors, intensity
 
 
-def plane_light(normal, distance_m, albedo):
+def plane_light(normal: ArrayLike, distance_m: float, albedo: float) -> Light:
     """Return the light of the plane normal · p = distance_m; normal away from the lens, distance positive."""
 
-    def light(d):
+    def light(d: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         facing = d @ np.asarray(normal, float)
         range_m = distance_m / facing
         return albedo * facing / range_m**2, range_m
@@ -129,7 +146,9 @@ def plane_light(normal, distance_m, albedo):
     return light
 
 
-def sphere_pixels(sensor, centre, radius, albedo, n=1500):
+def sphere_pixels(
+    sensor: Sensor, centre: Sequence[float], radius: float, albedo: float, n: int = 1500
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Integrate a sphere over the pixels of a level sensor in closed form along rows of constant z.
 
     Along z = const. the sphere is seen between the roots of a quadratic in y, and its light there is smooth in the
@@ -176,7 +195,9 @@ def sphere_pixels(sensor, centre, radius, albedo, n=1500):
     return phasor, intensity, coverage
 
 
-def sphere_light(d, centre, radius, albedo):
+def sphere_light(
+    d: NDArray[Any], centre: NDArray[Any], radius: float, albedo: float
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return amplitude and range of a sphere along unit rays that meet it."""
     along = d @ centre
     range_m = along - np.sqrt(np.maximum(along**2 - centre @ centre + radius**2, 0))
@@ -184,10 +205,10 @@ def sphere_light(d, centre, radius, albedo):
     return albedo * np.maximum(cos, 0) / range_m**2, range_m
 
 
-def mean_of_blocks(image, factor):
+def mean_of_blocks(image: NDArray[Any], factor: int) -> NDArray[Any]:
     """Average blocks of factor × factor pixels of (n, rows, cols)."""
     n, rows, cols = image.shape
-    return image.reshape(n, rows // factor, factor, cols // factor, factor).mean(axis=(2, 4))
+    return np.asarray(image.reshape(n, rows // factor, factor, cols // factor, factor).mean(axis=(2, 4)))
 
 
 class RayShader:
@@ -200,13 +221,13 @@ class RayShader:
         One view.
     """
 
-    def __init__(self, renderer, view, kind="auto"):
+    def __init__(self, renderer: Renderer, view: Views, kind: str = "auto") -> None:
         self.sensor, self.albedo, self.mesh = renderer.sensor, renderer.albedo, renderer.topology
         self.intersector = make_intersector(self.mesh.vertices, self.mesh.faces, kind)
         self.lens = view.lens_in_landmark()[0]
         self.rotation = view.landmark2cam()[0][0]
 
-    def __call__(self, uv, light=True):
+    def __call__(self, uv: NDArray[Any], light: bool = True) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
         """Return S, intensity, coverage, range and smooth patch (−1: none) of points (n, 2) of the image."""
         d = self.sensor.ray_directions(*uv.T) @ self.rotation
         origins = np.broadcast_to(self.lens.astype(np.float32), d.shape).copy()
@@ -226,7 +247,9 @@ class RayShader:
         return out, range_m, patch
 
 
-def adaptive_images(renderer, view, *, tolerance=1e-5, first=4, last=10):
+def adaptive_images(
+    renderer: Renderer, view: Views, *, tolerance: float = 1e-5, first: int = 4, last: int = 10
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Integrate all pixels of one view on quadtrees.
 
     It knows nothing of projected edges: where the rays of a cell, its corners' among them, meet different smooth
@@ -248,7 +271,7 @@ def adaptive_images(renderer, view, *, tolerance=1e-5, first=4, last=10):
     gauss = quarters * 2 / math.sqrt(3)
     corners = quarters * 2 * (1 - 1e-9)
 
-    def integrate(centre, width, jitter=False):
+    def integrate(centre: NDArray[Any], width: float, jitter: bool = False) -> NDArray[Any]:
         values = np.empty((len(centre), 3), complex)
         for start in range(0, len(centre), 1 << 16):
             part = centre[start : start + (1 << 16), None]
@@ -260,7 +283,7 @@ def adaptive_images(renderer, view, *, tolerance=1e-5, first=4, last=10):
             values[start : start + (1 << 16)] = width**2 * light.reshape(-1, 4, 3).mean(axis=1)
         return values
 
-    def mixed(centre, width):
+    def mixed(centre: NDArray[Any], width: float) -> NDArray[Any]:
         out = np.empty(len(centre), bool)
         places = np.vstack([corners, quarters, [[0, 0]]])
         for start in range(0, len(centre), 1 << 16):
@@ -272,7 +295,7 @@ def adaptive_images(renderer, view, *, tolerance=1e-5, first=4, last=10):
 
     total = np.zeros((sensor.rows * sensor.cols, 3), complex)
 
-    def add(centre, value):
+    def add(centre: NDArray[Any], value: NDArray[Any]) -> None:
         index = np.floor(centre[:, 1]).astype(int) * sensor.cols + np.floor(centre[:, 0]).astype(int)
         for k in range(3):
             total[:, k] += np.bincount(index, value[:, k].real, len(total))

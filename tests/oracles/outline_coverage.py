@@ -1,21 +1,25 @@
 """Oracle: the share of every pixel of a 16 × 16, 2 × 11° camera that an outline covers, exact for polygons."""
 
+from typing import Any
+
 import numpy as np
+import trimesh
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 SIZE = 16
 TAN = np.tan(np.radians(11.0))
 
 
-def project(points, lens, heading):
+def project(points: NDArray[Any], lens: NDArray[Any], heading: float) -> NDArray[Any]:
     """Return image coordinates (n, 2) of points for a level lens that looks along ``heading`` (PHYSICS section 2)."""
     x, y, z = (points - lens).T
     c, s = np.cos(heading), np.sin(heading)
     forward, left = c * x + s * y, -s * x + c * y
-    return np.c_[SIZE / 2 * (1 - left / forward / TAN), SIZE / 2 * (1 - z / forward / TAN)]
+    return np.column_stack([SIZE / 2 * (1 - left / forward / TAN), SIZE / 2 * (1 - z / forward / TAN)])
 
 
-def coverage_of_segments(start, end):
+def coverage_of_segments(start: NDArray[Any], end: NDArray[Any]) -> NDArray[Any]:
     """Return the (16, 16) coverage inside closed curves given as segments (n, 2) → (n, 2), each run the same way.
 
     Green's theorem: the area of a pixel inside is ∮ clamp(u − c, 0, 1) dv over its rows. Every segment is cut where
@@ -39,13 +43,13 @@ def coverage_of_segments(start, end):
     return area if area.sum() >= 0 else -area
 
 
-def coverage_of_hull(points_uv):
+def coverage_of_hull(points_uv: NDArray[Any]) -> NDArray[Any]:
     """Return the coverage of the convex hull of image points."""
     hull = points_uv[ConvexHull(points_uv).vertices]
     return coverage_of_segments(hull, np.roll(hull, -1, axis=0))
 
 
-def coverage_of_mesh(mesh, lens, heading):
+def coverage_of_mesh(mesh: trimesh.Trimesh, lens: NDArray[Any], heading: float) -> NDArray[Any]:
     """Return the coverage of a closed mesh: the curves between faces that look at the lens and faces that do not."""
     corners = mesh.vertices[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -12,10 +12,13 @@ the tessellation, whose traces have to stay below the bar like everything else's
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import trimesh
+from numpy.typing import NDArray
 
-from phasemark.render import Views
+from phasemark.render import Renderer, Sensor, Views
 
 PARAMETERS = ("distance_m", "delta_rad", "bearing_rad", "height_m")
 STEP = 1e-6
@@ -24,7 +27,7 @@ _CREASE_RAD = math.radians(30)
 _CORNER_RAD = math.radians(10)
 
 
-def random_views(rng, n):
+def random_views(rng: np.random.Generator, n: int) -> Views:
     """Return n views over the range in which the landmarks are to be matched."""
     return Views(
         rng.uniform(0.75, 2.0, n),
@@ -34,7 +37,7 @@ def random_views(rng, n):
     )
 
 
-def shifted(views, parameter, step):
+def shifted(views: Views, parameter: str, step: float | NDArray[Any]) -> Views:
     """Return views with one parameter moved."""
     values = {name: getattr(views, name) for name in PARAMETERS}
     values[parameter] = values[parameter] + step
@@ -52,7 +55,7 @@ class Outline:
         Level.
     """
 
-    def __init__(self, mesh, sensor):
+    def __init__(self, mesh: trimesh.Trimesh, sensor: Sensor) -> None:
         mesh = mesh.copy()
         mesh.merge_vertices()
         self.sensor = sensor
@@ -65,7 +68,7 @@ class Outline:
         self.edges, self.faces, self.crease = self.edges[bent], self.faces[bent], angle[bent] > _CREASE_RAD + 1e-9
         self.is_corner = self._corners(self.edges[self.crease])
 
-    def _corners(self, creases):
+    def _corners(self, creases: NDArray[Any]) -> NDArray[Any]:
         """Tell which vertices are corners: more or fewer than two creases meet, or two that do not run on."""
         corner = np.zeros(len(self.vertices), bool)
         count = np.bincount(creases.ravel(), minlength=len(self.vertices))
@@ -79,7 +82,7 @@ class Outline:
         corner[(count == 2) & (np.linalg.norm(outward, axis=1) > 2 * math.sin(_CORNER_RAD / 2))] = True
         return corner
 
-    def project(self, view, points):
+    def project(self, view: Views, points: NDArray[Any]) -> NDArray[Any]:
         """Return u, v of points of the landmark frame, (n, 2)."""
         rotation, translation = view.landmark2cam()
         x, y, z = (points @ rotation[0].T + translation[0]).T
@@ -89,7 +92,7 @@ class Outline:
             [u0 - y / x * self.sensor.cols / (2 * tan_h), v0 - z / x * self.sensor.rows / (2 * tan_v)]
         )
 
-    def shown(self, view):
+    def shown(self, view: Views) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the edges that can be seen from a view, as indices, and whether each is a silhouette."""
         lens = view.lens_in_landmark()[0]
         front = np.einsum("ij,ij->i", self.normals, lens - self.origins) > 0
@@ -97,7 +100,7 @@ class Outline:
         silhouette = first != second
         return np.flatnonzero((first | second) & (self.crease | silhouette)), silhouette
 
-    def events(self, view, parameter, reach):
+    def events(self, view: Views, parameter: str, reach: float) -> tuple[int, int]:
         """Return how many pixel corners edges pass, and how many borders vertices pass, within ± reach of a view."""
         before, after = (self.project(shifted(view, parameter, s), self.vertices) for s in (-reach, reach))
         middle = self.project(view, self.vertices)
@@ -118,7 +121,7 @@ class Outline:
         return passed, _borders_passed(points, slack, self.sensor)
 
 
-def _corners_passed(a, b, moved, sensor):
+def _corners_passed(a: NDArray[Any], b: NDArray[Any], moved: NDArray[Any], sensor: Sensor) -> int:
     """Count the pixel corners that lie within `moved` of a segment."""
     count = 0
     for p, q, reach in zip(a, b, moved, strict=True):
@@ -133,13 +136,13 @@ def _corners_passed(a, b, moved, sensor):
     return count
 
 
-def _borders_passed(points, reach, sensor):
+def _borders_passed(points: NDArray[Any], reach: NDArray[Any], sensor: Sensor) -> int:
     """Count the points inside the image that lie within `reach` of a border between pixels."""
-    inside = ((points > -0.01) & (points < np.array([sensor.cols, sensor.rows]) + 0.01)).all(axis=1)
+    inside = np.all((points > -0.01) & (points < np.array([sensor.cols, sensor.rows]) + 0.01), axis=1)
     return int((inside[:, None] & (np.abs(points - np.round(points)) <= reach[:, None])).sum())
 
 
-def _crossings(a, b, moved):
+def _crossings(a: NDArray[Any], b: NDArray[Any], moved: NDArray[Any]) -> NDArray[Any]:
     """Return where segments cross, (n, 3): u, v, and how far the place moves at most."""
     low, high = np.minimum(a, b), np.maximum(a, b)
     order = np.argsort(low[:, 0])
@@ -178,12 +181,12 @@ class Windows:
         Whether an edge passes a pixel corner, or a vertex a border, in the window.
     """
 
-    residual: np.ndarray
-    pixel: np.ndarray
-    crossed: np.ndarray
+    residual: NDArray[Any]
+    pixel: NDArray[Any]
+    crossed: NDArray[Any]
 
 
-def measure_windows(renderer, outline, views, parameter, **background):
+def measure_windows(renderer: Renderer, outline: Outline, views: Views, parameter: str, **background: Any) -> Windows:
     """Measure windows of one parameter around some views."""
     offsets = STEP * (np.arange(STEPS) - STEPS // 2)
     n = len(views)
@@ -203,10 +206,12 @@ def measure_windows(renderer, outline, views, parameter, **background):
     )
 
 
-def difference_quotients(renderer, views, parameter, steps=(1e-4, 5e-5), **background):
+def difference_quotients(
+    renderer: Renderer, views: Views, parameter: str, steps: tuple[float, float] = (1e-4, 5e-5), **background: Any
+) -> NDArray[Any]:
     """Compare central differences of two steps: their largest difference as a share of the largest slope, (n,)."""
     slopes = []
     for step in steps:
         up, down = (renderer.render_views(shifted(views, parameter, s), **background).phasor for s in (step, -step))
         slopes.append((up - down) / (2 * step))
-    return np.abs(slopes[0] - slopes[1]).max(axis=(1, 2)) / np.abs(slopes[1]).max(axis=(1, 2))
+    return np.asarray(np.abs(slopes[0] - slopes[1]).max(axis=(1, 2)) / np.abs(slopes[1]).max(axis=(1, 2)))

@@ -1,11 +1,18 @@
 """The catalogue's solids met by rays in closed form."""
 
+from typing import Any, TypeAlias
+
 import numpy as np
+from numpy.typing import NDArray
 
 from phasemark.landmarks import catalog
+from phasemark.landmarks.spec import Cone, Cylinder, Sphere
+
+Hit: TypeAlias = tuple[NDArray[Any], NDArray[Any]]
+"""Range and cosine of the angle of incidence, (n,) each; inf and 0 where nothing is met."""
 
 
-def first_hit(name, origin, d):
+def first_hit(name: str, origin: NDArray[Any], d: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return where rays from one point first meet a landmark.
 
     Parameters
@@ -25,11 +32,12 @@ def first_hit(name, origin, d):
         1 for the box, 2 for what stands on it.
     """
     upper = catalog()[name].upper
-    if name == "sphere":
+    if isinstance(upper, Sphere):
         hits = [(*_sphere(origin, d, upper.radius_m), 2)]
-    elif name == "cone":
+    elif isinstance(upper, Cone):
         hits = [(*_cone(origin, d, upper.radius_m, upper.height_m), 2)]
     else:
+        assert isinstance(upper, Cylinder)
         hits = [(*_side(origin, d, upper.radius_m, upper.height_m), 2)]
         hits.append((*_lid(origin, d, upper.radius_m, upper.height_m), 2))
     hits.append((*_box(origin, d, np.array([0.24, 0.16, 0.15])), 1))
@@ -39,39 +47,39 @@ def first_hit(name, origin, d):
     return t.min(axis=0), cos, np.array([hit[2] for hit in hits])[nearest]
 
 
-def _keep(t, cos, good):
+def _keep(t: NDArray[Any], cos: NDArray[Any], good: NDArray[Any]) -> Hit:
     good = good & (t > 0)
     return np.where(good, t, np.inf), np.where(good, cos, 0.0)
 
 
-def _roots(a, b, c):
+def _roots(a: NDArray[Any], b: NDArray[Any], c: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return both roots of a t² + 2 b t + c, nan where there are none."""
     with np.errstate(invalid="ignore", divide="ignore"):
         root = np.sqrt(b * b - a * c)
         return (-b - root) / a, (-b + root) / a
 
 
-def _sphere(o, d, radius):
+def _sphere(o: NDArray[Any], d: NDArray[Any], radius: float) -> Hit:
     o = o - [0, 0, radius]
     t, _ = _roots(np.ones(len(d)), d @ o, o @ o - radius**2)
     normal = (o + t[:, None] * d) / radius
     return _keep(t, -np.einsum("ij,ij->i", normal, d), np.isfinite(t))
 
 
-def _side(o, d, radius, height):
+def _side(o: NDArray[Any], d: NDArray[Any], radius: float, height: float) -> Hit:
     t, _ = _roots((d[:, :2] ** 2).sum(axis=1), d[:, :2] @ o[:2], o[:2] @ o[:2] - radius**2)
     p = o + t[:, None] * d
     return _keep(t, -np.einsum("ij,ij->i", p[:, :2] / radius, d[:, :2]), (p[:, 2] >= 0) & (p[:, 2] <= height))
 
 
-def _lid(o, d, radius, height):
+def _lid(o: NDArray[Any], d: NDArray[Any], radius: float, height: float) -> Hit:
     with np.errstate(divide="ignore"):
         t = (height - o[2]) / d[:, 2]
     p = o[:2] + t[:, None] * d[:, :2]
     return _keep(t, -d[:, 2], ((p**2).sum(axis=1) <= radius**2) & (d[:, 2] < 0))
 
 
-def _cone(o, d, radius, height):
+def _cone(o: NDArray[Any], d: NDArray[Any], radius: float, height: float) -> Hit:
     k = (radius / height) ** 2
     w = o[2] - height
     a = (d[:, :2] ** 2).sum(axis=1) - k * d[:, 2] ** 2
@@ -83,7 +91,7 @@ def _cone(o, d, radius, height):
     return _keep(t, -np.einsum("ij,ij->i", normal, d), (p[:, 2] >= 0) & (p[:, 2] <= height))
 
 
-def _box(o, d, size):
+def _box(o: NDArray[Any], d: NDArray[Any], size: NDArray[Any]) -> Hit:
     low, high = np.array([-size[0] / 2, -size[1] / 2, -size[2]]), np.array([size[0] / 2, size[1] / 2, 0.0])
     with np.errstate(divide="ignore"):
         a, b = (low - o) / d, (high - o) / d

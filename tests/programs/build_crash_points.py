@@ -19,7 +19,7 @@ from phasemark.inputs import checksum_path, verify_checksum
 CALLS = ("pwrite", "write", "fsync", "replace", "posix_fallocate", "ftruncate")
 
 
-def fail_at(path, at, action, force):
+def fail_at(path: Path, at: int, action: str, force: bool) -> int:
     trap = Trap(at, action, CALLS)
     try:
         build(ToyJob(mark=1), path, workers=1, shard_items=3, force=force)
@@ -28,28 +28,28 @@ def fail_at(path, at, action, force):
     return 0 if trap.count < at else 6  # 6: the call failed, and the build did without
 
 
-def resume(path):
+def resume(path: Path) -> int:
     build(ToyJob(mark=1), path, workers=1, resume=True, force=True)
     check_toy_file(path)
     verify_checksum(path)
     return 0
 
 
-def tidy(folder):
-    for entry in Path(folder).iterdir():
+def tidy(folder: Path) -> None:
+    for entry in folder.iterdir():
         if entry.name not in ("reference", "reference.sha256", "old", "old.sha256"):
             entry.unlink()
 
 
-def main(folder, action):
-    reference = Path(folder) / "reference"
+def main(folder: Path, action: str) -> None:
+    reference = folder / "reference"
     build(ToyJob(mark=1), reference)
-    old_job = Path(folder) / "old"
+    old_job = folder / "old"
     build(ToyJob(mark=0), old_job)
     points = 0
     for with_old in (False, True):
         for at in range(1, 1000):
-            path = Path(folder) / f"{action}-{with_old}-{at}"
+            path = folder / f"{action}-{with_old}-{at}"
             if with_old:
                 path.write_bytes(old_job.read_bytes())
                 checksum_path(path).write_bytes(
@@ -60,9 +60,7 @@ def main(folder, action):
             assert path.read_bytes() in allowed if path.exists() else not with_old, f"a partial file after call {at}"
             if action != "kill" and code == 5 and path.exists() and path.read_bytes() == old_job.read_bytes():
                 verify_checksum(path)
-            leftovers = {
-                entry.name for entry in Path(folder).iterdir() if entry.name.startswith((path.name + ".", "."))
-            }
+            leftovers = {entry.name for entry in folder.iterdir() if entry.name.startswith((path.name + ".", "."))}
             expected = {p.name for p in (manifest_path(path), partial_path(path), checksum_path(path))}
             if action != "kill":
                 assert leftovers - expected == set(), f"debris after call {at}: {leftovers - expected}"
@@ -73,11 +71,11 @@ def main(folder, action):
             points += 1
             assert in_fork(resume, path) == 0, f"cannot be resumed after call {at}"
             assert path.read_bytes() == reference.read_bytes()
-            left = {entry.name for entry in Path(folder).iterdir() if not entry.name.startswith(("reference", "old"))}
+            left = {entry.name for entry in folder.iterdir() if not entry.name.startswith(("reference", "old"))}
             assert left == {path.name, checksum_path(path).name}, f"debris after resuming from call {at}: {left}"
             tidy(folder)
     sys.stdout.write(f"{points}\n")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(Path(sys.argv[1]), sys.argv[2])

@@ -7,9 +7,12 @@ Prints, for each build, the way and the file's SHA-256.
 
 import hashlib
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from distributed import LocalCluster
+from numpy.typing import NDArray
 
 from phasemark.data import FramePlan, build_frames
 from phasemark.data.frames.build_frames import FrameJob
@@ -22,26 +25,26 @@ PLAN = FramePlan(classes=["cone", "post"], views=130, frames_per_view=2, seed=7,
 class Twice(ProcessMaker):
     """Has every shard made twice, mostly by different processes, and takes the second one."""
 
-    def make(self, start, stop):
+    def make(self, start: int, stop: int) -> Sequence[NDArray[Any]]:
         super().make(start, stop)
         return super().make(start, stop)
 
 
-def main(folder):
+def main(folder: str) -> None:
     path = Path(folder) / "frames.h5"
 
-    def say(*way):
+    def say(*way: object) -> None:
         print(*way, hashlib.sha256(path.read_bytes()).hexdigest(), flush=True)
 
     for workers in (1, 2, 3, 8):
-        with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster:
+        with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster:  # type: ignore[no-untyped-call]
             for kind, scheduler in (
                 ("threads", "threads"),
                 ("processes", f"local:{workers}"),
                 ("dask", cluster.scheduler_address),
             ):
                 for shard_items in (1, 7, 64):
-                    options = {"workers": workers} if kind == "threads" else {}
+                    options: dict[str, Any] = {"workers": workers} if kind == "threads" else {}
                     build_frames(
                         PLAN, path, force=True, scheduler=scheduler, shard_items=shard_items, **options
                     ).close()

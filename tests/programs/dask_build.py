@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import warnings
+from typing import Any
 
 from distributed import LocalCluster
 
@@ -16,7 +17,7 @@ from phasemark.data import FramePlan, build_frames
 from phasemark.data.shards import remote
 
 
-def worker(address):
+def worker(address: str) -> subprocess.Popen[bytes]:
     """Start a worker that nobody looks after; the scheduler knows it by its process id.
 
     It loads what it will need before it offers itself: killed every other second, it would do nothing else.
@@ -31,17 +32,19 @@ def worker(address):
     return subprocess.Popen([sys.executable, "-c", program, address], stderr=subprocess.DEVNULL)
 
 
-def main(out, views, seconds):
+def main(out: str, views: int, seconds: float) -> None:
     plan = FramePlan(classes=["cone", "post"], views=views, frames_per_view=2, seed=7, wall_m=4.0)
-    ended, told, workers, killed = threading.Event(), [], [], 0
+    ended, killed = threading.Event(), 0
+    told: list[str] = []
+    workers: list[subprocess.Popen[bytes]] = []
     remote.PATIENCE_SECONDS = 1
-    with LocalCluster(n_workers=0, dashboard_address=":0") as cluster:
+    with LocalCluster(n_workers=0, dashboard_address=":0") as cluster:  # type: ignore[no-untyped-call]
 
-        def begin(message, *_):
+        def begin(message: object, *_: Any, **__: Any) -> None:
             told.append(str(message))
             workers.extend(worker(cluster.scheduler_address) for _ in range(2))
 
-        def kill():
+        def kill() -> None:
             nonlocal killed
             while not ended.wait(seconds):
                 known = {state.name for state in cluster.scheduler.workers.values()}

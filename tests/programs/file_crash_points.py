@@ -13,11 +13,11 @@ from pathlib import Path
 from programs.system_calls import Trap, in_fork
 
 from phasemark import OutputExistsError, StorageError
-from phasemark.data import verify_checksum, write_atomically
-from phasemark.inputs import checksum_path
+from phasemark.data.files import write_atomically
+from phasemark.inputs import checksum_path, verify_checksum
 
 
-def second(path, force):
+def second(path: Path, force: bool) -> int:
     try:
         write_atomically(path, b"second", force=force, checksum=force)
     except OutputExistsError:
@@ -25,8 +25,8 @@ def second(path, force):
     return 0
 
 
-def fail_at(path, at, action, force):
-    seconds = []
+def fail_at(path: Path, at: int, action: str, force: bool) -> int:
+    seconds: list[int] = []
     trap = Trap(at, (lambda: seconds.append(in_fork(second, path, force))) if action == "other" else action)
     try:
         write_atomically(path, [b"new"], force=force, checksum=force)
@@ -39,8 +39,8 @@ def fail_at(path, at, action, force):
     return 0 if trap.count < at else 6
 
 
-def main(folder, action):
-    folder, points = Path(folder), 0
+def main(folder: Path, action: str) -> None:
+    points = 0
     for force in (False, True):
         for at in range(1, 100):
             path = folder / "picture.png"
@@ -68,4 +68,4 @@ def main(folder, action):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(Path(sys.argv[1]), sys.argv[2])

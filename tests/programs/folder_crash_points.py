@@ -19,7 +19,7 @@ from phasemark.data.files import renames
 from phasemark.data.files.replaced_folder import replacing_folder
 
 
-def write(path, mark, *, force):
+def write(path: Path, mark: str, *, force: bool) -> None:
     with replacing_folder(path, "test", force=force) as temporary:
         (temporary / "inner").mkdir()
         for k in range(2):
@@ -27,16 +27,16 @@ def write(path, mark, *, force):
         (temporary / mark).write_text(mark)
 
 
-def again(path):
+def again(path: Path) -> int:
     write(path, "next", force=True)
     return 0
 
 
-def content(path):
+def content(path: Path) -> list[str]:
     return sorted(str(one.relative_to(path)) for one in path.rglob("*") if not one.name.startswith("."))
 
 
-def second(path):
+def second(path: Path) -> int:
     try:
         write(path, "second", force=True)
     except OutputExistsError:
@@ -44,7 +44,7 @@ def second(path):
     return 0
 
 
-def fail_at(path, at, action, force):
+def fail_at(path: Path, at: int, action: str, force: bool) -> int:
     trap = Trap(at, (lambda: in_fork(second, path)) if action == "other" else action)
     try:
         write(path, "new", force=force)
@@ -55,10 +55,10 @@ def fail_at(path, at, action, force):
     return 0 if trap.count < at else 6  # 6: the call failed, and the writing did without
 
 
-def main(folder, action, way):
+def main(folder: Path, action: str, way: str) -> None:
     if way == "two-renames":
         renames._renameat2 = lambda source, target, flags: False
-    folder, points = Path(folder), 0
+    points = 0
     for with_old in (False, True):
         for at in range(1, 1000):
             path = folder / "out"
@@ -92,4 +92,4 @@ def main(folder, action, way):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(Path(sys.argv[1]), *sys.argv[2:])

@@ -10,6 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from programs.random_kills import code_of, fork, warm
@@ -21,10 +22,10 @@ PAGE = 4096
 LARGE = "64m"
 
 
-def commands(folder):
+def commands(folder: Path) -> Iterator[tuple[str, list[object], bool]]:
     """Return name, arguments and whether the command can be resumed, of every command that writes."""
     plan, frames, out = folder / "plan.toml", folder / "frames.h5", folder / "disk" / "out"
-    build = ["frames", "build", plan, "--shard-size", "7"]
+    build: list[object] = ["frames", "build", plan, "--shard-size", "7"]
     yield "frames build", [*build, "-o", out], True
     yield "frames build --shard", [*build, "--shard", "1/2", "-o", out], True
     yield "frames merge", ["frames", "merge", folder / "part1", folder / "part2", "-o", out], True
@@ -36,28 +37,27 @@ def commands(folder):
     yield "show", ["frames", "show", frames, "-o", f"{out}.png"], False
 
 
-def resize(disk, size):
+def resize(disk: Path, size: int | str) -> None:
     subprocess.run(["mount", "-o", f"remount,size={size}", disk], check=True)
 
 
-def used_bytes(disk):
+def used_bytes(disk: Path) -> int:
     state = os.statvfs(disk)
     return (state.f_blocks - state.f_bfree) * state.f_frsize
 
 
-def contents(folder):
+def contents(folder: Path) -> dict[str, bytes]:
     """Return the bytes of all files, by name. A bag's database has the time in it, and ZIP files too."""
     found = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
     return {name: b"" if path.suffix in (".db3", ".npz") else path.read_bytes() for name, path in found.items()}
 
 
-def clear(disk):
+def clear(disk: Path) -> None:
     for entry in disk.iterdir():
         shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 
 
-def main(folder):
-    folder = Path(folder)
+def main(folder: Path) -> None:
     disk = folder / "disk"
     (folder / "plan.toml").write_text(PLAN)
     for arguments in (
@@ -92,4 +92,4 @@ def main(folder):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(Path(sys.argv[1]))

@@ -19,19 +19,23 @@ import time
 import warnings
 import zipfile
 import zlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phasemark import PhasemarkError
 from phasemark.data import BankPlan, FramePlan, open_bank, open_frames, read_frames
 from phasemark.data.shards.build import _Manifest
 from phasemark.inputs import checksum_path, read_checksum
 from phasemark.landmarks import build_mesh, catalog, export_mesh, read_mesh
-from phasemark.matcher import read_landmark_map
 from phasemark.matcher.calibration.known_poses import read_poses
 from phasemark.matcher.plan_kinds import KINDS as PLANS
 from phasemark.matcher.plan_kinds import check_plan, plan_example
+from phasemark.matcher.position import read_landmark_map
 from phasemark.render import Sensor, preset
 
 CORPUS = Path(__file__).resolve().parent.parent / "corpus"
@@ -61,23 +65,23 @@ SAMPLES = ("bank", "frames", "h5")
 """Kinds that are read by a child process of the guard first, which takes a fraction of a second each."""
 
 
-def frames(path):
+def frames(path: Path) -> None:
     read_frames(path, sensor=SENSOR, unit="m", quantity="range", valid_status=[5])
 
 
-def stated_frames(path):
+def stated_frames(path: Path) -> None:
     read_frames(path, sensor=SENSOR, valid_status=[5], untrusted=True)
 
 
-def mesh(path):
+def mesh(path: Path) -> None:
     read_mesh(path, unit="m")
 
 
-def plan(kind):
+def plan(kind: str) -> Callable[[Path], object]:
     return lambda path: check_plan(path, kind)
 
 
-def whole_bank(path):
+def whole_bank(path: Path) -> None:
     with open_bank(path, untrusted=True) as bank:
         for group in (bank.lower, bank.upper, bank.full):
             if group is not None:
@@ -87,17 +91,17 @@ def whole_bank(path):
         bank.mesh(bank.classes[0])
 
 
-def whole_frames(path):
+def whole_frames(path: Path) -> None:
     with open_frames(path, untrusted=True) as found:
         found.frames()
         found.info()
 
 
-def checksum(path):
+def checksum(path: Path) -> None:
     read_checksum(path.with_suffix(""))
 
 
-KINDS = {
+KINDS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "npy": (".npy", frames), "npz": (".npz", stated_frames), "png": (".png", stated_frames), "csv": (".csv", frames),
     **{f"{kind}-plan": (".toml", plan(kind)) for kind in PLANS},
     "sensor": (".toml", Sensor.from_toml), "map": (".toml", read_landmark_map),
@@ -108,17 +112,17 @@ KINDS = {
 }  # fmt: skip
 
 
-def seeds(kind, folder):
+def seeds(kind: str, folder: Path) -> list[bytes]:
     """Return small good files of a kind, and what is kept in the corpus; a bag is a list of files with their names."""
     kept = [path.read_bytes() for path in sorted((CORPUS / kind).glob("*"))] if kind != "bag" else []
     return kept + GOOD[kind](folder)
 
 
-def _image():
+def _image() -> NDArray[Any]:
     return np.random.default_rng(0).uniform(0.5, 2, (2, 4, 4))
 
 
-def _good_npy(folder):
+def _good_npy(folder: Path) -> list[bytes]:
     path = folder / "a.npy"
     found = []
     for values in (_image(), _image().astype("<f4"), np.asfortranarray(_image()), (1e3 * _image()).astype("u2")):
@@ -127,8 +131,8 @@ def _good_npy(folder):
     return found
 
 
-def _good_npz(folder):
-    path, found = folder / "a.npz", []
+def _good_npz(folder: Path) -> list[bytes]:
+    path, found = folder / "a.npz", list[bytes]()
     for save in (np.savez, np.savez_compressed):
         save(path, range=_image(), amplitude=_image(), t_ms=np.arange(2), unit="m", quantity="range")
         found.append(path.read_bytes())
@@ -141,57 +145,58 @@ def _good_npz(folder):
     return found
 
 
-def _good_png(folder):
+def _good_png(folder: Path) -> list[bytes]:
     from phasemark.data.export.images import encode_png16
 
     return [encode_png16(_image()[0], 1e-4, "z")]
 
 
-def _good_csv(folder):
+def _good_csv(folder: Path) -> list[bytes]:
     rows = [",".join(f"{v:.3f}" for v in frame.ravel()) for frame in _image()]
     named = ["t_ms", *(f"mm_{k}" for k in range(16)), *(f"status_{k}" for k in range(16)), "truth_class"]
     line = ",".join(["0", *("1000",) * 16, *("5",) * 16, "cone"])
     return ["\n".join(rows).encode(), "\n".join([",".join(named), line, line]).encode()]
 
 
-def _good_plan(kind):
+def _good_plan(kind: str) -> Callable[[Path], list[bytes]]:
     return lambda folder: [plan_example(kind).encode()]
 
 
-def _good_sensor(folder):
+def _good_sensor(folder: Path) -> list[bytes]:
     fields = [preset(name).model_dump() for name in ("vl53l5cx-8x8", "pmd-16x16-wiggle")]
     stated = [{name: value for name, value in one.items() if value not in (None, [], ())} for one in fields]
     return ["".join(f"{name} = {json.dumps(value)}\n" for name, value in one.items()).encode() for one in stated]
 
 
-def _good_map(folder):
+def _good_map(folder: Path) -> list[bytes]:
     one = b'[[landmark]]\nname = "door"\nclass = "cone"\nx_m = 2.0\ny_m = 1.0\nyaw_deg = 30.0\n'
     return [one, one + b"xy_std_m = 0.01\nyaw_std_deg = 1\n" + one.replace(b"door", b"gate")]
 
 
-def _good_poses(folder):
+def _good_poses(folder: Path) -> list[bytes]:
     polar = b"distance_m,delta_deg,t_s,frames\n1.0,10,0.1,3\n1.2,20,0.2,3\n"
     return [polar, b"x_m;y_m;heading_deg\n1,0;0,5;180\n"]
 
 
-def _good_manifest(folder):
+def _good_manifest(folder: Path) -> list[bytes]:
     head = _Manifest({"plan": {"views": 3}}, 2, 1000, "a" * 64).head()
     return [head + b"".join(json.dumps({"shard": k, "sha256": "b" * 64}).encode() + b"\n" for k in range(3))]
 
 
-def _good_checksum(folder):
+def _good_checksum(folder: Path) -> list[bytes]:
     return [b"a" * 64 + b"  input\n", b"\\" + b"a" * 64 + b" *input\n"]
 
 
-def _good_mesh(kind):
+def _good_mesh(kind: str) -> Callable[[Path], list[bytes]]:
     return lambda folder: [export_mesh(build_mesh(catalog()[name]), kind) for name in ("post", "cone")][:1]
 
 
-def _good_h5(folder):
+def _good_h5(folder: Path) -> list[bytes]:
     import h5py
 
     found = []
-    for options in ({}, {"compression": "gzip", "shuffle": True, "chunks": (1, 4, 4)}):
+    ways: tuple[dict[str, Any], ...] = ({}, {"compression": "gzip", "shuffle": True, "chunks": (1, 4, 4)})
+    for options in ways:
         with h5py.File(folder / "a.h5", "w") as file:
             dataset = file.create_dataset("range", data=_image(), **options)
             dataset.attrs["units"], dataset.attrs["quantity"] = "m", "range"
@@ -200,22 +205,23 @@ def _good_h5(folder):
     return found
 
 
-def _good_bank(folder):
+def _good_bank(folder: Path) -> list[bytes]:
     from phasemark.data import build_bank
 
     build_bank(BankPlan(classes=["cone"], distance_m="1", delta_deg="0:90:45", model="planar"), folder / "b.h5").close()
     return [(folder / "b.h5").read_bytes()]
 
 
-def _good_frames(folder):
+def _good_frames(folder: Path) -> list[bytes]:
     from phasemark.data import build_frames
 
     build_frames(FramePlan(classes=["cone"], views=2), folder / "f.h5").close()
     return [(folder / "f.h5").read_bytes()]
 
 
-def _good_bag(folder):
-    from phasemark.data import build_frames, export_frames
+def _good_bag(folder: Path) -> list[bytes]:
+    from phasemark.data import build_frames
+    from phasemark.data.export import export_frames
 
     plan = FramePlan(classes=["cone"], views=2, sensor_overrides={"rows": 4, "cols": 4})
     with build_frames(plan, folder / "g.h5") as found:
@@ -223,12 +229,12 @@ def _good_bag(folder):
     return [b"".join(_packed(path) for path in sorted((folder / "bag").iterdir()))]
 
 
-def _packed(path):
+def _packed(path: Path) -> bytes:
     content = path.read_bytes()
     return f"{path.name}\n{len(content)}\n".encode() + content
 
 
-GOOD = {
+GOOD: dict[str, Callable[[Path], list[bytes]]] = {
     "npy": _good_npy, "npz": _good_npz, "png": _good_png, "csv": _good_csv,
     **{f"{kind}-plan": _good_plan(kind) for kind in PLANS},
     "sensor": _good_sensor, "map": _good_map,
@@ -239,7 +245,7 @@ GOOD = {
 }  # fmt: skip
 
 
-def mutate(content, others, rng):
+def mutate(content: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
     """Return a mutant: bits, numbers, words and pieces changed, moved, repeated, or taken from another file."""
     data = bytearray(content)
     for _ in range(rng.choice((1, 1, 1, 2, 3, 6))):
@@ -272,7 +278,7 @@ def mutate(content, others, rng):
     return bytes(data[: 1 << 18])
 
 
-def mend(kind, content, rng):
+def mend(kind: str, content: bytes, rng: random.Random) -> bytes:
     """Give the chunks of a PNG their checksums back, most of the time: what lies behind them is to be reached."""
     if kind == "npz" and rng.random() < 0.7:
         return _archive(content, rng)
@@ -287,7 +293,7 @@ def mend(kind, content, rng):
     return bytes(out) + content[at:]
 
 
-def _archive(content, rng):
+def _archive(content: bytes, rng: random.Random) -> bytes:
     """Return an NPZ file, sound as an archive, one of whose members is a mutant."""
     image, time_s = _npy(_image()), _npy(np.arange(2.0))
     members = {"range": image, "t_s": time_s, "amplitude": image}
@@ -301,13 +307,13 @@ def _archive(content, rng):
     return buffer.getvalue()
 
 
-def _npy(values):
+def _npy(values: NDArray[Any]) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, values)
     return buffer.getvalue()
 
 
-def put(kind, content, folder):
+def put(kind: str, content: bytes, folder: Path) -> Path:
     """Write an input where its reader finds it; return that path."""
     suffix, _ = KINDS[kind]
     path = folder / f"input{suffix}"
@@ -329,11 +335,11 @@ class Hang(BaseException):
     """A reader that has not answered in time."""
 
 
-def _ring(number, frame):
+def _ring(number: int, frame: FrameType | None) -> None:
     raise Hang(f"no answer within {MOST_SECONDS} s")
 
 
-def read_one(kind, content, folder):
+def read_one(kind: str, content: bytes, folder: Path) -> bool:
     """Have the reader of a kind read an input; return whether it was refused, or raise what it raised."""
     path = put(kind, content, folder)
     signal.signal(signal.SIGALRM, _ring)
@@ -354,37 +360,37 @@ def read_one(kind, content, folder):
 class Lines:
     """Follows which lines of the readers are run."""
 
-    def __init__(self):
-        self.seen = set()
+    def __init__(self) -> None:
+        self.seen: set[tuple[CodeType, int]] = set()
         self.fresh = 0
 
-    def _local(self, frame, event, _):
+    def _local(self, frame: FrameType, event: str, _: object) -> Any:
         key = (frame.f_code, frame.f_lineno)
         if key not in self.seen:
             self.seen.add(key)
             self.fresh += 1
         return self._local
 
-    def _global(self, frame, event, _):
+    def _global(self, frame: FrameType, event: str, _: object) -> Any:
         return self._local if any(part in frame.f_code.co_filename for part in _TRACED) else None
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         self.fresh = 0
         sys.settrace(self._global)
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         sys.settrace(None)
 
 
-def fuzz(kind, count, seed, folder):
+def fuzz(kind: str, count: int, seed: int, folder: Path) -> dict[str, Any]:
     """Read mutants of a kind; return what was found, as plain numbers and text."""
     rng = random.Random(f"{kind} {seed}")
     work = folder / f"work-{kind}"
     work.mkdir(parents=True, exist_ok=True)
     pool = seeds(kind, work)
     put("checksum", b"a" * 64 + b"  input\n", work)
-    lines, refused, longest, found = Lines(), 0, 0.0, []
+    lines, refused, longest, found = Lines(), 0, 0.0, list[str]()
     if kind != "checksum":
         checksum_path(work / "input").unlink()
     for number in range(count):
@@ -416,8 +422,8 @@ def fuzz(kind, count, seed, folder):
     }  # fmt: skip
 
 
-def _mutated_bag(content, rng):
-    files, at = [], 0
+def _mutated_bag(content: bytes, rng: random.Random) -> bytes:
+    files, at = list[list[bytes]](), 0
     while at < len(content):
         name, size, _ = content[at : at + 300].split(b"\n", 2)
         at += len(name) + len(size) + 2
@@ -428,9 +434,9 @@ def _mutated_bag(content, rng):
     return b"".join(b"%s\n%d\n" % (name, len(body)) + body for name, body in files)
 
 
-def main(kinds, count, seed, folder):
+def main(kinds: str, count: str, seed: str, folder: str) -> int:
     """Read mutants of each kind in a fork of this process, and print a line each; return 1 if a reader crashed."""
-    codes = []
+    codes: list[int] = []
     for kind in kinds.split(","):
         child = os.fork()
         if child == 0:

@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from phasemark.cli import main as phasemark
@@ -20,7 +21,7 @@ from phasemark.data.shards.build import partial_path
 PLAN = 'views = {views}\nframes_per_view = 2\nseed = 7\nwall_m = 4.0\nclasses = ["cone", "post"]\n'
 
 
-def fork(*arguments):
+def fork(*arguments: object) -> int:
     """Run the command line in a child, which ends as a program does; return its process id."""
     child = os.fork()
     if child == 0:
@@ -30,22 +31,22 @@ def fork(*arguments):
     return child
 
 
-def warm(arguments):
+def warm(arguments: Sequence[object]) -> None:
     """Run the command line here, so that the children have all that it loads."""
     assert phasemark([str(argument) for argument in arguments]) == 0
     assert threading.active_count() == 1
 
 
-def code_of(child):
+def code_of(child: int) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def main(folder, views, runs, seed):
-    folder, rng = Path(folder), random.Random(seed)
+def main(folder: Path, views: int, runs: int, seed: int) -> None:
+    rng = random.Random(seed)
     plan, reference, out = (folder / name for name in ("plan.toml", "reference.h5", "frames.h5"))
     plan.write_text(PLAN.format(views=views))
 
-    def build(path):
+    def build(path: Path) -> int:
         return fork("frames", "build", plan, "-o", path, "--resume", "--shard-size", "20")
 
     warm(["frames", "build", plan, "-o", folder / "warm.h5"])
@@ -72,4 +73,4 @@ def main(folder, views, runs, seed):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], *map(int, sys.argv[2:]))
+    main(Path(sys.argv[1]), *map(int, sys.argv[2:]))

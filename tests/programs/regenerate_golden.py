@@ -1,8 +1,10 @@
 """Write the golden files of our own: ``python tests/programs/regenerate_golden.py`` from the root of the repository."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phasemark.data import BankPlan, FramePlan, build_bank, build_frames
 from phasemark.landmarks import build_mesh, catalog
@@ -10,7 +12,7 @@ from phasemark.render import Background, Renderer, preset
 
 GOLDEN = Path(__file__).resolve().parent.parent / "golden"
 CATALOGUE = GOLDEN / "catalogue.npz"
-VIEW = {"distance_m": 0.9, "delta_rad": 0.5, "bearing_rad": 0.02, "height_m": -0.01}
+VIEW: dict[str, Any] = {"distance_m": 0.9, "delta_rad": 0.5, "bearing_rad": 0.02, "height_m": -0.01}
 BACKGROUND = Background(wall_m=3.0, floor_m=0.3)
 
 TINY_CAMERA = {"rows": 4, "cols": 4}
@@ -29,7 +31,7 @@ FRAMES_PLAN = FramePlan(
 )
 
 
-def render_catalogue():
+def render_catalogue() -> dict[str, tuple[NDArray[Any], NDArray[Any]]]:
     """Return name → (phasor, coverage) of every class in one view, before a wall and above a floor."""
     images = {}
     for name, spec in catalog().items():
@@ -39,7 +41,7 @@ def render_catalogue():
 
 
 if __name__ == "__main__":
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for name, (phasor, coverage) in render_catalogue().items():
         arrays[f"{name}_phasor"], arrays[f"{name}_coverage"] = phasor, coverage
     np.savez_compressed(CATALOGUE, **arrays)

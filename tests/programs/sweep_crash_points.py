@@ -10,7 +10,9 @@ trials are those of an uninterrupted sweep. Prints how many points there were.
 import shutil
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from programs.system_calls import Trap, in_fork
@@ -26,7 +28,7 @@ PLAN = SweepPlan(
 MINE = "trials-001.h5.my-backup"
 
 
-def fail_at(folder, at, action, options):
+def fail_at(folder: Path, at: int, action: str, options: dict[str, Any]) -> int:
     trap = Trap(at, action)
     try:
         run_sweep(PLAN, folder, workers=1, **options)
@@ -37,7 +39,7 @@ def fail_at(folder, at, action, options):
     return 0 if trap.count < at else 6
 
 
-def finish(folder, options):
+def finish(folder: Path, options: dict[str, Any]) -> int:
     try:
         run_sweep(PLAN, folder, workers=1, **options)
     except OutputExistsError:
@@ -45,12 +47,12 @@ def finish(folder, options):
     return 0
 
 
-def main(folder, action, step):
-    folder, step = Path(folder), int(step)
+def main(folder: Path, action: str, step: int) -> None:
     run_sweep(PLAN, folder / "reference", workers=1)
     expected = read_sweep(folder / "reference")[1].estimate
     points = 0
-    for options in ({}, {"force": True}):
+    ways: tuple[dict[str, Any], ...] = ({}, {"force": True})
+    for options in ways:
         for at in range(1, 1000, 3 * step if options else step):
             path = folder / "sweep"
             path.mkdir()
@@ -72,12 +74,12 @@ def main(folder, action, step):
     sys.stdout.write(f"{points}\n")
 
 
-def second_runs(path, step):
+def second_runs(path: Path, step: int) -> None:
     """Have a second run with --force start during a first one, every few calls; the first ends as if it were alone."""
     for at in range(step, 1000, step):
-        codes = []
+        codes: list[int] = []
 
-        def second(codes=codes):
+        def second(codes: list[int] = codes) -> None:
             codes.append(in_fork(finish, path, {"force": True}))
 
         code = in_fork(first, path, at, second)
@@ -87,7 +89,7 @@ def second_runs(path, step):
             return
 
 
-def first(path, at, second):
+def first(path: Path, at: int, second: Callable[[], None]) -> int:
     trap = Trap(at, second)
     run_sweep(PLAN, path, workers=1)
     read_sweep(path)
@@ -95,4 +97,4 @@ def first(path, at, second):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))

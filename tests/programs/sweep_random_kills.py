@@ -24,7 +24,7 @@ TABLES = ("trials.csv", "cells.csv")
 """Their last column is the time."""
 
 
-def plan(trials):
+def plan(trials: int) -> SweepPlan:
     """Return a sweep of two rounds."""
     return SweepPlan(
         name="ways", trials=trials, until_percent=1.0, max_trials=2 * trials, classes=["post"],
@@ -34,21 +34,21 @@ def plan(trials):
     )  # fmt: skip
 
 
-def tables(folder):
+def tables(folder: Path) -> dict[str, list[str]]:
     """Return the tables of a sweep without the times."""
     return {name: [line.rsplit(",", 1)[0] for line in (folder / name).read_text().splitlines()] for name in TABLES}
 
 
-def on_dask(sweep, folder):
+def on_dask(sweep: SweepPlan, folder: Path) -> None:
     try:
         from distributed import LocalCluster
     except ImportError:
         return
-    with LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+    with LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:  # type: ignore[no-untyped-call]
         run_sweep(sweep, folder, scheduler=cluster.scheduler_address)
 
 
-def fork(sweep, folder):
+def fork(sweep: SweepPlan, folder: Path) -> int:
     """Run the sweep in a child, going on with what it finds; return its process id."""
     child = os.fork()
     if child == 0:
@@ -57,7 +57,7 @@ def fork(sweep, folder):
     return child
 
 
-def stage(folder):
+def stage(folder: Path) -> int:
     """Return how far a sweep has come: 0 nothing is safe, 1 trials are, 2 the first round is, 3 the tables are."""
     first = folder / "trials-000.h5"
     if first.exists():
@@ -66,7 +66,7 @@ def stage(folder):
     return int(manifest.exists() and manifest.read_bytes().count(b"\n") > 1)
 
 
-def kill_and_resume(sweep, folder, runs, seed):
+def kill_and_resume(sweep: SweepPlan, folder: Path, runs: int, seed: int) -> None:
     rng = random.Random(seed)
     run_sweep(sweep, folder / "warm", workers=2)
     expected = tables(folder / "warm")
@@ -90,7 +90,7 @@ def kill_and_resume(sweep, folder, runs, seed):
     sys.stdout.write(f"{' '.join(map(str, counts))}\n")
 
 
-def main(folder, trials, runs, seed):
+def main(folder: Path, trials: int, runs: int, seed: int) -> None:
     kill_and_resume(plan(trials), folder, runs, seed)
     on_dask(plan(trials), folder / "dask")
 

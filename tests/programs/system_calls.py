@@ -4,8 +4,9 @@ import builtins
 import errno
 import io
 import os
-import pathlib
 import signal
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from phasemark.data.files import renames
 
@@ -28,7 +29,7 @@ class Trap:
         The functions of :mod:`os` that count.
     """
 
-    def __init__(self, at, action, calls=CALLS):
+    def __init__(self, at: int, action: str | Callable[[], object], calls: Sequence[str] = CALLS) -> None:
         self.count, self.at, self.action = 0, at, action
         for name in calls:
             setattr(os, name, self.wrapped(getattr(os, name)))
@@ -36,10 +37,11 @@ class Trap:
             setattr(renames, name, self.wrapped(getattr(renames, name)))
         if "mkdir" in calls:  # files that Python's own objects write
             opened = self.wrapped(io.open)
-            io.open = builtins.open = pathlib.io.open = opened
+            for module in (io, builtins):
+                setattr(module, "open", opened)  # noqa: B010 (a type of its own)
 
-    def wrapped(self, call):
-        def trapped(*arguments, **options):
+    def wrapped(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def trapped(*arguments: Any, **options: Any) -> Any:
             self.count += 1
             if self.count == self.at:
                 if callable(self.action):
@@ -53,7 +55,7 @@ class Trap:
         return trapped
 
 
-def in_fork(function, *arguments):
+def in_fork(function: Callable[..., int], *arguments: Any) -> int:
     """Run a function in a child; return its exit code, −signal if it was killed."""
     child = os.fork()
     if child == 0:

@@ -49,7 +49,7 @@ class BoardData:
     def of(
         cls,
         frames: Sequence[Frames],
-        distance_m: Sequence[float],
+        distance_m: Sequence[float] | NDArray[np.floating],
         distance_std_m: Sequence[float],
         albedo: Sequence[float],
         base: Sensor,
@@ -92,7 +92,7 @@ class BoardData:
             np.zeros(share.shape[1:], np.bool_),
         )
 
-    def of_usable_boards(self, distance_m: Sequence[float], notes: list[str]) -> BoardData:
+    def of_usable_boards(self, distance_m: Sequence[float] | NDArray[np.floating], notes: list[str]) -> BoardData:
         """Leave out the distances at which too few pixels answer, and then the pixels that do not answer at the rest.
 
         Raises
@@ -200,7 +200,9 @@ def _means(
     return np.array(means)
 
 
-def known_distance_std(distance_m: Sequence[float], stated: float | Sequence[float] | None) -> list[float]:
+def known_distance_std(
+    distance_m: Sequence[float] | NDArray[np.floating], stated: float | Sequence[float] | None
+) -> list[float]:
     """Return the standard deviation of each distance."""
     std = np.atleast_1d(np.asarray(DISTANCE_STD_M if stated is None else stated, np.float64)).ravel().tolist()
     if len(std) == 1:

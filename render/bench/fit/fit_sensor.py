@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.render.bench.fit.boards import (
@@ -34,7 +35,7 @@ _CORRELATED_SIGMAS = 4.0
 
 def fit_sensor(
     frames: Sequence[Frames],
-    distance_m: Sequence[float],
+    distance_m: Sequence[float] | NDArray[np.floating],
     *,
     base: Sensor,
     albedo: Sequence[float] | None = None,

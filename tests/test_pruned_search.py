@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from phasemark.data import BankPlan, build_bank
-from phasemark.matcher import Matches, TrialSetup
+from phasemark.matcher import Matches
+from phasemark.matcher.accuracy import TrialSetup
 from phasemark.matcher.accuracy.trials import noisy_frames
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.matcher.nearest.search import ExactSearch, PrunedSearch, nearest_search

@@ -12,6 +12,7 @@ import time
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -19,25 +20,26 @@ import pytest
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
-from phasemark.data import (
-    BankPlan,
-    FramePlan,
-    build_bank,
-    build_frames,
-    export_frames,
-    open_bank,
-    read_frames,
-    unverified,
-    verify_frames,
-    write_checksum,
-)
+from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_bank, read_frames
+from phasemark.data.export import export_frames
+from phasemark.data.files import write_checksum
 from phasemark.data.files.narrow import narrowed
-from phasemark.inputs import ahead, checksum_path, is_vouched_for, read_whole, remembered, sha256_of, vouching_begun
+from phasemark.data.verify import verify_frames
+from phasemark.inputs import (
+    ahead,
+    checksum_path,
+    is_vouched_for,
+    read_whole,
+    remembered,
+    sha256_of,
+    unverified,
+    vouching_begun,
+)
 from phasemark.landmarks import read_mesh
 from phasemark.render import Sensor, preset
 
 SENSOR = preset("pmd-16x16")
-STATED = {"unit": "m", "quantity": "range"}
+STATED: dict[str, Any] = {"unit": "m", "quantity": "range"}
 BANK = BankPlan(classes=["cone"], distance_m="1", delta_deg="0:90:45", model="planar")
 FRAMES = FramePlan(classes=["cone"], views=3, frames_per_view=2)
 

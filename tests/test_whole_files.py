@@ -10,15 +10,15 @@ import pytest
 from builders import run_program
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
-from phasemark.data import read_checksum, verify_checksum, write_atomically, write_checksum
-from phasemark.data.files import renames
+from phasemark.data.files import renames, write_atomically, write_checksum
+from phasemark.inputs import read_checksum, verify_checksum
 
 
 def names(folder: Path) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def test_writes_bytes_and_pieces(tmp_path):
+def test_bytes_and_pieces_are_written(tmp_path):
     assert write_atomically(tmp_path / "a", b"whole").read_bytes() == b"whole"
     assert write_atomically(tmp_path / "b", (bytes([i]) for i in range(3))).read_bytes() == b"\0\1\2"
     assert names(tmp_path) == ["a", "b"]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from phasemark.landmarks import build_mesh, catalog
+from phasemark.landmarks.spec import Cone
 from phasemark.render import Background, Renderer, Views, preset
 
 WRONG_IN_THE_REFERENCE = (5, 4, 6)  # frame, row, column: see the closed form below
@@ -70,6 +71,7 @@ def cone_coverage_above_its_rim(case, row, col):
     cos(a − l) = r (h − z) / (h ρ). A straight line in space is a straight line in the image.
     """
     cone = catalog()["cone"].upper
+    assert isinstance(cone, Cone)
     view = Views.broadcast(**view_of(case))
     lens = view.lens_in_landmark()[0]
     rotation, translation = (array[0] for array in view.landmark2cam())

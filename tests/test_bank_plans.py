@@ -7,7 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from phasemark import InputFileError, UsageError
-from phasemark.data import BankPlan, MeshPlan, read_bank_plan
+from phasemark.data import BankPlan
+from phasemark.data.plans import MeshPlan, read_bank_plan
 from phasemark.data.plans.bank_plan import factored_refusal
 from phasemark.landmarks import catalog
 from phasemark.matcher.plan_kinds import KINDS, plan_schema
@@ -187,7 +188,7 @@ def test_an_unreadable_plan_is_an_input_error(tmp_path):
         ({"sensor_overrides": {"principal_point_px": (7.5, 8)}}, None),
     ],
 )
-def test_reasons_against_a_factored_bank(fields, reason):
+def test_only_a_bank_that_cannot_be_factored_says_why(fields, reason):
     found = factored_refusal(BankPlan(**fields).resolve())
     assert found is None if reason is None else reason in found
 

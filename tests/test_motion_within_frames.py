@@ -8,7 +8,8 @@ import trimesh
 from scipy.integrate import solve_ivp
 
 from phasemark import UsageError
-from phasemark.render import Background, Motion, Renderer, Views, capture, capture_moving, preset, render_moving
+from phasemark.render import Background, Renderer, Views, capture, preset
+from phasemark.render.exposure import Motion, capture_moving, render_moving
 from phasemark.render.exposure.motion import phase_image_times_s
 
 IDEAL = preset("ideal")

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from phasemark import UsageError
-from phasemark.data import format_grid, parse_grid
+from phasemark.data.plans import format_grid, parse_grid
 from phasemark.data.plans.grid_axis import MAX_POINTS, drop_repeated_stop
 
 
@@ -30,7 +30,7 @@ def test_default_distances_are_141_exactly_rounded_decimals():
         ((3,), [3]),
     ],
 )
-def test_forms_of_a_grid(text, values):
+def test_every_form_of_a_grid_gives_its_values(text, values):
     assert parse_grid(text).tolist() == values
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from phasemark.matcher import motion_test
+from phasemark.matcher.recordings import motion_test
 from phasemark.matcher.recordings.stillness import _correlations
 from phasemark.render import Background, Frames, Renderer, capture, preset
 

@@ -10,9 +10,10 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Matcher, cramer_rao, kalman_filter, within_ellipsoid
+from phasemark.matcher import Matcher, cramer_rao, kalman_filter
 from phasemark.matcher.filters.filtered_frames import noise_free
 from phasemark.matcher.likelihood.systematic import calibrated_slopes, rates_of_views
+from phasemark.matcher.statistics import within_ellipsoid
 from phasemark.render import Background, Frames, Renderer, Views, capture
 
 VIEW = ("distance_m", "delta_rad")
@@ -122,7 +123,7 @@ def test_a_stamp_that_jitters_adds_the_motion_of_its_time(bank):
     # a camera that turns by 40°/s and approaches by 0.3 m/s: the covariance grows by the square of 20 ms of that
     rate, jitter_s = np.array([-0.3, math.radians(40.0)]), 0.02
     sensor = bank.sensor.with_(systematic_time_s=jitter_s)
-    time_s = np.arange(6) * 0.06
+    time_s = 0.06 * np.arange(6.0)
     view = np.array([1.05, 0.4]) + rate * time_s[:, None]
     images = Renderer(bank.mesh("cone"), sensor, albedo=0.8).render_views(Views.broadcast(*view.T, 0.0, 0.0))
     frames = replace(noise_free(images, 50), time_s=time_s)

@@ -1,6 +1,7 @@
 """What stands beside the area integral: centre rays, part labels, backgrounds composed later, finer cameras."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,7 +51,7 @@ def test_hard_images_are_what_centre_rays_meet_in_closed_form(name, changes):
 
 def test_hard_images_see_the_background_where_the_centre_ray_misses():
     background = Background(wall_m=3.0, floor_m=0.25, floor_albedo=0.3)
-    view = {"distance_m": [0.9, 1.6], "delta_rad": 0.4, "bearing_rad": 0.02, "background": background}
+    view: dict[str, Any] = {"distance_m": [0.9, 1.6], "delta_rad": 0.4, "bearing_rad": 0.02, "background": background}
     sensor = PMD.with_(vignetting=True)
     image = Renderer(MESHES["cone"], sensor, harmonics=(3,)).render(**view, variant="hard")
     d = sensor.pixel_directions()
@@ -85,7 +86,7 @@ def test_rows_and_workers_do_not_change_hard_images():
 
 def test_an_unknown_variant_is_refused():
     with pytest.raises(UsageError, match="'variant' must be exact or hard, got 'soft'"):
-        Renderer(MESHES["post"], PMD).render(1.0, variant="soft")
+        Renderer(MESHES["post"], PMD).render(1.0, variant="soft")  # type: ignore[arg-type]
 
 
 # --- parts ---
@@ -132,7 +133,7 @@ def test_a_composed_background_agrees_with_a_rendered_one(background, typical, l
 
 def test_composition_takes_one_background_for_each_view_and_harmonics():
     renderer, empty = Renderer(MESHES["cone"], PMD, harmonics=(3,)), Renderer(None, PMD, harmonics=(3, 5))
-    view = {"distance_m": [0.9, 1.4], "bearing_rad": [0.0, 0.05], "background": Background(wall_m=4.0)}
+    view: dict[str, Any] = {"distance_m": [0.9, 1.4], "bearing_rad": [0.0, 0.05], "background": Background(wall_m=4.0)}
     composed = renderer.render(view["distance_m"], 0.0, view["bearing_rad"]).composed_with(empty.render(**view))
     full = renderer.render(**view)
     assert list(composed.harmonics) == [3]
@@ -162,7 +163,7 @@ def test_next_to_no_pixel_of_the_catalogue_needs_a_fallback():
 
 @pytest.mark.parametrize("name", ["cylinder", "sphere"])
 def test_a_camera_of_176_by_144_pixels_averages_to_one_of_16_by_16(name):
-    view = {"distance_m": 1.2, "delta_rad": 0.6, "bearing_rad": 0.01, "height_m": -0.02}
+    view: dict[str, Any] = {"distance_m": 1.2, "delta_rad": 0.6, "bearing_rad": 0.01, "height_m": -0.02}
     background = Background(wall_m=4.0, floor_m=0.2)
     fine = Renderer(MESHES[name], PMD.with_(rows=144, cols=176)).render(**view, background=background)
     coarse = Renderer(MESHES[name], PMD).render(**view, background=background)

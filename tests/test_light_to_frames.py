@@ -10,21 +10,12 @@ from oracles.noise_law import FALSE_ALARM, exact_over_law, noise_law_m, noise_ta
 from scipy import special, stats
 
 from phasemark import UsageError
-from phasemark.render import (
-    Flag,
-    Renderer,
-    Sensor,
-    camera_unit,
-    capture,
-    predicted_range_std,
-    preset,
-    pulse_harmonics,
-    square_harmonics,
-)
+from phasemark.render import Flag, Renderer, Sensor, camera_unit, capture, predicted_range_std, preset
 from phasemark.render.exposure import capture as chain
 from phasemark.render.exposure import photoelectrons as read_out
 from phasemark.render.exposure.random_streams import fill_normal, fill_uniform, philox, uniform_pair
 from phasemark.render.exposure.stray_light import spread_light
+from phasemark.render.sensor import pulse_harmonics, square_harmonics
 from phasemark.render.sensor.correlation import correlation_curve, correlation_peak
 from phasemark.render.sensor.sensor_checks import PATTERN_BOUND
 

@@ -7,9 +7,10 @@ import typer
 
 from phasemark import UsageError
 from phasemark.cli import app, main
-from phasemark.data import BankPlan, MeshPlan, build_bank
+from phasemark.data import BankPlan, build_bank
 from phasemark.data.commands.command import OUTPUTS
 from phasemark.data.files.same_file import refuse_inputs
+from phasemark.data.plans import MeshPlan
 from phasemark.landmarks import build_mesh, catalog, export_mesh
 
 SENSOR = "rows = 8\ncols = 8\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\n"

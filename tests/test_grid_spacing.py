@@ -10,10 +10,12 @@ import pytest
 
 from phasemark import UsageError
 from phasemark.cli import main
-from phasemark.data import BankPlan, build_bank, open_bank, write_checksum
+from phasemark.data import BankPlan, build_bank, open_bank
+from phasemark.data.files import write_checksum
 from phasemark.inputs import checksum_path
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import grid_loss, noise_free
+from phasemark.matcher.accuracy import grid_loss
+from phasemark.matcher.filters import noise_free
 from phasemark.render import Renderer, capture, predicted_range_std, preset
 
 SENSOR = preset("pmd-16x16")
@@ -22,7 +24,7 @@ SENSOR = preset("pmd-16x16")
 @pytest.fixture(scope="module")
 def banks(tmp_path_factory):
     folder = tmp_path_factory.mktemp("banks")
-    for name, distance, delta in (("coarse", "0.9:1.1:0.01", "0:180:1"), ("fine", "0.9:1.1:0.005", "0:180:0.5")):
+    for name, distance, delta in (("coarse", "0.95:1.05:0.01", "0:180:1"), ("fine", "0.95:1.05:0.005", "0:180:0.5")):
         build_bank(BankPlan(classes=["cone", "post"], distance_m=distance, delta_deg=delta), folder / name).close()
     return folder
 
@@ -98,7 +100,7 @@ def test_views_lie_beyond_the_last_angle_where_the_grid_closes(tmp_path, monkeyp
     from phasemark.matcher.accuracy import grid_spacing as population
 
     seen = []
-    render = population.noise_free
+    render = noise_free
     monkeypatch.setattr(
         population, "noise_free", lambda images, n: (seen.append(images.views.delta_rad), render(images, n))[1]
     )
