@@ -5,14 +5,15 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 from phasemark.render import compile_cache  # noqa: F401 - first, for the modules below compile functions
 from phasemark.render.background import Background
-from phasemark.render.bench.data_sheet import characterise
+from phasemark.render.bench.data_sheet.characterise import characterise
 from phasemark.render.exposure.capture import capture
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m
 from phasemark.render.renderer import Renderer, background_image
 from phasemark.render.sensor.camera_unit import camera_unit
 from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
-from phasemark.render.sensor.sensor import Sensor, preset, preset_names
+from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.shipped_sensors import preset, preset_names
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:

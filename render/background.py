@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
+from phasemark.render.kernel import inlined, kernel
 from phasemark.render.view import FARTHEST_M, Views
 
 
@@ -119,7 +119,7 @@ class Background:
         return farthest, -vertices[:, 2].min() - views.height_m
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def background_hit(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the multiple of a ray at which it meets the nearer plane, its albedo, and cos θ times the ray's length.
 
@@ -137,8 +137,8 @@ def background_hit(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-unt
     return t, albedo, facing
 
 
-@njit(cache=True, nogil=True)
-def background_edge(parameters, cos_b, sin_b, level, scale, centre, rows, cols, out):  # type: ignore[no-untyped-def]
+@kernel
+def background_edge(parameters, cos_b, sin_b, camera, out):  # type: ignore[no-untyped-def]
     """Project the line where wall and floor meet, or the floor's horizon, across the image.
 
     Parameters
@@ -147,11 +147,8 @@ def background_edge(parameters, cos_b, sin_b, level, scale, centre, rows, cols, 
         As :meth:`Background.parameters` returns them.
     cos_b, sin_b : float
         Of the bearing.
-    level : (3, 3)
-        Rotation from the tilted to the level camera.
-    scale, centre : (2,)
-        u = centre[0] − scale[0] · y, v = centre[1] − scale[1] · z for the ray (1, y, z).
-    rows, cols : int
+    camera : Camera
+        :class:`~phasemark.render.integral.arguments.Camera`.
     out : (4,), overwritten
         u, v of both ends.
 
@@ -163,19 +160,23 @@ def background_edge(parameters, cos_b, sin_b, level, scale, centre, rows, cols, 
     if parameters[1] == 0.0:
         return False
     # points of the line satisfy normal · ray = 0 in the level frame
-    normal = np.array([parameters[1] * cos_b, parameters[1] * sin_b, parameters[0]])
+    nx, ny, nz = parameters[1] * cos_b, parameters[1] * sin_b, parameters[0]
     if parameters[0] == 0.0:
-        normal = np.array([0.0, 0.0, 1.0])
-    tilted = normal @ level
+        nx, ny, nz = 0.0, 0.0, 1.0
+    # the normal in the tilted frame
+    level = camera.level
+    tx = nx * level[0, 0] + ny * level[1, 0] + nz * level[2, 0]
+    ty = nx * level[0, 1] + ny * level[1, 1] + nz * level[2, 1]
+    tz = nx * level[0, 2] + ny * level[1, 2] + nz * level[2, 2]
     # in image coordinates: k0 + ku · u + kv · v = 0
-    ku, kv = -tilted[1] / scale[0], -tilted[2] / scale[1]
-    k0 = tilted[0] + tilted[1] * centre[0] / scale[0] + tilted[2] * centre[1] / scale[1]
+    ku, kv = -ty / camera.scale_u, -tz / camera.scale_v
+    k0 = tx + ty * camera.centre_u / camera.scale_u + tz * camera.centre_v / camera.scale_v
     if abs(kv) >= abs(ku):
         if kv == 0.0:
             return False
-        out[0], out[2] = -1.0, cols + 1.0
+        out[0], out[2] = -1.0, camera.cols + 1.0
         out[1], out[3] = -(k0 + ku * out[0]) / kv, -(k0 + ku * out[2]) / kv
     else:
-        out[1], out[3] = -1.0, rows + 1.0
+        out[1], out[3] = -1.0, camera.rows + 1.0
         out[0], out[2] = -(k0 + kv * out[1]) / ku, -(k0 + kv * out[3]) / ku
     return True

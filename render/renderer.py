@@ -18,19 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
-from phasemark.render.integral.accumulate import (
-    UNTRUSTED,
-    add_background,
-    aim,
-    pick_scouts,
-    plan_rays,
-    share_faces,
-    sum_samples,
-)
-from phasemark.render.integral.edge_projection import MeshTopology
+from phasemark.render.integral.arguments import Camera, Edges, Light, Poses, Samples, Sums
 from phasemark.render.integral.footprint import Scratch
 from phasemark.render.integral.intersect import make_intersector
+from phasemark.render.integral.light import add_background, sum_samples
+from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.integral.ray_plan import UNTRUSTED, plan_rays
 from phasemark.render.integral.shells import unite_shells
+from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
@@ -54,28 +49,35 @@ class _Buffers:
 
     def __post_init__(self) -> None:
         rows, cols = self.shape
-        self.segments = np.empty((self.n_edges + 1, 4))
-        self.limb = np.empty(self.n_edges + 1, np.int8)
-        self.head = np.empty((rows + 2, cols + 2), np.int32)
         self.scratch = Scratch.empty()
-        self.grow_links(self.n_links)
-        self.grow_samples(self.n_samples)
+        self.edges = Edges(
+            segments=np.empty((self.n_edges + 1, 4)),
+            limb=np.empty(self.n_edges + 1, np.int8),
+            head=np.empty((rows + 2, cols + 2), np.int32),
+            link=np.empty(self.n_links, np.int32),
+            owner=np.empty(self.n_links, np.int32),
+        )
+        self.samples = _room_for(self.n_samples)
 
-    def grow_links(self, n: int) -> None:
-        self.n_links = n
-        self.link = np.empty(n, np.int32)
-        self.owner = np.empty(n, np.int32)
+    def grow_links(self) -> None:
+        n = 2 * len(self.edges.link)
+        self.edges = self.edges._replace(link=np.empty(n, np.int32), owner=np.empty(n, np.int32))
 
-    def grow_samples(self, n: int) -> None:
-        self.n_samples = n
-        self.points = np.empty((n, 2))
-        self.weights = np.empty(n)
-        self.regions = np.empty(n, np.int32)
-        self.pixel = np.empty(n, np.int64)
-        self.face = np.empty(n, np.int32)
-        self.chosen = np.empty(n, np.int64)
-        self.origins = np.empty((n, 3), np.float32)
-        self.directions = np.empty((n, 3), np.float32)
+    def grow_samples(self) -> None:
+        self.samples = _room_for(2 * len(self.samples.weights))
+
+
+def _room_for(n: int) -> Samples:
+    return Samples(
+        points=np.empty((n, 2)),
+        weights=np.empty(n),
+        regions=np.empty(n, np.int32),
+        pixel=np.empty(n, np.int64),
+        face=np.empty(n, np.int32),
+        chosen=np.empty(n, np.int64),
+        origins=np.empty((n, 3), np.float32),
+        directions=np.empty((n, 3), np.float32),
+    )
 
 
 class Renderer:
@@ -135,7 +137,6 @@ class Renderer:
         self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
         self._orders = np.array([1, *harmonics], dtype=np.int64)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
-        self._camera = _camera(sensor)
         self.untrusted_pixels = 0
         """How many pixels, of all rendered so far, had too many edges to be split exactly."""
 
@@ -147,7 +148,7 @@ class Renderer:
         sensor : Sensor
         """
         other = copy.copy(self)
-        other.sensor, other._camera, other.untrusted_pixels = sensor, _camera(sensor), 0
+        other.sensor, other.untrusted_pixels = sensor, 0
         return other
 
     def render(
@@ -281,15 +282,22 @@ class Renderer:
         run = self._render_tasks if variant == "exact" else self._cast_centres
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)
-        sums = _Sums(shape, len(self._orders))
-        behind = (background or Background()).parameters()
+        sums = _no_light(shape, len(self._orders))
+        camera = _camera(self.sensor, rows)
+        light = Light(
+            (background or Background()).parameters(),
+            self.albedo,
+            1 / self.sensor.metres_per_radian,
+            self._orders,
+            self.sensor.vignetting,
+        )
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
         if workers == 1 or len(tasks) <= 1:
-            run(tasks, views, behind, rows, sums)
+            run(tasks, views, camera, light, sums)
         else:
             with ThreadPoolExecutor(workers) as pool:
                 lanes = [tasks[i::workers] for i in range(workers)]
-                list(pool.map(lambda lane: run(lane, views, behind, rows, sums), lanes))
+                list(pool.map(lambda lane: run(lane, views, camera, light, sums), lanes))
         self.untrusted_pixels += int((sums.state == UNTRUSTED).sum())
         phasor = sums.phasor.reshape(*shape, len(self._orders))
         return PhasorImages(
@@ -304,114 +312,62 @@ class Renderer:
             },
         )
 
-    def _render_tasks(
-        self,
-        tasks: Iterable[slice],
-        views: Views,
-        behind: NDArray[np.float64],
-        rows: tuple[int, int],
-        sums: _Sums,
-    ) -> None:
+    def _render_tasks(self, tasks: Iterable[slice], views: Views, camera: Camera, light: Light, sums: Sums) -> None:
         """Render slices of the views into `sums`, in one thread."""
-        mesh, sensor = self.topology, self.sensor
-        buffers = _Buffers(len(mesh.creases) + len(mesh.folds), (sensor.rows, sensor.cols))
-        level = np.ascontiguousarray(sensor.cam2level)
-        row_range = np.array(rows, np.int64)
-        radians_per_metre = 1 / sensor.metres_per_radian
-        per_view = (rows[1] - rows[0]) * sensor.cols
+        mesh = self.topology
+        buffers = _Buffers(len(mesh.creases) + len(mesh.folds), (camera.rows, camera.cols))
         for task in tasks:
-            part = views[task]
-            rotation, translation = part.landmark2cam()
-            matrix = np.ascontiguousarray(level.T @ rotation)
-            offset = np.ascontiguousarray(translation @ level)
-            lens = part.lens_in_landmark()
-            state = sums.state[task]
-            pixels = slice(task.start * per_view, task.stop * per_view)
-            phasor, intensity = sums.phasor[pixels], sums.intensity[pixels]
-            coverage, upper = sums.coverage[pixels], sums.upper[pixels]
+            poses, own = _poses(views[task], camera), _of_views(sums, task)
             view = 0
-            while view < len(part):
-                b = buffers
+            while view < len(poses.lens):
                 reached, n = plan_rays(
-                    view, mesh, lens, matrix, offset, part.bearing_rad, self._camera, level, row_range, self.splits,
-                    behind, b.segments, b.limb, b.head, b.link, b.owner, b.scratch,
-                    b.points, b.weights, b.regions, b.pixel, state,
+                    view, mesh, poses, camera, self.splits, light.background, buffers.edges, buffers.scratch,
+                    buffers.samples, own.state,
                 )  # fmt: skip
                 if reached == -1:
-                    buffers.grow_links(2 * buffers.n_links)
+                    buffers.grow_links()
                     continue
                 if reached == view:
-                    buffers.grow_samples(2 * buffers.n_samples)
+                    buffers.grow_samples()
                     continue
-                self._find_faces(n, b, state, lens, matrix, per_view)
-                sum_samples(
-                    n, b.points, b.weights, b.pixel, b.face, mesh, lens, matrix, part.bearing_rad, self._camera, level,
-                    behind, self.albedo, radians_per_metre, self._orders, sensor.vignetting, per_view,
-                    phasor, intensity, coverage, upper,
-                )  # fmt: skip
-                if behind[0] or behind[1]:
-                    add_background(
-                        view, reached, state, part.bearing_rad, self._camera, level, row_range, behind,
-                        radians_per_metre, self._orders, sensor.vignetting, phasor, intensity,
-                    )  # fmt: skip
+                self._find_faces(n, buffers.samples, own.state, poses, camera)
+                sum_samples(n, buffers.samples, mesh, poses, camera, light, own)
+                if light.background[0] or light.background[1]:
+                    add_background(view, reached, poses, camera, light, own)
                 view = reached
 
-    def _cast_centres(
-        self,
-        tasks: Iterable[slice],
-        views: Views,
-        behind: NDArray[np.float64],
-        rows: tuple[int, int],
-        sums: _Sums,
-    ) -> None:
+    def _cast_centres(self, tasks: Iterable[slice], views: Views, camera: Camera, light: Light, sums: Sums) -> None:
         """Render slices of the views with one ray a pixel into `sums`, in one thread."""
-        mesh, sensor = self.topology, self.sensor
-        level = np.ascontiguousarray(sensor.cam2level)
-        v, u = np.mgrid[slice(*rows), : sensor.cols] + 0.5
+        v, u = np.mgrid[camera.first_row : camera.stop_row, : camera.cols] + 0.5
         centres = np.column_stack([u.ravel(), v.ravel()])
-        per_view = len(centres)
         for task in tasks:
-            part = views[task]
-            rotation, _ = part.landmark2cam()
-            matrix = np.ascontiguousarray(level.T @ rotation)
-            lens = part.lens_in_landmark()
-            n = len(part) * per_view
-            points, pixel = np.tile(centres, (len(part), 1)), np.arange(n)
-            origins, directions = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
-            aim(n, pixel, points, pixel, lens, matrix, self._camera, per_view, origins, directions)
-            pixels = slice(task.start * per_view, task.stop * per_view)
-            sum_samples(
-                n, points, np.ones(n), pixel, self._intersector.first_face(origins, directions), mesh, lens, matrix,
-                part.bearing_rad, self._camera, level, behind, self.albedo, 1 / sensor.metres_per_radian, self._orders,
-                sensor.vignetting, per_view,
-                sums.phasor[pixels], sums.intensity[pixels], sums.coverage[pixels], sums.upper[pixels],
-            )  # fmt: skip
+            poses = _poses(views[task], camera)
+            n = len(poses.lens) * len(centres)
+            samples = _room_for(n)
+            samples.points[:] = np.tile(centres, (len(poses.lens), 1))
+            samples.weights[:] = 1.0
+            samples.pixel[:] = samples.chosen[:] = np.arange(n)
+            aim(n, samples, poses, camera)
+            samples.face[:] = self._intersector.first_face(samples.origins, samples.directions)
+            sum_samples(n, samples, self.topology, poses, camera, light, _of_views(sums, task))
 
-    def _find_faces(
-        self,
-        n: int,
-        b: _Buffers,
-        state: NDArray[np.uint8],
-        lens: NDArray[np.float64],
-        matrix: NDArray[np.float64],
-        per_view: int,
-    ) -> None:
-        """Find the face that each of n samples sees, −1 for none, into ``b.face``."""
+    def _find_faces(self, n: int, samples: Samples, state: NDArray[np.uint8], poses: Poses, camera: Camera) -> None:
+        """Find the face that each of n samples sees, −1 for none, into ``samples.face``."""
 
         def cast(count: int) -> NDArray[np.int32]:
-            aim(count, b.chosen, b.points, b.pixel, lens, matrix, self._camera, per_view, b.origins, b.directions)
-            return self._intersector.first_face(b.origins[:count], b.directions[:count])
+            aim(count, samples, poses, camera)
+            return self._intersector.first_face(samples.origins[:count], samples.directions[:count])
 
-        scouts = cast(pick_scouts(n, b.regions, b.chosen))
         mesh = self.topology
-        rest = share_faces(n, b.regions, b.pixel, state, mesh.plain, scouts, mesh.closed, b.face, b.chosen)
-        b.face[b.chosen[:rest]] = cast(rest)
+        scouts = cast(pick_scouts(n, samples))
+        rest = share_faces(n, mesh, mesh.closed, scouts, samples, poses, camera, state)
+        samples.face[samples.chosen[:rest]] = cast(rest)
 
     def _check_lens_outside(self, views: Views) -> None:
         """Refuse views whose lens lies inside the landmark, or within a millimetre of its axis-aligned box."""
         if not len(self.topology.faces):
             return
-        low, high = self.topology.vertices.min(axis=0), self.topology.vertices.max(axis=0)
+        low, high = self.topology.low, self.topology.high
         lens = views.lens_in_landmark()
         near = np.flatnonzero(((lens > low - 1e-3) & (lens < high + 1e-3)).all(axis=1))
         if near.size:
@@ -420,6 +376,22 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
             )
+
+
+def background_image(background: Background, sensor: Sensor) -> PhasorImages:
+    """Return what a background alone returns, straight ahead.
+
+    Parameters
+    ----------
+    background : Background
+    sensor : Sensor
+
+    Returns
+    -------
+    PhasorImages
+        One image.
+    """
+    return Renderer(None, sensor).render(distance_m=1.0, background=background)
 
 
 _TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
@@ -444,36 +416,54 @@ def _topology(mesh: trimesh.Trimesh) -> MeshTopology:
     return found
 
 
-def _camera(sensor: Sensor) -> NDArray[np.float64]:
-    """Return a camera's intrinsic numbers as the kernels take them."""
+def _camera(sensor: Sensor, rows: tuple[int, int]) -> Camera:
+    """Return a camera as the kernels take it, and which rows to render."""
     tan_h, tan_v = sensor.tan_half_angles
-    scale = (sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v))
-    return np.array([*scale, *sensor.centre_px, sensor.rows, sensor.cols, *sensor.fill_factor], float)
+    return Camera(
+        scale_u=sensor.cols / (2 * tan_h),
+        scale_v=sensor.rows / (2 * tan_v),
+        centre_u=float(sensor.centre_px[0]),
+        centre_v=float(sensor.centre_px[1]),
+        rows=sensor.rows,
+        cols=sensor.cols,
+        first_row=rows[0],
+        stop_row=rows[1],
+        fill_u=float(sensor.fill_factor[0]),
+        fill_v=float(sensor.fill_factor[1]),
+        level=np.ascontiguousarray(sensor.cam2level),
+    )
 
 
-class _Sums:
-    """What the pixels of a batch add up to."""
-
-    def __init__(self, shape: tuple[int, int, int], n_orders: int) -> None:
-        n = math.prod(shape)
-        self.phasor = np.zeros((n, n_orders), np.complex128)
-        self.intensity = np.zeros(n)
-        self.coverage = np.zeros(n)
-        self.upper = np.zeros(n)
-        self.state = np.zeros(shape, np.uint8)
+def _poses(views: Views, camera: Camera) -> Poses:
+    rotation, translation = views.landmark2cam()
+    return Poses(
+        views.lens_in_landmark(),
+        np.ascontiguousarray(camera.level.T @ rotation),
+        np.ascontiguousarray(translation @ camera.level),
+        views.bearing_rad,
+    )
 
 
-def background_image(background: Background, sensor: Sensor) -> PhasorImages:
-    """Return what a background alone returns, straight ahead.
+def _no_light(shape: tuple[int, int, int], n_orders: int) -> Sums:
+    """Return the sums that a batch of n views starts from; `shape` is (n, rows, cols)."""
+    n = math.prod(shape)
+    return Sums(
+        phasor=np.zeros((n, n_orders), np.complex128),
+        intensity=np.zeros(n),
+        coverage=np.zeros(n),
+        upper=np.zeros(n),
+        state=np.zeros(shape, np.uint8),
+    )
 
-    Parameters
-    ----------
-    background : Background
-    sensor : Sensor
 
-    Returns
-    -------
-    PhasorImages
-        One image.
-    """
-    return Renderer(None, sensor).render(distance_m=1.0, background=background)
+def _of_views(sums: Sums, views: slice) -> Sums:
+    """Return the part of the sums that belongs to some views."""
+    per_view = math.prod(sums.state.shape[1:])
+    pixels = slice(views.start * per_view, views.stop * per_view)
+    return Sums(
+        phasor=sums.phasor[pixels],
+        intensity=sums.intensity[pixels],
+        coverage=sums.coverage[pixels],
+        upper=sums.upper[pixels],
+        state=sums.state[views],
+    )

@@ -1,7 +1,6 @@
 """The data sheet of a sensor against closed forms, and the files it is written to."""
 
 import csv
-import importlib
 import json
 import math
 import re
@@ -16,12 +15,11 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.render import Sensor, camera_unit, capture, characterise, preset
-from phasemark.render.bench.data_sheet import fit_line
+from phasemark.render.bench.data_sheet.transfer_curve import fit_line
 from phasemark.render.bench.figures import characterisation_figures
 from phasemark.render.bench.flat_field import board_image, expected_flat_field, flat_field
 from phasemark.render.sensor.range_noise import exact_phase_moments, phase_density
 
-bench = importlib.import_module("phasemark.render.bench.data_sheet")  # hidden by its function of the same name
 N = 30  # frames a point, 7 680 readings of a 16 × 16 camera
 
 
@@ -180,7 +178,7 @@ def test_a_wrong_prediction_is_noticed(monkeypatch):
             lying = actual.with_(**changed, min_amplitude_e=sensor.min_amplitude_e)
             return capture(replace(image, sensor=lying), lying, **options)
 
-        monkeypatch.setattr(bench, "capture", take)
+        monkeypatch.setattr("phasemark.render.bench.data_sheet.bench.capture", take)
         found = characterise(told, rng=np.random.default_rng(5), n_frames=10)
         assert figure in {one.figure for one in found.disagreements}
 

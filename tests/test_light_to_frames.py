@@ -17,7 +17,7 @@ from phasemark.render.exposure.random_streams import fill_normal, fill_uniform, 
 from phasemark.render.exposure.stray_light import spread_light
 from phasemark.render.sensor import pulse_harmonics, square_harmonics
 from phasemark.render.sensor.correlation import correlation_curve, correlation_peak
-from phasemark.render.sensor.sensor import PATTERN_BOUND
+from phasemark.render.sensor.sensor_checks import PATTERN_BOUND
 
 PMD = preset("pmd-16x16")
 

@@ -12,8 +12,8 @@ from phasemark.data.pages.characterisation import _quantity_row
 from phasemark.matcher import Match
 from phasemark.matcher.statistics import Interval
 from phasemark.matcher.sweep.report import _with_interval
-from phasemark.render.bench.data_sheet import SheetQuantity
-from phasemark.render.bench.fit import FittedField
+from phasemark.render.bench.data_sheet.results import SheetQuantity
+from phasemark.render.bench.fit.fitted_sensor import FittedField
 from phasemark.render.integral.rounding import error_text, value_and_error, with_error, with_interval
 
 

@@ -12,7 +12,7 @@ from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.render import Flag, Frames, Sensor, camera_unit, capture, preset
 from phasemark.render.bench import fit_sensor
-from phasemark.render.bench.fit import FEWEST_FRAMES
+from phasemark.render.bench.fit.boards import FEWEST_FRAMES
 from phasemark.render.bench.flat_field import board_image
 from phasemark.render.exposure.stray_light import spread_light
 from phasemark.render.sensor.correlation import correlation_curve

@@ -25,7 +25,7 @@ from phasemark.data.commands.options import (
 from phasemark.data.commands.outputs import output_folder, refuse_existing
 
 if TYPE_CHECKING:
-    from phasemark.render.bench.fit import FittedField
+    from phasemark.render.bench.fit.fitted_sensor import FittedField
 
 
 def sensor_list(as_json: Json = False) -> None:
@@ -143,7 +143,7 @@ def sensor_fit(
     whatever the frames do not tell come from --sensor; the file says of each number whether it is measured or assumed.
     """
     from phasemark.data.files.atomic_write import write_atomically
-    from phasemark.render.bench.fit import fit_sensor
+    from phasemark.render.bench.fit.fit_sensor import fit_sensor
 
     if out.suffix.lower() != ".toml":
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")

@@ -10,7 +10,8 @@ from phasemark.data.files.atomic_write import write_atomically
 from phasemark.data.files.json_text import json_text
 from phasemark.data.files.provenance import versions
 from phasemark.data.pages.page import embedded_png, figure_png, page_template
-from phasemark.render.bench.data_sheet import ALBEDOS, Z95, Characterisation, SheetQuantity
+from phasemark.render.bench.data_sheet.bench import ALBEDOS
+from phasemark.render.bench.data_sheet.results import Z95, Characterisation, SheetQuantity
 from phasemark.render.integral.rounding import value_and_error
 from phasemark.render.sensor.range_noise import predicted_range_std
 

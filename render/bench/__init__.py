@@ -5,8 +5,10 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
-    from phasemark.render.bench.data_sheet import Characterisation, Comparison, SheetQuantity, characterise
-    from phasemark.render.bench.fit import FittedField, SensorFit, fit_sensor
+    from phasemark.render.bench.data_sheet.characterise import characterise
+    from phasemark.render.bench.data_sheet.results import Characterisation, Comparison, SheetQuantity
+    from phasemark.render.bench.fit.fit_sensor import fit_sensor
+    from phasemark.render.bench.fit.fitted_sensor import FittedField, SensorFit
 else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from phasemark.render.bench.data_sheet import Characterisation, Comparison
+from phasemark.render.bench.data_sheet.results import Characterisation, Comparison
 from phasemark.render.figures import draw_map
 
 if TYPE_CHECKING:

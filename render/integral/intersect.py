@@ -15,8 +15,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
+from phasemark.render.kernel import inlined, kernel
 
 _LEAF = 4
+_DEEPEST = 128  # nodes that wait to be looked at
 MOST_SCENES = 800
 """Embree ends the process when about a thousand scenes are open."""
 
@@ -98,6 +100,9 @@ class BvhIntersector:
             self._order,
             np.asarray(origins, np.float64),
             np.asarray(directions, np.float64),
+            np.empty(_DEEPEST, np.int64),
+            np.empty(_DEEPEST),
+            np.empty(3),
             out,
         )
         return out
@@ -147,7 +152,7 @@ def _build_tree(low, high):  # type: ignore[no-untyped-def]
     order = np.arange(n)
     bounds = np.empty((2 * n + 1, 6))
     children = np.empty((2 * n + 1, 2), np.int64)
-    stack = np.empty((128, 3), np.int64)
+    stack = np.empty((_DEEPEST, 3), np.int64)
     stack[0] = (0, 0, n)
     used, depth = 1, 1
     while depth > 0:
@@ -178,7 +183,7 @@ def _build_tree(low, high):  # type: ignore[no-untyped-def]
     return bounds[:used].copy(), children[:used].copy(), order
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _enters(bounds, node, origin, inverse, nearest):  # type: ignore[no-untyped-def]
     """Return the distance at which a ray enters a node, inf if it does not before `nearest`."""
     lo, hi = 0.0, nearest
@@ -193,7 +198,7 @@ def _enters(bounds, node, origin, inverse, nearest):  # type: ignore[no-untyped-
     return lo if lo <= hi * (1 + 1e-12) else np.inf
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _edge_side(vertices, i, j, origin, d):  # type: ignore[no-untyped-def]
     """Return on which side of the edge i → j a ray passes; exactly opposite for j → i."""
     a, b, sign = (i, j, 1.0) if i < j else (j, i, -1.0)
@@ -202,11 +207,10 @@ def _edge_side(vertices, i, j, origin, d):  # type: ignore[no-untyped-def]
     return sign * (d[0] * (ay * bz - az * by) + d[1] * (az * bx - ax * bz) + d[2] * (ax * by - ay * bx))
 
 
-@njit(cache=True, nogil=True)
-def _walk(vertices, faces, bounds, children, order, origins, directions, out):  # type: ignore[no-untyped-def]
-    stack = np.empty(128, np.int64)
-    entry = np.empty(128)
-    inverse = np.empty(3)
+@kernel
+def _walk(  # type: ignore[no-untyped-def]
+    vertices, faces, bounds, children, order, origins, directions, stack, entry, inverse, out
+):
     for ray in range(len(origins)):
         origin, d = origins[ray], directions[ray]
         for k in range(3):

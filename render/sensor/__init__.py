@@ -8,7 +8,8 @@ if TYPE_CHECKING:
     from phasemark.render.sensor.camera_unit import CameraUnit
     from phasemark.render.sensor.correlation import Harmonic, pulse_harmonics, square_harmonics
     from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
-    from phasemark.render.sensor.sensor import Sensor, preset, preset_names
+    from phasemark.render.sensor.sensor import Sensor
+    from phasemark.render.sensor.shipped_sensors import preset, preset_names
 else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from phasemark.render.sensor.sensor import PATTERN_BOUND, Sensor
+from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor_checks import PATTERN_BOUND
 
 # A normal cut at ± _CUT has the standard deviation _CUT / 3, so that scaled to 1 it ends at PATTERN_BOUND = 3.
 _CUT = 2.9545385593493396

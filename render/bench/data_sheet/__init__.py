@@ -1,0 +1,1 @@
+"""The data sheet of a camera: what flat fields show, beside what closed forms predict."""

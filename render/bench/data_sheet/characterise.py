@@ -1,0 +1,79 @@
+"""Characterise a sensor as EMVA 1288 and the literature on PMD cameras would: by flat fields, beside predictions.
+
+Every figure stands beside what closed forms predict (:mod:`~phasemark.render.bench.flat_field`), with its number of
+samples and its standard error; :attr:`~phasemark.render.bench.data_sheet.results.Comparison.chi2` says whether the two
+agree.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from phasemark import UsageError
+from phasemark.render.bench.data_sheet.bench import ALBEDOS, Bench, Part
+from phasemark.render.bench.data_sheet.direct import direct_parts
+from phasemark.render.bench.data_sheet.fixed_patterns import patterns
+from phasemark.render.bench.data_sheet.flagged_shares import saturation, threshold
+from phasemark.render.bench.data_sheet.range_curves import linearity, range_noise
+from phasemark.render.bench.data_sheet.results import Characterisation
+from phasemark.render.bench.data_sheet.transfer_curve import photon_transfer
+from phasemark.render.sensor.sensor import Sensor
+
+_SAMPLES_PER_POINT = 51_200  # σ is known to 0.3 %
+_FEWEST_FRAMES = 8
+
+
+def characterise(sensor: Sensor, *, rng: np.random.Generator, n_frames: int | None = None) -> Characterisation:
+    """Run a sensor before flat fields and compare what it reports with closed forms.
+
+    Photon transfer is measured with steady light and no ambient light; range noise on surfaces of three albedos that
+    face the camera; linearity along a delay line that keeps the light constant; patterns over many frames of one flat
+    field; saturation with rising light; the amplitude threshold with rising distance. The validity threshold and the
+    wrap guard are off but where they are measured, so that they select no samples.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    rng : numpy.random.Generator
+        Source of all noise.
+    n_frames : int, optional
+        Frames at each point, at least 2; by default as many as make 51 200 readings, and at least 8.
+
+    Returns
+    -------
+    Characterisation
+
+    Raises
+    ------
+    UsageError
+        `n_frames` is less than 2, or no pixel works.
+    """
+    if n_frames is None:
+        n_frames = max(_FEWEST_FRAMES, math.ceil(_SAMPLES_PER_POINT / (sensor.rows * sensor.cols)))
+    if n_frames < 2:
+        raise UsageError(f"'n_frames' must be at least 2, for one frame has no noise, got {n_frames}")
+    bench = Bench(sensor, rng, n_frames)
+    parts = direct_parts(bench) if sensor.kind == "direct" else _phase_parts(bench)
+    return Characterisation(
+        sensor,
+        n_frames,
+        bench.reference_range_m,
+        tuple(one for part in parts for one in part.comparisons),
+        tuple(one for part in parts for one in part.quantities),
+        {name: values for part in parts for name, values in part.maps.items()},
+        {"dead": bench.unit.dead, "hot": bench.unit.hot},
+        tuple(note for part in parts for note in part.notes),
+    )
+
+
+def _phase_parts(bench: Bench) -> list[Part]:
+    return [
+        photon_transfer(bench),
+        *(range_noise(bench, albedo) for albedo in ALBEDOS),
+        linearity(bench),
+        patterns(bench),
+        saturation(bench),
+        *(threshold(bench, albedo) for albedo in ALBEDOS),
+    ]

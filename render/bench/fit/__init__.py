@@ -1,0 +1,1 @@
+"""A sensor fitted to measured flat fields: boards, offsets, wiggling, photon transfer and noise."""

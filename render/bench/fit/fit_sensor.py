@@ -1,0 +1,150 @@
+"""FittedField a sensor from measured flat-field frames: a board, square to the camera, at known distances.
+
+What can be told depends on what was measured. Ranges alone at one distance show one number of noise; several
+distances or albedos tell shot noise, which follows the light, from noise that does not; amplitude and intensity add the
+electrons themselves. :func:`fit_sensor` says of every number whether it was measured, and from what.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.render.bench.fit.boards import (
+    FEWEST_FRAMES,
+    PIXEL_STD_ERROR,
+    BoardData,
+    known_distance_std,
+    say_of_distances,
+)
+from phasemark.render.bench.fit.electron_noise import fit_noise, possible_contrast
+from phasemark.render.bench.fit.fitted_sensor import AmplitudeUnit, FittedField, SensorFit
+from phasemark.render.bench.fit.offsets import fit_offsets
+from phasemark.render.bench.fit.pixel_pattern import odd_pixels, pattern, pattern_fields, pattern_moved
+from phasemark.render.frames import Frames
+from phasemark.render.integral.rounding import with_error
+from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor_file import rounded
+
+_CORRELATED_SIGMAS = 4.0
+
+
+def fit_sensor(
+    frames: Sequence[Frames],
+    distance_m: Sequence[float] | NDArray[np.floating],
+    *,
+    base: Sensor,
+    albedo: Sequence[float] | None = None,
+    amplitude_unit: AmplitudeUnit = "electrons",
+    distance_std_m: float | Sequence[float] | None = None,
+) -> SensorFit:
+    """Estimate a camera from frames of a flat board that fills the image, square to the optical axis.
+
+    With the range error e = offset + wiggling(phase) + pattern and the noise law σ_φ² = (I + V) / 2A² (PHYSICS section
+    4), the board's light follows from distance and albedo, S = ρ cos θ / r² averaged over each pixel:
+
+    - the offset is the mean error; with distances enough, wiggling is fitted beside it;
+    - the pattern is what is left of each pixel, its spread less the spread that noise leaves;
+    - from ranges alone, σ_φ² = a/S + b/S² with a = 1 / 2K²N₀ and b = (all noise that does not follow the light) /
+      2K²N₀²; K is assumed;
+    - from amplitude in electrons, K N₀ = A/S and 2σ_φ²A² = N₀S + (N_amb + N_dark + V); from intensity as well,
+      I = N₀S + N_amb + N_dark and V = 2σ_φ²A² − I;
+    - from amplitude and intensity in arbitrary units, g = slope of 2σ_φ²A² over I turns both into electrons.
+
+    The errors of the distances are propagated to first order: they move ranges directly and the light by −2σ_r / r.
+
+    Parameters
+    ----------
+    frames : sequence of Frames
+        One position each, at least `FEWEST_FRAMES` frames.
+    distance_m : sequence of float
+        Distance of the board along the optical axis for each.
+    base : Sensor
+        The camera as far as it is known: geometry, modulation frequency and all that is not measured.
+    albedo : sequence of float, optional
+        Albedo of each board, or one for all; without it 0.8 is assumed.
+    amplitude_unit : {"electrons", "arbitrary"}
+        Unit of the frames' amplitude and intensity.
+    distance_std_m : float or sequence of float, optional
+        Standard deviation of the distances, one for all or one for each, independent from board to board; without it
+        `DISTANCE_STD_M`, 1 mm, is assumed. 0: exact.
+
+    Returns
+    -------
+    SensorFit
+
+    Raises
+    ------
+    UsageError
+        Numbers of frames, distances, albedos and standard deviations do not fit; there are too few frames; no pixel is
+        valid often enough; a standard deviation is negative or more than a tenth of its distance.
+    """
+    if len(frames) != len(distance_m) or not frames:
+        raise UsageError(
+            f"each set of frames needs its distance: got {len(frames)} of frames and {len(distance_m)} of distances"
+        )
+    if amplitude_unit not in ("electrons", "arbitrary"):
+        raise UsageError(f"'amplitude_unit' must be 'electrons' or 'arbitrary', got {amplitude_unit!r}")
+    assumed_albedo = albedo is None
+    albedos = [0.8] if albedo is None else list(albedo)
+    if len(albedos) == 1:
+        albedos *= len(frames)
+    if len(albedos) != len(frames):
+        raise UsageError(f"give one albedo, or one for each of the {len(frames)} distances, got {len(albedos)}")
+    for one, distance in zip(frames, distance_m, strict=True):
+        if len(one) != 1:
+            raise UsageError(f"the frames at {distance:g} m must be of one position, got {len(one)}")
+        if one.n_frames < FEWEST_FRAMES:
+            raise UsageError(
+                f"too few frames at {distance:g} m: {one.n_frames}, but at least {FEWEST_FRAMES} are needed to know a "
+                f"pixel's noise to {100 * PIXEL_STD_ERROR:.0f} %"
+            )
+    notes: list[str] = []
+    estimates: dict[str, FittedField] = {}
+    distance_std = known_distance_std(distance_m, distance_std_m)
+    data = BoardData.of(frames, distance_m, distance_std, albedos, base).of_usable_boards(distance_m, notes)
+    if assumed_albedo and base.kind == "phase":
+        notes.append("The board's albedo was assumed to be 0.8: signal_e times albedo is what was measured.")
+    if not (data.variance_m2[:, data.good] > 0).any():
+        raise UsageError("the frames have no noise: every range is the same in all of them; is one frame repeated?")
+    notes.append(say_of_distances(distance_std, assumed=distance_std_m is None))
+    correlation, correlation_error = data.frame_correlation()
+    if abs(correlation) > _CORRELATED_SIGMAS * correlation_error:
+        notes.append(
+            "Frames are not independent: the noise of a pixel correlates by "
+            f"{with_error(correlation, correlation_error)} from one frame to the next, as behind a filter in time; "
+            "standard errors allow for it, σ may be too small."
+        )
+    widening = math.sqrt(max((1 + correlation) / (1 - correlation), 1.0)) if abs(correlation) < 1 else 1.0
+    changes = fit_offsets(data, base, estimates, notes, widening)
+    offset, offset_error = pattern(data, changes)
+    # the pixels that a flat field shows to be odd leave before anything else is measured
+    odd = odd_pixels(data, offset)
+    if odd.any():
+        data = data.without(odd)
+        changes = fit_offsets(data, base, estimates, [], widening)
+        offset, offset_error = pattern(data, changes)
+    offset_error, moved = offset_error * widening, pattern_moved(data, changes)
+    changes |= pattern_fields(data, base, offset, offset_error, moved, odd, estimates)
+    changes |= fit_noise(data, base, amplitude_unit, estimates, notes)
+    fields = {**base.model_dump(), **{name: rounded(value) for name, value in changes.items()}}
+    if base.kind == "phase":
+        fields["contrast"] = possible_contrast(fields, estimates, notes)
+    sensor = Sensor(**fields)
+    order = {name: position for position, name in enumerate(Sensor.model_fields)}
+    return SensorFit(
+        sensor,
+        {name: estimates[name] for name in sorted(estimates, key=order.__getitem__)},
+        tuple(notes),
+        offset,
+        np.sqrt(offset_error**2 + (moved**2).sum(axis=0)),
+        np.sqrt(data.variance_m2),
+        correlation,
+        correlation_error,
+        tuple(one.n_frames for one in frames),
+        tuple(distance_std),
+    )

@@ -1,0 +1,179 @@
+"""What the kernels of the integral are told: camera, poses, light, and the buffers they fill."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.render.kernel import inlined
+
+
+class Camera(NamedTuple):
+    """The camera of a batch.
+
+    Parameters
+    ----------
+    scale_u, scale_v, centre_u, centre_v : float
+        A ray (1, y, z) of the tilted camera meets the image in u = centre_u − scale_u · y, v = centre_v − scale_v · z.
+    rows, cols : int
+    first_row, stop_row : int
+        Image rows to render.
+    fill_u, fill_v : float
+        Fill factor.
+    level : (3, 3) float64
+        Tilted to level camera frame.
+    """
+
+    scale_u: float
+    scale_v: float
+    centre_u: float
+    centre_v: float
+    rows: int
+    cols: int
+    first_row: int
+    stop_row: int
+    fill_u: float
+    fill_v: float
+    level: NDArray[np.float64]
+
+
+class Poses(NamedTuple):
+    """Where the landmark stands in each of n views.
+
+    Parameters
+    ----------
+    lens : (n, 3) float64
+        The lens in the landmark frame.
+    matrix, offset : (n, 3, 3), (n, 3) float64
+        p_image = matrix · p' + offset: landmark frame to the tilted camera's frame (x along the axis).
+    bearing : (n,) float64
+    """
+
+    lens: NDArray[np.float64]
+    matrix: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    bearing: NDArray[np.float64]
+
+
+class Light(NamedTuple):
+    """What turns a hit into a phasor.
+
+    Parameters
+    ----------
+    background : (4,) float64
+        As :meth:`~phasemark.render.background.Background.parameters` returns them.
+    albedo : float
+        Of the landmark.
+    radians_per_metre : float
+        4πf / c.
+    orders : (k,) int64
+        Harmonic orders; the first is 1.
+    vignetting : bool
+    """
+
+    background: NDArray[np.float64]
+    albedo: float
+    radians_per_metre: float
+    orders: NDArray[np.int64]
+    vignetting: bool
+
+
+class Edges(NamedTuple):
+    """The edges of one view, and which of them each pixel has.
+
+    Parameters
+    ----------
+    segments : (e, 4) float64
+        u, v of both ends.
+    limb : (e,) int8
+        1 for a silhouette of a smooth surface; then the surface lies on the side where
+        du·(v − v_a) − dv·(u − u_a) < 0.
+    head : (rows + 2, cols + 2) int32
+        First entry of each pixel's list, −1: none; with a border of one pixel around the image.
+    link, owner : (m,) int32
+        Next entry, and the entry's segment.
+    """
+
+    segments: NDArray[np.float64]
+    limb: NDArray[np.int8]
+    head: NDArray[np.int32]
+    link: NDArray[np.int32]
+    owner: NDArray[np.int32]
+
+
+class Samples(NamedTuple):
+    """Samples of some views; room for m.
+
+    Parameters
+    ----------
+    points : (m, 2) float64
+        u, v.
+    weights : (m,) float64
+        Shares of their pixel's active area.
+    regions : (m,) int32
+        Number of the interval that each lies in.
+    pixel : (m,) int64
+        view · pixels + pixel.
+    face : (m,) int32
+        Face met, −1: none.
+    chosen : (m,) int64
+        Samples whose rays are cast.
+    origins, directions : (m, 3) float32
+        These rays, landmark frame.
+    """
+
+    points: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    regions: NDArray[np.int32]
+    pixel: NDArray[np.int64]
+    face: NDArray[np.int32]
+    chosen: NDArray[np.int64]
+    origins: NDArray[np.float32]
+    directions: NDArray[np.float32]
+
+
+class Sums(NamedTuple):
+    """What the pixels of a batch add up to.
+
+    Parameters
+    ----------
+    phasor : (pixels, k) complex128
+    intensity, coverage, upper : (pixels,) float64
+        `upper` is the coverage by the landmark's upper part.
+    state : (n, rows, cols) uint8
+        Per pixel whether it was sampled, see :mod:`~phasemark.render.integral.ray_plan`.
+    """
+
+    phasor: NDArray[np.complex128]
+    intensity: NDArray[np.float64]
+    coverage: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    state: NDArray[np.uint8]
+
+
+@inlined
+def ray_of(camera, u, v):  # type: ignore[no-untyped-def]
+    """Return y and z of the ray (1, y, z) of an image point, frame of the tilted camera."""
+    return (camera.centre_u - u) / camera.scale_u, (camera.centre_v - v) / camera.scale_v
+
+
+@inlined
+def towards_landmark(matrix, y, z):  # type: ignore[no-untyped-def]
+    """Return the ray (1, y, z) in the landmark frame; `matrix` as in :class:`Poses`, of one view."""
+    return (
+        matrix[0, 0] + matrix[1, 0] * y + matrix[2, 0] * z,
+        matrix[0, 1] + matrix[1, 1] * y + matrix[2, 1] * z,
+        matrix[0, 2] + matrix[1, 2] * y + matrix[2, 2] * z,
+    )
+
+
+@inlined
+def towards_level(level, y, z):  # type: ignore[no-untyped-def]
+    """Return the ray (1, y, z) in the level camera frame."""
+    return (
+        level[0, 0] + level[0, 1] * y + level[0, 2] * z,
+        level[1, 0] + level[1, 1] * y + level[1, 2] * z,
+        level[2, 0] + level[2, 1] * y + level[2, 2] * z,
+    )

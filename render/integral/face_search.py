@@ -1,0 +1,172 @@
+"""Faces of a curved patch found without an intersector: by a step across edges, or by a look into a grid.
+
+It is for patches with an apex. Slivers that fan out from one point lie in boxes that all meet there, so that a
+hierarchy of boxes separates them badly: on a cone a cast ray takes three times as long as on a cylinder.
+
+Neighbouring samples of an interval see the same smooth patch, so the face of one is near that of the other. From a face
+the plane of which a ray meets outside it, the search goes on to the neighbour on that side. Where the plane is met far
+outside, a grid over the patches says which face lies about there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.render.kernel import inlined, kernel
+
+_CELLS = 48
+"""Cells of the grid along the longest side of the box around all faces of the grid."""
+_MOST_STEPS = 16
+_MOST_LOOKS = 6
+"""Into the grid, for one ray."""
+_FAR = 1.5
+"""Barycentric coordinate below minus this: the face is far from the hit, and the grid is asked."""
+_GRAZING = 1e-3
+"""Cosine between ray and normal below which the plane of a face says little of where the surface is met."""
+_EDGE = 1e-3
+"""Barycentric coordinate below minus this: the ray does not meet the edge between two faces."""
+_SMOOTH = 0.1
+"""Sine by which a chord between two hits may lean on the mean of their normals; on an arc it does not at all."""
+
+
+class FaceGrid(NamedTuple):
+    """A face for every cell of the box around all faces of the grid.
+
+    Parameters
+    ----------
+    low : (3,) float64
+        Lower corner of the box around all faces of the grid, metres.
+    per_metre : float
+        Cells per metre.
+    faces : (nx, ny, nz) int32
+        A face that runs through the cell or near it, −1: there is none at all.
+    """
+
+    low: NDArray[np.float64]
+    per_metre: float
+    faces: NDArray[np.int32]
+
+    @classmethod
+    def of_faces(cls, corners: NDArray[np.float64], wanted: NDArray[np.bool_]) -> FaceGrid:
+        """Lay a grid over faces, given their corners (f, 3, 3) and which of them are wanted.
+
+        A cell gets the face that runs nearest to its middle, judged by points no further apart than half a cell; a cell
+        without any gets that of the nearest cell.
+        """
+        from scipy.ndimage import distance_transform_edt
+
+        if not wanted.any():
+            return cls(np.zeros(3), 1.0, np.full((1, 1, 1), -1, np.int32))
+        own = corners[wanted]
+        low, high = own.min(axis=(0, 1)), own.max(axis=(0, 1))
+        per_metre = _CELLS / float((high - low).max())
+        shape = np.floor((high - low) * per_metre).astype(np.int64) + 1
+        faces, distance = np.full(shape, -1, np.int32), np.full(shape, np.inf)
+        _fill_grid(np.ascontiguousarray(own), np.flatnonzero(wanted), low, per_metre, faces, distance)
+        nearest = distance_transform_edt(faces < 0, return_distances=False, return_indices=True)
+        return cls(low, per_metre, np.ascontiguousarray(faces[tuple(nearest)]))
+
+
+@kernel
+def _fill_grid(corners, numbers, low, per_metre, faces, distance):  # type: ignore[no-untyped-def]
+    for f in range(len(corners)):
+        ax, ay, az = corners[f, 0, 0], corners[f, 0, 1], corners[f, 0, 2]
+        bx, by, bz = corners[f, 1, 0] - ax, corners[f, 1, 1] - ay, corners[f, 1, 2] - az
+        cx, cy, cz = corners[f, 2, 0] - ax, corners[f, 2, 1] - ay, corners[f, 2, 2] - az
+        # one division for each side, so that a sliver takes a row of points and no square of them
+        n_b = 1 + int(2 * per_metre * math.sqrt(bx * bx + by * by + bz * bz))
+        n_c = 1 + int(2 * per_metre * math.sqrt(cx * cx + cy * cy + cz * cz))
+        for i in range(n_b + 1):
+            for j in range(n_c + 1):
+                v, w = i / n_b, j / n_c
+                if v + w > 1.0 + 1e-9:
+                    continue
+                gx = (ax + v * bx + w * cx - low[0]) * per_metre
+                gy = (ay + v * by + w * cy - low[1]) * per_metre
+                gz = (az + v * bz + w * cz - low[2]) * per_metre
+                x = min(max(int(gx), 0), faces.shape[0] - 1)
+                y = min(max(int(gy), 0), faces.shape[1] - 1)
+                z = min(max(int(gz), 0), faces.shape[2] - 1)
+                away = (gx - x - 0.5) ** 2 + (gy - y - 0.5) ** 2 + (gz - z - 0.5) ** 2
+                if away < distance[x, y, z]:
+                    distance[x, y, z], faces[x, y, z] = away, numbers[f]
+
+
+@inlined
+def _face_about(grid, x, y, z):  # type: ignore[no-untyped-def]
+    """Return a face near a point, −1 where there is none at all."""
+    cells = grid.faces
+    # clamped before the conversion: a ray along a plane meets it at any distance
+    i = min(max((x - grid.low[0]) * grid.per_metre, 0.0), cells.shape[0] - 1.0)
+    j = min(max((y - grid.low[1]) * grid.per_metre, 0.0), cells.shape[1] - 1.0)
+    k = min(max((z - grid.low[2]) * grid.per_metre, 0.0), cells.shape[2] - 1.0)
+    return cells[int(i), int(j), int(k)]
+
+
+@inlined
+def plane_hit(search, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Return the multiple of a ray at which it meets the plane of a face; 0 for a ray along it."""
+    face = search[f]
+    facing = face[0] * dx + face[1] * dy + face[2] * dz
+    return (face[3] - face[0] * ox - face[1] * oy - face[2] * oz) / facing if facing != 0.0 else 0.0
+
+
+@inlined
+def find_face(search, grid, start, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Return the face of a smooth patch that a ray meets, and the multiple of the ray there; (−1, 0) if none is found.
+
+    Parameters
+    ----------
+    search : (f, 16) float32
+        ``MeshTopology.search``; all that is asked of a face stands in one row, which is a line of the cache.
+    grid : FaceGrid
+    start : int
+        A face of the patch, from which the search starts.
+    ox, oy, oz, dx, dy, dz : float
+        The ray, landmark frame.
+    """
+    f, before, looks = start, -1, 0
+    patch = search[start, 15]
+    grazing = -_GRAZING * math.sqrt(dx * dx + dy * dy + dz * dz)
+    for _ in range(_MOST_STEPS):
+        face = search[f]
+        facing = face[0] * dx + face[1] * dy + face[2] * dz
+        if facing > grazing:
+            return -1, 0.0
+        t = (face[3] - face[0] * ox - face[1] * oy - face[2] * oz) / facing
+        px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
+        v = face[4] * px + face[5] * py + face[6] * pz + face[7]
+        w = face[8] * px + face[9] * py + face[10] * pz + face[11]
+        u = 1.0 - v - w
+        least = min(u, v, w)
+        if least >= 0.0:
+            return f, t
+        if least < -_FAR and looks < _MOST_LOOKS:
+            looks += 1
+            g = _face_about(grid, px, py, pz)
+            if g >= 0 and g != f and search[g, 15] == patch:
+                before, f = -1, g
+                continue
+        # across the edge that lies opposite the corner
+        g = int(face[13 if least == u else (14 if least == v else 12)])
+        if g < 0:
+            return -1, 0.0
+        if g == before:  # on the edge between the two
+            return (f, t) if least > -_EDGE else (-1, 0.0)
+        before, f = f, g
+    return -1, 0.0
+
+
+@inlined
+def turns_smoothly(search, f, g, x, y, z):  # type: ignore[no-untyped-def]
+    """Return whether a smooth surface may run from a hit on face f to one on face g, (x, y, z) further on.
+
+    On an arc the chord makes the same angle with both normals. Where a ray met another sheet of the patch, behind the
+    one that is seen, it does not.
+    """
+    lean = (search[f, 0] + search[g, 0]) * x + (search[f, 1] + search[g, 1]) * y + (search[f, 2] + search[g, 2]) * z
+    return lean * lean <= _SMOOTH * _SMOOTH * (x * x + y * y + z * z)

@@ -1,0 +1,231 @@
+"""Samples of a strip: its curves cut every line across it into intervals, and each interval gets Gauss points.
+
+An interval lies between two neighbouring curves of the strip, or between a curve and a side of the box. Samples that
+lie in one interval see one smooth patch of the surface.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from phasemark.render.integral.limbs import nearest_limb
+from phasemark.render.integral.pixel_clipping import edge_at
+from phasemark.render.integral.quadrature_rules import FELT, place_points
+from phasemark.render.kernel import inlined, kernel
+
+EMPTY = 1e-10
+"""Pieces narrower than this (pixels) are not sampled."""
+_NARROW = 0.04
+"""Strips narrower than this (pixels) get one line."""
+_TRIFLE = 4e-5
+"""Area times squared extent (pixels⁴) under which a piece gets one line."""
+_STRIP, _LIMB_STRIP = 0.6, 0.25
+"""Largest extent (pixels) of a piece that is given one Gauss rule: in general, and where a limb runs across it."""
+_PARALLEL = 0.1
+"""A limb runs along an interval if it keeps its distance (pixels) from both ends as well as this."""
+_SHRINKS = 0.3
+"""An interval shrinks to a point at an end of a strip where it is narrower than this share of its middle."""
+
+
+class Box(NamedTuple):
+    """A part of a pixel that is swept.
+
+    Parameters
+    ----------
+    s0, s1, x0, x1 : float
+        Begin and end along the sweep, and across it.
+    sweep_v : bool
+        Whether the sweep runs along v; s is v then, and x is u.
+    curved : bool
+        Whether a limb is near.
+    bent : bool
+        Whether the inside of a curved surface may be seen, which takes more points than a flat one.
+    scale : float
+        Turns areas into weights.
+    """
+
+    s0: float
+    s1: float
+    x0: float
+    x1: float
+    sweep_v: bool
+    curved: bool
+    bent: bool
+    scale: float
+
+
+class Strip(NamedTuple):
+    """Neighbouring slabs with the same curves: how many slabs, and how many curves."""
+
+    n_slabs: int
+    k: int
+
+
+@kernel
+def sample_strip(strip, box, scratch, samples, n, region):  # type: ignore[no-untyped-def]
+    """Sample the k + 1 intervals between the k curves of a strip.
+
+    An interval's light is ∫ width(s) · mean over x of f(s, x) ds. The width is known exactly; its moments give the
+    two-point Gauss rule for it as a weight, exact wherever the mean is cubic in s, and the area always.
+    """
+    points, weights, regions = samples.points, samples.weights, samples.regions
+    start, stop = scratch.slabs[0, 0], scratch.slabs[strip.n_slabs - 1, 1]
+    for i in range(strip.k + 1):
+        a, b, left, right = _interval(0.5 * (start + stop), i, strip, box, scratch, box.curved, box.curved)
+        near_left, near_right = a - left < FELT, right - b < FELT
+        limb, width = near_left or near_right, b - a
+        a_low, b_low = _bounds(start, 0, i, strip, box, scratch)
+        a_high, b_high = _bounds(stop, strip.n_slabs - 1, i, strip, box, scratch)
+        extent = max(stop - start, abs(a_high - a_low), abs(b_high - b_low))
+        steep = False
+        if limb:
+            _, _, left_low, right_low = _interval(start, i, strip, box, scratch, near_left, near_right)
+            _, _, left_high, right_high = _interval(stop, i, strip, box, scratch, near_left, near_right)
+            for near, at_low, at_high in ((near_left, left_low, left_high), (near_right, right_low, right_high)):
+                moved = max(abs(at_high - at_low - a_high + a_low), abs(at_high - at_low - b_high + b_low))
+                steep = steep or (near and not moved < _PARALLEL)
+        pieces = math.ceil(extent / (_LIMB_STRIP if steep else _STRIP) - 1e-9)
+        low, high = (max(b_low - a_low, 0.0), max(b_high - a_high, 0.0)) if limb else (1.0, 1.0)
+        pieces += min(low, high) < _SHRINKS * width
+        before = n
+        for piece in range(pieces):
+            lo = start + (stop - start) * _cut(piece / pieces, low, width, high)
+            hi = start + (stop - start) * _cut((piece + 1) / pieces, low, width, high)
+            nodes, area, s_a, s_b, share = _gauss_rule(lo, hi, i, strip, box, scratch)
+            for g in range(nodes):
+                s = s_a if g == 0 else s_b
+                weight = area * (share if g == 0 else 1.0 - share)
+                a, b, left, right = _interval(s, i, strip, box, scratch, near_left, near_right)
+                if n + 5 > len(weights):
+                    return -1, region
+                placed = place_points(a, b, left, right, box.bent, points[n:], weights[n:])
+                for j in range(n, n + placed):
+                    weights[j] *= weight * box.scale
+                    regions[j] = region
+                    x = points[j, 0]
+                    points[j, 0] = x if box.sweep_v else s
+                    points[j, 1] = s if box.sweep_v else x
+                n += placed
+        if n > before:
+            region += 1
+    return n, region
+
+
+@inlined
+def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
+    """Return where, from 0 to 1, a strip of some widths at its ends and in its middle is cut, t of the pieces on.
+
+    Beside a limb the mean over the width grows like the root of the width. Where the interval shrinks to a point the
+    cuts gather there.
+    """
+    if low < _SHRINKS * middle and high < _SHRINKS * middle:
+        return t * t * (3.0 - 2.0 * t)
+    if low < _SHRINKS * middle:
+        return t * t
+    if high < _SHRINKS * middle:
+        return t * (2.0 - t)
+    return t
+
+
+@inlined
+def _gauss_rule(lo, hi, i, strip, box, scratch):  # type: ignore[no-untyped-def]
+    """Return the Gauss rule for the width of an interval from `lo` to `hi` as weight.
+
+    Returns
+    -------
+    nodes : int
+        0 (nothing there), 1 or 2.
+    area : float
+    s_a, s_b : float
+        Nodes.
+    share : float
+        Of the first node in the area.
+    """
+    slabs = scratch.slabs
+    origin = 0.5 * (lo + hi)
+    m0, m1, m2, m3 = 0.0, 0.0, 0.0, 0.0
+    first_a, first_b, last_a, last_b, met = 0.0, 0.0, 0.0, 0.0, False
+    for slab in range(strip.n_slabs):
+        begin, end = max(slabs[slab, 0], lo), min(slabs[slab, 1], hi)
+        if end <= begin:
+            continue
+        a, b = _bounds(begin, slab, i, strip, box, scratch)
+        last_a, last_b = _bounds(end, slab, i, strip, box, scratch)
+        if not met:
+            first_a, first_b, met = a, b, True
+        low, high = max(b - a, 0.0), max(last_b - last_a, 0.0)
+        h, d = end - begin, 0.5 * (begin + end) - origin
+        # moments of a trapezoid about its middle, then about the origin
+        c0, c1 = 0.5 * (low + high) * h, (high - low) * h * h / 12.0
+        c2, c3 = c0 * h * h / 12.0, c1 * h * h * (12.0 / 80.0)
+        m0 += c0
+        m1 += c1 + d * c0
+        m2 += c2 + d * (2.0 * c1 + d * c0)
+        m3 += c3 + d * (3.0 * c2 + d * (3.0 * c1 + d * c0))
+    if m0 <= EMPTY * (hi - lo):
+        return 0, 0.0, 0.0, 0.0, 0.0
+    mean = m1 / m0
+    variance = m2 / m0 - mean * mean
+    extent = max(hi - lo, abs(last_a - first_a), abs(last_b - first_b))
+    if extent < _NARROW or m0 * extent * extent < _TRIFLE or variance < 1e-12:
+        return 1, m0, origin + mean, 0.0, 1.0
+    skew = (m3 / m0 - mean * (3.0 * m2 / m0 - 2.0 * mean * mean)) / variance
+    root = math.sqrt(skew * skew + 4.0 * variance)
+    below, above = 0.5 * (skew - root), 0.5 * (skew + root)
+    s_a, s_b = origin + mean + below, origin + mean + above
+    return 2, m0, max(s_a, lo), min(s_b, hi), above / root
+
+
+@inlined
+def _bounds(s, slab, i, strip, box, scratch):  # type: ignore[no-untyped-def]
+    """Return the ends of interval i on the line at s, which lies in a slab."""
+    row, edges, links = slab * strip.k, scratch.edges, scratch.links
+    a = box.x0 if i == 0 else edge_at(edges, links[row + i - 1], s)
+    b = box.x1 if i == strip.k else edge_at(edges, links[row + i], s)
+    return a, b
+
+
+@inlined
+def _interval(  # type: ignore[no-untyped-def]
+    s, i, strip, box, scratch, seek_left, seek_right
+):
+    """Return the ends of interval i on the line at s, and where its surface's limbs are, ∓inf where there is none.
+
+    Limbs beyond the strip are looked for where `seek_left` and `seek_right` say so.
+    """
+    edges, slabs, links = scratch.edges, scratch.slabs, scratch.links
+    low, high = 0, strip.n_slabs - 1
+    while low < high:
+        middle = (low + high) // 2
+        if slabs[middle, 1] < s:
+            low = middle + 1
+        else:
+            high = middle
+    row = low * strip.k
+    a, b = _bounds(s, low, i, strip, box, scratch)
+    left, right = -np.inf, np.inf
+    behind_limb = False
+    for j in range(i - 1, -1, -1):
+        side = edges[links[row + j], 4]
+        if side != 0.0:
+            behind_limb = side < 0.0
+            if side > 0.0:
+                left = edge_at(edges, links[row + j], s)
+            break
+    before_limb, alone = False, True
+    for j in range(i, strip.k):
+        side = edges[links[row + j], 4]
+        if side != 0.0:
+            before_limb, alone = side > 0.0, False
+            if side < 0.0:
+                right = edge_at(edges, links[row + j], s)
+            break
+    if not behind_limb:
+        if seek_left and left == -np.inf and not before_limb:
+            left = nearest_limb(scratch, s, 1.0, a)
+        if seek_right and alone:
+            right = nearest_limb(scratch, s, -1.0, b)
+    return a, b, left, right

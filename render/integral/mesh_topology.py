@@ -1,0 +1,375 @@
+"""A mesh as the renderer needs it: planes, smooth patches, and the edges where the integrand may not be smooth.
+
+What is analysed here does not depend on the view, so it is done once per mesh: creases are edges whose faces meet at
+more than 30°, or that have one face only; folds are the other edges, which matter where they are silhouettes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from numba import njit
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.render.integral.face_search import FaceGrid
+
+CREASE_RAD = math.radians(30.0)
+CLUSTER = 32
+"""Faces that are looked at together for silhouettes."""
+_COPLANAR_RAD = 1e-7
+
+
+class MeshTopology(NamedTuple):
+    """What the renderer needs to know of a mesh, in float64 and contiguous.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float64
+        Distinct points, metres, landmark frame.
+    faces : (f, 3) int32
+    planes : (f, 4) float64
+        Unit normal and offset of each face: n · p = offset on it.
+    corner_shares : (f, 2, 4) float32
+        The barycentric coordinates of a point on a face that belong to its second and third corner: the products of
+        the rows with (x, y, z, 1).
+    corner_normals : (f, 3, 3) float32
+        Shading normal at each corner of each face; zero at an apex, where there is none.
+    flat : (f,) bool
+        Whether the three corner normals are the face's own.
+    plain : (f,) bool
+        Whether all faces of the face's smooth patch are flat, which makes the patch a plane.
+    patch : (f,) int32
+        Number of the smooth patch, faces joined without a crease between them.
+    fanned : (f,) bool
+        Whether the face's smooth patch has an apex, from which slivers fan out.
+    search : (f, 16) float32
+        What the search of a face asks: plane (4), corner shares (8), the face of the same patch beyond the edge from
+        each corner to the next (3; −1: there is none), and the patch.
+    grid : FaceGrid
+        Where the faces of fanned patches are.
+    part : (f,) int8
+        0 for the landmark's lower part, 1 for the upper one.
+    concave : (e,) bool
+        Whether a crease is the bottom of a valley; then it is seen only from before both of its faces.
+    creases : (e, 4) int32
+        Edges (start, end, face, other face); −1 where there is no other face. An edge runs along the winding of its
+        first face.
+    folds : (e, 3) int32
+        Edges of smooth regions, which matter where they are silhouettes: start, end, and the other face's place among
+        the smooth faces. Those of a first face follow one another, in the order of the smooth faces.
+    first_fold : (g + 1,) int32
+        Where the folds begin whose first face is a smooth face.
+    smooth_planes : (g, 5) float64
+        Planes of the smooth faces, those with folds, and their reach: how far the normal turns, |n − n'|, over the
+        face's folds at most. Faces near one another stand near one another; each :data:`CLUSTER` are a cluster.
+    clusters : (c, 10) float64
+        Per cluster a point, a mean normal, its offset from the point's plane, how far the faces' normals and offsets
+        differ from those at most, and the largest reach.
+    low, high : (3,) float64
+        Corners of the box around all vertices.
+    radius_m : float
+        Distance of the farthest vertex from the origin.
+    closed : bool
+        Whether every shell of the mesh is watertight and wound outward, so that what faces away is never seen.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    planes: NDArray[np.float64]
+    corner_shares: NDArray[np.float32]
+    corner_normals: NDArray[np.float32]
+    flat: NDArray[np.bool_]
+    plain: NDArray[np.bool_]
+    patch: NDArray[np.int32]
+    fanned: NDArray[np.bool_]
+    search: NDArray[np.float32]
+    grid: FaceGrid
+    part: NDArray[np.int8]
+    creases: NDArray[np.int32]
+    concave: NDArray[np.bool_]
+    folds: NDArray[np.int32]
+    first_fold: NDArray[np.int32]
+    smooth_planes: NDArray[np.float64]
+    clusters: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    radius_m: float
+    closed: bool
+
+    @classmethod
+    def from_mesh(cls, mesh: trimesh.Trimesh) -> MeshTopology:
+        """Analyse a mesh; faces without area are dropped, vertices at one point merged.
+
+        Raises
+        ------
+        UsageError
+            The mesh has no face with an area, or a vertex that is not finite.
+        """
+        raw = np.asarray(mesh.vertices, dtype=np.float64)
+        if not np.isfinite(raw).all():
+            raise UsageError("the mesh has a vertex that is not finite")
+        vertices, merged = np.unique(raw + 0.0, axis=0, return_inverse=True)
+        faces = merged.reshape(-1)[np.asarray(mesh.faces, dtype=np.int64)]
+        part = np.asarray(mesh.face_attributes.get("part", _part_by_height(raw, mesh.faces)), dtype=np.int8)
+        a, b, c = (vertices[faces[:, k]] for k in range(3)) if len(faces) else (np.zeros((0, 3)),) * 3
+        normals = np.cross(b - a, c - a)
+        length = np.linalg.norm(normals, axis=1)
+        extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
+        kept = length > 1e-14 * extent**2
+        if not kept.any():
+            raise UsageError("the mesh has no face with an area")
+        faces, part, a = faces[kept], part[kept], a[kept]
+        normals = normals[kept] / length[kept, None]
+        planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, a)])
+        edges, regular = _edges(faces)
+        first, other = edges[:, 2], edges[:, 3]
+        turn = np.where(other >= 0, _angle_between(normals[first], normals[other]), np.inf)
+        crease = ~regular | (turn > CREASE_RAD + 1e-9)
+        fold = ~crease & (turn > _COPLANAR_RAD)
+        patch = _components(len(faces), edges[~crease][:, 2:])
+        corners = _corner_normals(vertices, faces, normals, patch)
+        flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
+        # the corner of the other face off the edge lies before the first face's plane
+        off_edge = vertices[faces[other]].sum(axis=1) - vertices[edges[:, 0]] - vertices[edges[:, 1]]
+        concave = np.einsum("ij,ij->i", planes[first, :3], off_edge) > planes[first, 3]
+        plain = np.bincount(patch, ~flat)[patch] == 0
+        shares = _corner_shares(vertices[faces])
+        apex = (corners == 0).all(axis=2).any(axis=1)
+        fanned = np.bincount(patch, apex)[patch] > 0
+        fold_reach = _fold_reach(edges[fold], normals)
+        smooth_faces, clusters = _cluster_faces(vertices[faces].mean(axis=1), planes, fold_reach)
+        folds, first_fold = _folds_in_order(edges[fold], smooth_faces)
+        shell = _components(len(faces), edges[other >= 0][:, 2:])
+        six_volumes = np.bincount(
+            shell, np.einsum("ij,ij->i", a, np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
+        )
+        return cls(
+            vertices=np.ascontiguousarray(vertices),
+            faces=np.ascontiguousarray(faces, dtype=np.int32),
+            planes=np.ascontiguousarray(planes),
+            corner_shares=shares,
+            corner_normals=np.ascontiguousarray(corners, dtype=np.float32),
+            flat=np.ascontiguousarray(flat),
+            plain=plain,
+            patch=patch,
+            fanned=fanned,
+            search=np.ascontiguousarray(
+                np.column_stack([planes, shares.reshape(-1, 8), _neighbours(faces, edges[~crease]), patch]), np.float32
+            ),
+            grid=FaceGrid.of_faces(vertices[faces], fanned),
+            part=np.ascontiguousarray(part),
+            creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
+            concave=np.ascontiguousarray(concave[crease]),
+            folds=folds,
+            first_fold=first_fold,
+            smooth_planes=np.ascontiguousarray(np.column_stack([planes, fold_reach])[smooth_faces]),
+            clusters=clusters,
+            low=vertices.min(axis=0),
+            high=vertices.max(axis=0),
+            radius_m=float(np.linalg.norm(vertices, axis=1).max()),
+            closed=bool(regular.all() and (six_volumes > 0).all()),
+        )
+
+    @classmethod
+    def empty(cls) -> MeshTopology:
+        """Return a mesh of nothing."""
+        return cls(
+            vertices=np.zeros((0, 3)),
+            faces=np.zeros((0, 3), np.int32),
+            planes=np.zeros((0, 4)),
+            corner_shares=np.zeros((0, 2, 4), np.float32),
+            corner_normals=np.zeros((0, 3, 3), np.float32),
+            flat=np.zeros(0, np.bool_),
+            plain=np.zeros(0, np.bool_),
+            patch=np.zeros(0, np.int32),
+            fanned=np.zeros(0, np.bool_),
+            search=np.zeros((0, 16), np.float32),
+            grid=FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_)),
+            part=np.zeros(0, np.int8),
+            creases=np.zeros((0, 4), np.int32),
+            concave=np.zeros(0, np.bool_),
+            folds=np.zeros((0, 3), np.int32),
+            first_fold=np.zeros(1, np.int32),
+            smooth_planes=np.zeros((0, 5)),
+            clusters=np.zeros((0, 10)),
+            low=np.zeros(3),
+            high=np.zeros(3),
+            radius_m=0.0,
+            closed=True,
+        )
+
+
+def _part_by_height(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int8]:
+    """Tell the parts of an unlabelled mesh apart by the side of the interface plane their centre lies on."""
+    return np.asarray(vertices[faces].mean(axis=1)[:, 2] > 0, dtype=np.int8)
+
+
+def _angle_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return angles between unit vectors, accurate near 0 where arccos is not."""
+    return np.asarray(2 * np.arctan2(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1)))
+
+
+def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Pair the half edges of a mesh.
+
+    Returns
+    -------
+    edges : (e, 4) int64
+        Start, end, face, other face (−1: none). An edge of more than two faces is listed with the first two.
+    regular : (e,) bool
+        Whether exactly two faces meet, wound alike.
+    """
+    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    owner = np.tile(np.arange(len(faces)), 3)
+    undirected = np.sort(half, axis=1)
+    order = np.lexsort((owner, undirected[:, 1], undirected[:, 0]))
+    half, owner, undirected = half[order], owner[order], undirected[order]
+    starts = np.flatnonzero(np.concatenate([[True], (undirected[1:] != undirected[:-1]).any(axis=1)]))
+    count = np.diff(np.append(starts, len(half)))
+    second = np.minimum(starts + 1, len(half) - 1)
+    other = np.where(count > 1, owner[second], -1)
+    opposed = half[starts, 0] == half[second, 1]
+    edges = np.column_stack([half[starts], owner[starts], other])
+    return edges, (count == 2) & opposed
+
+
+def _neighbours(faces: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return the face beyond each edge of each face, (f, 3), where one of the given edges is; −1 elsewhere."""
+    table = np.full(faces.shape, -1, np.int32)
+    start, end, first, other = edges.T
+    for corner, face, beyond in ((start, first, other), (end, other, first)):  # the other face has the edge reversed
+        table[face, (faces[face] == corner[:, None]).argmax(axis=1)] = beyond
+    return table
+
+
+def _fold_reach(folds: NDArray[np.int64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far the normal turns over each face's folds at most, −1: the face has none."""
+    reach = np.full(len(normals), -1.0)
+    turn = np.linalg.norm(normals[folds[:, 2]] - normals[folds[:, 3]], axis=1)
+    for side in (2, 3):
+        np.maximum.at(reach, folds[:, side], turn)
+    return reach
+
+
+def _folds_in_order(
+    folds: NDArray[np.int64], smooth_faces: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return ``folds`` and ``first_fold`` of :class:`MeshTopology`."""
+    place = np.zeros(int(smooth_faces.max(initial=-1)) + 1, np.int64)
+    place[smooth_faces] = np.arange(len(smooth_faces))
+    first = place[folds[:, 2]]
+    order = np.argsort(first, kind="stable")
+    table = np.column_stack([folds[:, :2], place[folds[:, 3]]])[order]
+    begins = np.searchsorted(first[order], np.arange(len(smooth_faces) + 1))
+    return np.ascontiguousarray(table, np.int32), begins.astype(np.int32)
+
+
+def _cluster_faces(
+    centres: NDArray[np.float64], planes: NDArray[np.float64], fold_reach: NDArray[np.float64]
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Order the faces with folds along a Z-curve through space, and bound each cluster's planes.
+
+    See :class:`MeshTopology` for what is returned.
+    """
+    smooth = np.flatnonzero(fold_reach >= 0)
+    if not len(smooth):
+        return np.zeros(0, np.int32), np.zeros((0, 10))
+    low = centres[smooth].min(axis=0)
+    cell = np.ptp(centres[smooth], axis=0).max() / 1023 or 1.0
+    grid = ((centres[smooth] - low) / cell).astype(np.int64)
+    key = np.zeros(len(smooth), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            key |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
+    smooth = smooth[np.argsort(key, kind="stable")]
+    starts = np.arange(0, len(smooth), CLUSTER)
+    size = np.diff(np.append(starts, len(smooth)))
+    point = np.add.reduceat(centres[smooth], starts) / size[:, None]
+    normal = np.add.reduceat(planes[smooth, :3], starts) / size[:, None]
+    # offset of each face from the cluster's point
+    own = np.repeat(np.arange(len(starts)), size)
+    offset = planes[smooth, 3] - np.einsum("ij,ij->i", planes[smooth, :3], point[own])
+    mean_offset = np.add.reduceat(offset, starts) / size
+    turn = np.linalg.norm(planes[smooth, :3] - normal[own], axis=1)
+    bounds = [
+        np.maximum.reduceat(values, starts) for values in (turn, np.abs(offset - mean_offset[own]), fold_reach[smooth])
+    ]
+    return smooth.astype(np.int32), np.ascontiguousarray(np.column_stack([point, normal, mean_offset, *bounds]))
+
+
+def _components(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Give the nodes of each connected component one number."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
+
+
+def _corner_shares(corners: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return ``corner_shares`` of faces, given their corners (f, 3, 3)."""
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    d11, d12, d22 = (np.einsum("ij,ij->i", x, y) for x, y in ((first, first), (first, second), (second, second)))
+    determinant = (d11 * d22 - d12 * d12)[:, None]
+    gradient = np.stack(
+        [
+            (d22[:, None] * first - d12[:, None] * second) / determinant,
+            (d11[:, None] * second - d12[:, None] * first) / determinant,
+        ],
+        axis=1,
+    )
+    constant = -np.einsum("fkx,fx->fk", gradient, corners[:, 0])
+    return np.ascontiguousarray(np.concatenate([gradient, constant[..., None]], axis=2), dtype=np.float32)
+
+
+def _corner_normals(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    normals: NDArray[np.float64],
+    patch: NDArray[np.int32],
+) -> NDArray[np.float64]:
+    """Average, at each corner, the normals of the vertex's faces that lie within 30° of the corner's own face.
+
+    Weighted by sin α / (|a| |b|), a and b being the edges of the face at the vertex and α the angle between them
+    (N. Max, Weights for computing vertex normals from facet normals, 1999): exact where the vertex and its neighbours
+    lie on a sphere, and independent of how a quadrilateral is split whose corners lie on a circle. A vertex whose faces
+    fan out further without a crease between them is an apex, as a cone has one: no normal serves there, and the corner
+    gets none (zero), so that the other two are blended along its generatrices.
+    """
+    corner_of = np.argsort(faces.ravel(), kind="stable")
+    start = np.searchsorted(faces.ravel()[corner_of], np.arange(len(vertices) + 1))
+    return np.asarray(_average_corners(vertices, faces, normals, patch, corner_of, start, math.cos(CREASE_RAD + 1e-9)))
+
+
+@njit(cache=True)
+def _average_corners(vertices, faces, normals, patch, corner_of, start, cos_limit):  # type: ignore[no-untyped-def]
+    n_faces = len(faces)
+    weight = np.empty((n_faces, 3))
+    for f in range(n_faces):
+        for k in range(3):
+            p = vertices[faces[f, k]]
+            a = vertices[faces[f, (k + 1) % 3]] - p
+            b = vertices[faces[f, (k + 2) % 3]] - p
+            cross = np.cross(a, b)
+            weight[f, k] = math.sqrt(np.dot(cross, cross)) / (np.dot(a, a) * np.dot(b, b))
+    out = np.zeros((n_faces, 3, 3))
+    for f in range(n_faces):
+        for k in range(3):
+            vertex = faces[f, k]
+            total = np.zeros(3)
+            apex = False
+            for j in range(start[vertex], start[vertex + 1]):
+                g, corner = corner_of[j] // 3, corner_of[j] % 3
+                if np.dot(normals[f], normals[g]) >= cos_limit:
+                    total += weight[g, corner] * normals[g]
+                else:
+                    apex = apex or patch[g] == patch[f]
+            if not apex:
+                out[f, k] = total / math.sqrt(np.dot(total, total))
+        if not out[f].any():
+            out[f] = normals[f]
+    return out

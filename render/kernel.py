@@ -1,0 +1,20 @@
+"""How the loops of the renderer are compiled.
+
+A kernel borrows the arrays it is given and allocates none. numba is told so (`_nrt`), for it would count references to
+every array at every call and every use of a field of a tuple: atomic operations that took two fifths of the time, and
+more where threads share a mesh. A function that makes an array must not be a kernel: numba refuses to compile it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import njit
+
+_BORROWING: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+
+kernel = njit(**_BORROWING)
+"""Compile a function that allocates nothing; floats divide as numpy's do."""
+
+inlined = njit(**_BORROWING, inline="always")
+"""Compile a small function that is copied into its callers."""

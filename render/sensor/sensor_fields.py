@@ -1,0 +1,193 @@
+"""The fields of a sensor: their types, limits and defaults, and which belong together."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from phasemark import UsageError
+from phasemark.inputs import refuse_truth_values
+
+_LARGEST = 1e12
+"""Of any number of a sensor: the square of none overflows, and the reciprocal of none is infinite."""
+
+
+def _not_vanishing(value: float) -> float:
+    if value < 1 / _LARGEST:
+        raise ValueError(f"must be at least {1 / _LARGEST:g}")
+    return value
+
+
+_Positive = Annotated[float, Field(gt=0, le=_LARGEST, allow_inf_nan=False), AfterValidator(_not_vanishing)]
+_NonNegative = Annotated[float, Field(ge=0, le=_LARGEST, allow_inf_nan=False)]
+_Fraction = Annotated[float, Field(gt=0, le=1)]
+_HalfAngleDeg = Annotated[float, Field(gt=0, lt=85)]
+_TiltDeg = Annotated[float, Field(ge=-45, le=45)]
+_TurnDeg = Annotated[float, Field(ge=-180, le=180)]
+_MountHeight = Annotated[float, Field(ge=-10, le=10)]
+_PixelCount = Annotated[int, Field(ge=1, le=4096)]
+_Share = Annotated[float, Field(ge=0, lt=1)]
+_Finite = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST, allow_inf_nan=False)]
+_Order = Annotated[int, Field(ge=2, le=199)]
+_Pixel = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
+_Row = tuple[_Finite, ...]
+_PulseShape = tuple[_NonNegative, ...]
+
+# What an image's rays and phases depend on: cameras that agree in these see the same noise-free image.
+OPTICS = (
+    "rows",
+    "cols",
+    "half_angle_h_deg",
+    "half_angle_v_deg",
+    "centre_px",
+    "pitch_deg",
+    "roll_deg",
+    "bearing_offset_deg",
+    "height_offset_m",
+    "fill_factor",
+    "vignetting",
+    "modulation_hz",
+)
+
+# What only a camera with taps has, and what only a direct one has.
+PHASE_ONLY = (
+    "phase_interval_s",
+    "contrast",
+    "modulation",
+    "max_harmonic",
+    "harmonics",
+    "emitted_pulse",
+    "reference_pulse",
+    "signal_e",
+    "ambient_e",
+    "dark_e",
+    "shot_noise",
+    "read_noise_e",
+    "prnu",
+    "dsnu_e",
+    "full_well_e",
+    "adc_bits",
+    "gain",
+    "black_level",
+    "phase_offset_std_rad",
+    "tap_phase_offset_std_rad",
+    "blur_share",
+    "blur_px",
+    "veil_share",
+    "veil_px",
+    "hot_share",
+    "hot_pixels",
+    "hot_e",
+    "max_phase_std_rad",
+    "min_amplitude_e",
+    "wrap_guard_m",
+)
+DIRECT_ONLY = (
+    "max_range_m",
+    "min_intensity",
+    "range_std_m",
+    "range_shot_std_m",
+    "range_ambient_std_m",
+    "zone_offset_m",
+)
+
+# What a calibration leaves: it moves no image and adds no noise to a frame.
+CALIBRATION = (
+    "calibration_fields",
+    "calibration_covariance",
+    "systematic_distance_m",
+    "systematic_delta_deg",
+    "systematic_bearing_deg",
+    "systematic_height_m",
+    "systematic_time_s",
+)
+
+
+class SensorFields(BaseModel):
+    """Hold what can be stated of a camera; :class:`~phasemark.render.Sensor` documents every field."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+    kind: Literal["phase", "direct"] = "phase"
+    # geometry
+    rows: _PixelCount
+    cols: _PixelCount
+    half_angle_h_deg: _HalfAngleDeg
+    half_angle_v_deg: _HalfAngleDeg
+    principal_point_px: tuple[float, float] | None = None
+    pitch_deg: _TiltDeg = 0.0
+    roll_deg: _TiltDeg = 0.0
+    bearing_offset_deg: _TurnDeg = 0.0
+    height_offset_m: _MountHeight = 0.0
+    fill_factor: tuple[_Fraction, _Fraction] = (1.0, 1.0)
+    vignetting: bool = False
+    # modulation and timing
+    modulation_hz: _Positive = 10e6
+    frame_rate_hz: _Positive = 3.0
+    phase_interval_s: _Positive | None = None
+    delay_s: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    contrast: _Fraction = 0.5
+    modulation: Literal["sine", "square", "harmonics", "pulse"] = "sine"
+    max_harmonic: _Order = 49
+    harmonics: tuple[tuple[_Order, _Fraction, _Finite], ...] = ()
+    emitted_pulse: _PulseShape = ()
+    reference_pulse: _PulseShape = ()
+    # electrons
+    signal_e: _Positive = 35_571.0
+    ambient_e: _NonNegative = 0.0
+    dark_e: _NonNegative = 0.0
+    shot_noise: bool = True
+    read_noise_e: _NonNegative = 0.0
+    prnu: Annotated[float, Field(ge=0, le=0.3)] = 0.0
+    dsnu_e: _NonNegative = 0.0
+    # read-out
+    full_well_e: _Positive | None = None
+    adc_bits: Annotated[int, Field(ge=1, le=32)] | None = None
+    gain: _Positive = 1.0
+    black_level: _NonNegative = 0.0
+    # offsets
+    phase_offset_std_rad: Annotated[float, Field(ge=0, le=1)] = 0.0
+    tap_phase_offset_std_rad: Annotated[float, Field(ge=0, le=1)] = 0.0
+    range_offset_m: _Finite = 0.0
+    unit_seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    # stray light
+    blur_share: _Share = 0.0
+    blur_px: _Positive = 1.0
+    veil_share: _Share = 0.0
+    veil_px: _Positive = 8.0
+    # defects
+    dead_share: _Share = 0.0
+    hot_share: _Share = 0.0
+    dead_pixels: tuple[_Pixel, ...] = ()
+    hot_pixels: tuple[_Pixel, ...] = ()
+    hot_e: _NonNegative = 10_000.0
+    # validity
+    max_phase_std_rad: _Positive | None = None
+    min_amplitude_e: _NonNegative = 0.0
+    wrap_guard_m: _NonNegative = 0.0
+    # direct time of flight
+    max_range_m: _Positive | None = None
+    min_intensity: _NonNegative = 0.0
+    range_std_m: _NonNegative = 0.0
+    range_shot_std_m: _NonNegative = 0.0
+    range_ambient_std_m: _NonNegative = 0.0
+    zone_offset_m: tuple[_Row, ...] = ()
+    # what a calibration leaves
+    calibration_fields: tuple[str, ...] = ()
+    calibration_covariance: tuple[_Row, ...] = ()
+    systematic_distance_m: _NonNegative = 0.0
+    systematic_delta_deg: _NonNegative = 0.0
+    systematic_bearing_deg: _NonNegative = 0.0
+    systematic_height_m: _NonNegative = 0.0
+    systematic_time_s: _NonNegative = 0.0
+
+    def __init__(self, **data: Any) -> None:
+        refuse_truth_values(data, type(self).model_fields)
+        try:
+            super().__init__(**data)
+        except ValidationError as error:
+            first = error.errors()[0]
+            if not first["loc"]:  # a finding about several fields names them itself
+                raise UsageError(first["msg"].removeprefix("Value error, ")) from None
+            raise UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"]) from None

@@ -1,0 +1,173 @@
+"""What follows from the fields of a sensor: rays, timing, harmonics, saturation and the scale of ranges."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.render.sensor.correlation import Harmonic, pulse_harmonics, square_harmonics
+from phasemark.render.sensor.sensor_fields import SensorFields
+
+SPEED_OF_LIGHT_M_S = 299_792_458.0
+
+
+class SensorQuantities(SensorFields):
+    """Derive geometry and electrical quantities from the fields."""
+
+    @property
+    def tan_half_angles(self) -> tuple[float, float]:
+        """Tangents of the horizontal and vertical half angle."""
+        return math.tan(math.radians(self.half_angle_h_deg)), math.tan(math.radians(self.half_angle_v_deg))
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """Where the optical axis meets the image, (u0, v0) in pixels."""
+        return self.principal_point_px or (self.cols / 2, self.rows / 2)
+
+    @property
+    def upper_rows(self) -> tuple[int, int]:
+        """First and stop of the image rows above the middle line, which see the upper part of a landmark."""
+        return 0, self.rows // 2
+
+    @property
+    def lower_rows(self) -> tuple[int, int]:
+        """First and stop of the image rows below the middle line; of an odd number the middle row is among them."""
+        return self.rows // 2, self.rows
+
+    @property
+    def cam2level(self) -> NDArray[np.float64]:
+        """Rotation Ry(pitch) · Rx(roll) from the tilted camera to the level one, (3, 3)."""
+        pitch, roll = math.radians(self.pitch_deg), math.radians(self.roll_deg)
+        ry = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]])
+        rx = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
+        return np.asarray(ry @ rx)
+
+    @property
+    def zone_offsets(self) -> NDArray[np.float64]:
+        """Offsets of the pixels beside `range_offset_m`, (rows, cols) metres; zero where none are stated."""
+        table = self.zone_offset_m or ((0.0,) * self.cols,) * self.rows
+        return np.array(table, dtype=np.float64)
+
+    @property
+    def calibration_matrix(self) -> NDArray[np.float64]:
+        """Covariance of `calibration_fields` in their units, (p, p); (0, 0) without a calibration."""
+        p = len(self.calibration_fields)
+        return np.array(self.calibration_covariance, dtype=np.float64).reshape(p, p)
+
+    @property
+    def quantity(self) -> Literal["range", "z"]:
+        """What the camera itself reports: range along the ray, or the distance z along the optical axis."""
+        return "z" if self.kind == "direct" else "range"
+
+    @property
+    def correlation_harmonics(self) -> tuple[Harmonic, ...]:
+        """The orders k > 1 of the correlation with their a_k and θ_k, in rising order; empty for a sine."""
+        if self.modulation == "square":
+            return square_harmonics(self.max_harmonic)
+        if self.modulation == "pulse":
+            return pulse_harmonics(self.emitted_pulse, self.reference_pulse, self.max_harmonic)
+        return tuple(Harmonic(*entry) for entry in sorted(self.harmonics))
+
+    @property
+    def harmonic_orders(self) -> tuple[int, ...]:
+        """Which S_k, k > 1, the taps need beside S_1; a Renderer for this sensor renders them unless told otherwise."""
+        return tuple(k for k, _, _ in self.correlation_harmonics)
+
+    @property
+    def phase_image_interval_s(self) -> float:
+        """Time from one phase image to the next: `phase_interval_s`, or 1 / (4 · frame rate)."""
+        return self.phase_interval_s or 1 / (4 * self.frame_rate_hz)
+
+    @property
+    def code_e(self) -> float:
+        """Electrons per code q, 0 without a converter."""
+        return 0.0 if self.adc_bits is None else 1 / self.gain
+
+    @property
+    def saturation_e(self) -> float:
+        """Electrons at which a tap saturates: full well or the converter's highest code, whichever comes first."""
+        well = math.inf if self.full_well_e is None else self.full_well_e
+        top = math.inf if self.adc_bits is None else (2**self.adc_bits - 1 - self.black_level) / self.gain
+        return min(well, top)
+
+    @property
+    def read_variance_e2(self) -> float:
+        """Variance that reading adds to one phase image's N_a − N_b, 2σ_r² + q²/6 (PHYSICS section 4), e-²."""
+        return 2 * self.read_noise_e**2 + self.code_e**2 / 6
+
+    @property
+    def metres_per_radian(self) -> float:
+        """Range per radian of phase, c / 4πf."""
+        return SPEED_OF_LIGHT_M_S / (4 * math.pi * self.modulation_hz)
+
+    @property
+    def unambiguous_range_m(self) -> float:
+        """Range at which the phase wraps, c / 2f."""
+        return SPEED_OF_LIGHT_M_S / (2 * self.modulation_hz)
+
+    def describe_beyond_range(self, name: str, distance_m: float) -> str | None:
+        """Return a sentence on what the sensor shows of something too far away, or None if it is near enough.
+
+        Parameters
+        ----------
+        name : str
+            What has this distance, for the sentence.
+        distance_m : float
+
+        Returns
+        -------
+        str or None
+            Ranges wrap at c / 2f; a direct sensor reports nothing from beyond `max_range_m`.
+
+        Examples
+        --------
+        >>> from phasemark.render import preset
+        >>> preset("pmd-16x16").describe_beyond_range("the wall", 20.0)
+        'the wall at 20 m is beyond c / 2f = 14.99 m, where ranges wrap: it shows at about 5.01 m'
+        """
+        if not math.isfinite(distance_m):
+            return None
+        if self.kind == "direct" and self.max_range_m is not None:
+            if distance_m <= self.max_range_m:
+                return None
+            limit = f"the sensor's 'max_range_m' = {self.max_range_m:.4g} m"
+            return f"{name} at {distance_m:g} m is beyond {limit}: the sensor reports nothing from there"
+        period_m = self.unambiguous_range_m
+        if distance_m < period_m:
+            return None
+        shown = f"it shows at about {distance_m % period_m:.3g} m"
+        return f"{name} at {distance_m:g} m is beyond c / 2f = {period_m:.4g} m, where ranges wrap: {shown}"
+
+    def ray_directions(self, u: NDArray[np.float64] | float, v: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return unit ray directions of image points, level camera frame (PHYSICS section 2).
+
+        Parameters
+        ----------
+        u, v : float or ndarray
+            Image coordinates, pixels; they broadcast against each other.
+
+        Returns
+        -------
+        ndarray, shape (..., 3)
+        """
+        tan_h, tan_v = self.tan_half_angles
+        u0, v0 = self.centre_px
+        y = 2 * tan_h * (u0 - np.asarray(u, float)) / self.cols
+        z = 2 * tan_v * (v0 - np.asarray(v, float)) / self.rows
+        d = np.stack(np.broadcast_arrays(1.0, y, z), axis=-1) @ self.cam2level.T
+        return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
+
+    def pixel_directions(self) -> NDArray[np.float64]:
+        """Return unit ray directions of all pixel centres, level camera frame, (rows, cols, 3)."""
+        v, u = np.mgrid[: self.rows, : self.cols] + 0.5
+        return self.ray_directions(u, v)
+
+    def axis_cosine(self) -> NDArray[np.float64]:
+        """Return the cosine between each pixel's ray and the camera's own optical axis, (rows, cols).
+
+        z = range · cosine. Tilting the camera turns both, so mounting does not enter.
+        """
+        return np.asarray(self.pixel_directions() @ self.cam2level[:, 0])
