@@ -3,6 +3,7 @@
 A kernel borrows the arrays it is given and allocates none. numba is told so (`_nrt`), for it would count references to
 every array at every call and every use of a field of a tuple: atomic operations that took two fifths of the time, and
 more where threads share a mesh. A function that makes an array must not be a kernel: numba refuses to compile it.
+The option is not documented by numba; a version without it compiles the same functions, slower.
 """
 
 from __future__ import annotations
@@ -10,8 +11,11 @@ from __future__ import annotations
 from typing import Any
 
 from numba import njit
+from numba.core.cpu import CPUTargetOptions
 
-_BORROWING: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+_BORROWING: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+if hasattr(CPUTargetOptions, "_nrt"):
+    _BORROWING["_nrt"] = False
 
 kernel = njit(**_BORROWING)
 """Compile a function that allocates nothing; floats divide as numpy's do."""
