@@ -18,11 +18,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.calibration import KnownPoses, Mounting, filter_poses
 from phasemark.matcher.calibration.mounting_fit import Fit
 from phasemark.matcher.calibration.mounting_model import NAMES, SCALE, STEP, CalibrationModel
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
+from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import Frames, Renderer, Views, capture, preset
 
 SENSOR = preset("pmd-16x16")

@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from phasemark.data import Bank
-from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match
+from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Background, Renderer, background_image, phasor_to_range_m, predicted_range_std
 from phasemark.render.figures import draw_difference, draw_range
 from phasemark.render.phasor_images import wrap_difference_m

@@ -19,10 +19,10 @@ from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
 from phasemark.render.integral.arguments import Camera, Edges, Light, Poses, Samples, Sums
-from phasemark.render.integral.footprint import Scratch
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.light import add_background, sum_samples
 from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.integral.pixel_splitting import Scratch
 from phasemark.render.integral.ray_plan import UNTRUSTED, plan_rays
 from phasemark.render.integral.shells import unite_shells
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces

@@ -12,8 +12,8 @@ from thin_landmarks import PRESETS, SETTINGS, WALL, bank_of, box, count, meshes
 from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.matcher.agreement import DISAGREEMENT, counts, disagrees
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts, disagrees
 from phasemark.render import Background, Frames, Renderer, Views, capture, preset
 
 DIRECT = preset("vl53l5cx-8x8")

@@ -9,7 +9,7 @@ import typer
 
 import phasemark
 from phasemark.cli import app
-from phasemark.data.commands.flags import FLAGS, PHRASES, in_flags
+from phasemark.data.commands.flag_wording import FLAGS, PHRASES, in_flags
 
 ROOT = Path(phasemark.__file__).parent
 ROOMS = ("inputs", "landmarks", "render", "data", "matcher")

@@ -10,11 +10,11 @@ from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Match, Matcher, Matches, kalman_filter
-from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.figures import match_figure, model_range_m
 from phasemark.matcher.filters import PixelState, noise_free
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.matcher.nearest.templates import Observation, Templates
+from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import Background, Frames, PhasorImages, Renderer, capture, preset
 
 SENSOR = preset("pmd-16x16")

@@ -14,8 +14,8 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.inputs.toml_file import toml_value
 from phasemark.matcher import kalman_filter
-from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import assumed_std_m
+from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import (
     Background,
     Flag,

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from phasemark import UsageError
-from phasemark.matcher.agreement import pixel_mask
 from phasemark.matcher.information import covariance_of, weak_direction
+from phasemark.matcher.pixel_agreement import pixel_mask
 from phasemark.matcher.statistics import (
     binomial_interval,
     error_statistics,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from phasemark.data.commands.flags import in_flags
+from phasemark.data.commands.flag_wording import in_flags
 
 if TYPE_CHECKING:
     from rich.progress import Progress

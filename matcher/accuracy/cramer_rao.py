@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from phasemark import UsageError
-from phasemark.matcher.agreement import counts, pixel_mask
 from phasemark.matcher.information import covariance_of, eliminated
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.residuals import ResidualKind
@@ -26,6 +25,7 @@ from phasemark.matcher.likelihood.systematic import (
     check_systematic,
     declared_covariance,
 )
+from phasemark.matcher.pixel_agreement import counts, pixel_mask
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, predicted_range_std
 from phasemark.render.sensor.range_noise import phase_image_variance
 

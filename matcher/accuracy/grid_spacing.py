@@ -19,12 +19,12 @@ from phasemark.data import Bank
 from phasemark.data.bank.build_bank import BankJob
 from phasemark.data.seeds import stream
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
-from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import noise_free
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.nearest.grid import closing_period
+from phasemark.matcher.pixel_agreement import counts
 from phasemark.matcher.statistics import error_statistics, view_errors
 from phasemark.render import PhasorImages, Renderer, Views
 from phasemark.render.sensor.range_noise import phase_image_variance

@@ -19,7 +19,6 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.data.progress import Progress, counter
-from phasemark.matcher.agreement import MIN_RETURNS
 from phasemark.matcher.calibration.judgement import doubts_about, likely_cause
 from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
 from phasemark.matcher.calibration.mounting_fit import Fit, Knowledge, Place
@@ -40,6 +39,7 @@ from phasemark.matcher.filters.filtered_frames import (
 from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
+from phasemark.matcher.pixel_agreement import MIN_RETURNS
 from phasemark.render import Background, Frames, Sensor
 from phasemark.render.phasor_images import wrap_difference_m, wrap_range_m
 from phasemark.render.sensor.sensor_file import rounded

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phasemark.matcher.agreement import DISAGREEMENT, one_frame_limit_m
 from phasemark.matcher.calibration.mounting_model import (
     ALL_NAMES,
     LONGEST_STEP,
@@ -35,6 +34,7 @@ from phasemark.matcher.calibration.mounting_model import (
 from phasemark.matcher.calibration.registration import OUTLINE, register
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, one_frame_limit_m
 from phasemark.render import predicted_range_std
 
 _CLEAR = 1.5

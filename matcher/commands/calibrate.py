@@ -15,7 +15,7 @@ import typer
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
-from phasemark.data.commands.flags import in_flags
+from phasemark.data.commands.flag_wording import in_flags
 from phasemark.data.commands.inputs import background_of, class_mesh, note_too_far, open_any_bank, read_sensor
 from phasemark.data.commands.options import (
     Floor,

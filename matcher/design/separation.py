@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from phasemark.landmarks import LandmarkSpec, build_mesh
 from phasemark.landmarks.spec import Box, Upper
-from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.position_bound import SEARCH_TOLERANCE_M, box_alone
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts
 from phasemark.render import Renderer, Sensor, Views, phasor_to_range_m, predicted_range_std
 from phasemark.render.phasor_images import wrap_difference_m
 

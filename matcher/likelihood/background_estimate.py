@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.nearest.templates import Observation
+from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Background, Sensor
 
 CLEARLY_BEHIND_M = 0.4

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.agreement import DISAGREEMENT
+from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
 
 

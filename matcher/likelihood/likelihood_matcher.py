@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
-from phasemark.matcher.agreement import DISAGREEMENT, counts, pixel_mask
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.likelihood.acceptance import rank
 from phasemark.matcher.likelihood.auto_background import AutoBackground
 from phasemark.matcher.likelihood.background_estimate import NEAREST_WALL_M
 from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.ranking import rank
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.likelihood.search import search_views
@@ -32,6 +31,7 @@ from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import Match
 from phasemark.matcher.nearest.bank_minima import Search
 from phasemark.matcher.nearest.templates import Observation
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts, pixel_mask
 from phasemark.render import Background, PhasorImages, background_image
 from phasemark.render.phasor_images import wrap_difference_m
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.agreement import MUST_RETURN_COVERAGE, counts
 from phasemark.matcher.information import NATURAL_UNITS
 from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
+from phasemark.matcher.pixel_agreement import MUST_RETURN_COVERAGE, counts
 
 ALBEDO = "albedo"
 """Name of the factor on the landmark's brightness, profiled out on phasors."""

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels
 from phasemark.matcher.likelihood.descent import descend
@@ -26,6 +25,7 @@ from phasemark.matcher.likelihood.uncertainty import (
     std_without_one_pixel,
     view_covariance,
 )
+from phasemark.matcher.pixel_agreement import DISAGREEMENT
 
 
 def refine(

@@ -16,9 +16,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.agreement import DISAGREEMENT, one_frame_limit_m
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.nearest.templates import Observation
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, one_frame_limit_m
 from phasemark.render import Sensor
 from phasemark.render.sensor.range_noise import phase_image_variance
 
@@ -138,7 +138,7 @@ def gauss_newton_sums(
         Which frame each model is held against.
     use : (m, pixels) bool
         Which pixels count. On ranges, one of them that returns where the model has no light costs
-        :data:`~phasemark.matcher.agreement.DISAGREEMENT`.
+        :data:`~phasemark.matcher.pixel_agreement.DISAGREEMENT`.
     huber : float, optional
         Residual, in σ, from which the loss grows linearly, until it costs what one costs that nothing explains; from
         there it stays, and the pixel no longer counts. None: squares throughout.

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, fields
 
 from phasemark import UsageError
-from phasemark.matcher.agreement import MIN_RETURNS
+from phasemark.matcher.pixel_agreement import MIN_RETURNS
 
 __all__ = ["DEFAULT_POLICY", "SearchPolicy"]
 

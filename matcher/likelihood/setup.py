@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.landmarks.symmetry import mesh_symmetry
-from phasemark.matcher.agreement import counts
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.problem import Settings
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import SearchPolicy
 from phasemark.matcher.nearest.bank_minima import Search
+from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Background, PhasorImages
 
 __all__ = ["Scene", "Setup", "Shapes", "check_free"]

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.stamps import spread_stamps
 from phasemark.matcher.information import covariance_of
+from phasemark.matcher.likelihood.acceptance import is_determined
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.ranking import is_determined
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Setup
@@ -27,6 +26,7 @@ from phasemark.matcher.likelihood.systematic import (
     rates_of_views,
 )
 from phasemark.matcher.match import Match
+from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Sensor, Views
 from phasemark.render.view import delta_period_rad
 

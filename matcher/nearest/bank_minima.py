@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
 from phasemark.data.plans.arrays import group_rows
-from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Observation, Templates
+from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import PhasorImages
 from phasemark.render.view import wrap_delta_difference_rad
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
-from phasemark.matcher.agreement import DISAGREEMENT, MIN_RETURNS
 from phasemark.matcher.chi_squared import p_values_of
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Candidate, Match, Reason
 from phasemark.matcher.nearest.search import nearest_search
 from phasemark.matcher.nearest.templates import Observation, Templates
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS
 from phasemark.render import Background, background_image
 from phasemark.render.phasor_images import wrap_difference_m
 

@@ -15,10 +15,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.nearest.bank_minima import modes
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Observation, Templates
+from phasemark.matcher.pixel_agreement import DISAGREEMENT
 
 _THIN_M, _THIN_RAD = 0.06, math.radians(6)
 """Spacing of the thinned grid: finer than the valleys are wide."""

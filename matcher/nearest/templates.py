@@ -25,8 +25,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from phasemark.matcher.agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, disagrees
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState, assumed_std_m
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, disagrees
 from phasemark.render import PhasorImages, Sensor, phasor_to_range_m, predicted_range_std
 from phasemark.render.phasor_images import wrap_difference_m
 

@@ -30,13 +30,13 @@ from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
-from phasemark.matcher.agreement import counts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, noise_free, phasor_mean
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
+from phasemark.matcher.pixel_agreement import counts
 from phasemark.matcher.sweep.plan import Method, SweepPlan
 from phasemark.render import Background, Frames, PhasorImages, Renderer, Sensor, Views, capture
 

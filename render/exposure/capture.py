@@ -2,13 +2,13 @@
 
 The chain is a row of functions in the order in which the camera does things::
 
-    spread_light          stray light, on intensity and every S_k           stray.py
-    tap_means             offsets, harmonics, contrast, ambient light       taps.py, unit.py
-    collect               PRNU, dark current, DSNU, dead and hot pixels     taps.py, unit.py
-    draw_arrived          Poisson                                           electrons.py
-    fill_well             clip at full well, flagged                        electrons.py
-    add_read_noise        Gaussian                                          electrons.py
-    convert, decode       gain, black level, round, clip; nominal inverse   electrons.py
+    spread_light          stray light, on intensity and every S_k           stray_light.py
+    tap_means             offsets, harmonics, contrast, ambient light       taps.py, camera_unit.py
+    collect               PRNU, dark current, DSNU, dead and hot pixels     taps.py, camera_unit.py
+    draw_arrived          Poisson                                           photoelectrons.py
+    fill_well             clip at full well, flagged                        photoelectrons.py
+    add_read_noise        Gaussian                                          photoelectrons.py
+    convert, decode       gain, black level, round, clip; nominal inverse   photoelectrons.py
     demodulate            phasor and intensity of the four phase images     taps.py
     validity_flags        why a pixel is not valid                          here
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from phasemark.render.integral.edges_in_pixels import edge_at
 from phasemark.render.integral.limbs import nearest_limb
-from phasemark.render.integral.pixel_clipping import edge_at
 from phasemark.render.integral.quadrature_rules import FELT, place_points
 from phasemark.render.kernel import inlined, kernel
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from phasemark.render.background import background_edge
 from phasemark.render.integral.edge_projection import project_edges
-from phasemark.render.integral.footprint import sample_pixel
-from phasemark.render.integral.pixel_clipping import bin_segments
+from phasemark.render.integral.edges_in_pixels import bin_segments
+from phasemark.render.integral.pixel_splitting import sample_pixel
 from phasemark.render.kernel import kernel
 
 SKIPPED = 0

@@ -6,8 +6,8 @@ line across it meets them in the same order.
 
 from __future__ import annotations
 
+from phasemark.render.integral.edges_in_pixels import MAX_SEGMENTS, edge_at
 from phasemark.render.integral.intervals import EMPTY, Strip, sample_strip
-from phasemark.render.integral.pixel_clipping import MAX_SEGMENTS, edge_at
 from phasemark.render.kernel import inlined, kernel
 
 MAX_EVENTS = 4 * MAX_SEGMENTS + 64

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.render.integral.edges_in_pixels import MAX_SEGMENTS, clip, clip_to_box
 from phasemark.render.integral.intervals import Box
 from phasemark.render.integral.limbs import MAX_LIMBS, collect_limbs, lists_limb
-from phasemark.render.integral.pixel_clipping import MAX_SEGMENTS, clip, clip_to_box
 from phasemark.render.integral.quadrature_rules import G2X, G3W, G3X
 from phasemark.render.integral.strips import MAX_EVENTS, MAX_LINKS, MAX_SLABS, find_events, sweep_box
 from phasemark.render.kernel import kernel

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from phasemark.matcher.agreement import DISAGREEMENT
 from phasemark.matcher.chi_squared import p_values_of
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.information import weak_direction
@@ -17,6 +16,7 @@ from phasemark.matcher.likelihood.fits import Fits, distinct
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.setup import Setup
 from phasemark.matcher.match import Candidate, Match, Reason
+from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import Background
 from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
 
