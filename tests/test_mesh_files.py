@@ -194,7 +194,7 @@ def _damaged(content, rng):
 
 
 @pytest.mark.parametrize("kind", list(CONTENT))
-@pytest.mark.filterwarnings("ignore::phasemark.landmarks.MeshWarning")
+@pytest.mark.filterwarnings("ignore::phasemark.landmarks.mesh_files.MeshWarning")
 def test_damage_anywhere_is_one_line_or_leaves_a_mesh_that_can_be_rendered(kind):
     rng = np.random.default_rng(2005)
     refusals = []

@@ -92,7 +92,9 @@ def test_a_mesh_whose_path_holds_nul_is_refused_in_one_line(answer, kind, symmet
 
 
 def test_a_build_beyond_the_limits_is_refused_before_its_size_is_noted(answer, monkeypatch):
-    monkeypatch.setattr("phasemark.data.estimate_build", lambda *_, **__: pytest.fail("timed what cannot be built"))
+    monkeypatch.setattr(
+        "phasemark.data.partial_outputs.estimate_build", lambda *_, **__: pytest.fail("timed what cannot be built")
+    )
     Path("many.toml").write_text('views = 6000000\nclasses = ["cone"]\n', encoding="utf-8")
     grid = ("--class", "cone", "--distance", "1:10:0.001", "--delta", "0:89.99:0.01")
     for command, what in (

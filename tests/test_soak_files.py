@@ -147,7 +147,7 @@ def test_two_builders_on_one_output_end_with_one_winner(tmp_path):
         assert not partial_path(path).exists()
 
 
-@pytest.mark.filterwarnings("ignore::phasemark.landmarks.MeshWarning")
+@pytest.mark.filterwarnings("ignore::phasemark.landmarks.mesh_files.MeshWarning")
 def test_six_thousand_mutated_meshes_are_a_valid_mesh_or_one_error(tmp_path):
     rng = np.random.default_rng(9)
     mesh = build_mesh(catalog()["post"])

@@ -67,7 +67,7 @@ def build_bank(
 
     The same plan gives the same bytes, whatever the number of workers. Memory does not grow with the bank. A run that
     was ended early leaves ``FILE.partial`` and ``FILE.manifest`` beside the file if anything was finished. Its size has
-    no limit here: :func:`phasemark.data.planned_size` says beforehand how large it gets.
+    no limit here: :func:`phasemark.data.plans.planned_size` says beforehand how large it gets.
 
     Parameters
     ----------

@@ -69,7 +69,7 @@ def export_frames(
         The format is unknown or cannot hold the quantity, what it needs is not installed, or the file is the frame
         set itself.
     OutputExistsError, StorageError
-        As :func:`phasemark.data.write_atomically`.
+        As :func:`phasemark.data.files.write_atomically`.
     """
     if to not in EXPORTS:
         raise UsageError(f"to=… must be one of {', '.join(EXPORTS)}, got '{to}'")

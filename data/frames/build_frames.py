@@ -45,7 +45,7 @@ def build_frames(
 ) -> FrameSet:
     """Render and capture a frame set and write it with its checksum.
 
-    Its size has no limit here: :func:`phasemark.data.planned_size` says beforehand how large it gets.
+    Its size has no limit here: :func:`phasemark.data.plans.planned_size` says beforehand how large it gets.
 
     The same plan gives the same bytes, whatever the number of workers or the size of shards. Memory does not grow with
     the frames. A run that was ended early leaves ``FILE.partial`` and ``FILE.manifest`` if anything was finished.

@@ -308,7 +308,7 @@ def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool 
     Raises
     ------
     OutputExistsError, StorageError
-        As :func:`phasemark.data.write_atomically`.
+        As :func:`phasemark.data.files.write_atomically`.
     """
     arrays: dict[str, Any] = {"range": frames.range_m, "valid": frames.valid, "flags": frames.flags}
     for name, values in (("amplitude", frames.amplitude_e), ("intensity", frames.intensity_e)):

@@ -148,7 +148,7 @@ def write_recording(
     UsageError
         The suffix is none of these.
     OutputExistsError, StorageError
-        As :func:`~phasemark.data.write_atomically`.
+        As :func:`~phasemark.data.files.write_atomically`.
     """
     path = Path(path)
     suffix = recording_format(path)

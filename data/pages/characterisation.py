@@ -67,7 +67,7 @@ def write_characterisation(
     Raises
     ------
     OutputExistsError, StorageError
-        As in :func:`phasemark.data.write_atomically`.
+        As in :func:`phasemark.data.files.write_atomically`.
     """
     from phasemark.render.bench.figures import characterisation_figures
 

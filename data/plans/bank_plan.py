@@ -250,7 +250,7 @@ class BankPlan(ScenePlan):
     sensor_overrides : mapping
         Fields of the sensor that replace those of `sensor`.
     distance_m, delta_deg : str, number or sequence of numbers
-        Grids as :func:`phasemark.data.parse_grid` reads them. A last δ that repeats the first by the landmarks'
+        Grids as :func:`phasemark.data.plans.parse_grid` reads them. A last δ that repeats the first by the landmarks'
         common symmetry is dropped. Default: 0.7 m to 2.1 m in steps of 1 cm, and one period in steps of 1°.
     model : {"ray", "hard", "planar"}
         The exact integral; the centre ray of each pixel alone, so that nothing is mixed; or the paper's own

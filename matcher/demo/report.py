@@ -39,7 +39,7 @@ def write_demo(result: DemoResult, folder: Path, *, force: bool = False) -> Path
     Raises
     ------
     OutputExistsError, StorageError
-        As in :func:`phasemark.data.write_atomically`.
+        As in :func:`phasemark.data.files.write_atomically`.
     """
     write_atomically(folder / "cells.csv", cells_csv(result.cells).encode(), force=force)
     write_atomically(folder / "trials.csv", trials_csv(result.cells).encode(), force=force)

@@ -69,7 +69,7 @@ def capture(
     Parameters
     ----------
     image : PhasorImages, or four of them
-        n views; or what a moving camera sees during each phase image, from :func:`~phasemark.render.render_moving`.
+        n views; or what a moving camera sees during each phase image, from :func:`~phasemark.render.exposure.render_moving`.
     sensor : Sensor
         The camera; it may differ from the one the image was rendered for in electrons, noise and validity, not in
         geometry or modulation.
@@ -179,7 +179,7 @@ def capture_moving(
     rng, n_frames, keep_taps, workers
         As in :func:`capture`; each of the frames starts from the same views.
     background : Background, optional
-        As seen at mid-frame; see :func:`~phasemark.render.render_moving`.
+        As seen at mid-frame; see :func:`~phasemark.render.exposure.render_moving`.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def capture_moving(
     Raises
     ------
     UsageError
-        As :func:`capture` and :func:`~phasemark.render.render_moving`; or sensor and renderer time phase images
+        As :func:`capture` and :func:`~phasemark.render.exposure.render_moving`; or sensor and renderer time phase images
         differently.
     """
     if renderer.sensor.phase_image_interval_s != sensor.phase_image_interval_s:
