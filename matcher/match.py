@@ -16,6 +16,8 @@ from phasemark.render.integral.rounding import with_error
 
 Reason = Literal["", "no landmark", "poor fit", "undetermined", "ambiguous"]
 """Why an answer is refused; empty if it is accepted."""
+TOLERANCE_M, TOLERANCE_RAD = 0.03, math.radians(6.0)
+"""How far off an accepted answer may be, unless the matcher is told."""
 
 
 @dataclass(frozen=True)

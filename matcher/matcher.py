@@ -12,15 +12,13 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import (
     BEARING_STD_RAD,
-    TOLERANCE_M,
-    TOLERANCE_RAD,
     LikelihoodMatcher,
     Pixels,
 )
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.likelihood.systematic import SYSTEMATICS, check_systematic
-from phasemark.matcher.match import Match, Matches
+from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.render import Background
 
@@ -69,9 +67,10 @@ class Matcher:
         of the frames' sensor leaves, what the sensor declares of a pose, and what the jitter of its stamps makes of
         the camera's motion. All unless stated.
     tolerance_m, tolerance_rad : float
-        How far off an accepted answer of "refine" may be. It is refused as "undetermined" where three standard
-        deviations of a free length or angle exceed this, and as "ambiguous" where other classes keep a probability of
-        more than 0.001, or where a view farther away than this costs less than one contradicted pixel more.
+        How far off an accepted answer may be. An answer of "refine" is refused as "undetermined" where three standard
+        deviations of a free length or angle exceed this. An answer is refused as "ambiguous" where other classes keep
+        a probability of more than 0.001 ("refine"), or where a view farther away than this costs less than one
+        contradicted pixel more, or would be accepted itself ("nearest").
     workers : int, optional
         Threads that render (None: one for each processor), where "refine" renders; the answer does not depend on it.
     policy : SearchPolicy
@@ -154,7 +153,13 @@ class Matcher:
             raise UsageError(
                 "'free', 'on', 'pixels', 'robust' and an automatic background belong to method 'refine', not 'nearest'"
             )
-        self._method = NearestMatcher(bank, background=background, false_alarm=false_alarm)
+        self._method = NearestMatcher(
+            bank,
+            background=background,
+            false_alarm=false_alarm,
+            tolerance_m=tolerance_m,
+            tolerance_rad=tolerance_rad,
+        )
 
     def match(self, frames: FilteredFrames) -> Matches:
         """Match a batch of filtered frames.

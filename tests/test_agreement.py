@@ -101,6 +101,14 @@ def test_a_plate_is_not_taken_for_its_back_where_the_search_stopped_beside_its_f
     assert set(matches.reason) <= {"ambiguous", "undetermined"}
 
 
+def test_the_nearest_image_is_ambiguous_where_another_one_explains_a_frame_as_well(thin_bank):
+    # near the camera a face of the bracket's plate, its back and a face of its arm look alike
+    found = count(thin_bank("bracket", "pmd-16x16"), "nearest", 60, 1, np.random.default_rng([3, 7]))
+    assert found.wrong_accepted == 0
+    assert found.right_accepted >= 40
+    assert "ambiguous" in {match.reason for match in found.answers}
+
+
 def test_a_bearing_that_nothing_tells_is_undetermined(thin_bank):
     # the panel fills the 16 × 16 camera's view: its heading is known, but not where along it the camera looks
     found = count(thin_bank("panel", "pmd-16x16"), "bearing", 8, 10, np.random.default_rng(6))

@@ -28,20 +28,18 @@ from phasemark.matcher.likelihood.setup import Scene, Setup, Shapes, check_free
 from phasemark.matcher.likelihood.shared_errors import with_motion, with_shared_errors
 from phasemark.matcher.likelihood.systematic import Systematic
 from phasemark.matcher.likelihood.unknown_things import fit_without_borders
-from phasemark.matcher.match import Match
+from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
 from phasemark.matcher.nearest.bank_minima import Search
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts, pixel_mask
 from phasemark.render import Background, PhasorImages, background_image
 from phasemark.render.phasor_images import wrap_difference_m
 
-__all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TOLERANCE_M", "TOLERANCE_RAD", "LikelihoodMatcher", "Pixels"]
+__all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "LikelihoodMatcher", "Pixels"]
 
 Pixels = Literal["all", "lower"]
 ROBUST_FROM = 3.0
 """Residual, in σ, from which Huber's loss is linear: far enough out to cost an honest frame nothing."""
-TOLERANCE_M, TOLERANCE_RAD = 0.03, math.radians(6.0)
-"""An accepted answer is right to within these at three standard deviations."""
 BEARING_STD_RAD = math.radians(1.5)
 """Standard deviation of the bearing before a frame is seen, unless the matcher is told."""
 

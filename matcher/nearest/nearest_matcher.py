@@ -14,16 +14,20 @@ from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
 from phasemark.matcher.chi_squared import p_values_of
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
-from phasemark.matcher.match import Candidate, Match, Reason
+from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Candidate, Match, Reason
 from phasemark.matcher.nearest.search import nearest_search
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS
 from phasemark.render import Background, background_image
 from phasemark.render.phasor_images import wrap_difference_m
+from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
 
 __all__ = ["NearestMatcher"]
 
 _FRAMES_AT_ONCE = 128
+_WORTH_A_LOOK = 4.0
+"""Ratio of costs on the grid up to which another minimum may, between grid points, explain a frame as well."""
+_Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +53,17 @@ class NearestMatcher:
         Finds the nearest of them.
     """
 
-    def __init__(self, bank: Bank, *, background: Background | None = None, false_alarm: float = 0.01) -> None:
+    def __init__(
+        self,
+        bank: Bank,
+        *,
+        background: Background | None = None,
+        false_alarm: float = 0.01,
+        tolerance_m: float = TOLERANCE_M,
+        tolerance_rad: float = TOLERANCE_RAD,
+    ) -> None:
         self._bank = bank
+        self._tolerance_m, self._tolerance_rad = tolerance_m, tolerance_rad
         self._false_alarm = false_alarm
         self._behind = None if background is None else background_image(background, bank.sensor)
         self._symmetry = {name: int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes}
@@ -93,6 +106,8 @@ class NearestMatcher:
         enough = pose_seen.returned.sum(axis=1) >= MIN_RETURNS
         chi2, dof = self._goodness(pose_seen, class_seen, found)
         p_value = p_values_of(chi2, dof, frames, np.arange(len(frames)))
+        good = enough & (p_value >= self._false_alarm)
+        ambiguous = self._is_ambiguous(frames, pose_seen, class_seen, found, good, chi2)
         nothing = Match(
             class_name=None,
             accepted=False,
@@ -100,7 +115,9 @@ class NearestMatcher:
             reason="no landmark",
         )
         return [
-            self._answer(found, k, float(none_cost[k]), float(chi2[k]), int(dof[k]), float(p_value[k]))
+            self._answer(
+                found, k, float(none_cost[k]), float(chi2[k]), int(dof[k]), float(p_value[k]), bool(ambiguous[k])
+            )
             if enough[k]
             else nothing
             for k in range(len(frames))
@@ -135,7 +152,52 @@ class NearestMatcher:
             (0, self._bank.sensor.rows),
         )
 
-    def _answer(self, found: _Found, k: int, none_cost: float, chi2: float, dof: int, p_value: float) -> Match:
+    def _is_ambiguous(
+        self,
+        frames: FilteredFrames,
+        pose_seen: Observation,
+        class_seen: Observation | None,
+        found: _Found,
+        which: NDArray[np.bool_],
+        chi2: NDArray[np.float64],
+    ) -> NDArray[np.bool_]:
+        """Return which frames a view of the same class beyond the tolerance explains as well, or acceptably."""
+        ambiguous = np.zeros(len(frames), np.bool_)
+        best = np.argmin(found.cost, axis=1)
+        n_distance, n_delta = len(self._bank.distance_m), len(self._bank.delta_rad)
+        for c in range(len(self._bank.classes)):
+            own = np.flatnonzero(which & (best == c))
+            if not own.size:
+                continue
+            block = c if class_seen is None else 0
+            at, cost = self.search.minima(pose_seen[own], block)
+            i, j = np.divmod(at - block * n_distance * n_delta, n_delta)
+            # a grid point is off its minimum: how much a frame costs between points is known from the best one
+            near = cost < _WORTH_A_LOOK * (found.cost[own, c, None] + DISAGREEMENT)
+            k, m = np.nonzero(near & self._far(c, i, j, found.i[own, c, None], found.j[own, c, None]))
+            if not k.size:
+                continue
+            frame = own[k]
+            others = _Found(*(np.full((len(k), len(self._bank.classes)), value) for value in (0, 0, np.inf)))
+            others.i[:, c], others.j[:, c], others.cost[:, c] = i[k, m], j[k, m], cost[k, m]
+            theirs, dof = self._goodness(pose_seen[frame], None if class_seen is None else class_seen[frame], others)
+            as_good = theirs < chi2[frame] + DISAGREEMENT
+            as_good |= p_values_of(theirs, dof, frames[frame], np.arange(len(frame))) >= self._false_alarm
+            ambiguous[frame[as_good]] = True
+        return ambiguous
+
+    def _far(self, class_index: int, i: _Index, j: _Index, of_i: _Index, of_j: _Index) -> NDArray[np.bool_]:
+        """Return which views of the grid are beyond the tolerance, and more than a cell, from others."""
+        bank = self._bank
+        period = delta_period_rad(self._symmetry[bank.classes[class_index]])
+        along = np.abs(bank.distance_m[i] - bank.distance_m[of_i])
+        around = np.abs(wrap_delta_difference_rad(bank.delta_rad[j] - bank.delta_rad[of_j], period))
+        far_along = (along > self._tolerance_m) & (np.abs(i - of_i) > 1)
+        return np.asarray(far_along | ((around > self._tolerance_rad) & (np.abs(j - of_j) > 1)))
+
+    def _answer(
+        self, found: _Found, k: int, none_cost: float, chi2: float, dof: int, p_value: float, ambiguous: bool
+    ) -> Match:
         """Turn what was found for one frame into an answer."""
         order = np.argsort(found.cost[k], kind="stable")
         candidates = tuple(
@@ -149,7 +211,11 @@ class NearestMatcher:
         )
         best = candidates[0]
         is_landmark = best.cost < none_cost
-        reason: Reason = "no landmark" if not is_landmark else "poor fit" if p_value < self._false_alarm else ""
+        reason: Reason = "ambiguous" if ambiguous else ""
+        if not is_landmark:
+            reason = "no landmark"
+        elif p_value < self._false_alarm:
+            reason = "poor fit"
         return Match(
             class_name=best.class_name if is_landmark else None,
             accepted=not reason,
@@ -179,18 +245,29 @@ class NearestMatcher:
         self, pose_seen: Observation, class_seen: Observation | None, found: _Found
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return χ² and degrees of freedom of the best images, the linear change in a cell taken out; (n,) each."""
-        n_distance, n_delta = len(self._bank.distance_m), len(self._bank.delta_rad)
         c = np.argmin(found.cost, axis=1)
         i, j = (np.take_along_axis(index, c[:, None], axis=1)[:, 0] for index in (found.i, found.j))
-        rows = np.stack([i, np.maximum(i - 1, 0), np.minimum(i + 1, n_distance - 1), i, i], axis=1)
-        columns = np.stack([j, j, j, (j - 1) % n_delta, (j + 1) % n_delta], axis=1)
-        block = c[:, None] if class_seen is None else np.zeros((len(c), 1), np.int64)
-        cells = _Cells.of(self.pose, pose_seen, (block * n_distance + rows) * n_delta + columns)
+        cells = self._cells_at(pose_seen, c if class_seen is None else np.zeros_like(c), i, j)
         if class_seen is not None:
             assert self._class is not None
-            cells = cells.beside(_Cells.of(self._class, class_seen, c[:, None] * n_distance + rows))
+            n_distance = len(self._bank.distance_m)
+            cells = cells.beside(_Cells.of(self._class, class_seen, c[:, None] * n_distance + self._rows_around(i)))
         chi2, n_fitted = cells.chi2()
         return chi2, np.maximum(n_fitted - 2, 0)
+
+    def _rows_around(self, i: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the indices of distance of grid points and of their neighbours, (n, 5)."""
+        last = len(self._bank.distance_m) - 1
+        return np.stack([i, np.maximum(i - 1, 0), np.minimum(i + 1, last), i, i], axis=1)
+
+    def _cells_at(
+        self, seen: Observation, block: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64]
+    ) -> _Cells:
+        """Return the cells around a grid point for each frame, of the templates that give distance and angle."""
+        n_distance, n_delta = len(self._bank.distance_m), len(self._bank.delta_rad)
+        columns = np.stack([j, j, j, (j - 1) % n_delta, (j + 1) % n_delta], axis=1)
+        at = (block[:, None] * n_distance + self._rows_around(i)) * n_delta + columns
+        return _Cells.of(self.pose, seen, at)
 
 
 @dataclass(frozen=True, eq=False)

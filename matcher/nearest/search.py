@@ -27,6 +27,8 @@ _REACH_M, _REACH_RAD = 0.01, math.radians(5)
 _WIDE_REACH_M, _WIDE_REACH_RAD = 0.03, math.radians(12)
 """The same before a background, where mixed pixels count and the ripples are wider."""
 _N_STARTS = 6
+_N_MINIMA = 12
+"""Minima that are looked at where another one may explain a frame as well."""
 _LEAST_THINNING = 4
 """A grid that is thinned by less than this is searched whole."""
 
@@ -36,6 +38,12 @@ class Nearest(Protocol):
 
     def nearest(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the nearest template of one block to each of n frames, and its distance; (n,) each."""
+
+    def minima(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the lowest minima of one block for each of n frames, (n, k), and their distances.
+
+        Some may be the same; where there are fewer, the index is that of the first template and the distance infinite.
+        """
 
 
 class ExactSearch:
@@ -47,11 +55,17 @@ class ExactSearch:
         Blocks, one behind the other.
     size : int
         Templates in a block.
+    n_delta : int, optional
+        Angles of the grid, δ running fastest; None: one.
+    closes : bool
+        Whether the last angle is next to the first.
     """
 
-    def __init__(self, templates: Templates, size: int) -> None:
+    def __init__(self, templates: Templates, size: int, n_delta: int | None = None, *, closes: bool = False) -> None:
         self._templates = templates
         self._size = size
+        self._shape = size // (n_delta or 1), n_delta or 1
+        self._closes = closes
 
     def nearest(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the nearest template of one block to each of n frames, and its distance; (n,) each."""
@@ -60,6 +74,14 @@ class ExactSearch:
         for k, costs in enumerate(self._templates.costs(seen, picked)):
             found[k], cost[k] = self._templates.best(seen, k, costs, offset=picked.start)
         return found, cost
+
+    def minima(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the lowest minima of the grid of one block for each of n frames, (n, k), and their distances."""
+        picked = slice(block * self._size, (block + 1) * self._size)
+        n = len(seen.range_m)
+        costs = self._templates.costs(seen, picked).reshape(n, 1, *self._shape)
+        found, cost = _minima(costs, _N_MINIMA, self._closes)
+        return found + picked.start, cost
 
 
 class PrunedSearch:
@@ -98,13 +120,23 @@ class PrunedSearch:
 
     def nearest(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the lowest template of one block that a descent reaches, and its distance; (n,) each."""
+        found, cost = self._descended(seen, block, self._n_starts)
+        best = np.argmin(cost, axis=1)[:, None]
+        return np.take_along_axis(found, best, axis=1)[:, 0], np.take_along_axis(cost, best, axis=1)[:, 0]
+
+    def minima(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return where the descents end that start at the lowest minima of the thinned grid, (n, k), and the costs."""
+        return self._descended(seen, block, _N_MINIMA)
+
+    def _descended(self, seen: Observation, block: int, n_starts: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return where n_starts descents end, and the costs there; (n, n_starts) each."""
         t = self._templates
         shape = len(seen.range_m), 1, len(self._i), len(self._j)
         size = math.prod(self._shape)
         picked = slice(block * size, (block + 1) * size)
         found, cost = _descend(
             self._thin[block].costs(seen).reshape(shape),
-            self._n_starts,
+            n_starts,
             self._i,
             self._j,
             self._shape[1],
@@ -132,7 +164,9 @@ def nearest_search(
         reach = _at_least_one(far[0] / steps[0]), _at_least_one(far[1] / steps[1])
         if math.prod(stride) >= _LEAST_THINNING:
             return PrunedSearch(templates, distance_m, delta_rad, stride, reach)
-    return ExactSearch(templates, len(distance_m) * len(delta_rad))
+    n_delta = len(delta_rad)
+    closes = steps[1] is not None and closing_period(delta_rad) is not None
+    return ExactSearch(templates, len(distance_m) * n_delta, n_delta, closes=closes)
 
 
 def _regular_step(values: NDArray[np.float64]) -> float | None:
@@ -146,18 +180,20 @@ def _at_least_one(steps: float) -> int:
 
 @njit(cache=True, nogil=True)
 def _descend(thin, n_starts, thin_i, thin_j, n_a, closes, reach, seen, model, period):  # type: ignore[no-untyped-def]
-    """Return the lowest point of the grid that descents reach, and its cost, for every frame."""
+    """Return the lowest points of the grid that descents reach, and their costs, for every frame."""
     about, weight, lost, absent = seen
     range_m, may, must = model
     reach_i, reach_j = reach
     n, n_points = len(about), len(range_m)
     n_d = n_points // n_a
-    found = np.zeros(n, np.int64)
-    lowest = np.full(n, np.inf)
+    found = np.zeros((n, n_starts), np.int64)
+    lowest = np.full((n, n_starts), np.inf)
     cost = np.empty(n_points)
     known_to = np.full(n_points, -1, np.int32)
     for k in range(n):
-        for _, i0, j0 in modes(thin[k], n_starts, closes):
+        starts = modes(thin[k], n_starts, closes)
+        for s in range(n_starts):
+            _, i0, j0 = starts[s]
             if i0 < 0:
                 break
             at = thin_i[i0] * n_a + thin_j[j0]
@@ -182,8 +218,23 @@ def _descend(thin, n_starts, thin_i, thin_j, n_a, closes, reach, seen, model, pe
                             best, at = cost[c], c
                 if at == centre:
                     break
-            if best < lowest[k]:
-                lowest[k], found[k] = best, at
+            lowest[k, s], found[k, s] = best, at
+    return found, lowest
+
+
+@njit(cache=True, nogil=True)
+def _minima(costs, n_minima, closes):  # type: ignore[no-untyped-def]
+    """Return the lowest local minima of grids (n, 1, distance, δ), flattened, and their costs; (n, n_minima) each."""
+    n, n_a = len(costs), costs.shape[3]
+    found = np.zeros((n, n_minima), np.int64)
+    lowest = np.full((n, n_minima), np.inf)
+    for k in range(n):
+        starts = modes(costs[k], n_minima, closes)
+        for s in range(n_minima):
+            _, i, j = starts[s]
+            if i < 0:
+                break
+            found[k, s], lowest[k, s] = i * n_a + j, costs[k, 0, i, j]
     return found, lowest
 
 

@@ -69,7 +69,8 @@ def capture(
     Parameters
     ----------
     image : PhasorImages, or four of them
-        n views; or what a moving camera sees during each phase image, from :func:`~phasemark.render.exposure.render_moving`.
+        n views; or what a moving camera sees during each phase image, from
+        :func:`~phasemark.render.exposure.render_moving`.
     sensor : Sensor
         The camera; it may differ from the one the image was rendered for in electrons, noise and validity, not in
         geometry or modulation.
@@ -189,8 +190,8 @@ def capture_moving(
     Raises
     ------
     UsageError
-        As :func:`capture` and :func:`~phasemark.render.exposure.render_moving`; or sensor and renderer time phase images
-        differently.
+        As :func:`capture` and :func:`~phasemark.render.exposure.render_moving`; or sensor and renderer time phase
+        images differently.
     """
     if renderer.sensor.phase_image_interval_s != sensor.phase_image_interval_s:
         raise UsageError(
