@@ -101,6 +101,13 @@ def test_a_plate_is_not_taken_for_its_back_where_the_search_stopped_beside_its_f
     assert set(matches.reason) <= {"ambiguous", "undetermined"}
 
 
+def test_pixels_that_are_counted_anew_do_not_let_a_view_slide_away(tmp_path):
+    # a column that the frame's front enters by little stopped counting, the view slid until the column was
+    # contradicted, and the back remained alone
+    bank = bank_of("frame", "pmd-16x16", tmp_path, distance="0.45:1.25:0.01")
+    assert count(bank, "bearing", 30, 1, np.random.default_rng([11, 5])).wrong_accepted == 0
+
+
 def test_the_nearest_image_is_ambiguous_where_another_one_explains_a_frame_as_well(thin_bank):
     # near the camera a face of the bracket's plate, its back and a face of its arm look alike
     found = count(thin_bank("bracket", "pmd-16x16"), "nearest", 60, 1, np.random.default_rng([3, 7]))

@@ -12,6 +12,7 @@ from phasemark.matcher.likelihood.images import ImageModel
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
+from phasemark.matcher.pixel_agreement import DISAGREEMENT
 
 __all__ = ["fit_look_alikes"]
 
@@ -41,13 +42,14 @@ def fit_look_alikes(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) 
 
 
 def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: NDArray[np.int64]) -> Fits:
-    """Fit what looks like some fits."""
-    candidates = [*_other_sides(setup, fits, best), *_from_behind(setup, scene, fits, best)]
+    """Fit what looks like some fits: of each kind of look-alike the few views that a first image speaks for."""
+    kinds = [*_other_sides(setup, fits, best), _from_behind(setup, scene, fits, best)]
     if setup.bearing_is_free:
-        candidates.extend(_other_bearings(setup, scene, fits, best))
-    source = np.concatenate([which for which, _ in candidates])
+        kinds.append(_other_bearings(setup, scene, fits, best))
+    chosen = [_most_promising(setup, scene.final, evidence, fits, *kind) for kind in kinds]
+    source = np.concatenate([which for which, _ in chosen])
+    view = np.concatenate([views for _, views in chosen])
     frame, class_index = fits.frame[source], fits.class_index[source]
-    view = np.concatenate([views for _, views in candidates])
     return refine(
         scene.final,
         evidence,
@@ -56,18 +58,53 @@ def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: 
         _at_measured_distance(setup, scene.final, evidence, frame, class_index, view),
         scene.settings(setup),
         fits.cost[source] + setup.policy.likely_cost,
-        # zones of a direct sensor do not mix light: the cost of a view says little of that of its neighbours
-        at_first_sight=len(setup.free) == 2 or bool(setup.prior_std) or evidence.sensor.kind == "phase",
+        at_first_sight=len(setup.free) == 2,
     )
+
+
+def _most_promising(
+    setup: Setup,
+    model: ImageModel,
+    evidence: Evidence,
+    fits: Fits,
+    source: NDArray[np.int64],
+    view: NDArray[np.float64],
+) -> _Views:
+    """Return the views of one kind that explain their frames best once they are at the measured distance.
+
+    Parameters
+    ----------
+    source : (k,) int64
+        The fits that they look like.
+    view : (k, 4) float64
+    """
+    most = setup.policy.slides_refined
+    if not source.size or np.bincount(source).max() <= most:
+        return source, view
+    view = view.copy()
+    view[:, 0] = np.clip(view[:, 0], *model.limits())
+    frame = fits.frame[source]
+    phasor = model.images(fits.class_index[source], np.ascontiguousarray(view), ()).phasor
+    residual = evidence.sensor.metres_per_radian * np.angle(evidence.value[frame] * phasor.conj())
+    weight, dark = evidence.weight[frame], phasor == 0
+    residual[dark | (weight == 0)] = np.nan
+    some = np.isfinite(residual).any(axis=1)
+    residual[some] -= np.nanmedian(residual[some], axis=1, keepdims=True)
+    squared = np.where(np.isnan(residual), DISAGREEMENT, weight * residual**2)
+    cost = np.where(weight > 0, np.minimum(squared, DISAGREEMENT), 0.0).sum(axis=1)
+    order = np.lexsort((cost, source))
+    rank = np.arange(len(order)) - np.searchsorted(source[order], source[order])
+    kept = np.sort(order[rank < most])
+    return source[kept], view[kept]
 
 
 _BETTER = 1.0
 """By how much a cost must be lower: below that both views remain, and the answer is ambiguous anyway."""
-_Candidates = list[tuple[NDArray[np.int64], NDArray[np.float64]]]
+_Views = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Indices of fits, and as many views to try instead of theirs."""
 
 
-def _other_sides(setup: Setup, fits: Fits, best: NDArray[np.int64]) -> _Candidates:
+def _other_sides(setup: Setup, fits: Fits, best: NDArray[np.int64]) -> list[_Views]:
     """Return the sides that a landmark's own symmetry makes equal, where its bank does not have it."""
     shapes = setup.shapes
     candidates = []
@@ -80,7 +117,7 @@ def _other_sides(setup: Setup, fits: Fits, best: NDArray[np.int64]) -> _Candidat
     return candidates
 
 
-def _from_behind(setup: Setup, scene: Scene, fits: Fits, best: NDArray[np.int64]) -> _Candidates:
+def _from_behind(setup: Setup, scene: Scene, fits: Fits, best: NDArray[np.int64]) -> _Views:
     """Return views from the other side, the landmark's middle at the same place, under several bearings."""
     odd = best[np.array([setup.shapes.symmetry[c] % 2 for c in fits.class_index[best]], np.bool_)]
     view = fits.view[odd].copy()
@@ -89,27 +126,30 @@ def _from_behind(setup: Setup, scene: Scene, fits: Fits, best: NDArray[np.int64]
     here, there = (_rotated(middle, delta) for delta in (fits.view[odd, 1], view[:, 1]))
     view[:, 0] += here[:, 0] - there[:, 0]
     if not setup.bearing_is_free:
-        return [(odd, view + np.zeros(4))]
+        return odd, view
     view[:, 2] += np.arctan2(here[:, 1], fits.view[odd, 0] + here[:, 0])
     view[:, 2] -= np.arctan2(there[:, 1], view[:, 0] + there[:, 0])
-    return [(odd, view + _slide(scene, side)) for side in (0.0, *_slides(setup))]
+    return _slid(setup, scene, odd, view, (0.0, *_slides(setup)))
 
 
-def _other_bearings(setup: Setup, scene: Scene, fits: Fits, best: NDArray[np.int64]) -> _Candidates:
+def _other_bearings(setup: Setup, scene: Scene, fits: Fits, best: NDArray[np.int64]) -> _Views:
     """Return other bearings of landmarks that tell the heading δ − b, and little of its two parts."""
     std = fits.std_without_one[best, setup.free.index("bearing_rad")]
     flat = best[std > setup.policy.sure_bearing * scene.search.column_rad / 2]
-    return [(flat, fits.view[flat] + _slide(scene, side)) for side in _slides(setup)]
+    return _slid(setup, scene, flat, fits.view[flat], _slides(setup))
 
 
 def _slides(setup: Setup) -> tuple[float, ...]:
     return setup.policy.slides_with_prior if setup.prior_std else setup.policy.slides
 
 
-def _slide(scene: Scene, side: float) -> NDArray[np.float64]:
-    """Return the change of a view whose bearing moves by some half columns, the heading kept."""
-    half = scene.search.column_rad / 2
-    return np.array([0.0, side * half, side * half, 0.0])
+def _slid(
+    setup: Setup, scene: Scene, which: NDArray[np.int64], view: NDArray[np.float64], sides: tuple[float, ...]
+) -> _Views:
+    """Return views whose bearings move by some half columns, the heading kept."""
+    moves = np.zeros((len(sides), 1, 4))
+    moves[:, 0, 1] = moves[:, 0, 2] = np.array(sides) * scene.search.column_rad / 2
+    return np.tile(which, len(sides)), (view + moves).reshape(-1, 4)
 
 
 def _at_measured_distance(

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.information import covariance_of
-from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels
+from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels, whole_cost
 from phasemark.matcher.likelihood.descent import descend
 from phasemark.matcher.likelihood.fits import Fits
 from phasemark.matcher.likelihood.images import ImageModel, ModelImages
 from phasemark.matcher.likelihood.kinks import look_beside, settle
-from phasemark.matcher.likelihood.problem import Problem, Settings, State
+from phasemark.matcher.likelihood.problem import Problem, Settings, State, picked
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import (
     capped_std,
@@ -75,8 +75,11 @@ def refine(
     changed = np.flatnonzero((use != state.use).any(axis=1))
     if changed.size:
         again = problem.some(changed)
+        before = whole_cost(again, picked(state, changed))[0]
         moved = descend(again, again.state(state.theta[changed], use[changed]), settings.policy.settled_cost)
-        state.update(changed, moved)
+        # pixels that no longer count may hold a view no longer: it would slide to where they are contradicted
+        better = np.flatnonzero(whole_cost(again, moved)[0] <= before + settings.policy.recount_cost)
+        state.update(changed[better], picked(moved, better))
     if not model.slopes_are_free:
         state = settle(problem, state)
     return conclude(problem, state)

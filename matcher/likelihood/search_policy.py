@@ -76,6 +76,8 @@ class SearchPolicy:
         does not make the covariance.
     close_cost : float
         A fit whose cost is above its frame's best by more will not become the best: its surroundings are not looked at.
+    recount_cost : float
+        What a view may cost more, contradicted pixels included, after it was decided anew which pixels count.
     settling_rounds : int
         How often a view that contradicts some pixels is left for a better one nearby.
     settling_sigma : tuple of float
@@ -106,6 +108,8 @@ class SearchPolicy:
     slides, slides_with_prior : tuple of float
         Bearings, in half columns, under which a flat landmark is compared with itself; the second where a prior holds
         the bearing.
+    slides_refined : int
+        Of these, how many are refined for each frame, from the front and from the back.
     sure_bearing : float
         Share of half a column to which a bearing must be known for other bearings to be out of the question.
     registrations : int
@@ -165,8 +169,9 @@ class SearchPolicy:
     promising_cost: float = 20.0
     slope_width: float = 0.05
     close_cost: float = 50.0
+    recount_cost: float = 25.0
     settling_rounds: int = 3
-    settling_sigma: tuple[float, ...] = (-5.0, -2.5, -1.0, 1.0, 2.5, 5.0)
+    settling_sigma: tuple[float, ...] = (-5.0, -2.5, -1.5, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 1.5, 2.5, 5.0)
 
     margin_cost: float = 500.0
     likely_cost: float = 100.0
@@ -182,14 +187,15 @@ class SearchPolicy:
 
     look_alike_rounds: int = 3
     most_equals: int = 12
-    slides: tuple[float, ...] = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
+    slides: tuple[float, ...] = (*range(-8, 0), *range(1, 9))
     slides_with_prior: tuple[float, ...] = (-1.0, 1.0)
+    slides_refined: int = 3
     sure_bearing: float = 0.05
     registrations: int = 2
 
     strange_sigma: float = 5.0
     explained_per_parameter: int = 6
-    largest_scale: float = 2.0
+    largest_scale: float = 1.5
     pixels_against_far_view: int = 4
 
     walls_beyond_m: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
