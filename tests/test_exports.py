@@ -77,7 +77,7 @@ def test_range_and_z_are_told_apart(frames, tmp_path):
     table = exported(frames, tmp_path, "csv", "z")
     contradicting: tuple[dict[str, Any], ...] = ({"quantity": "range"}, {"unit": "cm"})
     for wrong in contradicting:
-        with pytest.raises(UsageError, match=rf"--{next(iter(wrong))} is .*, but .* says (z|m)"):
+        with pytest.raises(UsageError, match=rf"{next(iter(wrong))}=… is .*, but .* says (z|m)"):
             read_frames(table, sensor=SENSOR, **wrong)
 
 
@@ -321,7 +321,7 @@ def test_an_existing_folder_needs_force_and_is_replaced_whole(frames, tmp_path):
 
 
 def test_an_unknown_format_is_named(frames, tmp_path):
-    with pytest.raises(UsageError, match="--to must be one of npz, csv, png16, ply, bop, rosbag, got 'gif'"):
+    with pytest.raises(UsageError, match="to=… must be one of npz, csv, png16, ply, bop, rosbag, got 'gif'"):
         exported(frames, tmp_path, "gif")
 
 

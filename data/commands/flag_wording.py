@@ -32,7 +32,11 @@ PHRASES = {
     "unverified()": "--no-verify",
 }
 """What messages name that is no parameter of the call, and what the command line has for it."""
-_PARAMETER = re.compile(rf"(?<![\w'/.-])({'|'.join(FLAGS)})=(?:…|True\b|(?=\w))")
+_WITH_VALUES = ("amplitude_unit", "fixed", "quantity", "scheduler", "trusted", "unit")
+"""Parameters that messages name with a value; others may stand in what a user wrote (``--mesh n=part.stl``)."""
+_STATED = rf"(?:({'|'.join(FLAGS)})=(?:…|True\b))"
+_VALUED = rf"(?:({'|'.join(_WITH_VALUES)})=(?=\w)|(part)=(?=\d+/))"
+_PARAMETER = re.compile(rf"(?<![\w'/.-])(?<!--mesh )(?:{_STATED}|{_VALUED})")
 
 
 def in_flags(message: str) -> str:
@@ -51,4 +55,4 @@ def in_flags(message: str) -> str:
 
 
 def _flag(match: re.Match[str]) -> str:
-    return FLAGS[match[1]] + (" " if match[0].endswith("=") else "")
+    return FLAGS[match[1]] if match[1] else f"{FLAGS[match[2] or match[3]]} "
