@@ -15,7 +15,7 @@ from phasemark.data.bank.bank_file import BankGroup
 from phasemark.matcher.chi_squared import p_values_of
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Candidate, Match, Reason
-from phasemark.matcher.nearest.search import nearest_search
+from phasemark.matcher.nearest.search import lowest, nearest_search
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS
 from phasemark.render import Background, background_image
@@ -34,12 +34,14 @@ _Index = NDArray[np.int64]
 class _Found:
     """The nearest template of every class: (n, classes) arrays.
 
-    `i` and `j` index distance and angle, `cost` is the distance from the frame.
+    `i` and `j` index distance and angle, `cost` is the distance from the frame. `minima` holds, by block of the bank,
+    the lowest minima that the search ended at and their costs, (n, k) each.
     """
 
     i: NDArray[np.int64]
     j: NDArray[np.int64]
     cost: NDArray[np.float64]
+    minima: tuple[tuple[NDArray[np.int64], NDArray[np.float64]], ...] = ()
 
 
 class NearestMatcher:
@@ -127,17 +129,19 @@ class NearestMatcher:
         """Find the nearest lower image, then the distance of each class's upper image at that distance."""
         assert self._class is not None
         n_class, n_distance = len(self._bank.classes), len(self._bank.distance_m)
-        best, cost = self.search.nearest(lower)
+        minima = self.search.minima(lower)
+        best, cost = lowest(*minima)
         i, j = np.divmod(best, len(self._bank.delta_rad))
         costs = cost[:, None] + self._class.costs_of_each(upper, np.arange(n_class) * n_distance + i[:, None])
-        return _Found(np.repeat(i[:, None], n_class, axis=1), np.repeat(j[:, None], n_class, axis=1), costs)
+        return _Found(np.repeat(i[:, None], n_class, axis=1), np.repeat(j[:, None], n_class, axis=1), costs, (minima,))
 
     def _search_full(self, seen: Observation) -> _Found:
         """Find the nearest image of each class."""
         n_class, n_distance, n_delta = len(self._bank.classes), len(self._bank.distance_m), len(self._bank.delta_rad)
-        nearest = [self.search.nearest(seen, c) for c in range(n_class)]
+        minima = tuple(self.search.minima(seen, c) for c in range(n_class))
+        nearest = [lowest(*some) for some in minima]
         best = np.stack([found for found, _ in nearest], axis=1) - np.arange(n_class) * n_distance * n_delta
-        return _Found(*np.divmod(best, n_delta), np.stack([cost for _, cost in nearest], axis=1))
+        return _Found(*np.divmod(best, n_delta), np.stack([cost for _, cost in nearest], axis=1), minima)
 
     def _nothing(self) -> Templates:
         """Return the one template of a scene without a landmark."""
@@ -170,7 +174,7 @@ class NearestMatcher:
             if not own.size:
                 continue
             block = c if class_seen is None else 0
-            at, cost = self.search.minima(pose_seen[own], block)
+            at, cost = (values[own] for values in found.minima[block])
             i, j = np.divmod(at - block * n_distance * n_delta, n_delta)
             # a grid point is off its minimum: how much a frame costs between points is known from the best one
             near = cost < _WORTH_A_LOOK * (found.cost[own, c, None] + DISAGREEMENT)
@@ -178,7 +182,8 @@ class NearestMatcher:
             if not k.size:
                 continue
             frame = own[k]
-            others = _Found(*(np.full((len(k), len(self._bank.classes)), value) for value in (0, 0, np.inf)))
+            shape = len(k), len(self._bank.classes)
+            others = _Found(np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.full(shape, np.inf))
             others.i[:, c], others.j[:, c], others.cost[:, c] = i[k, m], j[k, m], cost[k, m]
             theirs, dof = self._goodness(pose_seen[frame], None if class_seen is None else class_seen[frame], others)
             as_good = theirs < chi2[frame] + DISAGREEMENT

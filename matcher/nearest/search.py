@@ -27,8 +27,6 @@ _REACH_M, _REACH_RAD = 0.01, math.radians(5)
 _WIDE_REACH_M, _WIDE_REACH_RAD = 0.03, math.radians(12)
 """The same before a background, where mixed pixels count and the ripples are wider."""
 _N_STARTS = 6
-_N_MINIMA = 12
-"""Minima that are looked at where another one may explain a frame as well."""
 _LEAST_THINNING = 4
 """A grid that is thinned by less than this is searched whole."""
 
@@ -80,8 +78,11 @@ class ExactSearch:
         picked = slice(block * self._size, (block + 1) * self._size)
         n = len(seen.range_m)
         costs = self._templates.costs(seen, picked).reshape(n, 1, *self._shape)
-        found, cost = _minima(costs, _N_MINIMA, self._closes)
-        return found + picked.start, cost
+        found, cost = _minima(costs, _N_STARTS, self._closes)
+        best, least = self.nearest(seen, block)
+        # the costs of all templates are float32 products; the best one is known exactly
+        cost = np.maximum(cost, least[:, None])
+        return np.column_stack([best, found + picked.start]), np.column_stack([least, cost])
 
 
 class PrunedSearch:
@@ -120,23 +121,21 @@ class PrunedSearch:
 
     def nearest(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the lowest template of one block that a descent reaches, and its distance; (n,) each."""
-        found, cost = self._descended(seen, block, self._n_starts)
-        best = np.argmin(cost, axis=1)[:, None]
-        return np.take_along_axis(found, best, axis=1)[:, 0], np.take_along_axis(cost, best, axis=1)[:, 0]
+        return lowest(*self._descended(seen, block))
 
     def minima(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return where the descents end that start at the lowest minima of the thinned grid, (n, k), and the costs."""
-        return self._descended(seen, block, _N_MINIMA)
+        return self._descended(seen, block)
 
-    def _descended(self, seen: Observation, block: int, n_starts: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return where n_starts descents end, and the costs there; (n, n_starts) each."""
+    def _descended(self, seen: Observation, block: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return where the descents end, and the costs there; (n, k) each."""
         t = self._templates
         shape = len(seen.range_m), 1, len(self._i), len(self._j)
         size = math.prod(self._shape)
         picked = slice(block * size, (block + 1) * size)
         found, cost = _descend(
             self._thin[block].costs(seen).reshape(shape),
-            n_starts,
+            self._n_starts,
             self._i,
             self._j,
             self._shape[1],
@@ -147,6 +146,12 @@ class PrunedSearch:
             t.sensor.unambiguous_range_m,
         )
         return found + picked.start, cost
+
+
+def lowest(found: NDArray[np.int64], cost: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the lowest of the minima of each frame, and its cost; (n,) each."""
+    best = np.argmin(cost, axis=1)[:, None]
+    return np.take_along_axis(found, best, axis=1)[:, 0], np.take_along_axis(cost, best, axis=1)[:, 0]
 
 
 def nearest_search(
