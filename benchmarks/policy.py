@@ -71,7 +71,7 @@ def policy(sensor: Sensor, seed: int) -> dict[str, Any]:
 def _changed(value: Any, factor: float) -> Any:
     """Return a value scaled; counts stay whole and tuples are scaled element by element."""
     if isinstance(value, tuple):
-        return tuple(factor * one for one in value)
+        return tuple(factor * element for element in value)
     if isinstance(value, int):
         return max(1, round(factor * value))
     return factor * value

@@ -23,7 +23,7 @@ from phasemark.render.view import delta_period_rad
 
 _VIEWS_AT_ONCE = 250
 OUTLIER_SIGMA = 5.0
-"""An error of so many standard deviations in any parameter is an outlier, and counted apart."""
+"""Number of standard deviations, in any parameter, beyond which an error is an outlier and counted apart."""
 
 MatchFrames = Callable[[FilteredFrames], Matches]
 

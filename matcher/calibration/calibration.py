@@ -49,14 +49,14 @@ FEWEST_POSES = 3
 _FALSE_ALARM = 0.01
 """A fit whose χ² is exceeded with less than this probability does not fit."""
 _UNKNOWN = 3.0
-"""Natural units (1°, 1 cm, 0.1): what is known worse than to so many is not observable."""
+"""Standard deviation, in natural units (1°, 1 cm, 0.1), above which a parameter is not observable."""
 _POSES_FOR_ERRORS = 6
 """Fewer poses do not tell the size of their errors."""
 _ROUNDS = 2
 _MINIMA_COST = 50.0
 """χ² that ending in a small minimum may cost; what fits worse has other reasons."""
 _SLACK_M = 0.05
-"""A wall or floor may cut the landmark by so much where the mounting is thought to be."""
+"""Depth to which a wall or floor may cut the landmark at the initial guess of the mounting, metres."""
 _USUAL_RENDERINGS = 400
 """Of all poses: what a progress bar reckons with."""
 _FRAMES_FOR_SCATTER = 10
@@ -187,7 +187,7 @@ def calibrate(
     mesh : trimesh.Trimesh
         The landmark.
     frames : FilteredFrames
-        One for each pose; their sensor is the camera as it is thought to be. For phasors best from
+        One for each pose; their sensor is the camera before the calibration. For phasors best from
         :func:`~phasemark.matcher.phasor_mean`.
     poses : KnownPoses
     free : sequence of str, optional
@@ -196,9 +196,9 @@ def calibrate(
     fixed : sequence of str
         What of that to leave as it is.
     start : Mounting, optional
-        Where it is thought to be and what stays as it is; None: what the sensor states.
+        Initial guess of the mounting, and the values of what is fixed; None: what the sensor states.
     albedo : float
-        Of the landmark, as it is thought to be.
+        Of the landmark, as assumed.
     on : {"auto", "ranges", "phasors"}
         "auto": phasors where the frames have amplitude and intensity.
     background : Background, optional

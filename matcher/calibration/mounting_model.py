@@ -246,7 +246,7 @@ class CalibrationModel:
         Parameters
         ----------
         theta : (9,) float64
-            Where the mounting is thought to be.
+            Initial guess of the mounting.
         slack_m : float
 
         Raises

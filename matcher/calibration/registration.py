@@ -13,7 +13,7 @@ from phasemark.matcher.likelihood.residuals import Evidence
 OUTLINE = ("pitch", "roll", "height", "bearing", "half_angle_h", "half_angle_v")
 """What an outline tells."""
 _OUTLINE_STD = np.array([3.0, 3.0, 3.0, 3.0, 0.7, 0.7])
-"""How far each may be from where it was thought to be, in natural units: only the registration leans on it."""
+"""Standard deviation of each about its initial guess, in natural units; the registration alone uses it."""
 _OUTLINE_NOISE = 0.2
 """Of a pixel: how much of it the model says returns, against whether it did."""
 _RETURNS_FROM, _PREVAILS_FROM = 0.2, 0.6
@@ -44,7 +44,7 @@ def register(
     model : CalibrationModel
     evidence : Evidence
     theta : (9,) float64
-        Where the mounting is thought to be.
+        Initial guess of the mounting.
     free : sequence of str
         What may move.
 

@@ -41,11 +41,11 @@ class Calibration:
     Parameters
     ----------
     sensor : Sensor
-        The camera with what was found; what was not free is as it was, or as `start` said.
+        The camera after the calibration; fields that were not free keep their value, or the one of `start`.
     base : Sensor
-        The camera as it was thought to be.
+        The camera before the calibration.
     mounting, assumed : Mounting
-        What was found, and what it was thought to be.
+        The mounting after the calibration, and before it.
     free : tuple of str
         Names of what was estimated (:data:`NAMES`); the other numbers of `mounting` are assumptions.
     covariance : (p, p) float64

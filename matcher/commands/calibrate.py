@@ -81,9 +81,9 @@ def calibrate_camera(
     ] = None,
     bearing: Annotated[
         float | None,
-        typer.Option("--bearing", metavar="DEG", help="Where the camera sees it if 0 is stated, likewise."),
+        typer.Option("--bearing", metavar="DEG", help="Initial guess for the bearing offset."),
     ] = None,
-    albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmark, likewise.")] = None,
+    albedo: Annotated[float | None, typer.Option("--albedo", help="Initial guess for the landmark's albedo.")] = None,
     moving: Annotated[
         bool, typer.Option("--moving", help="A moving camera: each frame has a pose of its own, by time stamps.")
     ] = False,
@@ -224,7 +224,7 @@ def _albedo(mesh: Trimesh, stated: float | None) -> float:
 def _start(
     base: Sensor, albedo: float, height: float | None, bearing_deg: float | None, delay_ms: float | None
 ) -> Mounting:
-    """Return the mounting as it is thought to be."""
+    """Return the initial guess of the mounting."""
     from phasemark.matcher.calibration.mounting_model import Mounting
 
     start = Mounting.of_sensor(base, albedo)
@@ -257,7 +257,7 @@ def _names(text: str) -> list[str]:
 
 
 def _calibration_target(landmark: str, class_name: str | None, sensor: str | None) -> tuple[Trimesh, Sensor, str]:
-    """Return the mesh of a landmark, and the camera as it is thought to be with its name."""
+    """Return the mesh of a landmark, the camera before the calibration, and the name of that camera."""
     from phasemark.landmarks import catalog
 
     path = Path(landmark)

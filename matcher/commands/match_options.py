@@ -157,7 +157,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Place:
-    """Where landmarks stand, and where the robot is thought to be."""
+    """Poses of the landmarks, and the expected pose of the robot."""
 
     landmark_xy: Annotated[
         tuple[float, float] | None,
@@ -167,7 +167,9 @@ class Place:
     pan: Annotated[float, typer.Option("--pan", metavar="DEG", help="Pan angle of the camera on the robot.")] = 0.0
     prior: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--prior", metavar="X Y DEG", help="Where the robot is thought to be; orders the solutions."),
+        typer.Option(
+            "--prior", metavar="X Y DEG", help="Expected pose of the robot; the nearest solution comes first."
+        ),
     ] = None
     prior_std: Annotated[
         tuple[float, float] | None,
