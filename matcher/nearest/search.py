@@ -67,22 +67,28 @@ class ExactSearch:
 
     def nearest(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the nearest template of one block to each of n frames, and its distance; (n,) each."""
-        picked = slice(block * self._size, (block + 1) * self._size)
-        found, cost = np.zeros(len(seen.range_m), np.int64), np.zeros(len(seen.range_m))
-        for k, costs in enumerate(self._templates.costs(seen, picked)):
-            found[k], cost[k] = self._templates.best(seen, k, costs, offset=picked.start)
-        return found, cost
+        return self._best(seen, self._costs(seen, block), block)
 
     def minima(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the lowest minima of the grid of one block for each of n frames, (n, k), and their distances."""
-        picked = slice(block * self._size, (block + 1) * self._size)
-        n = len(seen.range_m)
-        costs = self._templates.costs(seen, picked).reshape(n, 1, *self._shape)
-        found, cost = _minima(costs, _N_STARTS, self._closes)
-        best, least = self.nearest(seen, block)
+        costs = self._costs(seen, block)
+        found, cost = _minima(costs.reshape(len(costs), 1, *self._shape), _N_STARTS, self._closes)
+        best, least = self._best(seen, costs, block)
         # the costs of all templates are float32 products; the best one is known exactly
         cost = np.maximum(cost, least[:, None])
-        return np.column_stack([best, found + picked.start]), np.column_stack([least, cost])
+        return np.column_stack([best, found + block * self._size]), np.column_stack([least, cost])
+
+    def _costs(self, seen: Observation, block: int) -> NDArray[np.float32]:
+        return self._templates.costs(seen, slice(block * self._size, (block + 1) * self._size))
+
+    def _best(
+        self, seen: Observation, costs: NDArray[np.float32], block: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the nearest template of one block to each of n frames, and its exact distance; (n,) each."""
+        found, cost = np.zeros(len(costs), np.int64), np.zeros(len(costs))
+        for k, row in enumerate(costs):
+            found[k], cost[k] = self._templates.best(seen, k, row, offset=block * self._size)
+        return found, cost
 
 
 class PrunedSearch:
