@@ -15,7 +15,7 @@ from phasemark.matcher.information import NATURAL_UNITS
 from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
-from phasemark.matcher.pixel_agreement import MUST_RETURN_COVERAGE, counts
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, MUST_RETURN_COVERAGE, counts
 
 ALBEDO = "albedo"
 """Name of the factor on the landmark's brightness, profiled out on phasors."""
@@ -227,7 +227,7 @@ class Problem:
             return np.sort(first[cost[first] <= self.limit[first]])
         least = np.full(len(self.evidence.weight), np.inf)
         least[self.frame[first]] = cost[first]
-        near = np.minimum(least[self.frame], self.rival) + margin
+        near = np.minimum(least[self.frame] + margin, self.rival + DISAGREEMENT)
         return np.flatnonzero((cost <= self.limit) & (cost <= near))
 
     def scaled(self, images: ModelImages, theta: NDArray[np.float64]) -> ModelImages:

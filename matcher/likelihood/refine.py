@@ -69,23 +69,43 @@ def refine(
     limit = np.full(len(frame), np.inf) if give_up_above is None else give_up_above
     problem = Problem(model, evidence, frame, class_index, settings, limit, rival)
     state = problem.start(view, at_first_sight)
-    state = descend(problem, state, settings.policy.rough_cost if roughly else settings.policy.settled_cost)
     if roughly:
+        state = descend(problem, state, settings.policy.rough_cost)
         return conclude(problem, state, look_around=False)
+    state = _descend_near(problem, state)
     if settings.look_beside_rad:
         state = look_beside(problem, state)
-    use = problem.pixels_at(state.images, state.theta)
-    changed = np.flatnonzero((use != state.use).any(axis=1))
-    if changed.size:
-        again = problem.some(changed)
-        before = whole_cost(again, picked(state, changed))[0]
-        moved = descend(again, again.state(state.theta[changed], use[changed]), settings.policy.settled_cost)
-        # pixels that no longer count may hold a view no longer: it would slide to where they are contradicted
-        better = np.flatnonzero(whole_cost(again, moved)[0] <= before + settings.policy.recount_cost)
-        state.update(changed[better], picked(moved, better))
+    state = _recounted(problem, state)
     if not model.slopes_are_free:
         state = settle(problem, state)
     return conclude(problem, state)
+
+
+def _descend_near(problem: Problem, state: State) -> State:
+    """Descend to the minimum; roughly only where another explanation is better by far."""
+    policy = problem.policy
+    if not np.isfinite(problem.rival).any():
+        return descend(problem, state, policy.settled_cost)
+    state = descend(problem, state, policy.rough_cost)
+    near = np.flatnonzero(state.sums.cost <= problem.rival + policy.close_cost)
+    if near.size:
+        state.update(near, descend(problem.some(near), picked(state, near), policy.settled_cost))
+    return state
+
+
+def _recounted(problem: Problem, state: State) -> State:
+    """Decide anew which pixels count, and descend again where others do."""
+    policy = problem.policy
+    use = problem.pixels_at(state.images, state.theta)
+    changed = np.flatnonzero((use != state.use).any(axis=1) & (state.sums.cost <= problem.rival + policy.margin_cost))
+    if changed.size:
+        again = problem.some(changed)
+        before = whole_cost(again, picked(state, changed))[0]
+        moved = descend(again, again.state(state.theta[changed], use[changed]), policy.settled_cost)
+        # pixels that no longer count may hold a view no longer: it would slide to where they are contradicted
+        better = np.flatnonzero(whole_cost(again, moved)[0] <= before + policy.recount_cost)
+        state.update(changed[better], picked(moved, better))
+    return state
 
 
 def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fits:

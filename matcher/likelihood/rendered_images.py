@@ -77,7 +77,9 @@ class RenderedModel:
         smooth = [name for name in free if name != "height_m"]
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
-            image, slopes = self._render_with_slopes(c, view[of], smooth) if smooth else (self._render(c, view[of]), None)
+            image, slopes = (
+                self._render_with_slopes(c, view[of], smooth) if smooth else (self._render(c, view[of]), None)
+            )
             phasor[of] = image.phasor.reshape(len(of), -1)
             intensity[of] = image.intensity.reshape(len(of), -1)
             coverage[of] = image.coverage.reshape(len(of), -1)
@@ -171,6 +173,4 @@ class RenderedModel:
 
     def _render(self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None) -> PhasorImages:
         renderer = self._renderers[class_index]
-        return renderer.render_views(
-            Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows
-        )
+        return renderer.render_views(Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows)

@@ -36,7 +36,9 @@ class SlopeSums:
     def __init__(self, slope: NDArray[np.complex128], motion: Motion, own: Sums, turns: NDArray[np.bool_]) -> None:
         self._slope, self._own, self._turns = slope, own, turns
         p = len(motion.step)
-        self._poses = [Poses(*(np.ascontiguousarray(part[k :: 1 + p]) for part in motion.poses)) for k in range(1, 1 + p)]
+        self._poses = [
+            Poses(*(np.ascontiguousarray(part[k :: 1 + p]) for part in motion.poses)) for k in range(1, 1 + p)
+        ]
         pixels = len(own.intensity)
         self._sums = Sums(
             phasor=np.empty((pixels, 1), np.complex128),
