@@ -36,7 +36,7 @@ def sum_samples(n, samples, mesh, poses, camera, light, sums):  # type: ignore[n
         length = math.sqrt(1.0 + y * y + z * z)
         face = samples.face[k]
         if face >= 0:
-            t, cos_theta = _landmark_hit(mesh, face, poses.lens[view], poses.matrix[view], y, z)
+            t, cos_theta = landmark_hit(mesh, face, poses.lens[view], poses.matrix[view], y, z)
             reflected = light.albedo * (cos_theta / length)
             sums.coverage[index] += weights[k]
             if mesh.part[face]:
@@ -65,7 +65,17 @@ def _add_phasor(index, distance, reflected, length, weight, light, sums):  # typ
 
 
 @inlined
-def _landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def]
+def phasor_of(distance, reflected, length, light):  # type: ignore[no-untyped-def]
+    """Return the light of one hit at the modulation frequency; arguments as :func:`_add_phasor` takes them."""
+    a = reflected / (distance * distance)
+    if light.vignetting:
+        a /= length * length * length * length
+    phase = light.radians_per_metre * distance
+    return complex(a * math.cos(phase), a * math.sin(phase))
+
+
+@inlined
+def landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def]
     """Return the multiple of the ray (1, y, z) at its hit, and |cos θ| there times the ray's length."""
     dx, dy, dz = towards_landmark(matrix, y, z)
     ox, oy, oz = lens[0], lens[1], lens[2]
