@@ -517,8 +517,8 @@ class _Track:
         """Take in the next frames."""
         self.range_m, self.scaled_var = self.range_m.copy(), self.scaled_var.copy()  # results may hold the old ones
         follow(
-            *map(_pixels_of_frames, (frames.range_m, frames.flags)), self.sensor.unambiguous_range_m, process_var_m2,
-            *map(_pixels, (measurement_var_m2, self.range_m, self.scaled_var)),
+            _pixels_of_frames(frames.range_m), _pixels_of_frames(frames.flags), self.sensor.unambiguous_range_m,
+            process_var_m2, _pixels(measurement_var_m2), _pixels(self.range_m), _pixels(self.scaled_var),
         )  # fmt: skip
 
     def n_effective(self) -> NDArray[np.float64]:
@@ -621,7 +621,7 @@ class _Sums:
     def of(cls, values: NDArray[np.float64], flags: NDArray[np.uint8], n_valid: NDArray[np.int64]) -> _Sums:
         """Add up frames, (n, frames, rows, cols)."""
         valid, other, n_other = np.zeros(n_valid.shape), np.zeros(n_valid.shape), np.zeros(n_valid.shape, np.int64)
-        add_up(*map(_pixels_of_frames, (values, flags)), *map(_pixels, (valid, other, n_other)))
+        add_up(_pixels_of_frames(values), _pixels_of_frames(flags), _pixels(valid), _pixels(other), _pixels(n_other))
         return cls(valid, n_valid, other, n_other)
 
     def mean(self) -> NDArray[np.float64]:

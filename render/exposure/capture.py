@@ -292,7 +292,7 @@ _MISSING, _SATURATED = np.uint8(Flag.MISSING), np.uint8(Flag.SATURATED)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _flag(range_m, amplitude_e, noise_e2, lit, saturated, broken, least, wrap, flags):
+def _flag(range_m, amplitude_e, noise_e2, lit, saturated, broken, least, wrap, flags):  # type: ignore[no-untyped-def]
     """Fill the flags of (n, pixels); `least` is the amplitude and the phase noise allowed, `wrap` guard and period."""
     least_e, most_rad = least
     guard_m, period_m = wrap
