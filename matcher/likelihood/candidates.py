@@ -90,10 +90,10 @@ def fit_other_classes(setup: Setup, model: ImageModel, evidence: Evidence, fits:
     others = np.array([(k, c) for k in best for c in range(n_class) if c != fits.class_index[k]], np.int64)
     others = others.reshape(-1, 2)
     source = others[:, 0]
-    limit = fits.cost[source] + setup.policy.likely_cost
-    return refine(
-        model, evidence, fits.frame[source], others[:, 1], fits.view[source], settings, limit, at_first_sight=True
-    )
+    rival = fits.cost[source]
+    limit = rival + setup.policy.likely_cost
+    frame, view = fits.frame[source], fits.view[source]
+    return refine(model, evidence, frame, others[:, 1], view, settings, limit, rival, at_first_sight=True)
 
 
 def _with_sides(

@@ -36,6 +36,7 @@ def refine(
     view: NDArray[np.float64],
     settings: Settings,
     give_up_above: NDArray[np.float64] | None = None,
+    rival: NDArray[np.float64] | None = None,
     *,
     roughly: bool = False,
     at_first_sight: bool = False,
@@ -53,6 +54,8 @@ def refine(
     settings : Settings
     give_up_above : (m,) float64, optional
         Stop where the cost promises to stay above this.
+    rival : (m,) float64, optional
+        Cost of the best explanation of each candidate's frame that is known: what is not near it is not looked at closely.
     roughly : bool
         Whether to stop within a fraction of a standard deviation, with the pixels that counted at the start.
     at_first_sight : bool
@@ -64,7 +67,7 @@ def refine(
         In the order of the candidates.
     """
     limit = np.full(len(frame), np.inf) if give_up_above is None else give_up_above
-    problem = Problem(model, evidence, frame, class_index, settings, limit)
+    problem = Problem(model, evidence, frame, class_index, settings, limit, rival)
     state = problem.start(view, at_first_sight)
     state = descend(problem, state, settings.policy.rough_cost if roughly else settings.policy.settled_cost)
     if roughly:
@@ -99,11 +102,14 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     # before a background the cost is final here; otherwise pixels that nothing explains may still change it
     margin = policy.close_cost if settings.background is None else 0.0
     near = problem.near_best(state, margin) if look_around else np.empty(0, np.intp)
-    covariance, without_one = _uncertainty(problem, state, near)
-    pixels, sums = _judged_pixels(problem, state, near, covariance), _sums_of_all_pixels(problem, state)
-    # a return that is neither compared nor wrong costs what a pixel costs on average: a model that counts fewer
-    # pixels is not better for it
-    further = DISAGREEMENT * pixels.wrong + pixels.undecided
+    sums, covariance = _sums_of_all_pixels(problem, state), view_covariance(problem, state.sums)
+    pixels = _judged_pixels(problem, state, near, covariance)
+    # what costs more than another explanation by a pixel's disagreement decides nothing
+    close = near[(sums.cost + _further_cost(pixels))[near] <= problem.rival[near] + DISAGREEMENT]
+    covariance, without_one = _uncertainty(problem, state, close)
+    if pixels.wrong[close].any():
+        pixels = _judged_pixels(problem, state, near, covariance)
+    further = _further_cost(pixels)
     n_residuals = pixels.compared * problem.evidence.per_pixel + pixels.wrong + pixels.undecided
     n_fitted = int((problem.prior_weight == 0).sum())
     scale = problem.scale[: len(settings.free)]
@@ -160,6 +166,15 @@ def _sums_of_all_pixels(problem: Problem, state: State) -> Sums:
         state.images.phasor, state.images.slope, problem.evidence, problem.frame, state.use, settings.huber
     )
     return problem.with_prior(sums, state.theta)
+
+
+def _further_cost(pixels: _PixelCounts) -> NDArray[np.float64]:
+    """Return what pixels cost that leave no residual, (m,).
+
+    A return that is neither compared nor wrong costs what a pixel costs on average: a model that counts fewer pixels is
+    not better for it.
+    """
+    return np.asarray(DISAGREEMENT * pixels.wrong + pixels.undecided, np.float64)
 
 
 class _PixelCounts(NamedTuple):

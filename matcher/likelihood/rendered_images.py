@@ -27,16 +27,13 @@ class RenderedModel:
     bank : Bank
     background : Background, optional
         What stands behind the landmark.
-    workers : int
-        Threads that render.
     """
 
     slopes_are_free = False
 
-    def __init__(self, bank: Bank, background: Background | None = None, workers: int = 1) -> None:
+    def __init__(self, bank: Bank, background: Background | None = None) -> None:
         self.sensor: Sensor = bank.sensor
         self.background = background
-        self.workers = workers
         self._renderers = []
         self._factored = bank.lower is not None
         self._radius_m = 0.0
@@ -169,11 +166,11 @@ class RenderedModel:
         self, class_index: int, view: NDArray[np.float64], free: Sequence[str]
     ) -> tuple[PhasorImages, NDArray[np.complex128]]:
         return self._renderers[class_index].render_with_slopes(
-            Views(*np.ascontiguousarray(view.T)), free, background=self.background, workers=self.workers
+            Views(*np.ascontiguousarray(view.T)), free, background=self.background
         )
 
     def _render(self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None) -> PhasorImages:
         renderer = self._renderers[class_index]
         return renderer.render_views(
-            Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows, workers=self.workers
+            Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows
         )
