@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.likelihood.fits import Fits, best_of_frame, distinct, distinct_of_frames, least_of_frame
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.problem import Settings
-from phasemark.matcher.likelihood.refine import refine
+from phasemark.matcher.likelihood.refine import costs_at, refine
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.nearest.bank_minima import Starts
@@ -128,9 +128,13 @@ def fit_surroundings(setup: Setup, scene: Scene, evidence: Evidence, which: NDAr
     """
     order = np.lexsort((fits.cost, fits.frame))
     likely = [k for k in order if fits.frame[k] in which and np.isfinite(fits.covariance[k]).all()]
-    again = _surrounded(fits[_most_likely(setup, fits, likely)])
-    rival = least_of_frame(fits, len(evidence.weight))[again.frame]
+    around = _surrounded(fits[_most_likely(setup, fits, likely)])
     close = _close_settings(setup, scene, evidence)
+    cost = costs_at(scene.final, evidence, around.frame, around.class_index, around.view, close)
+    order = np.lexsort((cost, around.frame))
+    place = np.arange(len(order)) - np.searchsorted(around.frame[order], around.frame[order])
+    again = around[order[place < setup.policy.most_refined]]
+    rival = least_of_frame(fits, len(evidence.weight))[again.frame]
     limit = np.full(len(again), np.inf)
     return refine(scene.final, evidence, again.frame, again.class_index, again.view, close, limit, rival)
 

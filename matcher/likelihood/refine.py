@@ -81,6 +81,22 @@ def refine(
     return conclude(problem, state)
 
 
+def costs_at(
+    model: ImageModel,
+    evidence: Evidence,
+    frame: NDArray[np.int64],
+    class_index: NDArray[np.int64],
+    view: NDArray[np.float64],
+    settings: Settings,
+) -> NDArray[np.float64]:
+    """Return what m candidates cost where they start, disagreements included; arguments as for :func:`refine`."""
+    problem = Problem(model, evidence, frame, class_index, settings, np.full(len(frame), np.inf))
+    if problem.with_albedo:  # the brightness of each has to be found first
+        return whole_cost(problem, problem.start(view, False))[0]
+    theta = np.column_stack([problem.clipped(view.copy()), np.ones(len(view))])
+    return whole_cost(problem, problem.at(theta))[0]
+
+
 def _descend_near(problem: Problem, state: State) -> State:
     """Descend to the minimum; roughly only where another explanation is better by far."""
     policy = problem.policy
