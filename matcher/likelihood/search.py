@@ -111,12 +111,16 @@ def _retry_unexplained(
     starts = scene.wide_search.starts(seen[poor], policy.modes_again, all_classes=all_classes)
     parts.append(fit_starts(setup, scene, evidence, poor, starts, policy.beside_again_rad, patient=True))
     poor = _unexplained(setup, scene, evidence, bare, Fits.joined(parts), p=policy.refused_p)
-    if poor.size and scene.scout is not None:
+    if poor.size and (scene.scout is not None or scene.background is not None):
         parts.append(fit_surroundings(setup, scene, evidence, poor, Fits.joined(parts)))
         poor = _unexplained(setup, scene, evidence, bare, Fits.joined(parts), p=policy.refused_p)
     if poor.size and scene.scout is not None:
         # too little may be smooth for the scout to see the way
         starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=all_classes)
+        parts.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
+    elif poor.size and scene.background is not None:
+        # edges between columns before a bright wall: no pixel may decide alone where the search starts
+        starts = scene.wide_search.capped().starts(seen[poor], policy.modes_again, all_classes=True)
         parts.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
     return Fits.joined(parts)
 
