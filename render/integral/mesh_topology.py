@@ -21,6 +21,8 @@ CREASE_RAD = math.radians(30.0)
 CLUSTER = 32
 """Faces that are looked at together for silhouettes."""
 _COPLANAR_RAD = 1e-7
+_HOLLOW = 1e-9
+"""Share of the mesh's extent by which a face rises before its neighbour's plane in a hollow; rounding is less."""
 
 
 class MeshTopology(NamedTuple):
@@ -44,13 +46,14 @@ class MeshTopology(NamedTuple):
         Whether all faces of the face's smooth patch are flat, which makes the patch a plane.
     patch : (f,) int32
         Number of the smooth patch, faces joined without a crease between them.
-    fanned : (f,) bool
-        Whether the face's smooth patch has an apex, from which slivers fan out.
+    searched : (f,) bool
+        Whether faces of the face's smooth patch are searched for from one another: a curved patch without a hollow, or
+        one with an apex, from which slivers fan out.
     search : (f, 16) float32
         What the search of a face asks: plane (4), corner shares (8), the face of the same patch beyond the edge from
         each corner to the next (3; −1: there is none), and the patch.
     grid : FaceGrid
-        Where the faces of fanned patches are.
+        Where the faces of the searched patches are.
     part : (f,) int8
         0 for the landmark's lower part, 1 for the upper one.
     concave : (e,) bool
@@ -85,7 +88,7 @@ class MeshTopology(NamedTuple):
     flat: NDArray[np.bool_]
     plain: NDArray[np.bool_]
     patch: NDArray[np.int32]
-    fanned: NDArray[np.bool_]
+    searched: NDArray[np.bool_]
     search: NDArray[np.float32]
     grid: FaceGrid
     part: NDArray[np.int8]
@@ -135,11 +138,12 @@ class MeshTopology(NamedTuple):
         flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
         # the corner of the other face off the edge lies before the first face's plane
         off_edge = vertices[faces[other]].sum(axis=1) - vertices[edges[:, 0]] - vertices[edges[:, 1]]
-        concave = np.einsum("ij,ij->i", planes[first, :3], off_edge) > planes[first, 3]
+        rise = np.einsum("ij,ij->i", planes[first, :3], off_edge) - planes[first, 3]
         plain = np.bincount(patch, ~flat)[patch] == 0
         shares = _corner_shares(vertices[faces])
         apex = (corners == 0).all(axis=2).any(axis=1)
-        fanned = np.bincount(patch, apex)[patch] > 0
+        hollow = np.bincount(patch[first], ~crease & (rise > _HOLLOW * extent), minlength=patch.max() + 1)[patch] > 0
+        searched = ~plain & ((np.bincount(patch, apex)[patch] > 0) | ~hollow)
         fold_reach = _fold_reach(edges[fold], normals)
         smooth_faces, clusters = _cluster_faces(vertices[faces].mean(axis=1), planes, fold_reach)
         folds, first_fold = _folds_in_order(edges[fold], smooth_faces)
@@ -156,14 +160,14 @@ class MeshTopology(NamedTuple):
             flat=np.ascontiguousarray(flat),
             plain=plain,
             patch=patch,
-            fanned=fanned,
+            searched=searched,
             search=np.ascontiguousarray(
                 np.column_stack([planes, shares.reshape(-1, 8), _neighbours(faces, edges[~crease]), patch]), np.float32
             ),
-            grid=FaceGrid.of_faces(vertices[faces], fanned),
+            grid=FaceGrid.of_faces(vertices[faces], searched),
             part=np.ascontiguousarray(part),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
-            concave=np.ascontiguousarray(concave[crease]),
+            concave=np.ascontiguousarray(rise[crease] > 0),
             folds=folds,
             first_fold=first_fold,
             smooth_planes=np.ascontiguousarray(np.column_stack([planes, fold_reach])[smooth_faces]),
@@ -186,7 +190,7 @@ class MeshTopology(NamedTuple):
             flat=np.zeros(0, np.bool_),
             plain=np.zeros(0, np.bool_),
             patch=np.zeros(0, np.int32),
-            fanned=np.zeros(0, np.bool_),
+            searched=np.zeros(0, np.bool_),
             search=np.zeros((0, 16), np.float32),
             grid=FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_)),
             part=np.zeros(0, np.int8),
