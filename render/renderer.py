@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
-from phasemark.render.integral.arguments import Camera, Edges, Light, Poses, Samples, Sums
+from phasemark.render.integral.arguments import Camera, Edges, Light, Poses, Returns, Samples, Sums
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.light import add_background, sum_samples
-from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.integral.mesh_topology import CLUSTER, MeshTopology
 from phasemark.render.integral.pixel_splitting import Scratch
 from phasemark.render.integral.ray_plan import UNTRUSTED, plan_rays
 from phasemark.render.integral.shells import unite_shells
@@ -34,8 +34,11 @@ Variant = Literal["exact", "hard"]
 """The area integral, or what the centre ray of each pixel sees."""
 
 _SAMPLES = 1 << 17
+_RETURNS = 1 << 9
 _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
+_LARGE = 1 << 13
+"""Faces above which a mesh is more than the processor's cache holds."""
 
 
 @dataclass
@@ -56,6 +59,7 @@ class _Buffers:
             head=np.empty((rows + 2, cols + 2), np.int32),
             link=np.empty(self.n_links, np.int32),
             owner=np.empty(self.n_links, np.int32),
+            heights=np.empty(CLUSTER),
         )
         self.samples = _room_for(self.n_samples)
 
@@ -77,6 +81,7 @@ def _room_for(n: int) -> Samples:
         chosen=np.empty(n, np.int64),
         origins=np.empty((n, 3), np.float32),
         directions=np.empty((n, 3), np.float32),
+        returns=Returns.empty(_RETURNS),
     )
 
 
@@ -280,6 +285,8 @@ class Renderer:
     ) -> PhasorImages:
         """Render rows of views that have been checked, as the camera itself has them."""
         run = self._render_tasks if variant == "exact" else self._cast_centres
+        order = self._by_direction(views)
+        ordered = views[order]
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)
         sums = _no_light(shape, len(self._orders))
@@ -293,24 +300,33 @@ class Renderer:
         )
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
         if workers == 1 or len(tasks) <= 1:
-            run(tasks, views, camera, light, sums)
+            run(tasks, ordered, camera, light, sums)
         else:
             with ThreadPoolExecutor(workers) as pool:
                 lanes = [tasks[i::workers] for i in range(workers)]
-                list(pool.map(lambda lane: run(lane, views, camera, light, sums), lanes))
+                list(pool.map(lambda lane: run(lane, ordered, camera, light, sums), lanes))
         self.untrusted_pixels += int((sums.state == UNTRUSTED).sum())
-        phasor = sums.phasor.reshape(*shape, len(self._orders))
+        phasor, intensity, coverage, upper = (
+            _restored(values.reshape(*shape, *values.shape[1:]), order)
+            for values in (sums.phasor, sums.intensity, sums.coverage, sums.upper)
+        )
         return PhasorImages(
             phasor=np.ascontiguousarray(phasor[..., 0]),
-            intensity=sums.intensity.reshape(shape),
-            coverage=np.minimum(sums.coverage.reshape(shape), 1.0),
-            upper_coverage=np.minimum(sums.upper.reshape(shape), 1.0),
+            intensity=intensity,
+            coverage=np.minimum(coverage, 1.0),
+            upper_coverage=np.minimum(upper, 1.0),
             sensor=self.sensor,
             views=views,
             harmonics={
                 int(order): np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._orders) if order > 1
             },
         )
+
+    def _by_direction(self, views: Views) -> slice | NDArray[np.int64]:
+        """Return in which order to render views: a large mesh side after side, for the cache does not hold it all."""
+        if len(self.topology.faces) < _LARGE:
+            return slice(None)
+        return np.argsort(views.delta_rad, kind="stable")
 
     def _render_tasks(self, tasks: Iterable[slice], views: Views, camera: Camera, light: Light, sums: Sums) -> None:
         """Render slices of the views into `sums`, in one thread."""
@@ -378,6 +394,15 @@ class Renderer:
             )
 
 
+def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:
+    """Return what was rendered in an order as the views came."""
+    if isinstance(order, slice):
+        return values
+    restored = np.empty_like(values)
+    restored[order] = values
+    return restored
+
+
 def background_image(background: Background, sensor: Sensor) -> PhasorImages:
     """Return what a background alone returns, straight ahead.
 
@@ -424,6 +449,8 @@ def _camera(sensor: Sensor, rows: tuple[int, int]) -> Camera:
         scale_v=sensor.rows / (2 * tan_v),
         centre_u=float(sensor.centre_px[0]),
         centre_v=float(sensor.centre_px[1]),
+        slope_u=2 * tan_h / sensor.cols,
+        slope_v=2 * tan_v / sensor.rows,
         rows=sensor.rows,
         cols=sensor.cols,
         first_row=rows[0],

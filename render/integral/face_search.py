@@ -76,7 +76,7 @@ class FaceGrid(NamedTuple):
 
 
 def _finest(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how many faces one crosses per metre along each axis, (3,): slivers along z are crossed in x and y only."""
+    """Return how many cells per metre a grid needs along each axis; slivers along z need them in x and y only."""
     edges = np.roll(corners, -1, axis=1) - corners
     longest = np.take_along_axis(edges, np.linalg.norm(edges, axis=2).argmax(axis=1)[:, None, None], axis=1)[:, 0]
     normals = np.cross(edges[:, 0], edges[:, 1])
@@ -159,7 +159,7 @@ def look_about(search, grid, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-unty
     """Return a face of the patch near where a ray meets the plane of its face f; f itself where the grid has none."""
     face = search[f]
     facing = face[0] * dx + face[1] * dy + face[2] * dz
-    if facing > -_GRAZING * math.sqrt(dx * dx + dy * dy + dz * dz):
+    if facing > 0.0 or facing * facing < _GRAZING * _GRAZING * (dx * dx + dy * dy + dz * dz):
         return f
     t = (face[3] - face[0] * ox - face[1] * oy - face[2] * oz) / facing
     g = _face_about(grid, ox + t * dx, oy + t * dy, oz + t * dz)
@@ -182,12 +182,12 @@ def find_face(search, grid, start, ox, oy, oz, dx, dy, dz):  # type: ignore[no-u
     """
     f, before, looks = start, -1, 0
     patch = search[start, 15]
-    grazing = _GRAZING * math.sqrt(dx * dx + dy * dy + dz * dz)
+    grazing = _GRAZING * _GRAZING * (dx * dx + dy * dy + dz * dz)
     for _ in range(_MOST_STEPS):
         face = search[f]
         # all that follows is multiplied by `facing`, so that no step waits for a division
         facing = -(face[0] * dx + face[1] * dy + face[2] * dz)
-        if facing < grazing:
+        if facing < 0.0 or facing * facing < grazing:
             return -1, 0.0
         height = face[0] * ox + face[1] * oy + face[2] * oz - face[3]
         along = face[4] * dx + face[5] * dy + face[6] * dz

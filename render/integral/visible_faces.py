@@ -10,7 +10,7 @@ from __future__ import annotations
 from phasemark.render.integral.arguments import ray_of, towards_landmark
 from phasemark.render.integral.face_search import find_face, look_about, plane_hit, turns_smoothly
 from phasemark.render.integral.ray_plan import SPLIT
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import kernel
 
 _LOOKS = 2
 """Into the grid, for each sample, before its face is searched for step by step."""
@@ -37,8 +37,8 @@ def pick_scouts(n, samples):  # type: ignore[no-untyped-def]
 def share_faces(n, mesh, share, scout_face, samples, poses, camera, state):  # type: ignore[no-untyped-def]
     """Hand the face a scout met to its interval where that is all there is to know, and list the samples left to cast.
 
-    On a plain patch the plane is the same for all samples, and where the scout met nothing nothing is met. On a searched
-    patch each sample's face is looked for from the scout's, and on any other curved patch it is cast.
+    On a plain patch the plane is the same for all samples, and where the scout met nothing nothing is met. On a
+    searched patch each sample's face is looked for from the scout's, and on any other curved patch it is cast.
     Pixels that could not be split are cast throughout, as is everything without `share`.
 
     Returns how many indices were written to ``samples.chosen``.
