@@ -100,6 +100,8 @@ class Edges(NamedTuple):
         Next entry, and the entry's segment.
     heights : (CLUSTER,) float64
         How far before the faces of one cluster the lens is.
+    ends : (e, 2) int32
+        Vertices at both ends; −1: the line where wall and floor meet, or the horizon.
     """
 
     segments: NDArray[np.float64]
@@ -108,6 +110,66 @@ class Edges(NamedTuple):
     link: NDArray[np.int32]
     owner: NDArray[np.int32]
     heights: NDArray[np.float64]
+    ends: NDArray[np.int32]
+
+
+class Borders(NamedTuple):
+    """Points on the edges inside pixels, where the light of a pixel changes as the edges move; room for m.
+
+    An integral over a pixel changes with a parameter by what the light changes at fixed points of the image, and by what
+    the edges sweep: ∫ (f_left − f_right) ẋ ds along each (Leibniz's rule).
+
+    Parameters
+    ----------
+    count : (1,) int64
+        Points placed; beyond m: there was not room for all.
+    points : (m, 2) float64
+        u, v.
+    weights : (m,) float64
+        Length along the sweep, over the pixel's active area.
+    regions : (m, 2) int32
+        Numbers of the intervals on both sides, towards smaller and larger x; see :class:`Samples`.
+    segment : (m,) int32
+        The edge.
+    side : (m,) float64
+        +1 for a limb with its surface towards larger x, −1 towards smaller x, 0 for a crease.
+    along_v : (m,) int8
+        1 where x is u, the coordinate in which the edge is said to move; 0 where it is v.
+    pixel : (m,) int64
+        view · pixels + pixel.
+    depth : (m,) float64
+        Of the edge along the camera's axis; 0: it is never hidden.
+    rates : (m, p) float64
+        How fast the edge moves along x, pixels per unit of each parameter.
+    """
+
+    count: NDArray[np.int64]
+    points: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    regions: NDArray[np.int32]
+    segment: NDArray[np.int32]
+    side: NDArray[np.float64]
+    along_v: NDArray[np.int8]
+    pixel: NDArray[np.int64]
+    depth: NDArray[np.float64]
+    rates: NDArray[np.float64]
+
+
+class Motion(NamedTuple):
+    """How the view of a batch is moved, to tell how fast its edges move.
+
+    Parameters
+    ----------
+    poses : Poses
+        1 + p for each view: the view itself, then each parameter moved by its step.
+    step : (p,) float64
+    segments : (1 + p, 4) float64
+        Scratch: one edge in these poses.
+    """
+
+    poses: Poses
+    step: NDArray[np.float64]
+    segments: NDArray[np.float64]
 
 
 class Returns(NamedTuple):

@@ -8,7 +8,7 @@ from phasemark.render.background import background_hit
 from phasemark.render.integral.arguments import ray_of, towards_landmark, towards_level
 from phasemark.render.integral.circular import turn
 from phasemark.render.integral.face_search import plane_hit
-from phasemark.render.integral.quadrature_rules import G4W, G4X
+from phasemark.render.integral.quadrature_rules import G3W, G3X, G4W, G4X
 from phasemark.render.integral.ray_plan import SKIPPED
 from phasemark.render.kernel import inlined, kernel
 
@@ -55,7 +55,7 @@ def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # typ
         length = math.sqrt(1.0 + y * y + z * z)
         face = samples.face[k]
         if face >= 0:
-            t, reflected = _landmark_hit(mesh, face, poses.lens[view], poses.matrix[view], y, z)
+            t, reflected = landmark_hit(mesh, face, poses.lens[view], poses.matrix[view], y, z)
             reflected *= light.albedo
             coverage += weights[k]
             if mesh.part[face]:
@@ -107,7 +107,17 @@ def _add_phasor(index, distance, reflected, length, weight, light, sums):  # typ
 
 
 @inlined
-def _landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def]
+def phasor_of(distance, reflected, length, light):  # type: ignore[no-untyped-def]
+    """Return the light of one hit at the modulation frequency; arguments as :func:`_add_phasor` takes them."""
+    a = reflected / (distance * distance)
+    if light.vignetting:
+        a /= length * length * length * length
+    phase = light.radians_per_metre * distance
+    return complex(a * math.cos(phase), a * math.sin(phase))
+
+
+@inlined
+def landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def]
     """Return the multiple of the ray (1, y, z) at its hit, and |cos θ| there times the ray's length."""
     dx, dy, dz = towards_landmark(matrix, y, z)
     ox, oy, oz = lens[0], lens[1], lens[2]
@@ -158,7 +168,11 @@ def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def
 
 @kernel
 def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-untyped-def]
-    """Integrate the background over the skipped pixels of views `start` to `stop`, 4 × 4 Gauss points each."""
+    """Integrate the background over the skipped pixels of views `start` to `stop`.
+
+    A wall takes 3 × 3 Gauss points a pixel. A floor, whose range changes fast towards the horizon, takes 4 × 4.
+    """
+    order = 4 if light.background[1] > 0.0 else 3
     rows, cols = camera.stop_row - camera.first_row, camera.cols
     for view in range(start, stop):
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
@@ -167,15 +181,17 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
                 if sums.state[view, r, c] != SKIPPED:
                     continue
                 index = (view * rows + r) * cols + c
-                for i in range(4):
-                    v = r + camera.first_row + 0.5 + camera.fill_v * (G4X[i] - 0.5)
-                    for j in range(4):
-                        u = c + 0.5 + camera.fill_u * (G4X[j] - 0.5)
+                for i in range(order):
+                    at = G4X[i] if order == 4 else G3X[i]
+                    v = r + camera.first_row + 0.5 + camera.fill_v * (at - 0.5)
+                    for j in range(order):
+                        at = G4X[j] if order == 4 else G3X[j]
+                        u = c + 0.5 + camera.fill_u * (at - 0.5)
                         y, z = ray_of(camera, u, v)
                         length = math.sqrt(1.0 + y * y + z * z)
                         dx, dy, dz = towards_level(camera.level, y, z)
                         t, rho, cos_theta = background_hit(light.background, cos_b, sin_b, dx, dy, dz)
                         if t == 0.0:
                             continue
-                        weight = G4W[i] * G4W[j]
+                        weight = G4W[i] * G4W[j] if order == 4 else G3W[i] * G3W[j]
                         _add_phasor(index, t * length, rho * cos_theta, length, weight, light, sums)

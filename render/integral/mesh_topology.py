@@ -73,6 +73,8 @@ class MeshTopology(NamedTuple):
         differ from those at most, the largest reach, and how far the faces' corners are from the point at most.
     low, high : (3,) float64
         Corners of the box around all vertices.
+    radius_m : float
+        Distance of the farthest vertex from the origin.
     closed : bool
         Whether every shell of the mesh is watertight and wound outward, so that what faces away is never seen.
     """
@@ -96,6 +98,7 @@ class MeshTopology(NamedTuple):
     clusters: NDArray[np.float64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
+    radius_m: float
     closed: bool
 
     @classmethod
@@ -170,6 +173,7 @@ class MeshTopology(NamedTuple):
             clusters=clusters,
             low=vertices.min(axis=0),
             high=vertices.max(axis=0),
+            radius_m=float(np.linalg.norm(vertices, axis=1).max()),
             closed=bool(regular.all() and (six_volumes > 0).all()),
         )
 
@@ -196,6 +200,7 @@ class MeshTopology(NamedTuple):
             clusters=np.zeros((0, 11)),
             low=np.zeros(3),
             high=np.zeros(3),
+            radius_m=0.0,
             closed=True,
         )
 
