@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
-from phasemark.render.integral.arguments import Borders, Camera, Edges, Light, Motion, Poses, Samples, Sums
+from phasemark.render.integral.arguments import Borders, Camera, Edges, Light, Motion, Poses, Returns, Samples, Sums
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.light import add_background, sum_samples
-from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.integral.mesh_topology import CLUSTER, MeshTopology
 from phasemark.render.integral.pixel_splitting import Scratch
 from phasemark.render.integral.ray_plan import UNTRUSTED, plan_rays
 from phasemark.render.integral.shells import unite_shells
@@ -36,9 +36,12 @@ Variant = Literal["exact", "hard"]
 """The area integral, or what the centre ray of each pixel sees."""
 
 _SAMPLES = 1 << 17
+_RETURNS = 1 << 9
 _BORDERS = 1 << 14
 _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
+_LARGE = 1 << 13
+"""Faces above which a mesh is more than the processor's cache holds."""
 
 
 @dataclass
@@ -61,6 +64,7 @@ class _Buffers:
             head=np.empty((rows + 2, cols + 2), np.int32),
             link=np.empty(self.n_links, np.int32),
             owner=np.empty(self.n_links, np.int32),
+            heights=np.empty(CLUSTER),
             ends=np.empty((self.n_edges + 1, 2), np.int32),
         )
         self.samples = _room_for(self.n_samples)
@@ -85,6 +89,7 @@ def _room_for(n: int) -> Samples:
         chosen=np.empty(n, np.int64),
         origins=np.empty((n, 3), np.float32),
         directions=np.empty((n, 3), np.float32),
+        returns=Returns.empty(_RETURNS),
     )
 
 
@@ -363,6 +368,8 @@ class Renderer:
         With `slope`, (pixels of all views, p), it is filled with how the phasors change with `parameters`.
         """
         run = self._render_tasks if variant == "exact" else self._cast_centres
+        order = self._by_direction(views) if slope is None else slice(None)
+        ordered = views[order]
         if slope is not None:
             run = partial(self._render_tasks, slope=slope, parameters=parameters)
         first, stop = rows
@@ -378,24 +385,33 @@ class Renderer:
         )
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
         if workers == 1 or len(tasks) <= 1:
-            run(tasks, views, camera, light, sums)
+            run(tasks, ordered, camera, light, sums)
         else:
             with ThreadPoolExecutor(workers) as pool:
                 lanes = [tasks[i::workers] for i in range(workers)]
-                list(pool.map(lambda lane: run(lane, views, camera, light, sums), lanes))
+                list(pool.map(lambda lane: run(lane, ordered, camera, light, sums), lanes))
         self.untrusted_pixels += int((sums.state == UNTRUSTED).sum())
-        phasor = sums.phasor.reshape(*shape, len(self._orders))
+        phasor, intensity, coverage, upper = (
+            _restored(values.reshape(*shape, *values.shape[1:]), order)
+            for values in (sums.phasor, sums.intensity, sums.coverage, sums.upper)
+        )
         return PhasorImages(
             phasor=np.ascontiguousarray(phasor[..., 0]),
-            intensity=sums.intensity.reshape(shape),
-            coverage=np.minimum(sums.coverage.reshape(shape), 1.0),
-            upper_coverage=np.minimum(sums.upper.reshape(shape), 1.0),
+            intensity=intensity,
+            coverage=np.minimum(coverage, 1.0),
+            upper_coverage=np.minimum(upper, 1.0),
             sensor=self.sensor,
             views=views,
             harmonics={
                 int(order): np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._orders) if order > 1
             },
         )
+
+    def _by_direction(self, views: Views) -> slice | NDArray[np.int64]:
+        """Return in which order to render views: a large mesh side after side, for the cache does not hold it all."""
+        if len(self.topology.faces) < _LARGE:
+            return slice(None)
+        return np.argsort(views.delta_rad, kind="stable")
 
     def _render_tasks(
         self,
@@ -486,6 +502,15 @@ class Renderer:
             )
 
 
+def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:
+    """Return what was rendered in an order as the views came."""
+    if isinstance(order, slice):
+        return values
+    restored = np.empty_like(values)
+    restored[order] = values
+    return restored
+
+
 def background_image(background: Background, sensor: Sensor) -> PhasorImages:
     """Return what a background alone returns, straight ahead.
 
@@ -532,6 +557,8 @@ def _camera(sensor: Sensor, rows: tuple[int, int]) -> Camera:
         scale_v=sensor.rows / (2 * tan_v),
         centre_u=float(sensor.centre_px[0]),
         centre_v=float(sensor.centre_px[1]),
+        slope_u=2 * tan_h / sensor.cols,
+        slope_v=2 * tan_v / sensor.rows,
         rows=sensor.rows,
         cols=sensor.cols,
         first_row=rows[0],

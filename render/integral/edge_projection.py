@@ -54,20 +54,23 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
             limb[n] = 0
             edges.ends[n, 0], edges.ends[n, 1] = start, end
             n += 1
-    farthest = mesh.radius_m + math.sqrt(lens[0] * lens[0] + lens[1] * lens[1] + lens[2] * lens[2])
+    heights = edges.heights
     for c in range(len(clusters)):
-        px, py, pz, nx, ny, nz, d, turn, slack, reach = clusters[c]
+        px, py, pz, nx, ny, nz, d, turn, slack, reach, radius = clusters[c]
         dx, dy, dz = lens[0] - px, lens[1] - py, lens[2] - pz
         away = math.sqrt(dx * dx + dy * dy + dz * dz)
+        farthest = away + radius
         if abs(nx * dx + ny * dy + nz * dz - d) > turn * away + slack + reach * farthest:
             continue
-        for i in range(c * CLUSTER, min((c + 1) * CLUSTER, len(smooth_planes))):
-            height = _height(smooth_planes, i, lens)
-            if abs(height) > smooth_planes[i, 4] * farthest:
+        first, count = c * CLUSTER, min(CLUSTER, smooth_planes.shape[1] - c * CLUSTER)
+        for i in range(count):  # in vector instructions
+            heights[i] = _smooth_height(smooth_planes, first + i, lens)
+        for i in range(count):
+            if abs(heights[i]) > smooth_planes[4, first + i] * farthest:
                 continue
-            before = height > 0.0
-            for e in range(mesh.first_fold[i], mesh.first_fold[i + 1]):
-                if before == (_height(smooth_planes, folds[e, 2], lens) > 0.0):
+            before = heights[i] > 0.0
+            for e in range(mesh.first_fold[first + i], mesh.first_fold[first + i + 1]):
+                if before == (_smooth_height(smooth_planes, folds[e, 2], lens) > 0.0):
                     continue
                 a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
                 if project(vertices, a, b, matrix, offset, camera, edges.segments[n]):
@@ -81,6 +84,12 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
 def _height(planes, f, lens):  # type: ignore[no-untyped-def]
     """Return how far before the front of a face the lens is."""
     return planes[f, 0] * lens[0] + planes[f, 1] * lens[1] + planes[f, 2] * lens[2] - planes[f, 3]
+
+
+@inlined
+def _smooth_height(planes, i, lens):  # type: ignore[no-untyped-def]
+    """Return the same for a smooth face; `planes` has a row for each number, not for each face."""
+    return planes[0, i] * lens[0] + planes[1, i] * lens[1] + planes[2, i] * lens[2] - planes[3, i]
 
 
 @inlined
