@@ -138,7 +138,7 @@ class Problem:
         if at_first_sight and not self.with_albedo and not self.model.slopes_are_free:
             images = self._images_at_first_sight(theta)
         else:
-            images = self.model.images(self.class_index, view, free)
+            images = self.model.first_images(self.class_index, view, free)
         if self.with_albedo:
             theta[:, 4] = self._brightness(images)
         return self.summed(theta, self.pixels_at(images, theta), self.scaled(images, theta))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.matcher.likelihood.images import VIEW, ModelImages
+from phasemark.matcher.likelihood.view_cache import ViewCache
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 
 STEP = 1e-5
@@ -27,13 +30,16 @@ class RenderedModel:
     bank : Bank
     background : Background, optional
         What stands behind the landmark.
+    cache_bytes : int
+        Room for images that other frames may start from too.
     """
 
     slopes_are_free = False
 
-    def __init__(self, bank: Bank, background: Background | None = None) -> None:
+    def __init__(self, bank: Bank, background: Background | None = None, cache_bytes: int = 0) -> None:
         self.sensor: Sensor = bank.sensor
         self.background = background
+        self.cache = ViewCache(cache_bytes)
         self._renderers = []
         self._factored = bank.lower is not None
         self._radius_m = 0.0
@@ -94,6 +100,24 @@ class RenderedModel:
                 there = self._render(c, moved).phasor.reshape(len(of), -1)
                 slope[of, k] = (there - phasor[of]) / width[:, None]
         return ModelImages(phasor, slope, intensity, coverage)
+
+    def first_images(
+        self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
+    ) -> ModelImages:
+        """Return images as :meth:`images` does, rendered only where no frame before has asked for them."""
+        keys = [(int(c), one.tobytes(), tuple(free), self.background) for c, one in zip(class_index, view, strict=True)]
+        place = {key: k for k, key in enumerate(keys)}  # of one that asks for it
+        found = {key: self.cache.get(key) for key in place}
+        missing = [k for key, k in place.items() if found[key] is None]
+        new = self.images(class_index[missing], np.ascontiguousarray(view[missing]), free)
+        for k, *arrays in zip(missing, new.phasor, new.slope, new.intensity, new.coverage, strict=True):
+            own = tuple(values.copy() for values in arrays)  # no view of the whole batch, which would stay too
+            found[keys[k]] = own
+            self.cache.put(keys[k], own)
+        rows = [row for row in map(found.get, keys) if row is not None]
+        if not rows:
+            return new
+        return ModelImages(*(np.stack([cast(Any, row[part]) for row in rows]) for part in range(4)))
 
     def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
         """Render the rows that δ changes."""
@@ -167,10 +191,21 @@ class RenderedModel:
     def _render_with_slopes(
         self, class_index: int, view: NDArray[np.float64], free: Sequence[str]
     ) -> tuple[PhasorImages, NDArray[np.complex128]]:
-        return self._renderers[class_index].render_with_slopes(
-            Views(*np.ascontiguousarray(view.T)), free, background=self.background
-        )
+        views = Views(*np.ascontiguousarray(view.T))
+        background = self._background_of(class_index, views)
+        return self._renderers[class_index].render_with_slopes(views, free, background=background)
 
     def _render(self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None) -> PhasorImages:
-        renderer = self._renderers[class_index]
-        return renderer.render_views(Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows)
+        views = Views(*np.ascontiguousarray(view.T))
+        background = self._background_of(class_index, views)
+        return self._renderers[class_index].render_views(views, background=background, rows=rows)
+
+    def _background_of(self, class_index: int, views: Views) -> Background | None:
+        """Return the background, its floor lowered to where the landmark ends: floors are estimated, views tried."""
+        if self.background is None or self.background.floor_m is None:
+            return self.background
+        vertices = self._renderers[class_index].topology.vertices
+        deepest = float(-vertices[:, 2].min() - views.in_camera(self.sensor).height_m.min(initial=0.0))
+        if deepest <= self.background.floor_m:
+            return self.background
+        return replace(self.background, floor_m=deepest)

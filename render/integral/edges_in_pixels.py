@@ -79,9 +79,9 @@ def clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
 def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore[no-untyped-def]
     """Clip a pixel's segments to a box, into ``scratch.edges``.
 
-    Its rows are s, x of both ends (s rising), the limb's side, the slope and the segment, sorted by where they begin. The
-    side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number, or
-    −1 if there are too many.
+    Its rows are s, x of both ends (s rising), the limb's side, the slope and the segment, sorted by where they begin.
+    The side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number,
+    or −1 if there are too many.
     """
     segments, limb, link, owner = edges.segments, edges.limb, edges.link, edges.owner
     clipped, order = scratch.clipped, scratch.order

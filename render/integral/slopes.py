@@ -1,7 +1,7 @@
 """How the phasors of a batch change with the view, from the samples and edges that its images are made of.
 
-∂S/∂p = Σ weights · ∂f/∂p at the samples, the faces they see held, + ∫ (f_left − f_right) ẋ ds along the edges. Both ẋ and
-∂f/∂p are differences over a step of 3e-8 that no edge and no sample notices: nothing is sampled or cast again.
+∂S/∂p = Σ weights · ∂f/∂p at the samples, the faces they see held, + ∫ (f_left − f_right) ẋ ds along the edges. Both
+ẋ and ∂f/∂p are differences over a step of 3e-8 that no edge and no sample notices: nothing is sampled or cast again.
 """
 
 from __future__ import annotations

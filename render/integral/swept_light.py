@@ -41,7 +41,7 @@ def sum_borders(n, samples, first_of, mesh, poses, camera, light, borders, slope
             count = region + 1
     first_of[count] = n
     pixels_per_view = (camera.stop_row - camera.first_row) * camera.cols
-    for b in range(borders.count[0]):
+    for b in range(borders.placed[0]):
         index = borders.pixel[b]
         view = index // pixels_per_view
         y, z = ray_of(camera, borders.points[b, 0], borders.points[b, 1])
