@@ -86,3 +86,20 @@ def test_answers_do_not_depend_on_the_cache_nor_on_threads(bank):
 def test_bytes_below_zero_are_refused():
     with pytest.raises(UsageError, match="'cache_bytes' must be an integer of at least 0"):
         replace(SearchPolicy(), cache_bytes=-1)
+
+
+def test_an_image_does_not_depend_on_what_is_rendered_beside_it_when_a_floor_gives_way(bank):
+    """The landmark ends 0.15 m or more below the lens; at some heights it would reach below the floor."""
+    model = RenderedModel(bank, Background(wall_m=4.0, floor_m=0.2))
+    view = np.array([[1.0, 0.3, 0.0, 0.0], [1.0, 0.3, 0.0, -0.1], [1.02, 0.4, 0.01, -0.06], [1.0, 0.3, 0.0, 0.05]])
+    c = np.full(4, bank.classes.index("post"))
+    together = model.images(c, view, BEARING)
+    for k in range(4):
+        alone = model.images(c[k : k + 1], view[k : k + 1], BEARING)
+        for name in ("phasor", "slope", "coverage"):
+            np.testing.assert_array_equal(getattr(together, name)[k], getattr(alone, name)[0])
+
+
+def test_a_stated_floor_above_the_landmarks_foot_is_refused(bank):
+    with pytest.raises(UsageError, match="the floor 0.05 m below the lens is above the landmark's lowest point"):
+        Matcher(bank, "refine", free=BEARING, background=Background(floor_m=0.05))

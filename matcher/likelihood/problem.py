@@ -219,7 +219,7 @@ class Problem:
         return counts(phasor, images.intensity, self.evidence.sensor) & trusted
 
     def near_best(self, state: State, margin: float) -> NDArray[np.intp]:
-        """Return the candidates that may be their frame's best, up to some cost above it; with none the best alone."""
+        """Return the candidates that may be their frame's best, up to some cost above it; at 0 the best alone."""
         cost = state.sums.cost
         order = np.lexsort((cost, self.frame))
         first = order[np.flatnonzero(np.diff(self.frame[order], prepend=-1))]

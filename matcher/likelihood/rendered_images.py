@@ -90,15 +90,17 @@ class RenderedModel:
             intensity[of] = image.intensity.reshape(len(of), -1)
             coverage[of] = image.coverage.reshape(len(of), -1)
             for k, name in enumerate(free):
-                _, first = self._changing_rows(name, view[of])
                 if slopes is not None and name in smooth:
-                    slope[of, k, first:] = slopes[:, smooth.index(name)].reshape(len(of), -1)[:, first:]
+                    slope[of, k] = slopes[:, smooth.index(name)].reshape(len(of), -1)
                     continue
                 moved = view[of]
                 moved[:, VIEW.index(name)] += STEP
                 width = (moved - view[of])[:, VIEW.index(name)]
                 there = self._render(c, moved).phasor.reshape(len(of), -1)
                 slope[of, k] = (there - phasor[of]) / width[:, None]
+        if self._factored and "delta_rad" in free:  # a body of revolution looks the same from every side
+            level, first = view[:, 3] == 0, self.sensor.lower_rows[0] * self.sensor.cols
+            slope[level, list(free).index("delta_rad"), :first] = 0
         return ModelImages(phasor, slope, intensity, coverage)
 
     def first_images(
@@ -191,21 +193,54 @@ class RenderedModel:
     def _render_with_slopes(
         self, class_index: int, view: NDArray[np.float64], free: Sequence[str]
     ) -> tuple[PhasorImages, NDArray[np.complex128]]:
-        views = Views(*np.ascontiguousarray(view.T))
-        background = self._background_of(class_index, views)
-        return self._renderers[class_index].render_with_slopes(views, free, background=background)
+        renderer, parts, slopes = self._renderers[class_index], [], []
+        for which, background in self._backgrounds_of(class_index, view):
+            views = Views(*np.ascontiguousarray(view[which].T))
+            image, slope = renderer.render_with_slopes(views, free, background=background)
+            parts.append((which, image))
+            slopes.append(slope)
+        order = np.argsort(np.concatenate([which for which, _ in parts]), kind="stable")
+        return _joined(parts), np.concatenate(slopes)[order]
 
     def _render(self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None) -> PhasorImages:
-        views = Views(*np.ascontiguousarray(view.T))
-        background = self._background_of(class_index, views)
-        return self._renderers[class_index].render_views(views, background=background, rows=rows)
+        renderer, parts = self._renderers[class_index], []
+        for which, background in self._backgrounds_of(class_index, view):
+            views = Views(*np.ascontiguousarray(view[which].T))
+            parts.append((which, renderer.render_views(views, background=background, rows=rows)))
+        return _joined(parts)
 
-    def _background_of(self, class_index: int, views: Views) -> Background | None:
-        """Return the background, its floor lowered to where the landmark ends: floors are estimated, views tried."""
+    def _backgrounds_of(
+        self, class_index: int, view: NDArray[np.float64]
+    ) -> list[tuple[NDArray[np.intp], Background | None]]:
+        """Return groups of views with the background of each.
+
+        A floor is lowered to where the landmark ends: floors are estimated, and heights are tried.
+        """
+        everything = np.arange(len(view))
         if self.background is None or self.background.floor_m is None:
-            return self.background
-        vertices = self._renderers[class_index].topology.vertices
-        deepest = float(-vertices[:, 2].min() - views.in_camera(self.sensor).height_m.min(initial=0.0))
-        if deepest <= self.background.floor_m:
-            return self.background
-        return replace(self.background, floor_m=deepest)
+            return [(everything, self.background)]
+        lowest_m = float(self._renderers[class_index].topology.vertices[:, 2].min())
+        height_m = Views(*np.ascontiguousarray(view.T)).in_camera(self.sensor).height_m
+        floor_m = np.maximum(self.background.floor_m, -(lowest_m + height_m))
+        return [
+            (np.flatnonzero(floor_m == own), replace(self.background, floor_m=float(own))) for own in np.unique(floor_m)
+        ] or [(everything, self.background)]
+
+
+def _joined(parts: list[tuple[NDArray[np.intp], PhasorImages]]) -> PhasorImages:
+    """Return images of groups of views in the order of the views."""
+    if len(parts) == 1:
+        return parts[0][1]
+    order = np.argsort(np.concatenate([which for which, _ in parts]), kind="stable")
+    images = [image for _, image in parts]
+
+    def of(name: str) -> Any:
+        return np.concatenate([getattr(image, name) for image in images])[order]
+
+    return PhasorImages(
+        phasor=of("phasor"),
+        intensity=of("intensity"),
+        coverage=of("coverage"),
+        sensor=images[0].sensor,
+        views=Views(*(np.concatenate([getattr(image.views, name) for image in images])[order] for name in VIEW)),
+    )

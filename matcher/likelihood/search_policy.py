@@ -59,9 +59,10 @@ class SearchPolicy:
         Longest step in natural units: of a descent, of one that starts where a scout ended, and of one whose scout did
         not know the bearing. Near a solution it is short: where an edge crosses a pixel's border, slopes jump.
     settled_cost, rough_cost : float
-        A step that promises to lower the cost by less is not taken; the second for first comparisons of minima.
+        A step that promises to lower the cost by less is not taken, and one that promised less than a hundred times as
+        much was the last; the second for first comparisons of minima.
     kept_slopes_cost : float
-        Where a step promises less than this, the slopes of the step before serve again.
+        Where a step promises less than this, slopes rendered before serve again, until a step with them fails.
     optimism : float
         A descent gives up where even this many times the promised decrease would not save it.
     first_sight_cost : float
@@ -99,8 +100,7 @@ class SearchPolicy:
         p-values at which the search is repeated more widely: where the likelihood has side peaks, and where
         it is smooth.
     refused_p : float
-        p-value at which, where there are side peaks, it goes on around the best fits, and from minima of the bank
-        without a scout.
+        p-value at which a repeated search goes on around the best fits, and from minima of the bank without a scout.
     trimmings : int
         How often a robust search starts again without the returns that fit worst.
     odd_ratio, odd_sigma : float

@@ -1,5 +1,7 @@
 """Points on the edges inside pixels, where the light of a pixel changes as the edges move.
 
+Left of an edge is the side of smaller x, right that of larger x, x being the coordinate across the sweep.
+
 The sweep knows which intervals lie on both sides of an edge; their samples tell later which faces are seen there. What
 becomes of the points stands in :mod:`~phasemark.render.integral.edge_motion` and
 :mod:`~phasemark.render.integral.swept_light`.
@@ -12,7 +14,7 @@ from phasemark.render.integral.quadrature_rules import G2W, G2X, G3W, G3X
 from phasemark.render.kernel import inlined, kernel
 
 _THIN = 1e-4
-"""Strips thinner than this (pixels) say nothing of what is seen beside an edge, which lies along the sweep's lines."""
+"""An edge that crosses a strip thinner than this (pixels) runs nearly along x: :func:`_place_level` handles it."""
 _SHORT, _LONG = 0.1, 0.5
 """Pieces of an edge up to the first (pixels) get one point, up to the second two, longer ones three."""
 
