@@ -101,5 +101,5 @@ def test_an_image_does_not_depend_on_what_is_rendered_beside_it_when_a_floor_giv
 
 
 def test_a_stated_floor_above_the_landmarks_foot_is_refused(bank):
-    with pytest.raises(UsageError, match="the floor 0.05 m below the lens is above the landmark's lowest point"):
+    with pytest.raises(UsageError, match=r"the floor 0\.05 m below the lens is above the landmark's lowest point"):
         Matcher(bank, "refine", free=BEARING, background=Background(floor_m=0.05))
