@@ -434,7 +434,7 @@ class Renderer:
         )
         for task in tasks:
             poses, own = _poses(views[task], camera), _of_views(sums, task)
-            motion = _motion(views[task], camera, parameters)
+            motion = _motion(views[task], poses, camera, parameters)
             slopes = None
             if slope is not None:
                 slopes = SlopeSums(slope[_pixels_of(task, sums)], motion, own, turns)
@@ -579,9 +579,11 @@ def _poses(views: Views, camera: Camera) -> Poses:
     )
 
 
-def _motion(views: Views, camera: Camera, parameters: Sequence[str]) -> Motion:
+def _motion(views: Views, poses: Poses, camera: Camera, parameters: Sequence[str]) -> Motion:
     """Return the poses of views, and of each with one parameter after the other moved."""
     p = len(parameters)
+    if not p:
+        return Motion(poses, np.empty(0), np.empty((1, 4)))
     many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_PARAMETERS))
     for k, name in enumerate(parameters):
         getattr(many, name)[k + 1 :: 1 + p] += STEP
