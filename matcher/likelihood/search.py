@@ -114,13 +114,30 @@ def _retry_with_prior(
     fits: Fits,
     poor: NDArray[np.int64],
 ) -> list[Fits]:
-    """Turn the best views of poor frames, heading kept, for a scout knows no bearing; then look at shifted images."""
+    """Search poor frames anew with the bearing free: turned, heading kept, then from shifted minima of the bank.
+
+    A scout knows no bearing.
+    """
     policy, direct = setup.policy, replace(scene, scout=None)
     found = [_fit_turned(setup, direct, evidence, poor, fits)]
     poor = _unexplained(setup, scene, evidence, bare, Fits.joined([fits, *found]))
     if poor.size:
         n_modes = policy.modes if scene.background is None else policy.modes_before_background
         starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=evidence.on == "phasors")
+        found.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
+        poor = _unexplained(
+            setup,
+            scene,
+            evidence,
+            bare,
+            Fits.joined([fits, *found]),
+            p=policy.refused_p,
+            among=poor,
+            even_beyond_bare=True,
+        )
+    if poor.size:
+        # edges between columns: no pixel may decide alone where the search starts
+        starts = scene.wide_search.capped().starts(seen[poor], policy.modes_again, all_classes=True)
         found.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
     return found
 
