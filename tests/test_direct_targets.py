@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.special import ndtr
 from scipy.stats import chi2
 
 from phasemark import UsageError
-from phasemark.render import Sensor
+from phasemark.cli import main
+from phasemark.render import Sensor, preset
 from phasemark.render.direct.histogram_frames import HistogramFrames, capture_histograms
 from phasemark.render.direct.targets import Status, find_targets
+from phasemark.render.sensor.sensor_file import sensor_toml
 
 SIGMA_BINS = 1.5
 WIDTH_M = 0.0137
@@ -198,3 +202,17 @@ def test_options_of_one_kind_of_sensor_are_refused_on_the_other() -> None:
 
 def test_a_sensor_without_histograms_is_written_as_it_was_before_there_were_any() -> None:
     assert "histogram" not in one_zone().with_(histogram=None).model_dump(mode="json")
+
+
+@pytest.mark.parametrize(
+    "name", ["vl53l5cx-8x8", "vl53l5cx-4x4", "vl53l8cx-8x8", "tmf8820-3x3", "tmf8828-8x8", "tmf8829-16x16"]
+)
+def test_what_sensor_show_prints_of_a_direct_sensor_is_its_file_again(
+    name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    main(["sensor", "show", name])
+    path = tmp_path / "shown.toml"
+    path.write_text(capsys.readouterr().out, encoding="utf-8")
+    assert Sensor.from_toml(path) == preset(name)
+    path.write_text(sensor_toml(preset(name), {}, header=(), otherwise="stated"), encoding="utf-8")
+    assert Sensor.from_toml(path) == preset(name)
