@@ -114,7 +114,7 @@ def _aligned(cells: int, scale: float) -> bool:
     return abs(border - round(border)) < _ALIGNED
 
 
-def footprint_grid(sensor: Sensor, margin_cells: int = 0) -> Camera:
+def footprint_grid(sensor: Sensor, margin_cells: int = 0, cells: int | None = None) -> Camera:
     """Return a camera whose pixels tile what the zones see: the grid on which the scene is integrated.
 
     Parameters
@@ -122,9 +122,11 @@ def footprint_grid(sensor: Sensor, margin_cells: int = 0) -> Camera:
     sensor : Sensor
     margin_cells : int
         Further cells on each side.
+    cells : int, optional
+        Cells along the side of a zone's share; None: as many as 1e-3 of a histogram's peak needs.
     """
     tan_h, tan_v = sensor.tan_half_angles
-    n_u, n_v = cells_per_zone(sensor)
+    n_u, n_v = cells_per_zone(sensor) if cells is None else (cells, cells)
     scale_u, scale_v = sensor.cols * n_u / (2 * tan_h), sensor.rows * n_v / (2 * tan_v)
     y_low, y_high, z_low, z_high = footprints_of(sensor).extent
     u0, v0 = sensor.centre_px[0] * n_u, sensor.centre_px[1] * n_v

@@ -51,7 +51,9 @@ class SceneSamples(NamedTuple):
     amplitude: NDArray[np.float64]
     part: NDArray[np.int8]
 
-    def __len__(self) -> int:
+    @property
+    def n_views(self) -> int:
+        """Number of poses."""
         return len(self.start) - 1
 
 

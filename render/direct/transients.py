@@ -80,7 +80,7 @@ def zone_transients(
         left out.
     """
     zones = footprints_of(sensor) if footprints is None else footprints
-    out = np.zeros((len(samples), PARTS, len(zones.centre), axis.n))
+    out = np.zeros((samples.n_views, PARTS, len(zones.centre), axis.n))
     _add_samples(
         samples.start, samples.tangents, samples.range_m, samples.amplitude, samples.part, zones,
         1 / footprint_areas(zones), axis.first_m, axis.step_m, out,
