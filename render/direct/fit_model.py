@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from phasemark.render.direct.expected_counts import piled_up
 from phasemark.render.direct.footprints import Footprints, footprint_grid, histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
-from phasemark.render.direct.recordings import ObjectRecording, PlaneRecording, world2cam
+from phasemark.render.direct.recordings import ObjectRecording, PlaneRecording, turn_about, world2cam
 from phasemark.render.direct.scene_samples import SceneSamples, plane_samples
 from phasemark.render.direct.transients import RangeAxis, zone_transients
 from phasemark.render.kernel import kernel
@@ -86,12 +86,13 @@ def start_parameters(sensor: Sensor, objects: Sequence[ObjectRecording], convert
         ("tilt_left", 0.0, 0.03),
         ("tilt_up", 0.0, 0.03),
         ("forward", 0.0, 0.003),
+        ("reference_gain", h.reference_gain, 1.0),
     ]
     table += [(f"converter_{k}", 1.0, 0.01) for k in sorted(set(converters))]
     table += [(f"delay_{k}", 0.0, 0.1) for k in range(sensor.rows * sensor.cols)]
     for one in objects:
         table += [(f"{one.name}_{axis}", 0.0, 0.003) for axis in "xyz"]
-        table += [(f"{one.name}_support", 1.0, 0.3)]
+        table += [(f"{one.name}_yaw", 0.0, 0.03), (f"{one.name}_support", 1.0, 0.3)]
     names, values, scales = zip(*table, strict=True)
     return Parameters(names, np.array(values), np.array(scales))
 
@@ -158,7 +159,7 @@ class FitModel:
 
     def transients(self, p: Parameters, recording: PlaneRecording | ObjectRecording) -> NDArray[np.float64]:
         """Return what each zone sees of a recording's scene, support and object apart, stray light included."""
-        key = (id(recording), *(p[name] for name in _GEOMETRY), *self._scene_key(p, recording))
+        key = (recording, *(p[name] for name in _GEOMETRY), *self._scene_key(p, recording))
         if key not in self._transients:
             if len(self._transients) >= 4:
                 self._transients.clear()
@@ -176,7 +177,8 @@ class FitModel:
         """Return expected and measured counts of a recording."""
         seen = self.transients(p, recording)
         light = seen.sum(axis=1)
-        measured, drift = recording.frames.zone_counts, recording.frames.drift_bins
+        measured = recording.frames.zone_counts
+        drift = p["reference_gain"] * recording.frames.reference_shift_bins
         cycles = 1e6 / max(p["inverse_cycles"], 1e-9)
         scales = np.array([p[f"converter_{k}"] for k in self.converters])
         delays = np.array([p[f"delay_{zone}"] for zone in range(light.shape[1])]) + drift[:, None]
@@ -207,13 +209,14 @@ class FitModel:
         return np.concatenate(parts)
 
     def _samples(self, p: Parameters, recording: PlaneRecording | ObjectRecording) -> SceneSamples:
-        key = (id(recording), *self._scene_key(p, recording))
+        key = (recording, *self._scene_key(p, recording))
         if key not in self._seen:
             if isinstance(recording, PlaneRecording):
                 samples = plane_samples(recording.distance_m, self.grid, (p["tilt_left"], p["tilt_up"]))
             else:
-                _, *placement = self._scene_key(p, recording)
-                transforms = world2cam(recording.sensor2world, (0.0, 0.0, p["forward"]), placement)
+                forward, *placement, yaw = self._scene_key(p, recording)
+                transforms = world2cam(recording.sensor2world, (0.0, 0.0, forward), placement)
+                transforms = transforms @ turn_about(recording.centre_m, yaw)
                 samples = recording.scene.samples(transforms, self.grid)
             self._remember(key, samples)
         return self._seen[key]
@@ -223,7 +226,7 @@ class FitModel:
         """Return the parameters on which the scene's samples depend."""
         if isinstance(recording, PlaneRecording):
             return p["tilt_left"], p["tilt_up"]
-        return (p["forward"], *(p[f"{recording.name}_{axis}"] for axis in "xyz"))
+        return (p["forward"], *(p[f"{recording.name}_{name}"] for name in ("x", "y", "z", "yaw")))
 
     def _remember(self, key: tuple[object, ...], samples: SceneSamples) -> None:
         if len(self._seen) > 12:

@@ -68,7 +68,8 @@ def fit_responses(model: FitModel, p: Parameters, plane: PlaneRecording) -> tupl
         Of :func:`bin_curve`, per zone; the last entry is the delay of the highest bin, bins.
     """
     light = model.transients(p, plane).sum(axis=1)
-    measured, drift = plane.frames.zone_counts, plane.frames.drift_bins
+    measured = plane.frames.zone_counts
+    drift = p["reference_gain"] * plane.frames.reference_shift_bins
     cycles = 1e6 / max(p["inverse_cycles"], 1e-9)
     rows = []
     for zone in range(light.shape[1]):
@@ -140,6 +141,10 @@ def responses_of(coefficients: NDArray[np.float64]) -> Responses:
         cumulative[:, k] = padded[:, k] + (cumulative[:, k - per_bin] if k >= per_bin else 0.0)
     scale = cumulative[:, n - 1 : n + per_bin - 1].mean(axis=1, keepdims=True)
     cumulative = cumulative / scale
+    # a response is nowhere negative: halfway between the rising curves just above and just below
+    above = np.maximum.accumulate(cumulative, axis=1)
+    below = np.minimum.accumulate(cumulative[:, ::-1], axis=1)[:, ::-1]
+    cumulative = 0.5 * (above + below)
     delays = coefficients[:, -1:]
     # zones have delays of their own, and one axis holds them all
     first = float(_KNOTS[0] + delays.min())

@@ -135,6 +135,8 @@ def fit_direct_sensor(
     p = start_parameters(base, objects, groups)
     responses, _ = fit_responses(model, p, plane)
     free = _free_parameters(p, objects)
+    if not any(one.frames.reference_shift_bins.any() for one in (plane, *objects)):
+        free.remove("reference_gain")
     some = plane[np.arange(0, len(plane.frames), max(1, len(plane.frames) // _MOST_PLANES))]
     recordings = [some, *objects]
     jacobian = np.zeros((0, 0))
@@ -205,7 +207,12 @@ def score_zone_orders(logged: ObjectRecording, base: Sensor) -> dict[str, float]
 def _free_parameters(p: Parameters, objects: Sequence[ObjectRecording]) -> list[str]:
     """Return the parameters that the recordings tell."""
     converters = sorted(name for name in p.names if name.startswith("converter_"))
-    free = ["inverse_cycles", *converters[1:], *(name for name in p.names if name.startswith("delay_"))]
+    free = [
+        "inverse_cycles",
+        "reference_gain",
+        *converters[1:],
+        *(name for name in p.names if name.startswith("delay_")),
+    ]
     if objects:
         free += [name for name in p.names if name not in free and not name.startswith("converter_")]
         free.append(converters[0])
@@ -253,7 +260,8 @@ def _plane_ranges(model: FitModel, p: Parameters, responses: Responses, plane: P
     n, zones = len(plane.frames), model.sensor.rows * model.sensor.cols
     unit = PlaneRecording(plane.frames[np.array([0])], np.array([0.5]))
     light = model.transients(p, unit)[0].sum(axis=0)
-    measured, drift = plane.frames.zone_counts, plane.frames.drift_bins
+    measured = plane.frames.zone_counts
+    drift = p["reference_gain"] * plane.frames.reference_shift_bins
     cycles = 1e6 / max(p["inverse_cycles"], 1e-9)
     out = np.empty((n, zones))
     x = responses.first + responses.step * np.arange(responses.cumulative.shape[1])
@@ -320,8 +328,8 @@ def _as_sensor(base: Sensor, model: FitModel, p: Parameters, responses: Response
     grid = np.arange(-4.0, 32.0, _IRF_STEP_BINS)
     irf = []
     for zone in range(rows * cols):
-        cumulative = np.interp(grid + delays[zone], x, responses.cumulative[zone], left=0.0, right=1.0)
-        density = np.maximum(np.gradient(cumulative, grid), 0.0)
+        cumulative = np.interp(grid / scales[zone] + delays[zone], x, responses.cumulative[zone], left=0.0, right=1.0)
+        density = np.maximum(np.gradient(cumulative, grid), 0.0)  # rounding alone makes it negative
         irf.append(tuple(float(f"{v:.4g}") for v in density / density.max()))
     measured = undo_pile_up(plane.frames.zone_counts, 1e6 / p["inverse_cycles"])
     ambient = measured[..., _AMBIENT_BINS].mean(axis=-1)
@@ -330,7 +338,7 @@ def _as_sensor(base: Sensor, model: FitModel, p: Parameters, responses: Response
     per_light = np.median(signal / (intensity * _PLANE_ALBEDO), axis=0)
     cycles = 1e6 / p["inverse_cycles"]
     tan_h, tan_v = p["pitch_h"] * cols / 2, p["pitch_v"] * rows / 2
-    offsets = (delays - start_bins) * width_m * scales
+    offsets = (delays * scales - start_bins) * width_m
     return base.with_(
         half_angle_h_deg=math.degrees(math.atan(tan_h)),
         half_angle_v_deg=math.degrees(math.atan(tan_v)),
@@ -352,6 +360,7 @@ def _as_sensor(base: Sensor, model: FitModel, p: Parameters, responses: Response
             "zone_blur": max(abs(p["blur"]), 1e-3),
             "light_width": 1 / math.sqrt(p["light"]) if p["light"] > 0.01 else None,
             "light_centre": (p["light_left"], p["light_up"]),
+            "reference_gain": p["reference_gain"],
             "stray": min(max(p["stray"], 0.0), 0.99),
             "zone_gain": [[float(v) for v in row] for row in (per_light / per_light.mean()).reshape(rows, cols)],
             "zone_bin_scale": [[float(v) for v in row] for row in scales.reshape(rows, cols)],

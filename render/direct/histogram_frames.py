@@ -99,13 +99,17 @@ class HistogramFrames:
         return np.asarray(self.counts.sum(axis=1).reshape(n, rows * cols, bins))
 
     @property
+    def reference_shift_bins(self) -> NDArray[np.float64]:
+        """How far the peak of the reference histogram lies from where it stood at calibration, bins, (n,)."""
+        histogram = histogram_of(self.sensor)
+        if self.reference is None or histogram.reference_peak is None:
+            return np.zeros(len(self))
+        return reference_centroid(self.reference.sum(axis=1)) - histogram.reference_peak
+
+    @property
     def drift_bins(self) -> NDArray[np.float64]:
         """How far histograms are shifted by the drift that the reference histogram shows, bins, (n,)."""
-        histogram = histogram_of(self.sensor)
-        if self.reference is None or histogram.reference_gain == 0 or histogram.reference_peak is None:
-            return np.zeros(len(self))
-        peaks = reference_centroid(self.reference.sum(axis=1))
-        return histogram.reference_gain * (peaks - histogram.reference_peak)
+        return histogram_of(self.sensor).reference_gain * self.reference_shift_bins
 
 
 def reference_centroid(reference: NDArray[np.float64]) -> NDArray[np.float64]:

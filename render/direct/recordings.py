@@ -72,6 +72,11 @@ class ObjectRecording:
         object.__setattr__(self, "sensor2world", poses)
         object.__setattr__(self, "scene", SceneMesh(self.mesh))
 
+    @property
+    def centre_m(self) -> NDArray[np.float64]:
+        """Middle of the box around the object, world frame, (3,)."""
+        return object_centre(self.mesh)
+
     def __getitem__(self, positions: NDArray[np.integer]) -> ObjectRecording:
         """Return some positions."""
         return replace(self, frames=self.frames[positions], sensor2world=self.sensor2world[positions])
@@ -99,6 +104,23 @@ def world2cam(
     poses[:, :3, 3] += poses[:, :3, :3] @ np.asarray(sensor_offset_m, dtype=np.float64)
     poses[:, :3, 3] -= np.asarray(placement_m, dtype=np.float64)
     return np.asarray(OPTICAL2CAM @ np.linalg.inv(poses))
+
+
+def object_centre(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
+    """Return the middle of the box around the faces of part 1, (3,); of all faces where parts are not labelled."""
+    part = np.asarray(mesh.face_attributes.get("part", np.ones(len(mesh.faces))), dtype=bool)
+    corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[part]].reshape(-1, 3)
+    return np.asarray(0.5 * (corners.min(axis=0) + corners.max(axis=0)), dtype=np.float64)
+
+
+def turn_about(centre_m: ArrayLike, yaw_rad: float) -> NDArray[np.float64]:
+    """Return the transform that turns a mesh about a vertical axis through a point, (4, 4)."""
+    centre = np.asarray(centre_m, dtype=np.float64)
+    turn = np.eye(4)
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    turn[:2, :2] = [[c, -s], [s, c]]
+    turn[:3, 3] = centre - turn[:3, :3] @ centre
+    return turn
 
 
 def label_object(mesh: trimesh.Trimesh, support_z_m: float, tolerance_m: float = 1e-3) -> trimesh.Trimesh:

@@ -1,0 +1,256 @@
+"""The pose of a known object from several histograms, by maximum likelihood, with covariance and χ² (PHYSICS 7, 11).
+
+Counts are Poisson, so a residual is weighted with 1/λ and the information is Σ_j ∂λ_j ∂λ_jᵀ / λ_j. Brightness and
+ambient light of every histogram are free and are projected out. What the model itself may be off adds to the variance:
+`model_error` as a share of a count and of the histogram's peak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
+
+from phasemark import UsageError
+from phasemark.matcher.histograms.scene_prediction import POSE_PARAMETERS, Linearised, ObjectScene
+from phasemark.render.direct.histogram_frames import HistogramFrames
+
+MODEL_ERROR = (0.05, 0.01)
+"""What a fitted TMF8820 is off, as a share of a count and of a histogram's peak."""
+
+_MOST_STEPS = 12
+_DONE = 1e-3  # of a standard deviation
+_MOST_SUPPORT = 20.0
+_LARGEST_STEP = {"m": 0.02, "rad": 0.15}
+_WEAK = 1e-10  # eigenvalue of the scaled information below which a direction is not observable
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectPose:
+    """Where an object stands.
+
+    Parameters
+    ----------
+    displacement : (6,) float64
+        From where the mesh's file has it: metres along the world's axes, and a rotation vector, radians, about the
+        object's centre. In the order of `POSE_PARAMETERS`.
+    transform : (4, 4) float64
+        The same as a transform of the mesh.
+    free : tuple of str
+        What was estimated, "support" included if it was.
+    covariance : (p, p) float64
+        Of the free parameters, in their order; infinite variance along directions that nothing tells.
+    support : float
+        Albedo of the support over that of the object.
+    chi2 : float
+    dof : int
+    accepted : bool
+        Whether χ² is one that the object at this pose makes, at the given false-alarm rate.
+    steps : int
+        Steps of the search.
+    """
+
+    displacement: NDArray[np.float64]
+    transform: NDArray[np.float64]
+    free: tuple[str, ...]
+    covariance: NDArray[np.float64]
+    support: float
+    chi2: float
+    dof: int
+    accepted: bool
+    steps: int
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger χ² if the model is right."""
+        return float(chi2.sf(self.chi2, self.dof))
+
+    def std(self, name: str) -> float:
+        """Return the standard deviation of a free parameter."""
+        return float(np.sqrt(self.covariance[self.free.index(name), self.free.index(name)]))
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the pose as plain numbers, for JSON."""
+        return {
+            "displacement": dict(zip(POSE_PARAMETERS, self.displacement.tolist(), strict=True)),
+            "free": list(self.free),
+            "covariance": self.covariance.tolist(),
+            "support": self.support,
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "p_value": self.p_value,
+            "accepted": self.accepted,
+        }
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Information and gradient of each sensor pose about one object pose.
+
+    Parameters
+    ----------
+    information : (n, p, p) float64
+    gradient : (n, p) float64
+    chi2 : (n,) float64
+    dof : (n,) int
+    """
+
+    information: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    chi2: NDArray[np.float64]
+    dof: NDArray[np.int64]
+
+
+def evidence_of(
+    linear: Linearised, measured: NDArray[np.float64], model_error: tuple[float, float] = (0.0, 0.0)
+) -> Evidence:
+    """Return what histograms tell about an object pose, brightness and ambient light of each projected out.
+
+    Parameters
+    ----------
+    linear : Linearised
+    measured : (n, zones, bins) float64
+    model_error : (float, float)
+    """
+    expected = linear.expected
+    peak = expected.max(axis=-1, keepdims=True)
+    variance = expected + (model_error[0] * expected) ** 2 + (model_error[1] * peak) ** 2
+    root = 1 / np.sqrt(variance)
+    residual = (measured - expected) * root
+    slope = linear.slope * root[..., None]
+    nuisance = np.stack([linear.brightness * root, root], axis=-1)
+    q, _ = np.linalg.qr(nuisance)
+    residual = residual - np.einsum("nzbk,nzk->nzb", q, np.einsum("nzbk,nzb->nzk", q, residual))
+    slope = slope - np.einsum("nzbk,nzkp->nzbp", q, np.einsum("nzbk,nzbp->nzkp", q, slope))
+    n, zones, bins = residual.shape
+    return Evidence(
+        np.einsum("nzbp,nzbq->npq", slope, slope, optimize=True),
+        np.einsum("nzbp,nzb->np", slope, residual),
+        (residual**2).sum(axis=(1, 2)),
+        np.full(n, zones * (bins - 2)),
+    )
+
+
+def solve_jointly(
+    evidence: Evidence, scales: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the Gauss-Newton step of all poses together, and the covariance that their information leaves.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    scales : (p,) float64, optional
+        Size of a step of each parameter; None: 1.
+
+    Returns
+    -------
+    step : (p,) float64
+        0 along directions that nothing tells.
+    covariance : (p, p) float64
+    """
+    information = evidence.information.sum(axis=0)
+    gradient = evidence.gradient.sum(axis=0)
+    unit = np.ones(len(gradient)) if scales is None else scales
+    values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
+    weak = values <= _WEAK * max(values.max(initial=0.0), 1e-300)
+    inverse = np.where(weak, 0.0, 1 / np.where(weak, 1.0, values))
+    scaled = (vectors * inverse) @ vectors.T
+    covariance = scaled * np.outer(unit, unit)
+    if weak.any():
+        blind = (vectors[:, weak] ** 2).sum(axis=1) > 1e-6
+        covariance[blind, blind] = np.inf
+    return (scaled @ (unit * gradient)) * unit, covariance
+
+
+def match_jointly(
+    frames: HistogramFrames,
+    sensor2world: ArrayLike,
+    scene: ObjectScene,
+    *,
+    start: ArrayLike = (0.0,) * 6,
+    free: Sequence[str] = (*POSE_PARAMETERS, "support"),
+    support: float = 1.0,
+    model_error: tuple[float, float] = MODEL_ERROR,
+    false_alarm: float = 0.01,
+) -> ObjectPose:
+    """Estimate the pose of an object from histograms of several sensor poses together.
+
+    Parameters
+    ----------
+    frames : HistogramFrames
+        n positions of one sensor.
+    sensor2world : (n, 4, 4) array_like
+        Pose of the optical frame at each.
+    scene : ObjectScene
+    start : (6,) array_like
+        Initial guess of the displacement; within about a bin and ten degrees.
+    free : sequence of str
+        What is estimated.
+    support : float
+        Initial guess of the support's albedo over the object's.
+    model_error : (float, float)
+        What the model may be off, as a share of a count and of a histogram's peak; (0, 0): Poisson noise alone.
+    false_alarm : float
+        Probability that the object itself is refused.
+
+    Returns
+    -------
+    ObjectPose
+        ``accepted`` is False where the histograms do not look like the object anywhere near the start.
+
+    Raises
+    ------
+    UsageError
+        Numbers of poses differ, or an unknown parameter is named.
+    """
+    if not 0 < false_alarm < 1:
+        raise UsageError(f"'false_alarm' must lie between 0 and 1, got {false_alarm!r}")
+    move = np.array(start, dtype=np.float64)
+    if move.shape != (6,):
+        raise UsageError(f"'start' must have 6 numbers, got {move.shape}")
+    poses, measured = np.asarray(sensor2world, dtype=np.float64), frames.zone_counts
+    limits = np.array(
+        [_LARGEST_STEP["m" if name.endswith("_m") else "rad"] if name != "support" else 1.0 for name in free]
+    )
+
+    def look(values: NDArray[np.float64], ratio: float) -> Evidence:
+        return evidence_of(scene.linearise(frames, poses, values, ratio, free), measured, model_error)
+
+    def stepped(step: NDArray[np.float64], shrink: float) -> tuple[NDArray[np.float64], float]:
+        values, ratio = move.copy(), support
+        for name, change in zip(free, step * shrink, strict=True):
+            if name == "support":
+                ratio = float(np.clip(support + change, support / 3, min(3 * support, _MOST_SUPPORT)))
+            else:
+                values[POSE_PARAMETERS.index(name)] += change
+        return values, ratio
+
+    here = look(move, support)
+    steps = 0
+    while steps < _MOST_STEPS:
+        steps += 1
+        step, covariance = solve_jointly(here, limits)
+        step = step / max(1.0, float((np.abs(step) / limits).max()))
+        shrink, better = 1.0, None
+        while shrink > 0.05:
+            values, ratio = stepped(step, shrink)
+            there = look(values, ratio)
+            if there.chi2.sum() <= here.chi2.sum():
+                better = (values, ratio, there)
+                break
+            shrink /= 3
+        if better is None:
+            break
+        move, support, here = better
+        std = np.sqrt(np.diag(covariance))
+        if (np.abs(step) * shrink <= _DONE * np.where(np.isfinite(std), std, np.inf)).all():
+            break
+    _, covariance = solve_jointly(here, limits)
+    total, dof = float(here.chi2.sum()), int(here.dof.sum()) - len(free)
+    return ObjectPose(
+        move, scene.moved(move), tuple(free), covariance, support, total, dof,
+        bool(chi2.sf(total, dof) > false_alarm), steps,
+    )  # fmt: skip
