@@ -1,14 +1,15 @@
 """The pose of a known object from several histograms, by maximum likelihood, with covariance and χ² (PHYSICS 7, 11).
 
 Counts are Poisson, so a residual is weighted with 1/λ and the information is Σ_j ∂λ_j ∂λ_jᵀ / λ_j. Brightness and
-ambient light of every histogram are free and are projected out. What the model itself may be off adds to the variance:
-`model_error` as a share of a count and of the histogram's peak.
+ambient light of every histogram are free and are projected out. What the model itself may be off (:class:`ModelError`)
+adds to the variance, and the covariance is then taken from the scatter of the histograms.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,14 +19,33 @@ from phasemark import UsageError
 from phasemark.matcher.histograms.scene_prediction import POSE_PARAMETERS, Linearised, ObjectScene
 from phasemark.render.direct.histogram_frames import HistogramFrames
 
-MODEL_ERROR = (0.05, 0.01)
-"""What a fitted TMF8820 is off, as a share of a count and of a histogram's peak."""
-
 _MOST_STEPS = 12
 _DONE = 1e-3  # of a standard deviation
 _MOST_SUPPORT = 20.0
 _LARGEST_STEP = {"m": 0.02, "rad": 0.15}
 _WEAK = 1e-10  # eigenvalue of the scaled information below which a direction is not observable
+
+
+class ModelError(NamedTuple):
+    """What the model of a sensor may be off.
+
+    Parameters
+    ----------
+    count_share : float
+        Standard deviation of an expected count, as a share of it.
+    peak_share : float
+        The same as a share of the histogram's highest count, in every bin.
+    """
+
+    count_share: float = 0.0
+    peak_share: float = 0.0
+
+
+MEASURED_ERROR = ModelError(0.05, 0.01)
+"""What a fitted TMF8820 was off before two objects at poses that were not fitted."""
+
+POISSON = ModelError()
+"""Poisson noise alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +108,14 @@ class ObjectPose:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Information and gradient of each sensor pose about one object pose.
+    """Information and gradient of every histogram about one object pose.
 
     Parameters
     ----------
-    information : (n, p, p) float64
-    gradient : (n, p) float64
-    chi2 : (n,) float64
-    dof : (n,) int
+    information : (n, zones, p, p) float64
+    gradient : (n, zones, p) float64
+    chi2 : (n, zones) float64
+    dof : (n, zones) int
     """
 
     information: NDArray[np.float64]
@@ -103,21 +123,23 @@ class Evidence:
     chi2: NDArray[np.float64]
     dof: NDArray[np.int64]
 
+    def of_poses(self, poses: NDArray[np.integer]) -> Evidence:
+        """Return the evidence of some sensor poses."""
+        return Evidence(self.information[poses], self.gradient[poses], self.chi2[poses], self.dof[poses])
 
-def evidence_of(
-    linear: Linearised, measured: NDArray[np.float64], model_error: tuple[float, float] = (0.0, 0.0)
-) -> Evidence:
+
+def evidence_of(linear: Linearised, measured: NDArray[np.float64], model_error: ModelError = POISSON) -> Evidence:
     """Return what histograms tell about an object pose, brightness and ambient light of each projected out.
 
     Parameters
     ----------
     linear : Linearised
     measured : (n, zones, bins) float64
-    model_error : (float, float)
+    model_error : ModelError
     """
     expected = linear.expected
     peak = expected.max(axis=-1, keepdims=True)
-    variance = expected + (model_error[0] * expected) ** 2 + (model_error[1] * peak) ** 2
+    variance = expected + (model_error.count_share * expected) ** 2 + (model_error.peak_share * peak) ** 2
     root = 1 / np.sqrt(variance)
     residual = (measured - expected) * root
     slope = linear.slope * root[..., None]
@@ -125,44 +147,51 @@ def evidence_of(
     q, _ = np.linalg.qr(nuisance)
     residual = residual - np.einsum("nzbk,nzk->nzb", q, np.einsum("nzbk,nzb->nzk", q, residual))
     slope = slope - np.einsum("nzbk,nzkp->nzbp", q, np.einsum("nzbk,nzbp->nzkp", q, slope))
-    n, zones, bins = residual.shape
-    return Evidence(
-        np.einsum("nzbp,nzbq->npq", slope, slope, optimize=True),
-        np.einsum("nzbp,nzb->np", slope, residual),
-        (residual**2).sum(axis=(1, 2)),
-        np.full(n, zones * (bins - 2)),
-    )
+    information = np.einsum("nzbp,nzbq->nzpq", slope, slope, optimize=True)
+    gradient = np.einsum("nzbp,nzb->nzp", slope, residual)
+    chi2_of = (residual**2).sum(axis=2)
+    return Evidence(information, gradient, chi2_of, np.full(residual.shape[:2], residual.shape[2] - 2))
 
 
 def solve_jointly(
-    evidence: Evidence, scales: NDArray[np.float64] | None = None
+    evidence: Evidence, scales: NDArray[np.float64] | None = None, *, robust: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the Gauss-Newton step of all poses together, and the covariance that their information leaves.
+    """Return the Gauss-Newton step of all poses together, and its covariance.
 
     Parameters
     ----------
     evidence : Evidence
     scales : (p,) float64, optional
         Size of a step of each parameter; None: 1.
+    robust : bool
+        Whether the covariance is taken from how far the histograms' gradients scatter (H⁻¹ Σ g gᵀ H⁻¹, each histogram
+        for itself) rather than from the information alone: for models that are off by more than noise.
 
     Returns
     -------
     step : (p,) float64
         0 along directions that nothing tells.
     covariance : (p, p) float64
+        Infinite for parameters that such a direction involves.
     """
-    information = evidence.information.sum(axis=0)
-    gradient = evidence.gradient.sum(axis=0)
-    unit = np.ones(len(gradient)) if scales is None else scales
+    p = evidence.gradient.shape[-1]
+    parts, gradients = evidence.information.reshape(-1, p, p), evidence.gradient.reshape(-1, p)
+    information, gradient = parts.sum(axis=0), gradients.sum(axis=0)
+    unit = np.ones(p) if scales is None else scales
     values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
     weak = values <= _WEAK * max(values.max(initial=0.0), 1e-300)
     inverse = np.where(weak, 0.0, 1 / np.where(weak, 1.0, values))
-    scaled = (vectors * inverse) @ vectors.T
-    covariance = scaled * np.outer(unit, unit)
+    covariance = (vectors * inverse) @ vectors.T * np.outer(unit, unit)
+    step = covariance @ gradient
+    if robust:
+        left = gradients - parts @ step
+        n = int((evidence.chi2 > 0).sum())
+        scatter = left.T @ left * (n / max(n - p, 1))
+        covariance = covariance @ scatter @ covariance
     if weak.any():
         blind = (vectors[:, weak] ** 2).sum(axis=1) > 1e-6
         covariance[blind, blind] = np.inf
-    return (scaled @ (unit * gradient)) * unit, covariance
+    return step, covariance
 
 
 def match_jointly(
@@ -173,7 +202,8 @@ def match_jointly(
     start: ArrayLike = (0.0,) * 6,
     free: Sequence[str] = (*POSE_PARAMETERS, "support"),
     support: float = 1.0,
-    model_error: tuple[float, float] = MODEL_ERROR,
+    model_error: ModelError = MEASURED_ERROR,
+    systematic: tuple[float, float] = (0.0, 0.0),
     false_alarm: float = 0.01,
 ) -> ObjectPose:
     """Estimate the pose of an object from histograms of several sensor poses together.
@@ -191,8 +221,11 @@ def match_jointly(
         What is estimated.
     support : float
         Initial guess of the support's albedo over the object's.
-    model_error : (float, float)
-        What the model may be off, as a share of a count and of a histogram's peak; (0, 0): Poisson noise alone.
+    model_error : ModelError
+        What the model may be off; `POISSON`: nothing.
+    systematic : (float, float)
+        Standard deviations, metres and radians, of what is common to all poses and noise does not explain: the frame
+        of the arm, the calibration. Added to the covariance.
     false_alarm : float
         Probability that the object itself is refused.
 
@@ -248,7 +281,9 @@ def match_jointly(
         std = np.sqrt(np.diag(covariance))
         if (np.abs(step) * shrink <= _DONE * np.where(np.isfinite(std), std, np.inf)).all():
             break
-    _, covariance = solve_jointly(here, limits)
+    _, covariance = solve_jointly(here, limits, robust=model_error != POISSON)
+    common = {"m": systematic[0], "rad": systematic[1]}
+    covariance = covariance + np.diag([common.get(name.rpartition("_")[2], 0.0) ** 2 for name in free])
     total, dof = float(here.chi2.sum()), int(here.dof.sum()) - len(free)
     return ObjectPose(
         move, scene.moved(move), tuple(free), covariance, support, total, dof,

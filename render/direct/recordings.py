@@ -107,9 +107,10 @@ def world2cam(
 
 
 def object_centre(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
-    """Return the middle of the box around the faces of part 1, (3,); of all faces where parts are not labelled."""
+    """Return the middle of the box around the faces of part 1, (3,); of all faces where none is labelled so."""
     part = np.asarray(mesh.face_attributes.get("part", np.ones(len(mesh.faces))), dtype=bool)
-    corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[part]].reshape(-1, 3)
+    chosen = part if part.any() else ~part
+    corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[chosen]].reshape(-1, 3)
     return np.asarray(0.5 * (corners.min(axis=0) + corners.max(axis=0)), dtype=np.float64)
 
 
