@@ -149,6 +149,28 @@ class Frames:
             self.time_s = times.reshape(shape[:2])
         self.sensor = sensor
 
+    @classmethod
+    def as_measured(
+        cls,
+        range_m: NDArray[np.float64],
+        amplitude_e: NDArray[np.float64],
+        intensity_e: NDArray[np.float64],
+        flags: NDArray[np.uint8],
+        sensor: Sensor,
+        *,
+        taps_e: NDArray[np.float64] | None = None,
+    ) -> Self:
+        """Return frames that hold the arrays of a camera model themselves: nothing is copied, and nothing checked.
+
+        The parameters are those of the constructor, (n, frames, rows, cols), finite, with a flag wherever amplitude_e
+        is zero. Only `range_m` is changed: a flagged pixel has none.
+        """
+        frames = cls.__new__(cls)
+        range_m[flags != 0] = np.nan
+        frames.range_m, frames.amplitude_e, frames.intensity_e, frames.flags = range_m, amplitude_e, intensity_e, flags
+        frames.taps_e, frames.time_s, frames.sensor = taps_e, None, sensor
+        return frames
+
     def __len__(self) -> int:
         return len(self.range_m)
 

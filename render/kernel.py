@@ -13,7 +13,7 @@ from typing import Any
 from numba import njit
 from numba.core.cpu import CPUTargetOptions
 
-_BORROWING: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+_BORROWING: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "forceinline": True}
 if hasattr(CPUTargetOptions, "_nrt"):
     _BORROWING["_nrt"] = False
 

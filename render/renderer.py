@@ -9,7 +9,8 @@ from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -18,13 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
-from phasemark.render.integral.arguments import Camera, Edges, Light, Poses, Samples, Sums
+from phasemark.render.integral.arguments import Borders, Camera, Edges, Light, Motion, Poses, Returns, Samples, Sums
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.light import add_background, sum_samples
-from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.integral.mesh_topology import CLUSTER, MeshTopology
 from phasemark.render.integral.pixel_splitting import Scratch
 from phasemark.render.integral.ray_plan import UNTRUSTED, plan_rays
 from phasemark.render.integral.shells import unite_shells
+from phasemark.render.integral.slopes import STEP, SlopeSums
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.sensor.sensor import Sensor
@@ -34,8 +36,12 @@ Variant = Literal["exact", "hard"]
 """The area integral, or what the centre ray of each pixel sees."""
 
 _SAMPLES = 1 << 17
+_RETURNS = 1 << 9
+_BORDERS = 1 << 14
 _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
+_LARGE = 1 << 13
+"""Faces above which a mesh is more than the processor's cache holds."""
 
 
 @dataclass
@@ -46,6 +52,8 @@ class _Buffers:
     shape: tuple[int, int]
     n_samples: int = _SAMPLES
     n_links: int = 1 << 14
+    n_borders: int = 0
+    n_parameters: int = 0
 
     def __post_init__(self) -> None:
         rows, cols = self.shape
@@ -56,8 +64,11 @@ class _Buffers:
             head=np.empty((rows + 2, cols + 2), np.int32),
             link=np.empty(self.n_links, np.int32),
             owner=np.empty(self.n_links, np.int32),
+            heights=np.empty(CLUSTER),
+            ends=np.empty((self.n_edges + 1, 2), np.int32),
         )
         self.samples = _room_for(self.n_samples)
+        self.borders = _room_for_borders(self.n_borders, self.n_parameters)
 
     def grow_links(self) -> None:
         n = 2 * len(self.edges.link)
@@ -65,6 +76,7 @@ class _Buffers:
 
     def grow_samples(self) -> None:
         self.samples = _room_for(2 * len(self.samples.weights))
+        self.borders = _room_for_borders(2 * len(self.borders.weights), self.n_parameters)
 
 
 def _room_for(n: int) -> Samples:
@@ -77,6 +89,22 @@ def _room_for(n: int) -> Samples:
         chosen=np.empty(n, np.int64),
         origins=np.empty((n, 3), np.float32),
         directions=np.empty((n, 3), np.float32),
+        returns=Returns.empty(_RETURNS),
+    )
+
+
+def _room_for_borders(n: int, p: int) -> Borders:
+    return Borders(
+        count=np.zeros(1, np.int64),
+        points=np.empty((n, 2)),
+        weights=np.empty(n),
+        regions=np.empty((n, 2), np.int32),
+        segment=np.empty(n, np.int32),
+        side=np.empty(n),
+        along_v=np.empty(n, np.int8),
+        pixel=np.empty(n, np.int64),
+        depth=np.empty(n),
+        rates=np.empty((n, p)),
     )
 
 
@@ -258,9 +286,64 @@ class Renderer:
         check_parameters(parameters)
         views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m).in_camera(self.sensor)
         self._check(views, background, workers)
+        return self._differences(views, background, parameters, workers)
+
+    def render_with_slopes(
+        self,
+        views: Views,
+        parameters: Sequence[str] = VIEW_PARAMETERS,
+        *,
+        background: Background | None = None,
+        workers: int = 1,
+    ) -> tuple[PhasorImages, NDArray[np.complex128]]:
+        """Render views, and how their phasors change with the view, from the same samples.
+
+        It takes two to three times as long as the images alone. Slopes agree with those of :meth:`jacobian` to some
+        1e-5 of the largest on plane faces. Beside the limb of a curved mesh, whose shading normals are interpolated
+        between its corners, single pixels differ by one to three percent of it. An edge that lies exactly along a border
+        between pixels counts for neither of them. Open meshes, and views with pixels too full of edges to be split,
+        get differences of whole images.
+
+        Parameters
+        ----------
+        views : Views
+            n views.
+        parameters : sequence of str
+            Which derivatives, in this order.
+        background, workers
+            As for :meth:`render`.
+
+        Returns
+        -------
+        images : PhasorImages
+        slope : (n, len(parameters), rows, cols) complex128
+            ∂S/∂parameter, per metre or radian; see :mod:`phasemark.render.integral.slopes`.
+
+        Raises
+        ------
+        UsageError
+            As for :meth:`jacobian`.
+        """
+        check_parameters(parameters)
+        seen = views.in_camera(self.sensor)
+        self._check(seen, background, workers)
+        whole, p = (0, self.sensor.rows), len(parameters)
+        slope = np.zeros((len(views) * self.sensor.rows * self.sensor.cols, p), np.complex128)
+        images = self._render(seen, background, whole, workers, slope=slope, parameters=parameters)
+        slope = np.moveaxis(slope.reshape(len(views), self.sensor.rows, self.sensor.cols, p), 3, 1)
+        unknown = np.isnan(slope).any(axis=(1, 2, 3)) | (not self.topology.closed)
+        full = np.flatnonzero(unknown)
+        if full.size:
+            slope[full] = self._differences(seen[full], background, parameters, workers)
+        return replace(images, views=views), slope
+
+    def _differences(
+        self, seen: Views, background: Background | None, parameters: Sequence[str], workers: int
+    ) -> NDArray[np.complex128]:
+        """Return slopes as differences of images; `seen` as the camera itself has the views."""
         # a step may take a landmark that stands on the floor a hair into it
         whole = (0, self.sensor.rows)
-        return differentiate(lambda v: self._render(v, background, whole, workers).phasor, views, parameters)
+        return differentiate(lambda v: self._render(v, background, whole, workers).phasor, seen, parameters)
 
     def _check(self, views: Views, background: Background | None, workers: int) -> None:
         """Refuse what cannot be rendered."""
@@ -277,9 +360,18 @@ class Renderer:
         rows: tuple[int, int],
         workers: int,
         variant: Variant = "exact",
+        slope: NDArray[np.complex128] | None = None,
+        parameters: Sequence[str] = (),
     ) -> PhasorImages:
-        """Render rows of views that have been checked, as the camera itself has them."""
+        """Render rows of views that have been checked, as the camera itself has them.
+
+        With `slope`, (pixels of all views, p), it is filled with how the phasors change with `parameters`.
+        """
         run = self._render_tasks if variant == "exact" else self._cast_centres
+        order = self._by_direction(views) if slope is None else slice(None)
+        ordered = views[order]
+        if slope is not None:
+            run = partial(self._render_tasks, slope=slope, parameters=parameters)
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)
         sums = _no_light(shape, len(self._orders))
@@ -293,18 +385,21 @@ class Renderer:
         )
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
         if workers == 1 or len(tasks) <= 1:
-            run(tasks, views, camera, light, sums)
+            run(tasks, ordered, camera, light, sums)
         else:
             with ThreadPoolExecutor(workers) as pool:
                 lanes = [tasks[i::workers] for i in range(workers)]
-                list(pool.map(lambda lane: run(lane, views, camera, light, sums), lanes))
+                list(pool.map(lambda lane: run(lane, ordered, camera, light, sums), lanes))
         self.untrusted_pixels += int((sums.state == UNTRUSTED).sum())
-        phasor = sums.phasor.reshape(*shape, len(self._orders))
+        phasor, intensity, coverage, upper = (
+            _restored(values.reshape(*shape, *values.shape[1:]), order)
+            for values in (sums.phasor, sums.intensity, sums.coverage, sums.upper)
+        )
         return PhasorImages(
             phasor=np.ascontiguousarray(phasor[..., 0]),
-            intensity=sums.intensity.reshape(shape),
-            coverage=np.minimum(sums.coverage.reshape(shape), 1.0),
-            upper_coverage=np.minimum(sums.upper.reshape(shape), 1.0),
+            intensity=intensity,
+            coverage=np.minimum(coverage, 1.0),
+            upper_coverage=np.minimum(upper, 1.0),
             sensor=self.sensor,
             views=views,
             harmonics={
@@ -312,17 +407,42 @@ class Renderer:
             },
         )
 
-    def _render_tasks(self, tasks: Iterable[slice], views: Views, camera: Camera, light: Light, sums: Sums) -> None:
-        """Render slices of the views into `sums`, in one thread."""
+    def _by_direction(self, views: Views) -> slice | NDArray[np.int64]:
+        """Return in which order to render views: a large mesh side after side, for the cache does not hold it all."""
+        if len(self.topology.faces) < _LARGE:
+            return slice(None)
+        return np.argsort(views.delta_rad, kind="stable")
+
+    def _render_tasks(
+        self,
+        tasks: Iterable[slice],
+        views: Views,
+        camera: Camera,
+        light: Light,
+        sums: Sums,
+        slope: NDArray[np.complex128] | None = None,
+        parameters: Sequence[str] = (),
+    ) -> None:
+        """Render slices of the views into `sums`, in one thread; with `slope`, (pixels, p), how they change too."""
         mesh = self.topology
-        buffers = _Buffers(len(mesh.creases) + len(mesh.folds), (camera.rows, camera.cols))
+        turns = np.array([name == "bearing_rad" for name in parameters], np.bool_) & light.background[:2].any()
+        buffers = _Buffers(
+            len(mesh.creases) + len(mesh.folds),
+            (camera.rows, camera.cols),
+            n_borders=_BORDERS if parameters else 0,
+            n_parameters=len(parameters),
+        )
         for task in tasks:
             poses, own = _poses(views[task], camera), _of_views(sums, task)
+            motion = _motion(views[task], camera, parameters)
+            slopes = None
+            if slope is not None:
+                slopes = SlopeSums(slope[_pixels_of(task, sums)], motion, own, turns)
             view = 0
             while view < len(poses.lens):
                 reached, n = plan_rays(
                     view, mesh, poses, camera, self.splits, light.background, buffers.edges, buffers.scratch,
-                    buffers.samples, own.state,
+                    buffers.samples, own.state, motion, buffers.borders,
                 )  # fmt: skip
                 if reached == -1:
                     buffers.grow_links()
@@ -334,7 +454,11 @@ class Renderer:
                 sum_samples(n, buffers.samples, mesh, poses, camera, light, own)
                 if light.background[0] or light.background[1]:
                     add_background(view, reached, poses, camera, light, own)
+                if slopes is not None:
+                    slopes.add((view, reached), n, buffers.samples, buffers.borders, mesh, poses, camera, light)
                 view = reached
+            if slopes is not None:
+                slopes.conclude()
 
     def _cast_centres(self, tasks: Iterable[slice], views: Views, camera: Camera, light: Light, sums: Sums) -> None:
         """Render slices of the views with one ray a pixel into `sums`, in one thread."""
@@ -376,6 +500,15 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
             )
+
+
+def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:
+    """Return what was rendered in an order as the views came."""
+    if isinstance(order, slice):
+        return values
+    restored = np.empty_like(values)
+    restored[order] = values
+    return restored
 
 
 def background_image(background: Background, sensor: Sensor) -> PhasorImages:
@@ -424,6 +557,8 @@ def _camera(sensor: Sensor, rows: tuple[int, int]) -> Camera:
         scale_v=sensor.rows / (2 * tan_v),
         centre_u=float(sensor.centre_px[0]),
         centre_v=float(sensor.centre_px[1]),
+        slope_u=2 * tan_h / sensor.cols,
+        slope_v=2 * tan_v / sensor.rows,
         rows=sensor.rows,
         cols=sensor.cols,
         first_row=rows[0],
@@ -444,6 +579,15 @@ def _poses(views: Views, camera: Camera) -> Poses:
     )
 
 
+def _motion(views: Views, camera: Camera, parameters: Sequence[str]) -> Motion:
+    """Return the poses of views, and of each with one parameter after the other moved."""
+    p = len(parameters)
+    many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_PARAMETERS))
+    for k, name in enumerate(parameters):
+        getattr(many, name)[k + 1 :: 1 + p] += STEP
+    return Motion(_poses(many, camera), np.full(p, STEP), np.empty((1 + p, 4)))
+
+
 def _no_light(shape: tuple[int, int, int], n_orders: int) -> Sums:
     """Return the sums that a batch of n views starts from; `shape` is (n, rows, cols)."""
     n = math.prod(shape)
@@ -456,10 +600,15 @@ def _no_light(shape: tuple[int, int, int], n_orders: int) -> Sums:
     )
 
 
+def _pixels_of(views: slice, sums: Sums) -> slice:
+    """Return which pixels belong to some views."""
+    per_view = math.prod(sums.state.shape[1:])
+    return slice(views.start * per_view, views.stop * per_view)
+
+
 def _of_views(sums: Sums, views: slice) -> Sums:
     """Return the part of the sums that belongs to some views."""
-    per_view = math.prod(sums.state.shape[1:])
-    pixels = slice(views.start * per_view, views.stop * per_view)
+    pixels = _pixels_of(views, sums)
     return Sums(
         phasor=sums.phasor[pixels],
         intensity=sums.intensity[pixels],

@@ -9,6 +9,7 @@ from scipy import integrate, special, stats
 from phasemark import UsageError
 from phasemark.render import (
     Flag,
+    Frames,
     PhasorImages,
     Sensor,
     Views,
@@ -203,6 +204,21 @@ def test_range_wraps_at_half_the_modulation_wavelength():
     assert (ranges > period - 0.2).any()
 
 
+@pytest.mark.parametrize("kind", [np.complex128, np.complex64])
+def test_ranges_of_a_view_into_an_array_are_those_of_a_copy(kind):
+    sensor, rng = preset("pmd-16x16"), np.random.default_rng(2)
+    phasor = (rng.normal(size=(6, 16, 16)) + 1j * rng.normal(size=(6, 16, 16))).astype(kind)
+    phasor[0, 0, 0] = 0
+    for part in (phasor[:, ::2], phasor[1:2, 3], phasor[..., 5]):
+        found = phasor_to_range_m(part, sensor)
+        np.testing.assert_array_equal(found, phasor_to_range_m(part.copy(), sensor))
+        # 2 ulp of a phase: the reference has another arctangent
+        exact = np.where(part == 0, np.nan, np.arctan2(part.imag.astype(float), part.real.astype(float)))
+        tolerance = 4 * np.finfo(kind).eps * math.pi * sensor.metres_per_radian
+        expected = exact * sensor.metres_per_radian % sensor.unambiguous_range_m
+        np.testing.assert_allclose(wrapped(found - expected, sensor), np.where(part == 0, np.nan, 0), atol=tolerance)
+
+
 def test_a_tiny_negative_phase_stays_inside_the_unambiguous_range():
     sensor = preset("ideal")
     assert phasor_to_range_m(np.array([1 - 1e-18j]), sensor)[0] < sensor.unambiguous_range_m
@@ -309,12 +325,37 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others():
 
 
 @pytest.mark.parametrize("block", [1, 8 * 256 * 3, 2**30])
-def test_frames_do_not_depend_on_how_the_work_is_cut(block, monkeypatch):
+@pytest.mark.parametrize("run", [1, 3])
+def test_frames_do_not_depend_on_how_the_work_is_cut(block, run, monkeypatch):
     sensor = preset("pmd-16x16").with_(read_noise_e=20)
     image = scene(4, sensor)
     usual = frame_bytes(capture(image, sensor, rng=np.random.default_rng(1), n_frames=7))
     monkeypatch.setattr(chain, "_TAPS_PER_BLOCK", block)
+    monkeypatch.setattr(chain, "_BLOCKS_PER_RUN", run)
     assert frame_bytes(capture(image, sensor, rng=np.random.default_rng(1), n_frames=7)) == usual
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"wrap_guard_m": 1.0},
+        {"min_amplitude_e": 3000.0},
+        {"full_well_e": 9000.0},
+        {"dead_pixels": ((2, 3),), "hot_pixels": ((4, 5),)},
+        {"max_phase_std_rad": None, "shot_noise": False},
+    ],
+)
+def test_captured_frames_are_what_the_checks_of_frames_make_of_them(changes):
+    sensor = preset("pmd-16x16").with_(**changes)
+    taken = capture(scene(3, sensor), sensor, rng=np.random.default_rng(1), n_frames=5, keep_taps=True)
+    checked = Frames(
+        taken.range_m, taken.amplitude_e, taken.intensity_e, sensor=sensor, flags=taken.flags, taps_e=taken.taps_e
+    )
+    for name in ("range_m", "amplitude_e", "intensity_e", "flags", "taps_e"):
+        np.testing.assert_array_equal(getattr(checked, name), getattr(taken, name), strict=True)
+    assert taken.time_s is None
+    assert (np.isnan(taken.range_m) == (taken.flags != 0)).all()
 
 
 def test_a_second_capture_from_the_same_generator_has_new_noise():

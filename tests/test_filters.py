@@ -7,7 +7,17 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.matcher import FilteredFrames, PixelKalman, kalman_filter, phasor_mean
 from phasemark.matcher.filters import PixelState, kalman, kalman_step
-from phasemark.render import Flag, Frames, PhasorImages, Sensor, Views, capture, predicted_range_std, preset
+from phasemark.render import (
+    Flag,
+    Frames,
+    PhasorImages,
+    Sensor,
+    Views,
+    capture,
+    measured_range_std,
+    predicted_range_std,
+    preset,
+)
 
 FALSE_ALARM = 1e-3  # of a whole test, whatever the number of cells
 
@@ -204,6 +214,45 @@ def test_invalid_frames_are_skipped(run):
     assert with_gaps.range_m.item() == pytest.approx(without.range_m.item(), rel=1e-12)
     assert with_gaps.std_m.item() == pytest.approx(without.std_m.item(), rel=1e-12)
     assert with_gaps.n_effective.item() == pytest.approx(3, rel=1e-12)
+
+
+@pytest.mark.parametrize("process_var_m2", [0.0, 1e-4])
+def test_every_pixel_is_filtered_as_if_it_were_alone_to_the_last_bit(process_var_m2):
+    rng, shape = np.random.default_rng(8), (3, 9, 4, 5)
+    amplitude = rng.uniform(50, 500, shape)
+    amplitude[rng.random(shape) < 0.1] = np.nan
+    flags = rng.choice([0, int(Flag.NO_RETURN), int(Flag.MISSING)], shape, p=[0.6, 0.3, 0.1]).astype(np.uint8)
+    flags[np.isnan(amplitude) & (flags == 0)] = int(Flag.NO_RETURN)
+    frames = Frames(
+        rng.uniform(0, PERIOD_M, shape), amplitude, rng.uniform(1e3, 1e4, shape), sensor=sensor_of(4, 5), flags=flags
+    )
+    found = kalman_filter(frames, process_var_m2)
+    for i, row, col in np.ndindex(3, 4, 5):
+        x = p = total = count = other = n_other = bright = 0.0
+        z, a, b, f = (v[i, :, row, col] for v in (frames.range_m, frames.amplitude_e, frames.intensity_e, frames.flags))
+        for k in range(9):
+            if f[k] == 0:
+                total, bright, count = total + a[k], bright + b[k], count + 1
+            elif f[k] == int(Flag.NO_RETURN) and np.isfinite(a[k]):
+                other, n_other = other + a[k], n_other + 1
+        r = 0.0
+        if count:
+            r = float(measured_range_std(total / count, bright / count, frames.sensor)) ** 2
+        for k in range(9):
+            prior = p + (process_var_m2 / r if process_var_m2 and r else 0.0)
+            if f[k] == 0 and p:
+                gain = prior / (prior + 1)
+                step = z[k] - x
+                x, p = x + gain * (step - PERIOD_M * math.floor(step / PERIOD_M + 0.5)), gain
+            elif f[k] == 0:
+                x, p = z[k], 1.0
+            elif p:
+                p = prior
+        mean = total / count if count else other / n_other if n_other else np.nan
+        assert found.amplitude_e[i, row, col] == mean or (math.isnan(mean) and np.isnan(found.amplitude_e[i, row, col]))
+        if found.state[i, row, col] == PixelState.RETURN:
+            assert found.range_m[i, row, col] == x % PERIOD_M
+            assert found.std_m[i, row, col] == math.sqrt(p * r)
 
 
 def test_process_noise_accumulates_over_skipped_frames():

@@ -62,11 +62,11 @@ def test_interpolated_slopes_are_those_of_the_interpolated_images(bank):
     view = np.array([[1.0137, 0.6512, 0, 0], [1.2651, 3.1379, 0, 0]])  # the second beyond the last angle of the grid
     c = np.array([0, 2])
     here = model.images(c, view, VIEW[:2])
-    for k, step in enumerate((1e-6, 1e-6)):
+    for k, step in enumerate((1e-4, 1e-4)):
         moved = [view + side * step * np.eye(4)[k] for side in (1, -1)]
         high, low = (model.images(c, v, VIEW[:2]).phasor for v in moved)
-        # a central difference over 2e-6 of numbers of order 1: rounding 1e-10, curvature less
-        np.testing.assert_allclose(here.slope[:, k], (high - low) / (2 * step), atol=1e-6)
+        # a central difference over 2e-4 of float32 numbers of order 1: rounding 6e-8 of each
+        np.testing.assert_allclose(here.slope[:, k], (high - low) / (2 * step), atol=1e-3)
 
 
 def test_rendered_images_are_the_renderers_own_with_its_jacobian(bank, renderers):
@@ -76,8 +76,8 @@ def test_rendered_images_are_the_renderers_own_with_its_jacobian(bank, renderers
     image = renderers["post"].render(*view[0], background=WALL)
     slope = renderers["post"].jacobian(*view[0], background=WALL, parameters=VIEW[:3])
     np.testing.assert_allclose(made.phasor, image.phasor.reshape(1, -1), atol=1e-6)  # the bank's mesh is float32
-    # one-sided against central differences: half the curvature of a pixel just entered, times 1e-5
-    np.testing.assert_allclose(made.slope, slope.reshape(1, 3, -1), atol=5e-3 * np.abs(slope).max())
+    # beside a limb, the tangents of interpolated normals: see tests/test_slopes.py
+    np.testing.assert_allclose(made.slope, slope.reshape(1, 3, -1), atol=0.03 * np.abs(slope).max())
 
 
 @pytest.mark.parametrize("delta_deg", [0.003, 179.997, 0.0, 90.0, 45.3])

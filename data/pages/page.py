@@ -34,10 +34,11 @@ def page_template(package: str, name: str) -> jinja2.Template:
 
 def figure_png(figure: Figure) -> bytes:
     """Return a figure as PNG, 110 dots an inch; its layout is computed once, and stays."""
-    if figure.get_layout_engine() is not None:
+    engine = figure.get_layout_engine()
+    if engine is not None:
         figure.set_dpi(_DPI)
-        figure.draw_without_rendering()
-        figure.set_layout_engine(None)  # or saving draws once more in vain
+        engine.execute(figure)
+        figure.set_layout_engine(None)  # or saving computes it once more in vain
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI)
     return buffer.getvalue()

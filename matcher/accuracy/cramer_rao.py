@@ -135,11 +135,8 @@ def cramer_rao(
     if (background is None or background.wall_m is None) and set(nuisances) & {"wall_m", "wall_albedo"}:
         raise UsageError("a wall can be a nuisance only where there is one: give 'background' a wall")
     sensor = renderer.sensor
-    if image is None:
-        image = renderer.render_views(views, background=background, workers=workers)
-    slope = renderer.jacobian(
-        *(getattr(views, name) for name in VIEW), background=background, parameters=free, workers=workers
-    )
+    rendered, slope = _image_and_slopes(renderer, views, free, background, workers)
+    image = rendered if image is None else image
     columns = [slope]
     if nuisances:
         alone = renderer.render_views(views, workers=workers).phasor if background else image.phasor
@@ -179,6 +176,26 @@ def cramer_rao(
             p = len(free)
             common += carried_covariance(known, rows, calibrated, calibrated_covariance(sensor))[:, :p, :p]
     return Bound(tuple(free), information, use, common)
+
+
+def _image_and_slopes(
+    renderer: Renderer, views: Views, free: Sequence[str], background: Background | None, workers: int
+) -> tuple[PhasorImages, NDArray[np.complex128]]:
+    """Return the images of views and their slopes; height, with its kink at 0, is differenced."""
+    smooth = [name for name in free if name != "height_m"]
+    if not smooth:
+        image, slope = renderer.render_views(views, background=background, workers=workers), None
+    else:
+        image, slope = renderer.render_with_slopes(views, smooth, background=background, workers=workers)
+    if slope is not None and len(smooth) == len(free):
+        return image, slope
+    by_height = renderer.jacobian(
+        *(getattr(views, name) for name in VIEW), background=background, parameters=("height_m",), workers=workers
+    )
+    parts = {"height_m": by_height[:, 0]}
+    if slope is not None:
+        parts |= {name: slope[:, k] for k, name in enumerate(smooth)}
+    return image, np.stack([parts[name] for name in free], axis=1)
 
 
 def _whitened(

@@ -10,14 +10,15 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from phasemark import UsageError
-from phasemark.render.frames import Flag, Frames
+from phasemark.matcher.filters.loops import add_up, count, follow
+from phasemark.render.frames import Frames
 from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m, wrap_difference_m, wrap_range_m
 from phasemark.render.png import figure_png
 from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
@@ -25,6 +26,8 @@ from phasemark.render.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
     pass
+
+_Number = TypeVar("_Number", bound=np.generic)
 
 _LEAST_POOLED = 1e-4
 """Least variance over that of the law; frames without any scatter are simulated, or frozen."""
@@ -364,8 +367,7 @@ def kalman_filter(frames: Frames, process_var_m2: float = 0.0) -> FilteredFrames
         measurement_var = scatter.variance_m2()
     measurement_var = _floored(measurement_var, process_var_m2)
     track = _Track.empty(tally.n_valid.shape, frames.sensor)
-    for range_m, valid in _in_time(frames):
-        track.step(range_m, valid, process_var_m2, measurement_var)
+    track.follow(frames, process_var_m2, measurement_var)
     filtered = _result(tally, track.range_m, np.sqrt(track.scaled_var * measurement_var), track.n_effective())
     return _timed(filtered, frames)
 
@@ -475,9 +477,8 @@ class PixelKalman:
             self._track = _Track.empty(news.n_valid.shape, self._sensor)
         else:
             self._tally = self._tally.plus(news)
-        range_m, valid = frame.range_m[:, 0], frame.valid[:, 0]
-        self._scatter.add(range_m, valid)
-        self._track.step(range_m, valid, self._process_var_m2, self._measurement_var_m2(self._tally))
+        self._scatter.add(frame.range_m[:, 0], frame.valid[:, 0])
+        self._track.follow(frame, self._process_var_m2, self._measurement_var_m2(self._tally))
 
     def result(self) -> FilteredFrames:
         """Return the filtered frame as of now.
@@ -501,8 +502,7 @@ class PixelKalman:
 class _Track:
     """State of the scalar filters, one per pixel, with P in units of R.
 
-    In p = P/R and q = Q/R the filter reads K = (p + q) / (p + q + 1) and P = (1 − K) P⁻ = K R, that is p = K. With
-    Q = 0 no R enters: R = 0 (noise switched off) and R = ∞ (not known yet) still give the running mean.
+    With Q = 0 no R enters: R = 0 (noise switched off) and R = ∞ (not known yet) still give the running mean.
     """
 
     range_m: NDArray[np.float64]
@@ -513,20 +513,13 @@ class _Track:
     def empty(cls, shape: tuple[int, ...], sensor: Sensor) -> _Track:
         return cls(np.full(shape, np.nan), np.full(shape, np.nan), sensor)
 
-    def step(
-        self,
-        range_m: NDArray[np.float64],
-        valid: NDArray[np.bool_],
-        process_var_m2: float,
-        measurement_var_m2: NDArray[np.float64],
-    ) -> None:
-        prior = self.scaled_var + (process_var_m2 / measurement_var_m2 if process_var_m2 > 0 else 0.0)
-        gain = prior / (prior + 1.0)
-        first = valid & np.isnan(self.range_m)
-        later = valid & ~first
-        innovation = wrap_difference_m(np.where(later, range_m - self.range_m, 0.0), self.sensor)
-        self.range_m = np.where(first, range_m, self.range_m + np.where(later, gain * innovation, 0.0))
-        self.scaled_var = np.where(first, 1.0, np.where(later, gain, prior))
+    def follow(self, frames: Frames, process_var_m2: float, measurement_var_m2: NDArray[np.float64]) -> None:
+        """Take in the next frames."""
+        self.range_m, self.scaled_var = self.range_m.copy(), self.scaled_var.copy()  # results may hold the old ones
+        follow(
+            _pixels_of_frames(frames.range_m), _pixels_of_frames(frames.flags), self.sensor.unambiguous_range_m,
+            process_var_m2, _pixels(measurement_var_m2), _pixels(self.range_m), _pixels(self.scaled_var),
+        )  # fmt: skip
 
     def n_effective(self) -> NDArray[np.float64]:
         return 1.0 / self.scaled_var
@@ -573,12 +566,13 @@ class _Tally:
     def of(cls, frames: Frames) -> _Tally:
         if frames.n_frames == 0:
             raise UsageError("there is no frame to filter")
-        usable = np.equal(frames.flags & ~np.uint8(Flag.NO_RETURN), 0)
+        n_valid, n_usable = (np.zeros(_one_each(frames), np.int64) for _ in range(2))
+        count(_pixels_of_frames(frames.flags), _pixels(n_valid), _pixels(n_usable))
         return cls(
-            frames.valid.sum(axis=1),
-            usable.sum(axis=1),
-            None if frames.amplitude_e is None else _Sums.of(frames.amplitude_e, frames.valid, usable),
-            None if frames.intensity_e is None else _Sums.of(frames.intensity_e, frames.valid, usable),
+            n_valid,
+            n_usable,
+            None if frames.amplitude_e is None else _Sums.of(frames.amplitude_e, frames.flags, n_valid),
+            None if frames.intensity_e is None else _Sums.of(frames.intensity_e, frames.flags, n_valid),
             frames.sensor,
         )
 
@@ -624,11 +618,11 @@ class _Sums:
     n_other: NDArray[np.int64]
 
     @classmethod
-    def of(cls, values: NDArray[np.float64], valid: NDArray[np.bool_], usable: NDArray[np.bool_]) -> _Sums:
-        other = usable & ~valid & np.isfinite(values)
-        return cls(
-            values.sum(axis=1, where=valid), valid.sum(axis=1), values.sum(axis=1, where=other), other.sum(axis=1)
-        )
+    def of(cls, values: NDArray[np.float64], flags: NDArray[np.uint8], n_valid: NDArray[np.int64]) -> _Sums:
+        """Add up frames, (n, frames, rows, cols)."""
+        valid, other, n_other = np.zeros(n_valid.shape), np.zeros(n_valid.shape), np.zeros(n_valid.shape, np.int64)
+        add_up(_pixels_of_frames(values), _pixels_of_frames(flags), _pixels(valid), _pixels(other), _pixels(n_other))
+        return cls(valid, n_valid, other, n_other)
 
     def mean(self) -> NDArray[np.float64]:
         """Return the mean of the valid frames, or where there is none of the others; NaN where there is neither."""
@@ -647,6 +641,21 @@ def _add_sums(name: str, old: _Sums | None, new: _Sums | None) -> _Sums | None:
         with_, without = ("frame", "ones before") if old is None else ("ones before", "frame")
         raise UsageError(f"'{name}' must come with every frame or none: given with the {with_}, not with the {without}")
     return _Sums(old.valid + new.valid, old.n_valid + new.n_valid, old.other + new.other, old.n_other + new.n_other)
+
+
+def _one_each(frames: Frames) -> tuple[int, ...]:
+    """Return the shape of one number for each pixel, (n, rows, cols)."""
+    return (len(frames), *frames.range_m.shape[2:])
+
+
+def _pixels(image: NDArray[_Number]) -> NDArray[_Number]:
+    """Return (n, rows, cols) as the compiled loops take it, (n, pixels)."""
+    return image.reshape(len(image), math.prod(image.shape[1:]))
+
+
+def _pixels_of_frames(values: NDArray[_Number]) -> NDArray[_Number]:
+    """Return (n, frames, rows, cols) as the compiled loops take it, (n, frames, pixels)."""
+    return np.ascontiguousarray(values).reshape(*values.shape[:2], math.prod(values.shape[2:]))
 
 
 def _in_time(frames: Frames) -> Iterator[tuple[NDArray[np.float64], NDArray[np.bool_]]]:

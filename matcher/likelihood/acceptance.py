@@ -87,7 +87,7 @@ def _answer(
     left = DISAGREEMENT * float(fits.unexplained[best])
     weight = _weights(np.append(fits.cost[kept], min(bare, float(doubt[best]) + left)))
     reason = _reason(setup, fits, kept, weight[:-1], float(p_values[best]), bare)
-    candidates = tuple(_candidate(setup, fits, k, w) for k, w in zip(kept, weight, strict=False))
+    candidates = _candidates(setup, fits, kept, weight)
     condition, weak = weak_direction(setup.free, information=fits.information[best])
     covariance = fits.covariance[best]
     is_landmark = reason != "no landmark"
@@ -119,14 +119,15 @@ def _weights(costs: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(weight / weight.sum())
 
 
-def _candidate(setup: Setup, fits: Fits, k: int, weight: float) -> Candidate:
-    """Return one fit as an explanation, δ within the landmark's period."""
-    c = int(fits.class_index[k])
-    distance, delta, bearing, height = (float(value) for value in fits.view[k])
-    turn = delta_period_rad(setup.shapes.symmetry[c])
-    cost = float(fits.cost[k])
-    return Candidate(
-        setup.shapes.names[c], distance, float(wrap_delta_rad(delta, turn)), cost, float(weight), bearing, height
+def _candidates(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float64]) -> tuple[Candidate, ...]:
+    """Return some fits of one frame as explanations, δ within the landmark's period."""
+    shapes, classes = setup.shapes, fits.class_index[kept].tolist()
+    view = fits.view[kept]
+    view[:, 1] = wrap_delta_rad(view[:, 1], [delta_period_rad(shapes.symmetry[c]) for c in classes])
+    rows = zip(classes, view.tolist(), fits.cost[kept].tolist(), weight.tolist(), strict=False)
+    return tuple(
+        Candidate(shapes.names[c], distance, delta, cost, share, bearing, height)
+        for c, (distance, delta, bearing, height), cost, share in rows
     )
 
 

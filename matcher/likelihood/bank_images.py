@@ -175,58 +175,83 @@ def _cubic(t, w, dw):  # type: ignore[no-untyped-def]
     dw[3] = (3 * t * t - 1) / 6
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _linear(t, w, dw):  # type: ignore[no-untyped-def]
-    """Fill the weights of the straight line between the two neighbours around t, and their derivatives."""
-    k = min(max(int(np.floor(t)), -1), 1)
-    for a in range(4):
-        w[a], dw[a] = 0.0, 0.0
-    w[k + 1], w[k + 2] = k + 1.0 - t, t - k
-    dw[k + 1], dw[k + 2] = -1.0, 1.0
+_vectorised = njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _gather(block, w, by_d, by_a, sums, extreme):  # type: ignore[no-untyped-def]
-    """Add one neighbour, (4, pixels), with its weights to the sums (9, pixels) of the cubic, and widen the extremes."""
-    for q in range(block.shape[1]):
-        re, im, cover = block[0, q], block[1, q], block[3, q]
-        sums[0, q] += w * re
-        sums[1, q] += by_d * re
-        sums[2, q] += by_a * re
-        sums[3, q] += w * im
-        sums[4, q] += by_d * im
-        sums[5, q] += by_a * im
-        sums[6, q] += w * cover
-        sums[7, q] += by_d * cover
-        sums[8, q] += by_a * cover
-        size = re * re + im * im
-        extreme[0, q] = size if size < extreme[0, q] else extreme[0, q]
-        extreme[1, q] = size if size > extreme[1, q] else extreme[1, q]
+@_vectorised
+def _along_delta(b0, b1, b2, b3, w, dw, out):  # type: ignore[no-untyped-def]
+    """Interpolate four neighbours in δ, (4, pixels) each, into `out` (8, pixels).
+
+    Its rows are value and slope of the real part, of the imaginary part and of the coverage, and the least and greatest
+    squared amplitude.
+    """
+    w0, w1, w2, w3 = np.float32(w[0]), np.float32(w[1]), np.float32(w[2]), np.float32(w[3])
+    d0, d1, d2, d3 = np.float32(dw[0]), np.float32(dw[1]), np.float32(dw[2]), np.float32(dw[3])
+    for q in range(out.shape[1]):
+        out[0, q] = w0 * b0[0, q] + w1 * b1[0, q] + w2 * b2[0, q] + w3 * b3[0, q]
+        out[1, q] = d0 * b0[0, q] + d1 * b1[0, q] + d2 * b2[0, q] + d3 * b3[0, q]
+        out[2, q] = w0 * b0[1, q] + w1 * b1[1, q] + w2 * b2[1, q] + w3 * b3[1, q]
+        out[3, q] = d0 * b0[1, q] + d1 * b1[1, q] + d2 * b2[1, q] + d3 * b3[1, q]
+        out[4, q] = w0 * b0[3, q] + w1 * b1[3, q] + w2 * b2[3, q] + w3 * b3[3, q]
+        out[5, q] = d0 * b0[3, q] + d1 * b1[3, q] + d2 * b2[3, q] + d3 * b3[3, q]
+    for q in range(out.shape[1]):
+        s0, s1 = b0[0, q] * b0[0, q] + b0[1, q] * b0[1, q], b1[0, q] * b1[0, q] + b1[1, q] * b1[1, q]
+        s2, s3 = b2[0, q] * b2[0, q] + b2[1, q] * b2[1, q], b3[0, q] * b3[0, q] + b3[1, q] * b3[1, q]
+        out[6, q] = min(min(s0, s1), min(s2, s3))
+        out[7, q] = max(max(s0, s1), max(s2, s3))
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _gather_linear(block, w, by_d, by_a, sums):  # type: ignore[no-untyped-def]
-    """Add one neighbour, (4, pixels), with its weights to the sums (10, pixels) of the straight interpolation."""
-    for q in range(block.shape[1]):
-        re, im, cover = block[0, q], block[1, q], block[3, q]
-        sums[0, q] += w * re
-        sums[1, q] += by_d * re
-        sums[2, q] += by_a * re
-        sums[3, q] += w * im
-        sums[4, q] += by_d * im
-        sums[5, q] += by_a * im
-        sums[6, q] += w * cover
-        sums[7, q] += by_d * cover
-        sums[8, q] += by_a * cover
-        sums[9, q] += w * block[2, q]
+@_vectorised
+def _along_distance(lines, w, dw, cubic):  # type: ignore[no-untyped-def]
+    """Interpolate four lines of :func:`_along_delta` in D, into `cubic` (11, pixels).
+
+    Its rows are value, slope by D and slope by δ of the real part, of the imaginary part and of the coverage, and the
+    least and greatest squared amplitude.
+    """
+    w0, w1, w2, w3 = np.float32(w[0]), np.float32(w[1]), np.float32(w[2]), np.float32(w[3])
+    d0, d1, d2, d3 = np.float32(dw[0]), np.float32(dw[1]), np.float32(dw[2]), np.float32(dw[3])
+    for part in range(3):
+        value, slope = 2 * part, 2 * part + 1
+        for q in range(cubic.shape[1]):
+            x0, x1, x2, x3 = lines[0, value, q], lines[1, value, q], lines[2, value, q], lines[3, value, q]
+            cubic[3 * part, q] = w0 * x0 + w1 * x1 + w2 * x2 + w3 * x3
+            cubic[3 * part + 1, q] = d0 * x0 + d1 * x1 + d2 * x2 + d3 * x3
+            cubic[3 * part + 2, q] = (
+                w0 * lines[0, slope, q] + w1 * lines[1, slope, q] + w2 * lines[2, slope, q] + w3 * lines[3, slope, q]
+            )
+    for q in range(cubic.shape[1]):
+        cubic[9, q] = min(min(lines[0, 6, q], lines[1, 6, q]), min(lines[2, 6, q], lines[3, 6, q]))
+        cubic[10, q] = max(max(lines[0, 7, q], lines[1, 7, q]), max(lines[2, 7, q], lines[3, 7, q]))
+
+
+@_vectorised
+def _between(b00, b01, b10, b11, d, a, step_d, step_a, straight):  # type: ignore[no-untyped-def]
+    """Interpolate linearly between two distances and two angles, into `straight` (10, pixels).
+
+    Its first nine rows are those of :func:`_along_distance`, the last one is the intensity; `d` and `a` are the places
+    between the neighbours.
+    """
+    w00, w01 = np.float32((1 - d) * (1 - a)), np.float32((1 - d) * a)
+    w10, w11 = np.float32(d * (1 - a)), np.float32(d * a)
+    d0, d1 = np.float32((1 - a) / step_d), np.float32(a / step_d)
+    a0, a1 = np.float32((1 - d) / step_a), np.float32(d / step_a)
+    for part in range(3):
+        plane = 3 if part == 2 else part
+        for q in range(straight.shape[1]):
+            x00, x01, x10, x11 = b00[plane, q], b01[plane, q], b10[plane, q], b11[plane, q]
+            straight[3 * part, q] = w00 * x00 + w01 * x01 + w10 * x10 + w11 * x11
+            straight[3 * part + 1, q] = d0 * (x10 - x00) + d1 * (x11 - x01)
+            straight[3 * part + 2, q] = a0 * (x01 - x00) + a1 * (x11 - x10)
+    for q in range(straight.shape[1]):
+        straight[9, q] = w00 * b00[2, q] + w01 * b01[2, q] + w10 * b10[2, q] + w11 * b11[2, q]
 
 
 @njit(cache=True, nogil=True)
-def _conclude(m, first, cubic, straight, extreme, behind, behind_intensity, phasor, slope, shade):  # type: ignore[no-untyped-def]
+def _conclude(m, first, cubic, straight, behind, behind_intensity, phasor, slope, shade):  # type: ignore[no-untyped-def]
     """Choose for every pixel between cubic and straight, put the background behind it, and store it."""
     for q in range(cubic.shape[1]):
         at = first + q
-        chosen = cubic if extreme[0, q] > _DIM * _DIM * extreme[1, q] else straight
+        chosen = cubic if cubic[9, q] > _DIM * _DIM * cubic[10, q] else straight
         phasor[m, at] = complex(chosen[0, q], chosen[3, q])
         slope[m, 0, at] = complex(chosen[1, q], chosen[4, q])
         slope[m, 1, at] = complex(chosen[2, q], chosen[5, q])
@@ -238,6 +263,13 @@ def _conclude(m, first, cubic, straight, extreme, behind, behind_intensity, phas
             shade[m, 0, at] += (1 - straight[6, q]) * behind_intensity[at]
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _straight_cell(t):  # type: ignore[no-untyped-def]
+    """Return the first of the two neighbours around t among those at −1, 0, 1, 2, counted from 0, and t's place there."""
+    k = min(max(int(np.floor(t)), -1), 1)
+    return k + 1, t - k
+
+
 @njit(cache=True, nogil=True)
 def _interpolate(  # type: ignore[no-untyped-def]
     class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, behind, behind_intensity,
@@ -247,9 +279,10 @@ def _interpolate(  # type: ignore[no-untyped-def]
     n_d, n_a = lower.shape[1], lower.shape[2]
     n_up, n_low = upper.shape[-1], lower.shape[-1]
     wd, dwd, wa, dwa = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
-    ld, dld, la, dla = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
-    cubic, straight, extreme = np.empty((9, n_low)), np.empty((10, n_low)), np.empty((2, n_low))
-    cubic_up, straight_up, extreme_up = np.empty((9, n_up)), np.empty((10, n_up)), np.empty((2, n_up))
+    once, never = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4)
+    lines, cubic = np.empty((4, 8, n_low), np.float32), np.empty((11, n_low), np.float32)
+    lines_up, cubic_up = np.empty((4, 8, n_up), np.float32), np.empty((11, n_up), np.float32)
+    straight, straight_up = np.empty((10, n_low), np.float32), np.empty((10, n_up), np.float32)
     for m in range(len(class_index)):
         c = class_index[m]
         cl = c if lower.shape[0] > 1 else 0
@@ -260,23 +293,27 @@ def _interpolate(  # type: ignore[no-untyped-def]
         j0, ta = _cell(x, n_a, closes)
         _cubic(td, wd, dwd)
         _cubic(ta, wa, dwa)
-        _linear(td, ld, dld)
-        _linear(ta, la, dla)
-        cubic[:], straight[:], extreme[0], extreme[1] = 0.0, 0.0, np.inf, 0.0
-        cubic_up[:], straight_up[:], extreme_up[0], extreme_up[1] = 0.0, 0.0, np.inf, 0.0
+        dwd /= step_d
+        dwa /= step_a
+        j1, j2, j3, j4 = j0 % n_a, (j0 + 1) % n_a, (j0 + 2) % n_a, (j0 + 3) % n_a
         for a in range(4):
+            block = lower[cl, i0 + a]
+            _along_delta(block[j1], block[j2], block[j3], block[j4], wa, dwa, lines[a])
             if n_up:
-                block = upper[c, i0 + a]
-                _gather(block, wd[a], dwd[a] / step_d, 0.0, cubic_up, extreme_up)
-                if dld[a] != 0.0:
-                    _gather_linear(block, ld[a], dld[a] / step_d, 0.0, straight_up)
-            for b in range(4):
-                block = lower[cl, i0 + a, (j0 + b) % n_a]
-                _gather(block, wd[a] * wa[b], dwd[a] * wa[b] / step_d, wd[a] * dwa[b] / step_a, cubic, extreme)
-                if dld[a] != 0.0 and dla[b] != 0.0:
-                    _gather_linear(block, ld[a] * la[b], dld[a] * la[b] / step_d, ld[a] * dla[b] / step_a, straight)
-        _conclude(m, 0, cubic_up, straight_up, extreme_up, behind, behind_intensity, phasor, slope, shade)
-        _conclude(m, n_up, cubic, straight, extreme, behind, behind_intensity, phasor, slope, shade)
+                one = upper[c, i0 + a]
+                _along_delta(one, one, one, one, once, never, lines_up[a])
+        _along_distance(lines, wd, dwd, cubic)
+        k, d = _straight_cell(td)
+        l, a = _straight_cell(ta)
+        near, far = lower[cl, i0 + k], lower[cl, i0 + k + 1]
+        ja, jb = (j0 + l) % n_a, (j0 + l + 1) % n_a
+        _between(near[ja], near[jb], far[ja], far[jb], d, a, step_d, step_a, straight)
+        if n_up:
+            _along_distance(lines_up, wd, dwd, cubic_up)
+            near_up, far_up = upper[c, i0 + k], upper[c, i0 + k + 1]
+            _between(near_up, near_up, far_up, far_up, d, 0.0, step_d, step_a, straight_up)
+            _conclude(m, 0, cubic_up, straight_up, behind, behind_intensity, phasor, slope, shade)
+        _conclude(m, n_up, cubic, straight, behind, behind_intensity, phasor, slope, shade)
 
 
 @njit(cache=True, nogil=True)

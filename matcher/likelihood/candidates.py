@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from phasemark.matcher.likelihood.fits import Fits, best_of_frame, distinct, distinct_of_frames, least_of_frame
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.problem import Settings
-from phasemark.matcher.likelihood.refine import refine
+from phasemark.matcher.likelihood.refine import costs_at, refine
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.nearest.bank_minima import Starts
 
-__all__ = ["fit_modes", "fit_other_classes", "fit_starts"]
+__all__ = ["fit_modes", "fit_other_classes", "fit_starts", "fit_surroundings"]
 
 
 def fit_starts(
@@ -43,7 +43,7 @@ def fit_starts(
     sides_rad : tuple of float
         Offsets of δ at which the best minimum of each frame is tried too.
     patient : bool
-        Whether to refine minima however bad they look at first, and the surroundings of what the scout found.
+        Whether to refine minima however bad they look at first.
     """
     policy, settings = setup.policy, scene.settings(setup)
     frame, class_index, view = _with_sides(which[starts.frame], starts, sides_rad)
@@ -56,7 +56,7 @@ def fit_starts(
     fits = Fits.joined([fits, fit_other_classes(setup, lead, evidence, fits, leading)])
     if scene.scout is None:
         return fits
-    return _polished(setup, scene, evidence, fits, settings, patient=patient)
+    return _polished(setup, scene, evidence, fits)
 
 
 def fit_modes(
@@ -90,10 +90,10 @@ def fit_other_classes(setup: Setup, model: ImageModel, evidence: Evidence, fits:
     others = np.array([(k, c) for k in best for c in range(n_class) if c != fits.class_index[k]], np.int64)
     others = others.reshape(-1, 2)
     source = others[:, 0]
-    limit = fits.cost[source] + setup.policy.likely_cost
-    return refine(
-        model, evidence, fits.frame[source], others[:, 1], fits.view[source], settings, limit, at_first_sight=True
-    )
+    rival = fits.cost[source]
+    limit = rival + setup.policy.likely_cost
+    frame, view = fits.frame[source], fits.view[source]
+    return refine(model, evidence, frame, others[:, 1], view, settings, limit, rival, at_first_sight=True)
 
 
 def _with_sides(
@@ -112,21 +112,52 @@ def _with_sides(
     )
 
 
-def _polished(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, settings: Settings, *, patient: bool) -> Fits:
+def fit_surroundings(setup: Setup, scene: Scene, evidence: Evidence, which: NDArray[np.int64], fits: Fits) -> Fits:
+    """Refine from around the best fits of some frames: where an edge has just left a pixel, nothing leads back.
+
+    Parameters
+    ----------
+    setup : Setup
+    scene : Scene
+        With a scout.
+    evidence : Evidence
+    which : (k,) int64
+        Frames.
+    fits : Fits
+        Of these frames and others, on the final images.
+    """
+    order = np.lexsort((fits.cost, fits.frame))
+    likely = [k for k in order if fits.frame[k] in which and np.isfinite(fits.covariance[k]).all()]
+    around = _surrounded(fits[_most_likely(setup, fits, likely)])
+    close = _close_settings(setup, scene, evidence)
+    cost = costs_at(scene.final, evidence, around.frame, around.class_index, around.view, close)
+    order = np.lexsort((cost, around.frame))
+    place = np.arange(len(order)) - np.searchsorted(around.frame[order], around.frame[order])
+    again = around[order[place < setup.policy.most_refined]]
+    rival = least_of_frame(fits, len(evidence.weight))[again.frame]
+    limit = np.full(len(again), np.inf)
+    return refine(scene.final, evidence, again.frame, again.class_index, again.view, close, limit, rival)
+
+
+def _close_settings(setup: Setup, scene: Scene, evidence: Evidence) -> Settings:
+    """Return how a descent runs that starts near a minimum."""
+    policy = setup.policy
+    side_peaks = evidence.on == "phasors" or scene.behind is not None
+    return replace(
+        scene.settings(setup),
+        longest_step=policy.step_after_scout_aside if setup.prior_std else policy.step_after_scout,
+        look_beside_rad=policy.close_by_rad if side_peaks else (),
+    )
+
+
+def _polished(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     """Refine on the final images what is likely after the scout; the other fits keep their distance from the best."""
     policy, n = setup.policy, len(evidence.weight)
     order = np.lexsort((fits.cost, fits.frame))
     least = least_of_frame(fits, n)
     likely = [k for k in order if fits.cost[k] < least[fits.frame[k]] + policy.likely_cost]
     again = fits[_most_likely(setup, fits, likely)]
-    if patient:
-        again = _surrounded(again)
-    side_peaks = evidence.on == "phasors" or scene.behind is not None
-    close = replace(
-        settings,
-        longest_step=policy.step_after_scout_aside if setup.prior_std else policy.step_after_scout,
-        look_beside_rad=policy.close_by_rad if side_peaks else (),
-    )
+    close = _close_settings(setup, scene, evidence)
     final = refine(scene.final, evidence, again.frame, again.class_index, again.view, close)
     others = fits[np.setdiff1d(order, likely)]
     gap = others.cost - least[others.frame]
@@ -148,15 +179,12 @@ def _most_likely(setup: Setup, fits: Fits, likely: list[int]) -> NDArray[np.int6
 
 
 def _surrounded(fits: Fits) -> Fits:
-    """Return fits and others two and four standard deviations away along the axes of their covariance.
-
-    Where an edge has just left a pixel, its slope is 0, and nothing leads back.
-    """
+    """Return fits two and four standard deviations away along the axes of the covariances of some."""
     p = fits.covariance.shape[1]
     columns = np.arange(p)
     values, vectors = np.linalg.eigh(np.where(np.isfinite(fits.covariance), fits.covariance, 0.0))
     axes = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    parts = [fits]
+    parts = []
     for k in range(p):
         for size in (-4.0, -2.0, 2.0, 4.0):
             view = fits.view.copy()

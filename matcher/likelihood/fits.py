@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
-from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
+from phasemark.render.view import delta_period_rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,15 +131,18 @@ def distinct(fits: Fits, own: NDArray[np.int64], symmetry: Sequence[int], same_m
         Fits nearer to each other are one.
     """
     kept: list[int] = []
-    for k in own:
-        period = delta_period_rad(symmetry[fits.class_index[k]])
-        for other in kept:
-            turned = wrap_delta_difference_rad(fits.view[k, 1] - fits.view[other, 1], period)
-            near = abs(fits.view[k, 0] - fits.view[other, 0]) < same_m and abs(turned) < same_rad
-            if near and fits.class_index[k] == fits.class_index[other]:
+    places: list[tuple[int, float, float]] = []
+    views, classes = fits.view[own, :2].tolist(), fits.class_index[own].tolist()
+    for k, (distance, delta), c in zip(own.tolist(), views, classes, strict=True):
+        period = delta_period_rad(symmetry[c])
+        for other, there, angle in places:
+            if other != c or abs(distance - there) >= same_m:
+                continue
+            if abs(math.remainder(delta - angle, period)) < same_rad:
                 break
         else:
-            kept.append(int(k))
+            kept.append(k)
+            places.append((c, distance, delta))
     return kept
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
 from typing import Literal
@@ -98,11 +99,17 @@ class LikelihoodMatcher:
         self._scene = Scene(self._stated, behind, final, None if self._exact else self._scout, search, wide)
 
     def match(self, frames: FilteredFrames) -> list[Match]:
-        """Match filtered frames."""
-        answers: list[Match] = []
-        for start in range(0, len(frames), self._setup.policy.frames_at_once):
-            some = frames[start : start + self._setup.policy.frames_at_once]
-            answers.extend(self._match_auto(some) if self._auto else self._match_before(some))
+        """Match filtered frames, in threads of their own parts of them; the answers do not depend on their number."""
+        match = self._match_auto if self._auto else self._match_before
+        share = max(math.ceil(len(frames) / self._workers), 1)
+        share = min(share, self._setup.policy.frames_at_once)
+        parts = [frames[start : start + share] for start in range(0, len(frames), share)]
+        if len(parts) < 2 or self._workers == 1:
+            found = [match(part) for part in parts]
+        else:
+            with ThreadPoolExecutor(self._workers) as pool:
+                found = list(pool.map(match, parts))
+        answers = [answer for some in found for answer in some]
         return with_motion(self._setup, self._systematic, frames, answers)
 
     def _match_before(self, frames: FilteredFrames) -> list[Match]:
@@ -137,7 +144,7 @@ class LikelihoodMatcher:
     @cached_property
     def _rendered(self) -> RenderedModel:
         """What renders the landmarks of the bank, made when it is first needed."""
-        return RenderedModel(self._bank, self._stated, self._workers)
+        return RenderedModel(self._bank, self._stated)
 
     def _bank_models(self, behind: PhasorImages | None) -> tuple[BankModel | None, BankModel | None]:
         """Return the interpolated images that the answer is taken from, and those of a scout; None where unfit."""

@@ -58,7 +58,8 @@ def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: 
         _at_measured_distance(setup, scene.final, evidence, frame, class_index, view),
         scene.settings(setup),
         fits.cost[source] + setup.policy.likely_cost,
-        at_first_sight=len(setup.free) == 2,
+        fits.cost[source],
+        at_first_sight=True,
     )
 
 

@@ -15,7 +15,7 @@ from phasemark.matcher.information import NATURAL_UNITS
 from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
-from phasemark.matcher.pixel_agreement import MUST_RETURN_COVERAGE, counts
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, MUST_RETURN_COVERAGE, counts
 
 ALBEDO = "albedo"
 """Name of the factor on the landmark's brightness, profiled out on phasors."""
@@ -93,6 +93,8 @@ class Problem:
     settings : Settings
     limit : (m,) float64
         Cost above which a candidate is given up.
+    rival : (m,) float64, optional
+        Cost of the best explanation of each candidate's frame that is known besides.
     """
 
     def __init__(
@@ -103,8 +105,10 @@ class Problem:
         class_index: NDArray[np.int64],
         settings: Settings,
         limit: NDArray[np.float64],
+        rival: NDArray[np.float64] | None = None,
     ) -> None:
         self.limit = limit
+        self.rival = np.full(len(frame), np.inf) if rival is None else rival
         self.model, self.evidence, self.settings = model, evidence, settings
         self.policy = settings.policy
         self.frame, self.class_index = frame, class_index
@@ -118,7 +122,13 @@ class Problem:
     def some(self, which: NDArray[np.integer]) -> Problem:
         """Return the problem of some of the candidates."""
         return Problem(
-            self.model, self.evidence, self.frame[which], self.class_index[which], self.settings, self.limit[which]
+            self.model,
+            self.evidence,
+            self.frame[which],
+            self.class_index[which],
+            self.settings,
+            self.limit[which],
+            self.rival[which],
         )
 
     def start(self, view: NDArray[np.float64], at_first_sight: bool) -> State:
@@ -217,7 +227,8 @@ class Problem:
             return np.sort(first[cost[first] <= self.limit[first]])
         least = np.full(len(self.evidence.weight), np.inf)
         least[self.frame[first]] = cost[first]
-        return np.flatnonzero((cost <= self.limit) & (cost <= least[self.frame] + margin))
+        near = np.minimum(least[self.frame] + margin, self.rival + DISAGREEMENT)
+        return np.flatnonzero((cost <= self.limit) & (cost <= near))
 
     def scaled(self, images: ModelImages, theta: NDArray[np.float64]) -> ModelImages:
         """Make the landmark as bright as the parameters have it, and append the slope by that."""

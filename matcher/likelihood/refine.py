@@ -36,6 +36,7 @@ def refine(
     view: NDArray[np.float64],
     settings: Settings,
     give_up_above: NDArray[np.float64] | None = None,
+    rival: NDArray[np.float64] | None = None,
     *,
     roughly: bool = False,
     at_first_sight: bool = False,
@@ -53,6 +54,8 @@ def refine(
     settings : Settings
     give_up_above : (m,) float64, optional
         Stop where the cost promises to stay above this.
+    rival : (m,) float64, optional
+        Cost of the best explanation of each candidate's frame that is known: what is not near it is not looked at closely.
     roughly : bool
         Whether to stop within a fraction of a standard deviation, with the pixels that counted at the start.
     at_first_sight : bool
@@ -64,25 +67,61 @@ def refine(
         In the order of the candidates.
     """
     limit = np.full(len(frame), np.inf) if give_up_above is None else give_up_above
-    problem = Problem(model, evidence, frame, class_index, settings, limit)
+    problem = Problem(model, evidence, frame, class_index, settings, limit, rival)
     state = problem.start(view, at_first_sight)
-    state = descend(problem, state, settings.policy.rough_cost if roughly else settings.policy.settled_cost)
     if roughly:
+        state = descend(problem, state, settings.policy.rough_cost)
         return conclude(problem, state, look_around=False)
+    state = _descend_near(problem, state)
     if settings.look_beside_rad:
         state = look_beside(problem, state)
-    use = problem.pixels_at(state.images, state.theta)
-    changed = np.flatnonzero((use != state.use).any(axis=1))
-    if changed.size:
-        again = problem.some(changed)
-        before = whole_cost(again, picked(state, changed))[0]
-        moved = descend(again, again.state(state.theta[changed], use[changed]), settings.policy.settled_cost)
-        # pixels that no longer count may hold a view no longer: it would slide to where they are contradicted
-        better = np.flatnonzero(whole_cost(again, moved)[0] <= before + settings.policy.recount_cost)
-        state.update(changed[better], picked(moved, better))
+    state = _recounted(problem, state)
     if not model.slopes_are_free:
         state = settle(problem, state)
     return conclude(problem, state)
+
+
+def costs_at(
+    model: ImageModel,
+    evidence: Evidence,
+    frame: NDArray[np.int64],
+    class_index: NDArray[np.int64],
+    view: NDArray[np.float64],
+    settings: Settings,
+) -> NDArray[np.float64]:
+    """Return what m candidates cost where they start, disagreements included; arguments as for :func:`refine`."""
+    problem = Problem(model, evidence, frame, class_index, settings, np.full(len(frame), np.inf))
+    if problem.with_albedo:  # the brightness of each has to be found first
+        return whole_cost(problem, problem.start(view, False))[0]
+    theta = np.column_stack([problem.clipped(view.copy()), np.ones(len(view))])
+    return whole_cost(problem, problem.at(theta))[0]
+
+
+def _descend_near(problem: Problem, state: State) -> State:
+    """Descend to the minimum; roughly only where another explanation is better by far."""
+    policy = problem.policy
+    if not np.isfinite(problem.rival).any():
+        return descend(problem, state, policy.settled_cost)
+    state = descend(problem, state, policy.rough_cost)
+    near = np.flatnonzero(state.sums.cost <= problem.rival + policy.close_cost)
+    if near.size:
+        state.update(near, descend(problem.some(near), picked(state, near), policy.settled_cost))
+    return state
+
+
+def _recounted(problem: Problem, state: State) -> State:
+    """Decide anew which pixels count, and descend again where others do."""
+    policy = problem.policy
+    use = problem.pixels_at(state.images, state.theta)
+    changed = np.flatnonzero((use != state.use).any(axis=1) & (state.sums.cost <= problem.rival + policy.margin_cost))
+    if changed.size:
+        again = problem.some(changed)
+        before = whole_cost(again, picked(state, changed))[0]
+        moved = descend(again, again.state(state.theta[changed], use[changed]), policy.settled_cost)
+        # pixels that no longer count may hold a view no longer: it would slide to where they are contradicted
+        better = np.flatnonzero(whole_cost(again, moved)[0] <= before + policy.recount_cost)
+        state.update(changed[better], picked(moved, better))
+    return state
 
 
 def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fits:
@@ -99,11 +138,14 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     # before a background the cost is final here; otherwise pixels that nothing explains may still change it
     margin = policy.close_cost if settings.background is None else 0.0
     near = problem.near_best(state, margin) if look_around else np.empty(0, np.intp)
-    covariance, without_one = _uncertainty(problem, state, near)
-    pixels, sums = _judged_pixels(problem, state, near, covariance), _sums_of_all_pixels(problem, state)
-    # a return that is neither compared nor wrong costs what a pixel costs on average: a model that counts fewer
-    # pixels is not better for it
-    further = DISAGREEMENT * pixels.wrong + pixels.undecided
+    sums, covariance = _sums_of_all_pixels(problem, state), view_covariance(problem, state.sums)
+    pixels = _judged_pixels(problem, state, near, covariance)
+    # what costs more than another explanation by a pixel's disagreement decides nothing
+    close = near[(sums.cost + _further_cost(pixels))[near] <= problem.rival[near] + DISAGREEMENT]
+    covariance, without_one = _uncertainty(problem, state, close)
+    if pixels.wrong[close].any():
+        pixels = _judged_pixels(problem, state, near, covariance)
+    further = _further_cost(pixels)
     n_residuals = pixels.compared * problem.evidence.per_pixel + pixels.wrong + pixels.undecided
     n_fitted = int((problem.prior_weight == 0).sum())
     scale = problem.scale[: len(settings.free)]
@@ -160,6 +202,15 @@ def _sums_of_all_pixels(problem: Problem, state: State) -> Sums:
         state.images.phasor, state.images.slope, problem.evidence, problem.frame, state.use, settings.huber
     )
     return problem.with_prior(sums, state.theta)
+
+
+def _further_cost(pixels: _PixelCounts) -> NDArray[np.float64]:
+    """Return what pixels cost that leave no residual, (m,).
+
+    A return that is neither compared nor wrong costs what a pixel costs on average: a model that counts fewer pixels is
+    not better for it.
+    """
+    return np.asarray(DISAGREEMENT * pixels.wrong + pixels.undecided, np.float64)
 
 
 class _PixelCounts(NamedTuple):

@@ -27,16 +27,13 @@ class RenderedModel:
     bank : Bank
     background : Background, optional
         What stands behind the landmark.
-    workers : int
-        Threads that render.
     """
 
     slopes_are_free = False
 
-    def __init__(self, bank: Bank, background: Background | None = None, workers: int = 1) -> None:
+    def __init__(self, bank: Bank, background: Background | None = None) -> None:
         self.sensor: Sensor = bank.sensor
         self.background = background
-        self.workers = workers
         self._renderers = []
         self._factored = bank.lower is not None
         self._radius_m = 0.0
@@ -70,24 +67,32 @@ class RenderedModel:
         return self._limits
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
-        """Render the views, and once more a step of 1e-5 m or rad along each parameter."""
+        """Render the views, and with them how they change.
+
+        Height has one-sided slopes at 0, where the top of the lower part appears: it is differenced over 1e-5 m.
+        """
         m, pixels, p = len(view), self.sensor.rows * self.sensor.cols, len(free)
         phasor, slope = np.empty((m, pixels), np.complex128), np.zeros((m, p, pixels), np.complex128)
         intensity, coverage = np.empty((m, pixels)), np.empty((m, pixels))
+        smooth = [name for name in free if name != "height_m"]
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
-            image = self._render(c, view[of])
+            image, slopes = (
+                self._render_with_slopes(c, view[of], smooth) if smooth else (self._render(c, view[of]), None)
+            )
             phasor[of] = image.phasor.reshape(len(of), -1)
             intensity[of] = image.intensity.reshape(len(of), -1)
             coverage[of] = image.coverage.reshape(len(of), -1)
             for k, name in enumerate(free):
-                axis = VIEW.index(name)
+                _, first = self._changing_rows(name, view[of])
+                if slopes is not None and name in smooth:
+                    slope[of, k, first:] = slopes[:, smooth.index(name)].reshape(len(of), -1)[:, first:]
+                    continue
                 moved = view[of]
-                moved[:, axis] += STEP
-                width = (moved - view[of])[:, axis]
-                rows, first = self._changing_rows(name, view[of])
-                there = self._render(c, moved, rows).phasor.reshape(len(of), -1)
-                slope[of, k, first:] = (there - phasor[of, first:]) / width[:, None]
+                moved[:, VIEW.index(name)] += STEP
+                width = (moved - view[of])[:, VIEW.index(name)]
+                there = self._render(c, moved).phasor.reshape(len(of), -1)
+                slope[of, k] = (there - phasor[of]) / width[:, None]
         return ModelImages(phasor, slope, intensity, coverage)
 
     def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
@@ -159,8 +164,13 @@ class RenderedModel:
                     low[of], high[of] = np.minimum(low[of], coverage), np.maximum(high[of], coverage)
         return low, high
 
+    def _render_with_slopes(
+        self, class_index: int, view: NDArray[np.float64], free: Sequence[str]
+    ) -> tuple[PhasorImages, NDArray[np.complex128]]:
+        return self._renderers[class_index].render_with_slopes(
+            Views(*np.ascontiguousarray(view.T)), free, background=self.background
+        )
+
     def _render(self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None) -> PhasorImages:
         renderer = self._renderers[class_index]
-        return renderer.render_views(
-            Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows, workers=self.workers
-        )
+        return renderer.render_views(Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from phasemark.matcher.likelihood.candidates import fit_modes, fit_other_classes, fit_starts
+from phasemark.matcher.likelihood.candidates import fit_modes, fit_other_classes, fit_starts, fit_surroundings
 from phasemark.matcher.likelihood.fits import Fits, best_of_frame
 from phasemark.matcher.likelihood.look_alikes import fit_look_alikes
 from phasemark.matcher.likelihood.residuals import Evidence
@@ -63,16 +63,24 @@ def _worth_a_search(setup: Setup, evidence: Evidence, bare: NDArray[np.float64])
 
 
 def _unexplained(
-    setup: Setup, scene: Scene, evidence: Evidence, bare: NDArray[np.float64], fits: Fits, *, hopeless: bool = False
+    setup: Setup,
+    scene: Scene,
+    evidence: Evidence,
+    bare: NDArray[np.float64],
+    fits: Fits,
+    *,
+    hopeless: bool = False,
+    p: float | None = None,
 ) -> NDArray[np.int64]:
     """Return the frames whose best fit is worse than good ones are, but not beyond hope.
 
     On ranges, that is where it costs more than returns that nothing explains; before a known background every fit may
-    be a side peak.
+    be a side peak. `p` is the share of good frames whose fits are as bad, if not the policy's.
     """
     best = best_of_frame(fits)
     side_peaks = evidence.on == "phasors" or scene.background is not None
-    p = setup.policy.doubtful_p if side_peaks else setup.policy.hopeless_p
+    if p is None:
+        p = setup.policy.doubtful_p if side_peaks else setup.policy.hopeless_p
     limit = special.chdtri(np.maximum(fits.dof[best], 1), p)
     cost, frame = fits.tested[best], fits.frame[best]
     certain = evidence.on == "phasors" or setup.background_is_known or hopeless
@@ -102,10 +110,17 @@ def _retry_unexplained(
         return Fits.joined(parts)
     starts = scene.wide_search.starts(seen[poor], policy.modes_again, all_classes=all_classes)
     parts.append(fit_starts(setup, scene, evidence, poor, starts, policy.beside_again_rad, patient=True))
-    poor = _unexplained(setup, scene, evidence, bare, parts[-1])
+    poor = _unexplained(setup, scene, evidence, bare, Fits.joined(parts), p=policy.refused_p)
+    if poor.size and (scene.scout is not None or scene.background is not None):
+        parts.append(fit_surroundings(setup, scene, evidence, poor, Fits.joined(parts)))
+        poor = _unexplained(setup, scene, evidence, bare, Fits.joined(parts), p=policy.refused_p)
     if poor.size and scene.scout is not None:
         # too little may be smooth for the scout to see the way
         starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=all_classes)
+        parts.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
+    elif poor.size and scene.background is not None:
+        # edges between columns before a bright wall: no pixel may decide alone where the search starts
+        starts = scene.wide_search.capped().starts(seen[poor], policy.modes_again, all_classes=True)
         parts.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
     return Fits.joined(parts)
 

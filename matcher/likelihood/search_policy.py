@@ -20,7 +20,7 @@ def _degrees(*angles: float) -> tuple[float, ...]:
 
 
 _MAY_BE_ZERO = ("settling_rounds", "trimmings", "registrations", "background_rounds")
-_PROBABILITIES = ("doubtful_p", "hopeless_p", "ambiguity")
+_PROBABILITIES = ("doubtful_p", "hopeless_p", "refused_p", "ambiguity")
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,9 @@ class SearchPolicy:
     doubtful_p, hopeless_p : float
         p-values at which the search is repeated more widely: where the likelihood has side peaks, and where
         it is smooth.
+    refused_p : float
+        p-value at which, where there are side peaks, it goes on around the best fits and from minima of the bank without
+        a scout.
     trimmings : int
         How often a robust search starts again without the returns that fit worst.
     odd_ratio, odd_sigma : float
@@ -158,7 +161,7 @@ class SearchPolicy:
     longest_step: float = 3.0
     step_after_scout: float = 0.1
     step_after_scout_aside: float = 1.0
-    settled_cost: float = 1e-4
+    settled_cost: float = 1e-3
     rough_cost: float = 0.1
     kept_slopes_cost: float = 30.0
     optimism: float = 3.0
@@ -181,6 +184,7 @@ class SearchPolicy:
 
     doubtful_p: float = 0.05
     hopeless_p: float = 1e-3
+    refused_p: float = 0.01
     trimmings: int = 3
     odd_ratio: float = 3.0
     odd_sigma: float = 5.0

@@ -123,15 +123,15 @@ def _carried(
     """Return what a calibration leaves of the views of some frames with one class and background, (k, p, p)."""
     background, renderer = matches[0].background, model.renderer(class_index)
     views = Views(*(np.array([getattr(match, name) for match in matches]) for name in VIEW))
-    image = renderer.render_views(views, background=background, workers=model.workers)
+    image = renderer.render_views(views, background=background)
     slope = renderer.jacobian(
         *(getattr(views, name) for name in VIEW),
-        background=background, parameters=setup.free, workers=model.workers,
+        background=background, parameters=setup.free,
     )  # fmt: skip
     if setup.on == "phasors":  # the albedo, which is fitted too, takes up part of an error
-        alone = image if background is None else renderer.render_views(views, workers=model.workers)
+        alone = image if background is None else renderer.render_views(views)
         slope = np.concatenate([slope, alone.phasor[:, None]], axis=1)
-    by_fields = calibrated_slopes(renderer, sensor, views, image, background, model.workers)
+    by_fields = calibrated_slopes(renderer, sensor, views, image, background)
     use = counts(image.phasor, image.intensity, sensor).reshape(len(which), -1) & setup.used
     weight = np.where(use, evidence.weight[which], 0.0)
     phasor = image.phasor.reshape(len(which), -1)

@@ -7,6 +7,7 @@ shifted out is one that no model explains.
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import TypeVar
@@ -106,6 +107,12 @@ class Search:
             group.phasor[which], group.intensity[which], group.coverage[which], self._bank.sensor, behind, rows
         )
         self._parts.append((templates, rows, group.name == "upper"))
+
+    def capped(self) -> Search:
+        """Return the same search, in which no pixel costs more than a disagreement."""
+        other = copy.copy(self)
+        other._capped = True
+        return other
 
     def starts(self, seen: Observation, n_modes: int, *, all_classes: bool = False) -> Starts:
         """Return the best modes of every frame.

@@ -18,9 +18,11 @@ The chain is a row of functions in the order in which the camera does things::
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,6 +53,9 @@ _MOST_FRAMES = 2**32
 
 # Taps held at once: small enough for the caches, large enough to hide the cost of a NumPy call.
 _TAPS_PER_BLOCK = 2**17
+
+# Blocks that a thread takes one after the other: what they share is computed and allocated once.
+_BLOCKS_PER_RUN = 8
 
 
 def capture(
@@ -118,40 +123,44 @@ def capture(
     flags = np.empty(shape, dtype=np.uint8)
     kept = np.empty((shape[0], N_PHASES, N_TAPS, *shape[1:])) if keep_taps else None
     key, unit, read_out = draw_key(rng), camera_unit(sensor), ReadOut.of(sensor)
+    per_block = max(1, _TAPS_PER_BLOCK // (N_PHASES * N_TAPS * sensor.rows * sensor.cols))
 
-    def take(block: slice) -> None:
-        views = slice(block.start // n_frames, (block.stop - 1) // n_frames + 1)
-        means, lit = _expected_taps(images, views, sensor, unit)
-        n = block.stop - block.start
-        taps = np.empty((n, N_PHASES, N_TAPS, *shape[1:])) if kept is None else kept[block]
-        saturated = np.empty((n, *shape[1:]), np.bool_)
-        read_taps(
-            means.reshape(*means.shape[:3], -1), block.start, block.stop, n_frames, first_view, first_frame, key,
-            read_out, taps.reshape(*taps.shape[:3], -1), saturated.reshape(n, -1),
-        )  # fmt: skip
-        phasor_e, intensity_e[block] = demodulate(taps)
-        range_m[block] = phasor_to_range_m(phasor_e, sensor)
-        amplitude_e[block] = np.abs(phasor_e)
-        of_frame = np.arange(block.start, block.stop) // n_frames - views.start
-        flags[block] = validity_flags(
-            range_m[block], amplitude_e[block], intensity_e[block], lit[of_frame], saturated, unit, sensor
-        )
+    def take(run: slice) -> None:
+        first = run.start // n_frames
+        means, lit = _expected_taps(images, slice(first, (run.stop - 1) // n_frames + 1), sensor, unit)
+        room = np.empty((min(per_block, run.stop - run.start), N_PHASES, N_TAPS, *shape[1:]))
+        full = np.empty((len(room), *shape[1:]), np.bool_)
+        for block in _cuts(run, per_block):
+            n = block.stop - block.start
+            taps, saturated = room[:n] if kept is None else kept[block], full[:n]
+            read_taps(
+                means.reshape(*means.shape[:3], -1)[block.start // n_frames - first :], block.start, block.stop,
+                n_frames, first_view, first_frame, key, read_out, taps.reshape(*taps.shape[:3], -1),
+                saturated.reshape(n, -1),
+            )  # fmt: skip
+            phasor_e, intensity_e[block] = demodulate(taps)
+            range_m[block] = phasor_to_range_m(phasor_e, sensor)
+            np.abs(phasor_e, out=amplitude_e[block])
+            of_frame = np.arange(block.start, block.stop) // n_frames - first
+            flags[block] = validity_flags(
+                range_m[block], amplitude_e[block], intensity_e[block], lit[of_frame], saturated, unit, sensor
+            )
 
-    blocks = list(_blocks(shape))
-    if workers == 1 or len(blocks) <= 1:
-        for block in blocks:
-            take(block)
+    runs = list(_cuts(slice(0, shape[0]), _BLOCKS_PER_RUN * per_block))
+    if workers == 1 or len(runs) <= 1:
+        for run in runs:
+            take(run)
     else:
         with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(take, blocks))
+            list(pool.map(take, runs))
     full = (n_views, n_frames, sensor.rows, sensor.cols)
-    return Frames(
+    return Frames.as_measured(
         range_m.reshape(full),
         amplitude_e.reshape(full),
         intensity_e.reshape(full),
-        flags=flags.reshape(full),
+        flags.reshape(full),
+        sensor,
         taps_e=None if kept is None else kept.reshape(*full[:2], N_PHASES, N_TAPS, *full[2:]),
-        sensor=sensor,
     )
 
 
@@ -265,16 +274,39 @@ def validity_flags(
     ndarray of uint8
         :class:`Flag` of each pixel, 0 where it is valid.
     """
-    returned = lit & (amplitude_e > 0) & (amplitude_e >= sensor.min_amplitude_e)
-    if sensor.max_phase_std_rad is not None:
-        noise = np.sqrt(0.5 * phase_image_variance(intensity_e, sensor))
-        returned &= amplitude_e * sensor.max_phase_std_rad >= noise
-    flags = np.where(returned, 0, int(Flag.NO_RETURN)).astype(np.uint8)
-    if sensor.wrap_guard_m > 0:
-        edge_m = np.minimum(range_m, sensor.unambiguous_range_m - range_m)
-        flags[returned & (edge_m < sensor.wrap_guard_m)] = int(Flag.NEAR_WRAP | Flag.MISSING)
-    broken = unit.dead * int(Flag.DEAD) + unit.hot * int(Flag.HOT) + saturated * int(Flag.SATURATED)
-    return np.where(broken > 0, broken | int(Flag.MISSING), flags).astype(np.uint8)
+    shape = np.shape(range_m)
+    flags = np.empty(shape, np.uint8)
+    noise_e2 = phase_image_variance(intensity_e, sensor)
+    broken = unit.dead * int(Flag.DEAD) + unit.hot * int(Flag.HOT)
+    _flag(
+        range_m.reshape(-1, broken.size), amplitude_e.reshape(-1, broken.size), noise_e2.reshape(-1, broken.size),
+        lit.reshape(-1, broken.size), saturated.reshape(-1, broken.size), broken.ravel().astype(np.uint8),
+        (sensor.min_amplitude_e, np.inf if sensor.max_phase_std_rad is None else sensor.max_phase_std_rad),
+        (sensor.wrap_guard_m, sensor.unambiguous_range_m), flags.reshape(-1, broken.size),
+    )  # fmt: skip
+    return flags
+
+
+_NO_RETURN, _NEAR_WRAP = np.uint8(Flag.NO_RETURN), np.uint8(Flag.NEAR_WRAP | Flag.MISSING)
+_MISSING, _SATURATED = np.uint8(Flag.MISSING), np.uint8(Flag.SATURATED)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _flag(range_m, amplitude_e, noise_e2, lit, saturated, broken, least, wrap, flags):  # type: ignore[no-untyped-def]
+    """Fill the flags of (n, pixels); `least` is the amplitude and the phase noise allowed, `wrap` guard and period."""
+    least_e, most_rad = least
+    guard_m, period_m = wrap
+    for i in range(len(flags)):
+        for pixel in range(flags.shape[1]):
+            amplitude = amplitude_e[i, pixel]
+            returned = lit[i, pixel] and amplitude > 0.0 and amplitude >= least_e
+            if most_rad < math.inf:
+                returned = returned and amplitude * most_rad >= math.sqrt(0.5 * noise_e2[i, pixel])
+            flag = np.uint8(0) if returned else _NO_RETURN
+            if guard_m > 0.0 and returned and min(range_m[i, pixel], period_m - range_m[i, pixel]) < guard_m:
+                flag = _NEAR_WRAP
+            wrong = broken[pixel] | _SATURATED if saturated[i, pixel] else broken[pixel]
+            flags[i, pixel] = wrong | _MISSING if wrong > 0 else flag
 
 
 def _check_numbers(
@@ -297,12 +329,10 @@ def _check_numbers(
         raise UsageError("a run has at most 2^32 views, and 2^32 frames of each")
 
 
-def _blocks(shape: tuple[int, int, int]) -> Iterator[slice]:
-    """Cut the frames into blocks; a frame's noise depends on its number alone, so the cuts leave no trace."""
-    n, rows, cols = shape
-    step = max(1, _TAPS_PER_BLOCK // (N_PHASES * N_TAPS * rows * cols))
-    for start in range(0, n, step):
-        yield slice(start, min(start + step, n))
+def _cuts(frames: slice, most: int) -> Iterator[slice]:
+    """Cut a range of frames; a frame's noise depends on its number alone, so the cuts leave no trace."""
+    for start in range(frames.start, frames.stop, most):
+        yield slice(start, min(start + most, frames.stop))
 
 
 def _check_image(image: PhasorImages, sensor: Sensor) -> None:

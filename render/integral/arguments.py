@@ -17,6 +17,8 @@ class Camera(NamedTuple):
     ----------
     scale_u, scale_v, centre_u, centre_v : float
         A ray (1, y, z) of the tilted camera meets the image in u = centre_u − scale_u · y, v = centre_v − scale_v · z.
+    slope_u, slope_v : float
+        1 / scale_u, 1 / scale_v.
     rows, cols : int
     first_row, stop_row : int
         Image rows to render.
@@ -30,6 +32,8 @@ class Camera(NamedTuple):
     scale_v: float
     centre_u: float
     centre_v: float
+    slope_u: float
+    slope_v: float
     rows: int
     cols: int
     first_row: int
@@ -94,6 +98,10 @@ class Edges(NamedTuple):
         First entry of each pixel's list, −1: none; with a border of one pixel around the image.
     link, owner : (m,) int32
         Next entry, and the entry's segment.
+    heights : (CLUSTER,) float64
+        How far before the faces of one cluster the lens is.
+    ends : (e, 2) int32
+        Vertices at both ends; −1: the line where wall and floor meet, or the horizon.
     """
 
     segments: NDArray[np.float64]
@@ -101,6 +109,89 @@ class Edges(NamedTuple):
     head: NDArray[np.int32]
     link: NDArray[np.int32]
     owner: NDArray[np.int32]
+    heights: NDArray[np.float64]
+    ends: NDArray[np.int32]
+
+
+class Borders(NamedTuple):
+    """Points on the edges inside pixels, where the light of a pixel changes as the edges move; room for m.
+
+    An integral over a pixel changes with a parameter by what the light changes at fixed points of the image, and by what
+    the edges sweep: ∫ (f_left − f_right) ẋ ds along each (Leibniz's rule).
+
+    Parameters
+    ----------
+    count : (1,) int64
+        Points placed; beyond m: there was not room for all.
+    points : (m, 2) float64
+        u, v.
+    weights : (m,) float64
+        Length along the sweep, over the pixel's active area.
+    regions : (m, 2) int32
+        Numbers of the intervals on both sides, towards smaller and larger x; see :class:`Samples`.
+    segment : (m,) int32
+        The edge.
+    side : (m,) float64
+        +1 for a limb with its surface towards larger x, −1 towards smaller x, 0 for a crease.
+    along_v : (m,) int8
+        1 where x is u, the coordinate in which the edge is said to move; 0 where it is v.
+    pixel : (m,) int64
+        view · pixels + pixel.
+    depth : (m,) float64
+        Of the edge along the camera's axis; 0: it is never hidden.
+    rates : (m, p) float64
+        How fast the edge moves along x, pixels per unit of each parameter.
+    """
+
+    count: NDArray[np.int64]
+    points: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    regions: NDArray[np.int32]
+    segment: NDArray[np.int32]
+    side: NDArray[np.float64]
+    along_v: NDArray[np.int8]
+    pixel: NDArray[np.int64]
+    depth: NDArray[np.float64]
+    rates: NDArray[np.float64]
+
+
+class Motion(NamedTuple):
+    """How the view of a batch is moved, to tell how fast its edges move.
+
+    Parameters
+    ----------
+    poses : Poses
+        1 + p for each view: the view itself, then each parameter moved by its step.
+    step : (p,) float64
+    segments : (1 + p, 4) float64
+        Scratch: one edge in these poses.
+    """
+
+    poses: Poses
+    step: NDArray[np.float64]
+    segments: NDArray[np.float64]
+
+
+class Returns(NamedTuple):
+    """What comes back to some samples that follow one another; room for m.
+
+    Parameters
+    ----------
+    amplitude, phase : (m,) float64
+        Weighted amplitude, 0 where nothing is met, and phase of the first order.
+    real, imaginary : (m,) float64
+        Of the phasor of one order.
+    """
+
+    amplitude: NDArray[np.float64]
+    phase: NDArray[np.float64]
+    real: NDArray[np.float64]
+    imaginary: NDArray[np.float64]
+
+    @classmethod
+    def empty(cls, m: int) -> Returns:
+        """Return room for m samples."""
+        return cls(*np.empty((4, m)))
 
 
 class Samples(NamedTuple):
@@ -122,6 +213,8 @@ class Samples(NamedTuple):
         Samples whose rays are cast.
     origins, directions : (m, 3) float32
         These rays, landmark frame.
+    returns : Returns
+        Of fewer than m samples at a time.
     """
 
     points: NDArray[np.float64]
@@ -132,6 +225,7 @@ class Samples(NamedTuple):
     chosen: NDArray[np.int64]
     origins: NDArray[np.float32]
     directions: NDArray[np.float32]
+    returns: Returns
 
 
 class Sums(NamedTuple):
@@ -156,7 +250,7 @@ class Sums(NamedTuple):
 @inlined
 def ray_of(camera, u, v):  # type: ignore[no-untyped-def]
     """Return y and z of the ray (1, y, z) of an image point, frame of the tilted camera."""
-    return (camera.centre_u - u) / camera.scale_u, (camera.centre_v - v) / camera.scale_v
+    return (camera.centre_u - u) * camera.slope_u, (camera.centre_v - v) * camera.slope_v
 
 
 @inlined

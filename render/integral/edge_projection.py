@@ -32,7 +32,7 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
         Which of the poses.
     camera : Camera
     edges : Edges
-        ``segments`` and ``limb`` are overwritten.
+        ``segments``, ``limb`` and ``ends`` are overwritten.
 
     Returns
     -------
@@ -50,27 +50,32 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
             before, before_other = _height(planes, face, lens) > 0.0, _height(planes, other, lens) > 0.0
             if not (before or before_other) or (concave[e] and not (before and before_other)):
                 continue
-        if _project(vertices, start, end, matrix, offset, camera, edges.segments, n):
+        if project(vertices, start, end, matrix, offset, camera, edges.segments[n]):
             limb[n] = 0
+            edges.ends[n, 0], edges.ends[n, 1] = start, end
             n += 1
-    farthest = mesh.radius_m + math.sqrt(lens[0] * lens[0] + lens[1] * lens[1] + lens[2] * lens[2])
+    heights = edges.heights
     for c in range(len(clusters)):
-        px, py, pz, nx, ny, nz, d, turn, slack, reach = clusters[c]
+        px, py, pz, nx, ny, nz, d, turn, slack, reach, radius = clusters[c]
         dx, dy, dz = lens[0] - px, lens[1] - py, lens[2] - pz
         away = math.sqrt(dx * dx + dy * dy + dz * dz)
+        farthest = away + radius
         if abs(nx * dx + ny * dy + nz * dz - d) > turn * away + slack + reach * farthest:
             continue
-        for i in range(c * CLUSTER, min((c + 1) * CLUSTER, len(smooth_planes))):
-            height = _height(smooth_planes, i, lens)
-            if abs(height) > smooth_planes[i, 4] * farthest:
+        first, count = c * CLUSTER, min(CLUSTER, smooth_planes.shape[1] - c * CLUSTER)
+        for i in range(count):  # in vector instructions
+            heights[i] = _smooth_height(smooth_planes, first + i, lens)
+        for i in range(count):
+            if abs(heights[i]) > smooth_planes[4, first + i] * farthest:
                 continue
-            before = height > 0.0
-            for e in range(mesh.first_fold[i], mesh.first_fold[i + 1]):
-                if before == (_height(smooth_planes, folds[e, 2], lens) > 0.0):
+            before = heights[i] > 0.0
+            for e in range(mesh.first_fold[first + i], mesh.first_fold[first + i + 1]):
+                if before == (_smooth_height(smooth_planes, folds[e, 2], lens) > 0.0):
                     continue
                 a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
-                if _project(vertices, a, b, matrix, offset, camera, edges.segments, n):
+                if project(vertices, a, b, matrix, offset, camera, edges.segments[n]):
                     limb[n] = 1
+                    edges.ends[n, 0], edges.ends[n, 1] = a, b
                     n += 1
     return n
 
@@ -82,7 +87,14 @@ def _height(planes, f, lens):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _project(vertices, a, b, matrix, offset, camera, segments, n):  # type: ignore[no-untyped-def]
+def _smooth_height(planes, i, lens):  # type: ignore[no-untyped-def]
+    """Return the same for a smooth face; `planes` has a row for each number, not for each face."""
+    return planes[0, i] * lens[0] + planes[1, i] * lens[1] + planes[2, i] * lens[2] - planes[3, i]
+
+
+@inlined
+def project(vertices, a, b, matrix, offset, camera, segment):  # type: ignore[no-untyped-def]
+    """Project the edge between two vertices into `segment` (4,); return whether any of it lies before the camera."""
     ax = matrix[0, 0] * vertices[a, 0] + matrix[0, 1] * vertices[a, 1] + matrix[0, 2] * vertices[a, 2] + offset[0]
     bx = matrix[0, 0] * vertices[b, 0] + matrix[0, 1] * vertices[b, 1] + matrix[0, 2] * vertices[b, 2] + offset[0]
     if ax < _NEAR_M and bx < _NEAR_M:
@@ -97,8 +109,8 @@ def _project(vertices, a, b, matrix, offset, camera, segments, n):  # type: igno
     elif bx < _NEAR_M:
         w = (_NEAR_M - bx) / (ax - bx)
         bx, by, bz = _NEAR_M, by + w * (ay - by), bz + w * (az - bz)
-    segments[n, 0] = camera.centre_u - camera.scale_u * ay / ax
-    segments[n, 1] = camera.centre_v - camera.scale_v * az / ax
-    segments[n, 2] = camera.centre_u - camera.scale_u * by / bx
-    segments[n, 3] = camera.centre_v - camera.scale_v * bz / bx
+    segment[0] = camera.centre_u - camera.scale_u * ay / ax
+    segment[1] = camera.centre_v - camera.scale_v * az / ax
+    segment[2] = camera.centre_u - camera.scale_u * by / bx
+    segment[3] = camera.centre_v - camera.scale_v * bz / bx
     return 1

@@ -79,7 +79,7 @@ def clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
 def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore[no-untyped-def]
     """Clip a pixel's segments to a box, into ``scratch.edges``.
 
-    Its rows are s, x of both ends (s rising), the limb's side and the slope, sorted by where they begin. The
+    Its rows are s, x of both ends (s rising), the limb's side, the slope and the segment, sorted by where they begin. The
     side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number, or
     −1 if there are too many.
     """
@@ -109,6 +109,7 @@ def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore
         clipped[m, 4] = side if limb[k] else 0.0
         length = clipped[m, 2] - clipped[m, 0]
         clipped[m, 5] = (clipped[m, 3] - clipped[m, 1]) / length if length > 0.0 else 0.0
+        clipped[m, 6] = k
         begin, place = clipped[m, 0], m
         while place > 0 and clipped[order[place - 1], 0] > begin:
             order[place] = order[place - 1]
@@ -116,7 +117,7 @@ def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore
         order[place] = m
         m += 1
     for i in range(m):
-        for j in range(6):
+        for j in range(7):
             scratch.edges[i, j] = clipped[order[i], j]
     return m
 

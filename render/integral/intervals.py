@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from phasemark.render.integral.borders import place_borders
 from phasemark.render.integral.edges_in_pixels import edge_at
 from phasemark.render.integral.limbs import nearest_limb
 from phasemark.render.integral.quadrature_rules import FELT, place_points
@@ -65,7 +66,7 @@ class Strip(NamedTuple):
 
 
 @kernel
-def sample_strip(strip, box, scratch, samples, n, region):  # type: ignore[no-untyped-def]
+def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ignore[no-untyped-def]
     """Sample the k + 1 intervals between the k curves of a strip.
 
     An interval's light is ∫ width(s) · mean over x of f(s, x) ds. The width is known exactly; its moments give the
@@ -109,8 +110,10 @@ def sample_strip(strip, box, scratch, samples, n, region):  # type: ignore[no-un
                     points[j, 0] = x if box.sweep_v else s
                     points[j, 1] = s if box.sweep_v else x
                 n += placed
-        if n > before:
-            region += 1
+        scratch.found[i] = region if n > before else -1
+        region += n > before
+    if len(borders.weights) > 0:
+        place_borders(strip, box, scratch, borders)
     return n, region
 
 

@@ -6,7 +6,9 @@ import math
 
 from phasemark.render.background import background_hit
 from phasemark.render.integral.arguments import ray_of, towards_landmark, towards_level
-from phasemark.render.integral.quadrature_rules import G4W, G4X
+from phasemark.render.integral.circular import turn
+from phasemark.render.integral.face_search import plane_hit
+from phasemark.render.integral.quadrature_rules import G3W, G3X, G4W, G4X
 from phasemark.render.integral.ray_plan import SKIPPED
 from phasemark.render.kernel import inlined, kernel
 
@@ -27,37 +29,77 @@ def sum_samples(n, samples, mesh, poses, camera, light, sums):  # type: ignore[n
     sums : Sums
         All but ``state`` is added to.
     """
-    points, weights = samples.points, samples.weights
+    block = len(samples.returns.phase)
+    for start in range(0, n, block):
+        stop = min(start + block, n)
+        _hit_samples(start, stop, samples, mesh, poses, camera, light, sums)
+        for j in range(len(light.orders)):
+            _add_order(j, start, stop, samples, light, sums)
+
+
+@kernel
+def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # type: ignore[no-untyped-def]
+    """Write the returns of some samples, and add them to intensity and coverage."""
+    points, weights, returns = samples.points, samples.weights, samples.returns
     pixels_per_view = (camera.stop_row - camera.first_row) * camera.cols
-    for k in range(n):
-        index = samples.pixel[k]
-        view = index // pixels_per_view
+    index, view, intensity, coverage, upper = samples.pixel[start], 0, 0.0, 0.0, 0.0
+    has_background = light.background[0] > 0.0 or light.background[1] > 0.0
+    for k in range(start, stop):
+        if k == start or samples.pixel[k] != index:
+            if k > start:
+                sums.intensity[index], sums.coverage[index], sums.upper[index] = intensity, coverage, upper
+            index = samples.pixel[k]
+            view = index // pixels_per_view
+            intensity, coverage, upper = sums.intensity[index], sums.coverage[index], sums.upper[index]
         y, z = ray_of(camera, points[k, 0], points[k, 1])
         length = math.sqrt(1.0 + y * y + z * z)
         face = samples.face[k]
         if face >= 0:
-            t, cos_theta = _landmark_hit(mesh, face, poses.lens[view], poses.matrix[view], y, z)
-            reflected = light.albedo * (cos_theta / length)
-            sums.coverage[index] += weights[k]
+            t, reflected = landmark_hit(mesh, face, poses.lens[view], poses.matrix[view], y, z)
+            reflected *= light.albedo
+            coverage += weights[k]
             if mesh.part[face]:
-                sums.upper[index] += weights[k]
-        else:
+                upper += weights[k]
+        elif has_background:
             dx, dy, dz = towards_level(camera.level, y, z)
             bearing = poses.bearing[view]
             t, rho, cos_theta = background_hit(light.background, math.cos(bearing), math.sin(bearing), dx, dy, dz)
-            if t == 0.0:
-                continue
-            reflected = rho * cos_theta / length
-        _add_phasor(index, t * length, reflected, length, weights[k], light, sums)
+            reflected = rho * cos_theta
+        else:
+            t, reflected = 0.0, 0.0
+        distance = t * length
+        a = weights[k] * _amplitude(distance, reflected, length, light.vignetting) if t != 0.0 else 0.0
+        intensity += a
+        returns.amplitude[k - start], returns.phase[k - start] = a, light.radians_per_metre * distance
+    sums.intensity[index], sums.coverage[index], sums.upper[index] = intensity, coverage, upper
+
+
+@kernel
+def _add_order(j, start, stop, samples, light, sums):  # type: ignore[no-untyped-def]
+    """Add the returns of some samples to the phasor of the j-th order."""
+    returns, pixel = samples.returns, samples.pixel
+    turn(stop - start, light.orders[j], returns.phase, returns.amplitude, returns.real, returns.imaginary)
+    index, total = pixel[start], sums.phasor[pixel[start], j]
+    for k in range(start, stop):
+        if pixel[k] != index:
+            sums.phasor[index, j] = total
+            index = pixel[k]
+            total = sums.phasor[index, j]
+        total += complex(returns.real[k - start], returns.imaginary[k - start])
+    sums.phasor[index, j] = total
+
+
+@inlined
+def _amplitude(distance, reflected, length, vignetting):  # type: ignore[no-untyped-def]
+    """Return the amplitude of a hit; `length` is that of the ray (1, y, z), `reflected` ρ cos θ times that length."""
+    a = reflected / (length * distance * distance)
+    return a / (length * length * length * length) if vignetting else a
 
 
 @inlined
 def _add_phasor(index, distance, reflected, length, weight, light, sums):  # type: ignore[no-untyped-def]
-    """Add the light of one hit to a pixel; `reflected` is ρ cos θ, `length` that of the ray (1, y, z)."""
-    a = reflected / (distance * distance)
-    if light.vignetting:
-        a /= length * length * length * length
-    a *= weight
+    """Add the light of one hit to a pixel; see :func:`_amplitude`."""
+    a = weight * _amplitude(distance, reflected, length, light.vignetting)
     sums.intensity[index] += a
     for j in range(len(light.orders)):
         phase = light.radians_per_metre * distance * light.orders[j]
@@ -65,31 +107,44 @@ def _add_phasor(index, distance, reflected, length, weight, light, sums):  # typ
 
 
 @inlined
-def _landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def]
-    """Return the multiple of the ray (1, y, z) at its hit, and |cos θ| there times the ray's length."""
-    dx, dy, dz = towards_landmark(matrix, y, z)
-    ox, oy, oz = lens[0], lens[1], lens[2]
-    nx, ny, nz, d = mesh.planes[face, 0], mesh.planes[face, 1], mesh.planes[face, 2], mesh.planes[face, 3]
-    facing = nx * dx + ny * dy + nz * dz
-    t = (d - nx * ox - ny * oy - nz * oz) / facing if facing != 0.0 else 0.0
-    cos_theta = abs(facing)
-    if not (mesh.flat[face] and t > 0.0):
-        t, cos_theta = _curved_hit(mesh, face, ox, oy, oz, dx, dy, dz, t, facing)
-    return t, cos_theta
+def phasor_of(distance, reflected, length, light):  # type: ignore[no-untyped-def]
+    """Return the light of one hit at the modulation frequency; arguments as :func:`_add_phasor` takes them."""
+    a = reflected / (distance * distance)
+    if light.vignetting:
+        a /= length * length * length * length
+    phase = light.radians_per_metre * distance
+    return complex(a * math.cos(phase), a * math.sin(phase))
 
 
 @inlined
-def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz, t, facing):  # type: ignore[no-untyped-def]
+def landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def]
+    """Return the multiple of the ray (1, y, z) at its hit, and |cos θ| there times the ray's length."""
+    dx, dy, dz = towards_landmark(matrix, y, z)
+    ox, oy, oz = lens[0], lens[1], lens[2]
+    if not mesh.flat[face]:
+        return _curved_hit(mesh, face, ox, oy, oz, dx, dy, dz)
+    nx, ny, nz, d = mesh.planes[face, 0], mesh.planes[face, 1], mesh.planes[face, 2], mesh.planes[face, 3]
+    facing = nx * dx + ny * dy + nz * dz
+    t = (d - nx * ox - ny * oy - nz * oz) / facing if facing != 0.0 else 0.0
+    if t > 0.0:
+        return t, abs(facing)
+    return _curved_hit(mesh, face, ox, oy, oz, dx, dy, dz)
+
+
+@inlined
+def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the multiple of the ray at its hit, and |cos θ| of the shading normal times the ray's length.
 
-    `t` is the multiple at the face's plane, `facing` the product of the face's normal with the ray.
+    What is asked of a face stands in two lines of the cache; in float32 its plane is good to 1e-7 m.
     """
     vertices, faces = mesh.vertices, mesh.faces
-    shares, normals = mesh.corner_shares[f], mesh.corner_normals[f]
+    own, normals = mesh.search[f], mesh.corner_normals[f]
+    facing = own[0] * dx + own[1] * dy + own[2] * dz
+    t = plane_hit(mesh.search, f, ox, oy, oz, dx, dy, dz)
     px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
     # barycentric coordinates in the plane of the face
-    v = min(max(shares[0, 0] * px + shares[0, 1] * py + shares[0, 2] * pz + shares[0, 3], 0.0), 1.0)
-    w = min(max(shares[1, 0] * px + shares[1, 1] * py + shares[1, 2] * pz + shares[1, 3], 0.0), 1.0 - v)
+    v = min(max(own[4] * px + own[5] * py + own[6] * pz + own[7], 0.0), 1.0)
+    w = min(max(own[8] * px + own[9] * py + own[10] * pz + own[11], 0.0), 1.0 - v)
     u = 1.0 - v - w
     # a face seen edge-on leaves the plane's intersection ill-conditioned: take the nearest point of the face instead
     if abs(facing) < 1e-6 * math.sqrt(dx * dx + dy * dy + dz * dz):
@@ -99,9 +154,9 @@ def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz, t, facing):  # type: ignore[no-
         pz = u * vertices[a, 2] + v * vertices[b, 2] + w * vertices[c, 2]
         along = (px - ox) * dx + (py - oy) * dy + (pz - oz) * dz
         t = along / (dx * dx + dy * dy + dz * dz)
-    nx = u * normals[0, 0] + v * normals[1, 0] + w * normals[2, 0]
-    ny = u * normals[0, 1] + v * normals[1, 1] + w * normals[2, 1]
-    nz = u * normals[0, 2] + v * normals[1, 2] + w * normals[2, 2]
+    nx = u * normals[0] + v * normals[3] + w * normals[6]
+    ny = u * normals[1] + v * normals[4] + w * normals[7]
+    nz = u * normals[2] + v * normals[5] + w * normals[8]
     towards = nx * dx + ny * dy + nz * dz
     size = math.sqrt(nx * nx + ny * ny + nz * nz)
     if size == 0.0:  # at the very apex
@@ -113,7 +168,11 @@ def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz, t, facing):  # type: ignore[no-
 
 @kernel
 def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-untyped-def]
-    """Integrate the background over the skipped pixels of views `start` to `stop`, 4 × 4 Gauss points each."""
+    """Integrate the background over the skipped pixels of views `start` to `stop`.
+
+    A wall takes 3 × 3 Gauss points a pixel. A floor, whose range changes fast towards the horizon, takes 4 × 4.
+    """
+    order = 4 if light.background[1] > 0.0 else 3
     rows, cols = camera.stop_row - camera.first_row, camera.cols
     for view in range(start, stop):
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
@@ -122,15 +181,17 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
                 if sums.state[view, r, c] != SKIPPED:
                     continue
                 index = (view * rows + r) * cols + c
-                for i in range(4):
-                    v = r + camera.first_row + 0.5 + camera.fill_v * (G4X[i] - 0.5)
-                    for j in range(4):
-                        u = c + 0.5 + camera.fill_u * (G4X[j] - 0.5)
+                for i in range(order):
+                    at = G4X[i] if order == 4 else G3X[i]
+                    v = r + camera.first_row + 0.5 + camera.fill_v * (at - 0.5)
+                    for j in range(order):
+                        at = G4X[j] if order == 4 else G3X[j]
+                        u = c + 0.5 + camera.fill_u * (at - 0.5)
                         y, z = ray_of(camera, u, v)
                         length = math.sqrt(1.0 + y * y + z * z)
                         dx, dy, dz = towards_level(camera.level, y, z)
                         t, rho, cos_theta = background_hit(light.background, cos_b, sin_b, dx, dy, dz)
                         if t == 0.0:
                             continue
-                        weight = G4W[i] * G4W[j]
-                        _add_phasor(index, t * length, rho * cos_theta / length, length, weight, light, sums)
+                        weight = G4W[i] * G4W[j] if order == 4 else G3W[i] * G3W[j]
+                        _add_phasor(index, t * length, rho * cos_theta, length, weight, light, sums)

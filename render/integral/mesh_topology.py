@@ -7,7 +7,7 @@ more than 30°, or that have one face only; folds are the other edges, which mat
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -21,6 +21,8 @@ CREASE_RAD = math.radians(30.0)
 CLUSTER = 32
 """Faces that are looked at together for silhouettes."""
 _COPLANAR_RAD = 1e-7
+_HOLLOW = 1e-9
+"""Share of the mesh's extent by which a face rises before its neighbour's plane in a hollow; rounding is less."""
 
 
 class MeshTopology(NamedTuple):
@@ -31,26 +33,26 @@ class MeshTopology(NamedTuple):
     vertices : (v, 3) float64
         Distinct points, metres, landmark frame.
     faces : (f, 3) int32
+        Those near one another in space stand near one another.
     planes : (f, 4) float64
         Unit normal and offset of each face: n · p = offset on it.
-    corner_shares : (f, 2, 4) float32
-        The barycentric coordinates of a point on a face that belong to its second and third corner: the products of
-        the rows with (x, y, z, 1).
-    corner_normals : (f, 3, 3) float32
-        Shading normal at each corner of each face; zero at an apex, where there is none.
+    corner_normals : (f, 16) float32
+        Shading normal at each corner of each face (9), zero at an apex, where there is none; the rest is empty.
     flat : (f,) bool
         Whether the three corner normals are the face's own.
     plain : (f,) bool
         Whether all faces of the face's smooth patch are flat, which makes the patch a plane.
     patch : (f,) int32
         Number of the smooth patch, faces joined without a crease between them.
-    fanned : (f,) bool
-        Whether the face's smooth patch has an apex, from which slivers fan out.
+    searched : (f,) bool
+        Whether faces of the face's smooth patch are searched for from one another: a curved patch without a hollow, or
+        one with an apex, from which slivers fan out.
     search : (f, 16) float32
-        What the search of a face asks: plane (4), corner shares (8), the face of the same patch beyond the edge from
-        each corner to the next (3; −1: there is none), and the patch.
+        What the search of a face asks: plane (4); the barycentric coordinates of a point on the face that belong to its
+        second and third corner, the products of four numbers each with (x, y, z, 1) (8); the face of the same patch
+        beyond the edge from each corner to the next (3; −1: there is none); and the patch.
     grid : FaceGrid
-        Where the faces of fanned patches are.
+        Where the faces of the searched patches are.
     part : (f,) int8
         0 for the landmark's lower part, 1 for the upper one.
     concave : (e,) bool
@@ -63,12 +65,12 @@ class MeshTopology(NamedTuple):
         the smooth faces. Those of a first face follow one another, in the order of the smooth faces.
     first_fold : (g + 1,) int32
         Where the folds begin whose first face is a smooth face.
-    smooth_planes : (g, 5) float64
-        Planes of the smooth faces, those with folds, and their reach: how far the normal turns, |n − n'|, over the
-        face's folds at most. Faces near one another stand near one another; each :data:`CLUSTER` are a cluster.
-    clusters : (c, 10) float64
+    smooth_planes : (5, g) float64
+        Columns: planes of the smooth faces, those with folds, and their reach: how far the normal turns, |n − n'|, over
+        the face's folds at most. Each :data:`CLUSTER` are a cluster.
+    clusters : (c, 11) float64
         Per cluster a point, a mean normal, its offset from the point's plane, how far the faces' normals and offsets
-        differ from those at most, and the largest reach.
+        differ from those at most, the largest reach, and how far the faces' corners are from the point at most.
     low, high : (3,) float64
         Corners of the box around all vertices.
     radius_m : float
@@ -80,12 +82,11 @@ class MeshTopology(NamedTuple):
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
     planes: NDArray[np.float64]
-    corner_shares: NDArray[np.float32]
     corner_normals: NDArray[np.float32]
     flat: NDArray[np.bool_]
     plain: NDArray[np.bool_]
     patch: NDArray[np.int32]
-    fanned: NDArray[np.bool_]
+    searched: NDArray[np.bool_]
     search: NDArray[np.float32]
     grid: FaceGrid
     part: NDArray[np.int8]
@@ -122,6 +123,8 @@ class MeshTopology(NamedTuple):
         kept = length > 1e-14 * extent**2
         if not kept.any():
             raise UsageError("the mesh has no face with an area")
+        kept = np.flatnonzero(kept)
+        kept = kept[_along_curve(vertices[faces[kept]].mean(axis=1))]
         faces, part, a = faces[kept], part[kept], a[kept]
         normals = normals[kept] / length[kept, None]
         planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, a)])
@@ -135,13 +138,14 @@ class MeshTopology(NamedTuple):
         flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
         # the corner of the other face off the edge lies before the first face's plane
         off_edge = vertices[faces[other]].sum(axis=1) - vertices[edges[:, 0]] - vertices[edges[:, 1]]
-        concave = np.einsum("ij,ij->i", planes[first, :3], off_edge) > planes[first, 3]
+        rise = np.einsum("ij,ij->i", planes[first, :3], off_edge) - planes[first, 3]
         plain = np.bincount(patch, ~flat)[patch] == 0
         shares = _corner_shares(vertices[faces])
         apex = (corners == 0).all(axis=2).any(axis=1)
-        fanned = np.bincount(patch, apex)[patch] > 0
+        hollow = np.bincount(patch[first], ~crease & (rise > _HOLLOW * extent), minlength=patch.max() + 1)[patch] > 0
+        searched = ~plain & ((np.bincount(patch, apex)[patch] > 0) | ~hollow)
         fold_reach = _fold_reach(edges[fold], normals)
-        smooth_faces, clusters = _cluster_faces(vertices[faces].mean(axis=1), planes, fold_reach)
+        smooth_faces, clusters = _cluster_faces(vertices[faces], planes, fold_reach)
         folds, first_fold = _folds_in_order(edges[fold], smooth_faces)
         shell = _components(len(faces), edges[other >= 0][:, 2:])
         six_volumes = np.bincount(
@@ -151,22 +155,21 @@ class MeshTopology(NamedTuple):
             vertices=np.ascontiguousarray(vertices),
             faces=np.ascontiguousarray(faces, dtype=np.int32),
             planes=np.ascontiguousarray(planes),
-            corner_shares=shares,
-            corner_normals=np.ascontiguousarray(corners, dtype=np.float32),
+            corner_normals=_in_lines(corners.reshape(-1, 9)),
             flat=np.ascontiguousarray(flat),
             plain=plain,
             patch=patch,
-            fanned=fanned,
-            search=np.ascontiguousarray(
-                np.column_stack([planes, shares.reshape(-1, 8), _neighbours(faces, edges[~crease]), patch]), np.float32
+            searched=searched,
+            search=_in_lines(
+                np.column_stack([planes, shares.reshape(-1, 8), _neighbours(faces, edges[~crease]), patch])
             ),
-            grid=FaceGrid.of_faces(vertices[faces], fanned),
+            grid=FaceGrid.of_faces(vertices[faces], searched),
             part=np.ascontiguousarray(part),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
-            concave=np.ascontiguousarray(concave[crease]),
+            concave=np.ascontiguousarray(rise[crease] > 0),
             folds=folds,
             first_fold=first_fold,
-            smooth_planes=np.ascontiguousarray(np.column_stack([planes, fold_reach])[smooth_faces]),
+            smooth_planes=np.ascontiguousarray(np.column_stack([planes, fold_reach])[smooth_faces].T),
             clusters=clusters,
             low=vertices.min(axis=0),
             high=vertices.max(axis=0),
@@ -181,12 +184,11 @@ class MeshTopology(NamedTuple):
             vertices=np.zeros((0, 3)),
             faces=np.zeros((0, 3), np.int32),
             planes=np.zeros((0, 4)),
-            corner_shares=np.zeros((0, 2, 4), np.float32),
-            corner_normals=np.zeros((0, 3, 3), np.float32),
+            corner_normals=np.zeros((0, 16), np.float32),
             flat=np.zeros(0, np.bool_),
             plain=np.zeros(0, np.bool_),
             patch=np.zeros(0, np.int32),
-            fanned=np.zeros(0, np.bool_),
+            searched=np.zeros(0, np.bool_),
             search=np.zeros((0, 16), np.float32),
             grid=FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_)),
             part=np.zeros(0, np.int8),
@@ -194,13 +196,33 @@ class MeshTopology(NamedTuple):
             concave=np.zeros(0, np.bool_),
             folds=np.zeros((0, 3), np.int32),
             first_fold=np.zeros(1, np.int32),
-            smooth_planes=np.zeros((0, 5)),
-            clusters=np.zeros((0, 10)),
+            smooth_planes=np.zeros((5, 0)),
+            clusters=np.zeros((0, 11)),
             low=np.zeros(3),
             high=np.zeros(3),
             radius_m=0.0,
             closed=True,
         )
+
+
+def _along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Order points along a Z-curve through space: what is near in space is near in memory."""
+    cell = np.ptp(points, axis=0).max() / 1023 or 1.0
+    grid = ((points - points.min(axis=0)) / cell).astype(np.int64)
+    key = np.zeros(len(points), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            key |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(key, kind="stable")
+
+
+def _in_lines(rows: NDArray[Any]) -> NDArray[np.float32]:
+    """Return rows of up to 16 numbers as float32, each in one line of the cache."""
+    room = np.empty(64 * len(rows) + 64, np.uint8)
+    begin = -room.ctypes.data % 64
+    lines = room[begin : begin + 64 * len(rows)].view(np.float32).reshape(-1, 16)
+    lines[:, : rows.shape[1]], lines[:, rows.shape[1] :] = rows, 0.0
+    return lines
 
 
 def _part_by_height(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int8]:
@@ -269,34 +291,25 @@ def _folds_in_order(
 
 
 def _cluster_faces(
-    centres: NDArray[np.float64], planes: NDArray[np.float64], fold_reach: NDArray[np.float64]
+    corners: NDArray[np.float64], planes: NDArray[np.float64], fold_reach: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Order the faces with folds along a Z-curve through space, and bound each cluster's planes.
-
-    See :class:`MeshTopology` for what is returned.
-    """
+    """Return the faces with folds, and bounds of each cluster's planes; see :class:`MeshTopology`."""
     smooth = np.flatnonzero(fold_reach >= 0)
     if not len(smooth):
-        return np.zeros(0, np.int32), np.zeros((0, 10))
-    low = centres[smooth].min(axis=0)
-    cell = np.ptp(centres[smooth], axis=0).max() / 1023 or 1.0
-    grid = ((centres[smooth] - low) / cell).astype(np.int64)
-    key = np.zeros(len(smooth), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            key |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
-    smooth = smooth[np.argsort(key, kind="stable")]
+        return np.zeros(0, np.int32), np.zeros((0, 11))
     starts = np.arange(0, len(smooth), CLUSTER)
     size = np.diff(np.append(starts, len(smooth)))
-    point = np.add.reduceat(centres[smooth], starts) / size[:, None]
+    point = np.add.reduceat(corners[smooth].mean(axis=1), starts) / size[:, None]
     normal = np.add.reduceat(planes[smooth, :3], starts) / size[:, None]
     # offset of each face from the cluster's point
     own = np.repeat(np.arange(len(starts)), size)
     offset = planes[smooth, 3] - np.einsum("ij,ij->i", planes[smooth, :3], point[own])
     mean_offset = np.add.reduceat(offset, starts) / size
     turn = np.linalg.norm(planes[smooth, :3] - normal[own], axis=1)
+    radius = np.linalg.norm(corners[smooth] - point[own, None], axis=2).max(axis=1)
     bounds = [
-        np.maximum.reduceat(values, starts) for values in (turn, np.abs(offset - mean_offset[own]), fold_reach[smooth])
+        np.maximum.reduceat(values, starts)
+        for values in (turn, np.abs(offset - mean_offset[own]), fold_reach[smooth], radius)
     ]
     return smooth.astype(np.int32), np.ascontiguousarray(np.column_stack([point, normal, mean_offset, *bounds]))
 
@@ -311,7 +324,7 @@ def _components(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int32]:
 
 
 def _corner_shares(corners: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return ``corner_shares`` of faces, given their corners (f, 3, 3)."""
+    """Return the barycentric rows of ``search``, (f, 2, 4), of faces, given their corners (f, 3, 3)."""
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     d11, d12, d22 = (np.einsum("ij,ij->i", x, y) for x, y in ((first, first), (first, second), (second, second)))
     determinant = (d11 * d22 - d12 * d12)[:, None]

@@ -33,12 +33,15 @@ class Scratch(NamedTuple):
     ----------
     boxes : (4 * _MAX_DEPTH + 4, 5) float64
         Parts of the pixel still to be split: u, v of two corners, level.
-    clipped : (MAX_SEGMENTS, 6) float64
+    clipped : (MAX_SEGMENTS, 7) float64
         The edges of a box as they come.
     order : (MAX_SEGMENTS,) int64
         Their order.
-    edges : (MAX_SEGMENTS, 6) float64
-        The same in order: s, x of both ends (s rising), side of the surface where the edge is a limb, slope dx/ds.
+    edges : (MAX_SEGMENTS, 7) float64
+        The same in order: s, x of both ends (s rising), side of the surface where the edge is a limb, slope dx/ds,
+        number of the segment.
+    n_edges : (1,) int64
+        How many there are.
     events : (MAX_EVENTS,) float64
         Where slabs begin and end.
     active : (MAX_SEGMENTS,) int64
@@ -50,6 +53,12 @@ class Scratch(NamedTuple):
     limbs : (2, MAX_LIMBS, 4) float64
         Limbs of the pixel and its neighbours, see :func:`collect_limbs`.
     n_limbs : (2,) int64
+    found : (MAX_SEGMENTS + 1,) int64
+        Numbers of the intervals of the strip at hand as samples count them, −1: empty.
+    last_x, last_found : (MAX_SEGMENTS + 1,) float64, int64
+        The curves at the end of the strip before, and its intervals.
+    last_strip : (2,) float64
+        How many curves it has, −1: there is none; and where it ends.
     """
 
     boxes: NDArray[np.float64]
@@ -62,26 +71,36 @@ class Scratch(NamedTuple):
     links: NDArray[np.int64]
     limbs: NDArray[np.float64]
     n_limbs: NDArray[np.int64]
+    n_edges: NDArray[np.int64]
+    found: NDArray[np.int64]
+    last_x: NDArray[np.float64]
+    last_found: NDArray[np.int64]
+    last_strip: NDArray[np.float64]
 
     @classmethod
     def empty(cls) -> Scratch:
         """Return scratch for one thread."""
         return cls(
             boxes=np.empty((4 * _MAX_DEPTH + 4, 5)),
-            clipped=np.empty((MAX_SEGMENTS, 6)),
+            clipped=np.empty((MAX_SEGMENTS, 7)),
             order=np.empty(MAX_SEGMENTS, np.int64),
-            edges=np.empty((MAX_SEGMENTS, 6)),
+            edges=np.empty((MAX_SEGMENTS, 7)),
             events=np.empty(MAX_EVENTS),
             active=np.empty(MAX_SEGMENTS, np.int64),
             slabs=np.empty((MAX_SLABS, 2)),
             links=np.empty(MAX_LINKS, np.int64),
             limbs=np.empty((2, MAX_LIMBS, 4)),
             n_limbs=np.zeros(2, np.int64),
+            n_edges=np.zeros(1, np.int64),
+            found=np.empty(MAX_SEGMENTS + 1, np.int64),
+            last_x=np.empty(MAX_SEGMENTS + 1),
+            last_found=np.empty(MAX_SEGMENTS + 1, np.int64),
+            last_strip=np.empty(2),
         )
 
 
 @kernel
-def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, n, region):  # type: ignore[no-untyped-def]
+def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, borders, n, region):  # type: ignore[no-untyped-def]
     """Place the samples of one pixel.
 
     Parameters
@@ -98,6 +117,8 @@ def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, n, region)
     scratch : Scratch
     samples : Samples
         ``points``, ``weights``, which add up to one, and ``regions``, counted from `region`, are written from `n` on.
+    borders : Borders
+        Appended to if there is room for any.
     n, region : int
 
     Returns
@@ -188,7 +209,7 @@ def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, n, region)
         if n_events < 0:
             m, trusted = 0, False
             n_events = find_events(box, m, scratch)
-        n, region = sweep_box(box, n_events, m, scratch, samples, n, region)
+        n, region = sweep_box(box, n_events, m, scratch, samples, borders, n, region)
         if n < 0:
             return -1, region, trusted
     return n, region, trusted

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from phasemark.render.background import background_edge
+from phasemark.render.integral.edge_motion import follow_borders
 from phasemark.render.integral.edge_projection import project_edges
 from phasemark.render.integral.edges_in_pixels import bin_segments
 from phasemark.render.integral.pixel_splitting import sample_pixel
@@ -21,7 +22,7 @@ UNTRUSTED = 2
 
 
 @kernel
-def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, samples, state):  # type: ignore[no-untyped-def]
+def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, samples, state, motion, borders):  # type: ignore[no-untyped-def]
     """Place the samples of as many views as fit into the buffers, from view `first` on.
 
     Parameters
@@ -39,6 +40,9 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
         ``points``, ``weights``, ``regions`` and ``pixel`` are overwritten.
     state : (n, rows, cols) uint8, overwritten
         Per pixel :data:`SKIPPED`, :data:`SPLIT` or :data:`UNTRUSTED`.
+    motion : Motion
+    borders : Borders
+        Overwritten; without room for any, nothing is asked of the edges' motion.
 
     Returns
     -------
@@ -47,7 +51,8 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
     """
     segments, limb, head = edges.segments, edges.limb, edges.head
     rows, cols = camera.stop_row - camera.first_row, camera.cols
-    n, region = 0, 0
+    n, region, n_borders, room = 0, 0, 0, len(borders.weights)
+    borders.count[0] = 0
     for view in range(first, len(poses.lens)):
         n_edges = project_edges(mesh, poses, view, camera, edges)
         u_low, u_high, v_low, v_high = _extent(edges, n_edges, False)
@@ -55,10 +60,11 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
         if background_edge(background, cos_b, sin_b, camera, segments[n_edges]):
             limb[n_edges] = 0
+            edges.ends[n_edges, 0] = -1
             n_edges += 1
         if bin_segments(n_edges, camera, edges) < 0:
             return -1, n
-        start = n
+        start, first_border = n, n_borders
         for row in range(rows):
             r = camera.first_row + row
             for c in range(cols):
@@ -68,13 +74,21 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
                     continue
                 before = n
                 bent = c < bent_high_u and c + 1 > bent_low_u and r < bent_high_v and r + 1 > bent_low_v
-                n, region, trusted = sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, n, region)
-                if n < 0:
+                n, region, trusted = sample_pixel(
+                    r, c, bent, splits, camera, edges, scratch, samples, borders, n, region
+                )
+                if n < 0 or borders.count[0] > room:
+                    borders.count[0] = first_border
                     return view, start
                 state[view, row, c] = SPLIT if trusted else UNTRUSTED
                 index = (view * rows + row) * cols + c
                 for k in range(before, n):
                     samples.pixel[k] = index
+                for b in range(n_borders, borders.count[0]):
+                    borders.pixel[b] = index
+                n_borders = borders.count[0]
+        if room > 0:
+            follow_borders(view, first_border, mesh, motion, background, camera, edges, borders)
     return len(poses.lens), n
 
 

@@ -131,7 +131,7 @@ def _continues(m, last, n, stop, lo, scratch):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def sweep_box(box, n_events, m, scratch, samples, n, region):  # type: ignore[no-untyped-def]
+def sweep_box(box, n_events, m, scratch, samples, borders, n, region):  # type: ignore[no-untyped-def]
     """Sample a box strip by strip.
 
     A rim or silhouette is a chain of many short edges, each of which begins and ends a slab. Neighbouring slabs in
@@ -139,6 +139,7 @@ def sweep_box(box, n_events, m, scratch, samples, n, region):  # type: ignore[no
     """
     events, active, slabs, links = scratch.events, scratch.active, scratch.slabs, scratch.links
     started, n_active, n_slabs, k = 0, 0, 0, 0
+    scratch.n_edges[0], scratch.last_strip[0] = m, -1.0
     for e in range(n_events - 1):
         lo, hi = max(events[e], box.s0), min(events[e + 1], box.s1)
         if hi - lo <= EMPTY:
@@ -149,7 +150,7 @@ def sweep_box(box, n_events, m, scratch, samples, n, region):  # type: ignore[no
             full = n_slabs == len(slabs) or (n_slabs + 1) * k > len(links)
             joined = not full and n_active == k and lo - stop <= EMPTY
             if not (joined and _continues(m, (n_slabs - 1) * k, k, stop, lo, scratch)):
-                n, region = sample_strip(Strip(n_slabs, k), box, scratch, samples, n, region)
+                n, region = sample_strip(Strip(n_slabs, k), box, scratch, samples, borders, n, region)
                 if n < 0:
                     return -1, region
                 n_slabs = 0
@@ -159,5 +160,5 @@ def sweep_box(box, n_events, m, scratch, samples, n, region):  # type: ignore[no
             links[n_slabs * k + i] = active[i]
         n_slabs += 1
     if n_slabs > 0:
-        n, region = sample_strip(Strip(n_slabs, k), box, scratch, samples, n, region)
+        n, region = sample_strip(Strip(n_slabs, k), box, scratch, samples, borders, n, region)
     return n, region

@@ -90,7 +90,9 @@ def shading_normals(mesh: Any, face: NDArray[Any], point: NDArray[Any]) -> NDArr
         return np.asarray(np.einsum("ij,ij->i", np.cross(q - p, r - p), mesh.planes[face, :3]))
 
     share = np.column_stack([area(point, b, c), area(point, c, a), area(point, a, b)])
-    normal = np.einsum("ik,ikx->ix", share / share.sum(axis=1, keepdims=True), mesh.corner_normals[face])
+    normal = np.einsum(
+        "ik,ikx->ix", share / share.sum(axis=1, keepdims=True), mesh.corner_normals[face, :9].reshape(-1, 3, 3)
+    )
     size = np.linalg.norm(normal, axis=1, keepdims=True)
     return np.asarray(np.where(size > 0, normal / np.where(size > 0, size, 1), mesh.planes[face, :3]))
 

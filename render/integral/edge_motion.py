@@ -1,0 +1,70 @@
+"""How fast edges move through the image while a parameter of the view changes."""
+
+from __future__ import annotations
+
+import math
+
+from phasemark.render.background import background_edge
+from phasemark.render.integral.edge_projection import project
+from phasemark.render.kernel import inlined, kernel
+
+
+@kernel
+def follow_borders(view, first, mesh, motion, background, camera, edges, borders):  # type: ignore[no-untyped-def]
+    """Fill depth and rates of the borders of one view, from `first` on.
+
+    Parameters
+    ----------
+    view, first : int
+    mesh : MeshTopology
+    motion : Motion
+    background : (4,) float64
+    camera : Camera
+    edges : Edges
+    borders : Borders
+    """
+    moved, step, shifted = motion.poses, motion.step, motion.segments
+    p = len(step)
+    depth_a, depth_b, last = 0.0, 0.0, -1
+    for b in range(first, min(borders.count[0], len(borders.weights))):
+        e = borders.segment[b]
+        start, end = edges.ends[e, 0], edges.ends[e, 1]
+        if e != last:
+            last = e
+            for k in range(p + 1):
+                pose = view * (p + 1) + k
+                if start < 0:
+                    bearing = moved.bearing[pose]
+                    background_edge(background, math.cos(bearing), math.sin(bearing), camera, shifted[k])
+                else:
+                    project(mesh.vertices, start, end, moved.matrix[pose], moved.offset[pose], camera, shifted[k])
+            if start >= 0:
+                depth_a, depth_b = _depth(mesh, moved, view * (p + 1), start), _depth(mesh, moved, view * (p + 1), end)
+        along_v = borders.along_v[b] == 1
+        s = borders.points[b, 1 if along_v else 0]
+        here = _crossing(shifted[0], s, along_v)
+        for k in range(p):
+            borders.rates[b, k] = (_crossing(shifted[k + 1], s, along_v) - here) / step[k]
+        borders.depth[b] = 0.0
+        if start >= 0 and depth_a > 0.0 and depth_b > 0.0:
+            own = shifted[0]
+            du, dv = own[2] - own[0], own[3] - own[1]
+            share = ((borders.points[b, 0] - own[0]) * du + (borders.points[b, 1] - own[1]) * dv) / (du * du + dv * dv)
+            share = min(max(share, 0.0), 1.0)
+            borders.depth[b] = 1.0 / ((1.0 - share) / depth_a + share / depth_b)
+
+
+@inlined
+def _depth(mesh, poses, pose, vertex):  # type: ignore[no-untyped-def]
+    """Return how far a vertex lies along the camera's axis."""
+    matrix, corner = poses.matrix[pose], mesh.vertices[vertex]
+    return matrix[0, 0] * corner[0] + matrix[0, 1] * corner[1] + matrix[0, 2] * corner[2] + poses.offset[pose, 0]
+
+
+@inlined
+def _crossing(segment, s, along_v):  # type: ignore[no-untyped-def]
+    """Return where the line of a segment meets the line at s across the sweep."""
+    i = 1 if along_v else 0
+    begin, length = segment[i], segment[i + 2] - segment[i]
+    x, rise = segment[1 - i], segment[3 - i] - segment[1 - i]
+    return x + (s - begin) * rise / length if length != 0.0 else x

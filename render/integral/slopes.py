@@ -1,0 +1,87 @@
+"""How the phasors of a batch change with the view, from the samples and edges that its images are made of.
+
+∂S/∂p = Σ weights · ∂f/∂p at the samples, the faces they see held, + ∫ (f_left − f_right) ẋ ds along the edges. Both ẋ and
+∂f/∂p are differences over a step of 3e-8 that no edge and no sample notices: nothing is sampled or cast again.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.render.integral.arguments import Borders, Camera, Light, Motion, Poses, Samples, Sums
+from phasemark.render.integral.light import add_background, sum_samples
+from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.integral.ray_plan import SKIPPED, UNTRUSTED
+from phasemark.render.integral.swept_light import sum_borders
+
+STEP = 2.0**-25
+"""Width of a difference, metres or radians: far below the facets of a curved mesh, far above rounding."""
+
+
+class SlopeSums:
+    """Sums for the slopes of one batch.
+
+    Parameters
+    ----------
+    slope : (pixels, p) complex128
+        The result, added to.
+    motion : Motion
+    own : Sums
+        The sums of the images themselves; read when the batch is complete.
+    turns : (p,) bool
+        Which parameters turn what stands behind the landmark.
+    """
+
+    def __init__(self, slope: NDArray[np.complex128], motion: Motion, own: Sums, turns: NDArray[np.bool_]) -> None:
+        self._slope, self._own, self._turns = slope, own, turns
+        p = len(motion.step)
+        self._poses = [
+            Poses(*(np.ascontiguousarray(part[k :: 1 + p]) for part in motion.poses)) for k in range(1, 1 + p)
+        ]
+        pixels = len(own.intensity)
+        self._sums = Sums(
+            phasor=np.empty((pixels, 1), np.complex128),
+            intensity=np.empty(pixels),
+            coverage=np.empty(pixels),
+            upper=np.empty(pixels),
+            state=own.state,
+        )
+        self._moved = np.zeros((p, pixels), np.complex128)
+
+    def add(
+        self,
+        views: tuple[int, int],
+        n: int,
+        samples: Samples,
+        borders: Borders,
+        mesh: MeshTopology,
+        poses: Poses,
+        camera: Camera,
+        light: Light,
+    ) -> None:
+        """Add n samples and the points on edges of some of the views, the first and the one after the last."""
+        first_order = light._replace(orders=light.orders[:1])
+        per_view = self._own.state[0].size
+        pixels = slice(views[0] * per_view, views[1] * per_view)
+        for k, moved in enumerate(self._poses):
+            for values in self._sums[:4]:
+                values[pixels] = 0
+            sum_samples(n, samples, mesh, moved, camera, first_order, self._sums)
+            if self._turns[k]:
+                add_background(views[0], views[1], moved, camera, first_order, self._sums)
+            self._moved[k, pixels] = self._sums.phasor[pixels, 0]
+        sum_borders(n, samples, samples.chosen, mesh, poses, camera, first_order, borders, self._slope)
+
+    def conclude(self) -> None:
+        """Add what the light changes at fixed points of the image, once all samples of the batch are in.
+
+        Pixels whose edges are not all known become NaN.
+        """
+        skipped = (self._own.state == SKIPPED).reshape(-1)
+        self._slope[(self._own.state == UNTRUSTED).reshape(-1)] = np.nan
+        for k, moved in enumerate(self._moved):
+            change = (moved - self._own.phasor[:, 0]) / STEP
+            if not self._turns[k]:
+                change[skipped] = 0
+            self._slope[:, k] += change

@@ -1,0 +1,85 @@
+"""How the light of pixels changes because edges move: ∫ (f_left − f_right) ẋ ds along each (Leibniz's rule)."""
+
+from __future__ import annotations
+
+import math
+
+from phasemark.render.background import background_hit
+from phasemark.render.integral.arguments import ray_of, towards_landmark, towards_level
+from phasemark.render.integral.face_search import find_face
+from phasemark.render.integral.light import landmark_hit, phasor_of
+from phasemark.render.kernel import inlined, kernel
+
+_SAME_DEPTH = 1e-4
+"""Relative difference of two depths up to which they are one."""
+
+
+@kernel
+def sum_borders(n, samples, first_of, mesh, poses, camera, light, borders, slope):  # type: ignore[no-untyped-def]
+    """Add what the edges sweep to the slopes of the pixels.
+
+    Parameters
+    ----------
+    n : int
+        Number of samples.
+    samples : Samples
+        With their faces.
+    first_of : (m,) int64
+        Scratch: the first sample of each interval.
+    mesh : MeshTopology
+    poses : Poses
+    camera : Camera
+    light : Light
+    borders : Borders
+    slope : (pixels, p) complex128, added to
+    """
+    count, region = 0, -1
+    for k in range(n):
+        if samples.regions[k] != region:
+            region = samples.regions[k]
+            first_of[region] = k
+            count = region + 1
+    first_of[count] = n
+    pixels_per_view = (camera.stop_row - camera.first_row) * camera.cols
+    for b in range(borders.count[0]):
+        index = borders.pixel[b]
+        view = index // pixels_per_view
+        y, z = ray_of(camera, borders.points[b, 0], borders.points[b, 1])
+        near, left = _light_beside(b, 0, y, z, view, samples, first_of, mesh, poses, camera, light, borders)
+        far, right = _light_beside(b, 1, y, z, view, samples, first_of, mesh, poses, camera, light, borders)
+        limit, side = borders.depth[b] * (1.0 - _SAME_DEPTH), borders.side[b]
+        if side > 0.0:  # at a limb its own surface shines no longer; hidden, it changes nothing
+            jump = left if near > limit else 0j
+        elif side < 0.0:
+            jump = -right if far > limit else 0j
+        else:
+            jump = left - right if near > limit or far > limit else 0j
+        for k in range(slope.shape[1]):
+            slope[index, k] += borders.weights[b] * borders.rates[b, k] * jump
+
+
+@inlined
+def _light_beside(b, which, y, z, view, samples, first_of, mesh, poses, camera, light, borders):  # type: ignore[no-untyped-def]
+    """Return depth and light of what is seen on one side of an edge; depth is infinite where there is nothing."""
+    points, region = samples.points, borders.regions[b, which]
+    nearest, least = first_of[region], math.inf
+    for k in range(first_of[region], first_of[region + 1]):
+        du, dv = points[k, 0] - borders.points[b, 0], points[k, 1] - borders.points[b, 1]
+        if du * du + dv * dv < least:
+            nearest, least = k, du * du + dv * dv
+    face = samples.face[nearest]
+    length = math.sqrt(1.0 + y * y + z * z)
+    lens, matrix = poses.lens[view], poses.matrix[view]
+    if face >= 0:
+        if not mesh.plain[face]:
+            dx, dy, dz = towards_landmark(matrix, y, z)
+            g, t = find_face(mesh.search, mesh.grid, face, lens[0], lens[1], lens[2], dx, dy, dz)
+            face = g if g >= 0 else face
+        t, cos_theta = landmark_hit(mesh, face, lens, matrix, y, z)
+        return t, phasor_of(t * length, light.albedo * cos_theta / length, length, light)
+    dx, dy, dz = towards_level(camera.level, y, z)
+    bearing = poses.bearing[view]
+    t, rho, cos_theta = background_hit(light.background, math.cos(bearing), math.sin(bearing), dx, dy, dz)
+    if t == 0.0:
+        return math.inf, 0j
+    return t, phasor_of(t * length, rho * cos_theta / length, length, light)
