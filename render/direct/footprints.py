@@ -140,6 +140,8 @@ def footprint_grid(sensor: Sensor, margin_cells: int = 0, cells: int | None = No
         scale_v=scale_v,
         centre_u=u0 + left,
         centre_v=v0 + top,
+        slope_u=1 / scale_u,
+        slope_v=1 / scale_v,
         rows=rows,
         cols=cols,
         first_row=0,

@@ -14,18 +14,19 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
-from phasemark.render.integral.arguments import Camera, Edges, Poses, Samples, ray_of
+from phasemark.render.integral.arguments import Camera, Motion, Poses, ray_of
 from phasemark.render.integral.intersect import make_intersector
-from phasemark.render.integral.light import _landmark_hit
+from phasemark.render.integral.light import landmark_hit
 from phasemark.render.integral.mesh_topology import MeshTopology
-from phasemark.render.integral.pixel_splitting import Scratch
 from phasemark.render.integral.quadrature_rules import gauss_legendre
 from phasemark.render.integral.ray_plan import plan_rays
 from phasemark.render.integral.shells import unite_shells
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.kernel import kernel
+from phasemark.render.renderer import _Buffers
 
 _NO_BACKGROUND = np.zeros(4)
+_SAMPLES = 1 << 15
 _PLANE_POINTS = 2  # Gauss points a side of a cell: the integrand of a plane is smooth
 
 
@@ -71,7 +72,7 @@ class SceneMesh:
     def __init__(self, mesh: trimesh.Trimesh, *, intersector: str = "auto") -> None:
         self.topology = MeshTopology.from_mesh(unite_shells(mesh))
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
-        self._n_links, self._n_samples = 1 << 14, 1 << 15
+        self._room: tuple[tuple[int, int], _Buffers] | None = None
 
     def samples(self, landmark2cam: ArrayLike, grid: Camera) -> SceneSamples:
         """Sample what a grid of cells sees.
@@ -110,17 +111,20 @@ class SceneMesh:
         mesh = self.topology
         rows, cols = grid.stop_row - grid.first_row, grid.cols
         state = np.zeros((1, rows, cols), np.uint8)
+        buffers = self._buffers(rows, cols)
+        still = Motion(pose, np.empty(0), np.empty((1, 4)))  # no slopes are asked for
         while True:
-            edges, samples = self._buffers(rows, cols), self._room()
             reached, n = plan_rays(
-                0, mesh, pose, grid, 1, _NO_BACKGROUND, edges, Scratch.empty(), samples, state
+                0, mesh, pose, grid, 1, _NO_BACKGROUND, buffers.edges, buffers.scratch, buffers.samples, state, still,
+                buffers.borders,
             )  # fmt: skip
             if reached == 1:
                 break
             if reached == -1:
-                self._n_links *= 2
+                buffers.grow_links()
             else:
-                self._n_samples *= 2
+                buffers.grow_samples()
+        samples = buffers.samples
 
         def cast(count: int) -> NDArray[np.int32]:
             aim(count, samples, pose, grid)
@@ -133,28 +137,12 @@ class SceneMesh:
         kept = _hits(n, samples, mesh, pose, grid, tangents, range_m, amplitude, part)
         return tangents[:kept], range_m[:kept], amplitude[:kept], part[:kept]
 
-    def _buffers(self, rows: int, cols: int) -> Edges:
-        n_edges = len(self.topology.creases) + len(self.topology.folds)
-        return Edges(
-            segments=np.empty((n_edges + 1, 4)),
-            limb=np.empty(n_edges + 1, np.int8),
-            head=np.empty((rows + 2, cols + 2), np.int32),
-            link=np.empty(self._n_links, np.int32),
-            owner=np.empty(self._n_links, np.int32),
-        )
-
-    def _room(self) -> Samples:
-        n = self._n_samples
-        return Samples(
-            points=np.empty((n, 2)),
-            weights=np.empty(n),
-            regions=np.empty(n, np.int32),
-            pixel=np.empty(n, np.int64),
-            face=np.empty(n, np.int32),
-            chosen=np.empty(n, np.int64),
-            origins=np.empty((n, 3), np.float32),
-            directions=np.empty((n, 3), np.float32),
-        )
+    def _buffers(self, rows: int, cols: int) -> _Buffers:
+        """Return the scratch for a grid, made once for each size."""
+        if self._room is None or self._room[0] != (rows, cols):
+            n_edges = len(self.topology.creases) + len(self.topology.folds)
+            self._room = (rows, cols), _Buffers(n_edges, (rows, cols), n_samples=_SAMPLES)
+        return self._room[1]
 
 
 def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float] = (0.0, 0.0)) -> SceneSamples:
@@ -235,7 +223,7 @@ def _hits(n, samples, mesh, poses, camera, tangents, range_m, amplitude, part): 
             continue
         y, z = ray_of(camera, samples.points[k, 0], samples.points[k, 1])
         length = math.sqrt(1.0 + y * y + z * z)
-        t, cos_theta = _landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], y, z)
+        t, cos_theta = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], y, z)
         if not t > 0.0:
             continue
         tangents[kept, 0], tangents[kept, 1] = y, z
