@@ -112,7 +112,7 @@ def fit_direct_sensor(
     base : Sensor
         The sensor as far as it is known; the fit starts there.
     converters : sequence of int, optional
-        Time converter of each zone in image order; zones of one converter share a bin width. None: one for all.
+        Time converter of each zone in image order; zones of one converter share a bin width. None: as `base` has it.
     rounds : int
         How often geometry and responses are fitted in turn.
 
@@ -128,7 +128,7 @@ def fit_direct_sensor(
     if len(plane.frames) < 8:
         raise UsageError(f"a fit needs a plane at 8 distances or more, got {len(plane.frames)}")
     n = base.rows * base.cols
-    groups = tuple(converters) if converters is not None else (0,) * n
+    groups = tuple(converters) if converters is not None else converters_of(base)
     if len(groups) != n:
         raise UsageError(f"'converters' must name the converter of each of {n} zones, got {len(groups)}")
     model = FitModel(base, groups, zone_brightness(plane, histogram_of(base).cycles))
@@ -152,6 +152,16 @@ def fit_direct_sensor(
     }
     sensor = _as_sensor(base, model, p, responses, plane)
     return DirectFit(sensor, p, responses, std, _reduced_chi2(model, p, responses, plane), model)
+
+
+def converters_of(sensor: Sensor) -> tuple[int, ...]:
+    """Return the time converter of each zone of a sensor, in image order."""
+    histogram = histogram_of(sensor)
+    n = sensor.rows * sensor.cols
+    logged = np.array(histogram.time_converters or (0,) * n)
+    out = np.empty(n, np.int64)
+    out[np.array(histogram.zone_order or range(n))] = logged
+    return tuple(int(k) for k in out)
 
 
 def zone_brightness(plane: PlaneRecording, cycles: float) -> NDArray[np.float64]:

@@ -66,6 +66,9 @@ class Histogram(BaseModel):
         Bin width of each zone over `bin_width_m`, rows × cols; empty: 1. Zones that share a time converter share it.
     zone_order : tuple of int
         Where each zone of a log stands in the image, row · cols + col counted from the top left. Empty: as logged.
+    time_converters : tuple of int
+        Time converter of each zone in the order of the log; zones of one converter share a bin width. Empty: one for
+        all.
     reference_gain : float
         How far histograms shift, in bins, when the peak of the reference histogram shifts by one bin.
     reference_peak : float, optional
@@ -113,6 +116,7 @@ class Histogram(BaseModel):
     zone_gain: tuple[tuple[_NonNegative, ...], ...] = ()
     zone_bin_scale: tuple[tuple[Annotated[float, Field(ge=0.5, le=2)], ...], ...] = ()
     zone_order: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    time_converters: tuple[Annotated[int, Field(ge=0, le=255)], ...] = ()
     reference_gain: _Number = 0.0
     reference_peak: _Number | None = None
     estimator: Literal["centroid", "parabola"] = "centroid"
@@ -182,6 +186,11 @@ class Histogram(BaseModel):
         n = rows * cols
         if self.irf and len(self.irf) not in (1, n):
             raise ValueError(f"'histogram.irf' must have 1 row or {n}, one for each zone, got {len(self.irf)}")
+        if self.time_converters and len(self.time_converters) != n:
+            raise ValueError(
+                f"'histogram.time_converters' must name the converter of each of {n} zones, got"
+                f" {len(self.time_converters)}"
+            )
         if self.zone_order and sorted(self.zone_order) != list(range(n)):
             raise ValueError(f"'histogram.zone_order' must hold each number from 0 to {n - 1} once")
 
