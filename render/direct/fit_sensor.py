@@ -44,6 +44,8 @@ _IRF_STEP_BINS = 1 / 6
 _RANGE_WINDOW = (5, 12)
 _AMBIENT_BINS = slice(2, 9)
 _PLANE_ALBEDO = 0.8
+_ALONE = 0.9  # share of a zone's light that makes the object what it sees
+_LEAST_ALONE = 3
 
 
 @dataclass(frozen=True)
@@ -207,10 +209,14 @@ def score_zone_orders(logged: ObjectRecording, base: Sensor) -> dict[str, float]
     scores = {}
     for name, place in zone_orders(base.rows, base.cols).items():
         error = peak_centroids(logged.frames.zone_counts) - peak_centroids(expected)[:, place]
-        alone = share[:, place] > 0.9
-        error = np.where(alone, error, np.nan)
-        error = error - np.nanmedian(error, axis=0)
-        scores[name] = float(np.nanmedian(np.abs(error)) * histogram_of(base).bin_width_m)
+        alone = share[:, place] > _ALONE
+        rest = [
+            error[alone[:, zone], zone] - np.median(error[alone[:, zone], zone])
+            for zone in range(error.shape[1])
+            if alone[:, zone].sum() >= _LEAST_ALONE
+        ]
+        off = np.median(np.abs(np.concatenate(rest))) if rest else math.nan
+        scores[name] = float(off * histogram_of(base).bin_width_m)
     return scores
 
 

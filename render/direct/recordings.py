@@ -12,6 +12,9 @@ from phasemark import UsageError
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.scene_samples import SceneMesh, rigid_transforms
 
+_LEVEL = 0.999  # least upward part of the normal of a level face
+_SAME_HEIGHT_M = 1e-3
+
 OPTICAL2CAM = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From the optical frame (x right, y down, z forward) to the camera frame (x forward, y left, z up)."""
 
@@ -139,3 +142,20 @@ def label_object(mesh: trimesh.Trimesh, support_z_m: float, tolerance_m: float =
     top = np.asarray(mesh.vertices)[np.asarray(mesh.faces)][:, :, 2].max(axis=1)
     labelled.face_attributes["part"] = (top > support_z_m + tolerance_m).astype(np.int8)
     return labelled
+
+
+def support_height(mesh: trimesh.Trimesh) -> float:
+    """Return the height of the largest level surface that faces up: what an object stands on.
+
+    Raises
+    ------
+    UsageError
+        No face is level.
+    """
+    level = np.asarray(mesh.face_normals)[:, 2] > _LEVEL
+    if not level.any():
+        raise UsageError("the mesh has no level face: an object's mesh must hold the table that it stands on")
+    height = np.asarray(mesh.triangles_center)[level, 2]
+    steps, group = np.unique(np.round(height / _SAME_HEIGHT_M), return_inverse=True)
+    area = np.bincount(group, np.asarray(mesh.area_faces)[level], minlength=len(steps))
+    return float(np.median(height[group == area.argmax()]))
