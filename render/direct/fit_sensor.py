@@ -341,7 +341,7 @@ def _as_sensor(base: Sensor, model: FitModel, p: Parameters, responses: Response
     start_bins = float(delays.mean())
     scales = np.array([p[f"converter_{k}"] for k in model.converters])
     x = responses.first + responses.step * np.arange(responses.cumulative.shape[1])
-    grid = np.arange(-4.0, 32.0, _IRF_STEP_BINS)
+    grid = np.arange(-7.0, 32.0, _IRF_STEP_BINS)
     irf = []
     for zone in range(rows * cols):
         cumulative = np.interp(grid / scales[zone] + delays[zone], x, responses.cumulative[zone], left=0.0, right=1.0)
