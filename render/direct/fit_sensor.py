@@ -44,8 +44,6 @@ _IRF_STEP_BINS = 1 / 6
 _RANGE_WINDOW = (5, 12)
 _AMBIENT_BINS = slice(2, 9)
 _PLANE_ALBEDO = 0.8
-_ALONE = 0.9  # share of a zone's light that makes the object what it sees
-_LEAST_ALONE = 3
 
 
 @dataclass(frozen=True)
@@ -192,8 +190,8 @@ def zone_orders(rows: int, cols: int) -> dict[str, NDArray[np.int64]]:
 def score_zone_orders(logged: ObjectRecording, base: Sensor) -> dict[str, float]:
     """Return how badly each order of the zones explains a recording, metres: smaller is better.
 
-    The score is the median, over zones and poses that see the object alone, of how far the centroid of the highest
-    peak lies from that of the sensor as it is described, each zone's own delay taken out.
+    The score is the median, over zones and poses, of how far the centroid of the highest peak lies from that of the
+    sensor as it is described, each zone's own delay taken out.
 
     Parameters
     ----------
@@ -205,17 +203,10 @@ def score_zone_orders(logged: ObjectRecording, base: Sensor) -> dict[str, float]
     samples = SceneMesh(logged.mesh).samples(world2cam(logged.sensor2world), footprint_grid(base))
     seen = zone_transients(samples, base, axis)
     expected = expected_counts(seen, base, axis)
-    share = seen[:, 1].sum(axis=-1) / np.maximum(seen.sum(axis=(1, 3)), 1e-300)
     scores = {}
     for name, place in zone_orders(base.rows, base.cols).items():
         error = peak_centroids(logged.frames.zone_counts) - peak_centroids(expected)[:, place]
-        alone = share[:, place] > _ALONE
-        rest = [
-            error[alone[:, zone], zone] - np.median(error[alone[:, zone], zone])
-            for zone in range(error.shape[1])
-            if alone[:, zone].sum() >= _LEAST_ALONE
-        ]
-        off = np.median(np.abs(np.concatenate(rest))) if rest else math.nan
+        off = np.median(np.abs(error - np.median(error, axis=0)))
         scores[name] = float(off * histogram_of(base).bin_width_m)
     return scores
 
