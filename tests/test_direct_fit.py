@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ def true_sensor() -> Sensor:
     )  # fmt: skip
 
 
-def write_log(path: Path, counts: np.ndarray, sensor: Sensor, **arrays: np.ndarray) -> Path:
+def write_log(path: Path, counts: np.ndarray, sensor: Sensor, **arrays: Any) -> Path:
     """Write histograms in the order of the chip's log."""
     flat = counts.reshape(len(counts), 9, -1)
     np.savez(path, histogram=flat[:, list(sensor.histogram.zone_order)].astype(np.uint32), **arrays)
@@ -118,7 +119,7 @@ def test_what_cannot_be_fitted_is_refused_in_one_line(
     logs: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-    arguments: list,
+    arguments: list[str],
     code: int,
     message: str,
 ) -> None:

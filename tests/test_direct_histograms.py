@@ -48,12 +48,12 @@ def zone_borders(sensor: Sensor) -> list[tuple[float, float, float, float]]:
 
 def counts_of(samples: SceneSamples, sensor: Sensor) -> np.ndarray:
     axis = range_axis(sensor)
-    return expected_counts(zone_transients(samples, sensor, axis), sensor, axis)[0]
+    return np.asarray(expected_counts(zone_transients(samples, sensor, axis), sensor, axis)[0])
 
 
 def oracle_counts(scene: oracle.Hit, sensor: Sensor, points: int = 600) -> np.ndarray:
     h = sensor.histogram
-    edges = h.start_m + h.bin_width_m * np.arange(h.bins + 1)
+    edges = np.asarray(h.start_m + h.bin_width_m * np.arange(h.bins + 1), dtype=np.float64)
     scale = h.cycles * h.photons
     return scale * np.stack(
         [oracle.histogram(scene, zone, edges, h.irf_std_m, points) for zone in zone_borders(sensor)]
@@ -62,9 +62,9 @@ def oracle_counts(scene: oracle.Hit, sensor: Sensor, points: int = 600) -> np.nd
 
 def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> trimesh.Trimesh:
     low, high = np.array([x[0], y[0], z[0]]), np.array([x[1], y[1], z[1]])
-    return trimesh.creation.box(
-        extents=high - low, transform=trimesh.transformations.translation_matrix((low + high) / 2)
-    )
+    made = trimesh.creation.box(high - low, trimesh.transformations.translation_matrix((low + high) / 2))
+    assert isinstance(made, trimesh.Trimesh)
+    return made
 
 
 @pytest.mark.parametrize("scale", [(1.0, 1.0), (1.25, 1.5)])
@@ -76,6 +76,7 @@ def test_histogram_of_two_planes_is_that_of_dense_quadrature(scale: tuple[float,
     scene = trimesh.util.concatenate(
         [box((near, near + 1e-3), (-3, near * edge), (-3, 3)), box((far, far + 1e-3), (-3, 3), (-3, 3))]
     )
+    assert isinstance(scene, trimesh.Trimesh)
     got = counts_of(SceneMesh(scene).samples(np.eye(4), footprint_grid(sensor)), sensor)
     want = oracle_counts(oracle.half_plane_before(near, far, edge), sensor, points=1200)
     assert np.abs(got - want).max() < 1e-3 * want.max()  # the bar

@@ -33,7 +33,7 @@ def one_zone(**changes: object) -> Sensor:
 def gaussian_counts(places_bins: list[float], counts: float, ambient: float) -> np.ndarray:
     edges = np.arange(129)
     each = [np.diff(ndtr((edges - x) / SIGMA_BINS)) for x in places_bins]
-    return ambient + counts * np.sum(each, axis=0)
+    return np.asarray(ambient + counts * np.sum(each, axis=0))
 
 
 def test_counts_have_the_mean_and_the_variance_of_poisson() -> None:
@@ -108,7 +108,7 @@ def test_two_equal_targets_merge_below_two_sigma_of_the_response() -> None:
     def targets_at(distance_bins: float) -> np.ndarray:
         mean = gaussian_counts([60.5 - distance_bins / 2, 60.5 + distance_bins / 2], 1e9, 10.0)
         frames = capture_histograms(mean[None, None], sensor, rng=np.random.default_rng(2), n_frames=n)
-        return (find_targets(frames).status == Status.VALID).sum(axis=-1).ravel()
+        return np.asarray((find_targets(frames).status == Status.VALID).sum(axis=-1).ravel())
 
     assert (targets_at(0.9 * limit) == 1).all()
     assert (targets_at(limit + 2.0) == 2).all()  # a minimum between two bins needs a bin between them
@@ -187,7 +187,9 @@ def test_a_sensor_without_a_histogram_table_is_refused() -> None:
         ({"width": 1}, "'width' is no key of"),
     ],
 )
-def test_a_histogram_table_that_contradicts_itself_is_refused_in_one_line(changes: dict, message: str) -> None:
+def test_a_histogram_table_that_contradicts_itself_is_refused_in_one_line(
+    changes: dict[str, object], message: str
+) -> None:
     with pytest.raises(UsageError, match=message) as error:
         one_zone(**changes)
     assert "\n" not in str(error.value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ RNG = np.random.default_rng(3)
 COUNTS = RNG.poisson(40, (5, 9, 128)).astype(np.uint32)
 
 
-def write_npz(path: Path, **arrays: np.ndarray) -> Path:
+def write_npz(path: Path, **arrays: Any) -> Path:
     np.savez(path, **arrays)
     return path
 
@@ -64,7 +65,7 @@ def test_lines_of_json_hold_what_npz_does(tmp_path: Path) -> None:
         ({"histogram": COUNTS.astype("U4")}, "'histogram' must hold numbers"),
     ],
 )
-def test_a_log_that_cannot_be_is_refused_in_one_line(tmp_path: Path, arrays: dict, message: str) -> None:
+def test_a_log_that_cannot_be_is_refused_in_one_line(tmp_path: Path, arrays: dict[str, Any], message: str) -> None:
     path = write_npz(tmp_path / "a.npz", **arrays)
     with pytest.raises(InputFileError, match=message) as error:
         read_histograms(path, sensor=TMF)

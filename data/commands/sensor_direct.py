@@ -17,7 +17,7 @@ from phasemark.data.commands.outputs import refuse_existing
 
 if TYPE_CHECKING:
     from phasemark.render import Sensor
-    from phasemark.render.direct.recordings import ObjectRecording
+    from phasemark.render.direct import DirectFit, ObjectRecording, PlaneRecording
 
 
 def sensor_fit_direct(
@@ -45,55 +45,26 @@ def sensor_fit_direct(
     are logged, how large they are and how much light strays. Each log holds `histogram`, a plane's `distance_m`, an
     object's `sensor2world`; an object's mesh holds the table that it stands on.
     """
-    import numpy as np
-
     from phasemark.data.files.atomic_write import write_atomically
-    from phasemark.data.measured.histogram_logs import read_histograms
-    from phasemark.render.direct.fit_sensor import fit_direct_sensor, score_zone_orders
-    from phasemark.render.direct.histogram_frames import reference_centroid
-    from phasemark.render.direct.recordings import PlaneRecording
+    from phasemark.render.direct import fit_direct_sensor
     from phasemark.render.sensor.sensor_file import sensor_toml
 
     if out.suffix.lower() != ".toml":
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")
     refuse_existing([out], force)
-    base = read_sensor(sensor)
-    if base.histogram is None:
-        raise UsageError(f"the sensor '{sensor}' has no [histogram] table: its histograms are not described")
-    log = read_histograms(plane, sensor=base)
-    if log.distance_m is None:
-        raise UsageError(f"{plane} must state 'distance_m', the distance of the plane in each frame")
-    if log.frames.reference is not None and base.histogram.reference_peak is None:
-        peak = float(reference_centroid(log.frames.reference.sum(axis=1))[-1])
-        base = base.with_(histogram={**base.histogram.model_dump(), "reference_peak": peak})
-        log = read_histograms(plane, sensor=base)
-    kept = np.flatnonzero(log.distance_m >= nearest)
-    recording = PlaneRecording(log.frames[kept], log.distance_m[kept])
+    base, recording = _plane(plane, sensor, nearest)
     objects = [_object(text, base) for text in known or []]
-    scores = {}
-    if objects:
-        plain = base.with_(histogram={**base.histogram.model_dump(), "zone_order": ()})
-        scores = score_zone_orders(_object((known or [""])[0], plain), plain)
+    scores = _zone_orders(known, base)
     with LongWork("fitting"):
         fit = fit_direct_sensor(recording, objects, base=base)
-    spread = 1e3 * np.sqrt(((fit.plane_range_m(recording) - recording.distance_m[:, None]) ** 2).mean(axis=0))
     header = [f"Fitted by phasemark to {plane.name}" + "".join(f", {one.name}" for one in objects)]
     text = sensor_toml(fit.sensor, {}, header=header, otherwise="measured or as the sensor it was fitted from")
     write_atomically(out, text.encode(), force=force)
+    spread = 1e3 * ((fit.plane_range_m(recording) - recording.distance_m[:, None]) ** 2).mean(axis=0) ** 0.5
     if as_json:
         echo_json({"file": str(out), **fit.as_dict(), "range_rms_mm": spread.tolist(), "zone_orders": scores})
         return
-    echo_table(
-        ("parameter", "value", "std"),
-        (
-            (name, f"{fit.parameters[name]:.5g}", f"{fit.std[name]:.2g}" if name in fit.std else "fixed")
-            for name in fit.parameters.names
-        ),
-    )
-    echo_table(
-        ("zone", "range r.m.s. (mm)", "chi2/nu"),
-        ((str(k), f"{s:.2f}", f"{c:.3g}") for k, (s, c) in enumerate(zip(spread, fit.reduced_chi2, strict=True))),
-    )
+    _echo_fit(fit, spread.tolist())
     if scores:
         best, second = sorted(scores, key=lambda name: scores[name])[:2]
         typer.echo(
@@ -101,10 +72,52 @@ def sensor_fit_direct(
             f" {1e3 * scores[second]:.1f} mm."
         )
     else:
-        tell(
-            f"without --object the directions of the zones are those of {readable(sensor)}: a plane does not tell them"
-        )
+        tell(f"without --object the directions of zones are those of {readable(sensor)}: a plane does not tell them")
     typer.echo(out)
+
+
+def _echo_fit(fit: DirectFit, spread_mm: list[float]) -> None:
+    """Print the fitted parameters, and how well each zone measures the plane."""
+    names = fit.parameters.names
+    echo_table(
+        ("parameter", "value", "std"),
+        ((n, f"{fit.parameters[n]:.5g}", f"{fit.std[n]:.2g}" if n in fit.std else "fixed") for n in names),
+    )
+    echo_table(
+        ("zone", "range r.m.s. (mm)", "chi2/nu"),
+        ((str(k), f"{s:.2f}", f"{c:.3g}") for k, (s, c) in enumerate(zip(spread_mm, fit.reduced_chi2, strict=True))),
+    )
+
+
+def _plane(path: Path, sensor: str, nearest_m: float) -> tuple[Sensor, PlaneRecording]:
+    """Return the sensor that a fit starts from, and the plane's histograms from `nearest_m` on."""
+    import numpy as np
+
+    from phasemark.data.measured.histogram_logs import read_histograms
+    from phasemark.render.direct import PlaneRecording, reference_centroid
+
+    base = read_sensor(sensor)
+    if base.histogram is None:
+        raise UsageError(f"the sensor '{sensor}' has no [histogram] table: its histograms are not described")
+    log = read_histograms(path, sensor=base)
+    if log.distance_m is None:
+        raise UsageError(f"{path} must state 'distance_m', the distance of the plane in each frame")
+    if log.frames.reference is not None and base.histogram.reference_peak is None:
+        peak = float(reference_centroid(log.frames.reference.sum(axis=1))[-1])
+        base = base.with_(histogram={**base.histogram.model_dump(), "reference_peak": peak})
+        log = read_histograms(path, sensor=base)
+    far = np.flatnonzero(log.distance_m >= nearest_m)
+    return base, PlaneRecording(log.frames[far], log.distance_m[far])
+
+
+def _zone_orders(known: list[str] | None, base: Sensor) -> dict[str, float]:
+    """Return the score of each order of the zones from the first object; nothing without one."""
+    from phasemark.render.direct import score_zone_orders
+
+    if not known or base.histogram is None:
+        return {}
+    plain = base.with_(histogram={**base.histogram.model_dump(), "zone_order": ()})
+    return score_zone_orders(_object(known[0], plain), plain)
 
 
 def _object(text: str, sensor: Sensor) -> ObjectRecording:

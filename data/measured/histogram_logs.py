@@ -26,6 +26,7 @@ _MOST_BYTES = 1 << 28
 _MOST_VALUES = 1 << 26
 _NAMES = ("histogram", "reference_histogram", "distance_m", "sensor2world", "t_ms", "t_s")
 _SECONDS = {"t_ms": 1e-3, "t_s": 1.0}
+_MOST_LISTED = 16
 _TARGET_COLUMNS = ("mm", "sigma_mm", "signal", "status")
 
 
@@ -151,22 +152,25 @@ def read_targets(path: str | os.PathLike[str], *, sensor: Sensor, valid_status: 
     n_zones = sensor.rows * sensor.cols
     places: dict[tuple[str, int, int], int] = {}
     for column, name in enumerate(header):
-        kind, _, rest = name.rpartition("_")
-        kind, _, zone = kind.rpartition("_")
-        if kind in _TARGET_COLUMNS and zone.isdigit() and rest.isdigit():
-            if int(zone) >= n_zones or int(rest) >= 16:
-                raise InputFileError(f"{path}: column '{name}' is beyond {n_zones} zones of at most 16 targets")
-            places[kind, int(zone), int(rest)] = column
+        kind, _, numbers = name.removeprefix("sigma_").partition("_")
+        kind = f"sigma_{kind}" if name.startswith("sigma_") else kind
+        zone, _, target = numbers.partition("_")
+        if kind in _TARGET_COLUMNS and zone.isdigit() and target.isdigit():
+            if int(zone) >= n_zones or int(target) >= _MOST_LISTED:
+                raise InputFileError(
+                    f"{path}: column '{name}' is beyond {n_zones} zones of at most {_MOST_LISTED} targets"
+                )
+            places[kind, int(zone), int(target)] = column
     if not any(kind == "mm" for kind, *_ in places):
         raise InputFileError(f"{path}: must have columns mm_0_0 … (zone, target), got {', '.join(header[:4])} …")
-    most = 1 + max(target for _, _, target in places)
+    most = 1 + max(k for _, _, k in places)
     out = {kind: np.full((len(lines) - 1, n_zones, most), np.nan) for kind in _TARGET_COLUMNS}
     for row, line in enumerate(lines[1:]):
         cells = line.split(",")
         if len(cells) != len(header):
             raise InputFileError(f"{path}: frame {row} has {len(cells)} cells, the header {len(header)}")
-        for (kind, zone, target), column in places.items():
-            out[kind][row, zone, target] = _cell(cells[column].strip(), path, row, header[column])
+        for (kind, place, k), column in places.items():
+            out[kind][row, place, k] = _cell(cells[column].strip(), path, row, header[column])
     has_status = any(kind == "status" for kind, *_ in places)
     listed = np.isin(out["status"], list(valid_status)) if has_status else np.isfinite(out["mm"])
     valid = listed & np.isfinite(out["mm"]) & (out["mm"] > 0)

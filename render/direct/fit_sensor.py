@@ -135,10 +135,11 @@ def fit_direct_sensor(
     p = start_parameters(base, objects, groups)
     responses, _ = fit_responses(model, p, plane)
     free = _free_parameters(p, objects)
-    if not any(one.frames.reference_shift_bins.any() for one in (plane, *objects)):
+    shifts = [one.frames.reference_shift_bins for one in objects] + [plane.frames.reference_shift_bins]
+    if not any(shift.any() for shift in shifts):
         free.remove("reference_gain")
     some = plane[np.arange(0, len(plane.frames), max(1, len(plane.frames) // _MOST_PLANES))]
-    recordings = [some, *objects]
+    recordings: list[PlaneRecording | ObjectRecording] = [some, *objects]
     jacobian = np.zeros((0, 0))
     cost = 1.0
     for _ in range(rounds):
@@ -254,7 +255,7 @@ def _fit_parameters(
     found = least_squares(at, p.values[where] / scales, jac=slope, loss="soft_l1", max_nfev=_EVALUATIONS)
     values = p.values.copy()
     values[where] = found.x * scales
-    return replace(p, values=values), found.jac, float(2 * found.cost / max(len(found.fun) - len(where), 1))
+    return replace(p, values=values), np.asarray(found.jac), float(2 * found.cost / max(len(found.fun) - len(where), 1))
 
 
 def _anchored(p: Parameters, zones: int) -> Parameters:
@@ -271,7 +272,7 @@ def _plane_ranges(model: FitModel, p: Parameters, responses: Responses, plane: P
     drift = p["reference_gain"] * plane.frames.reference_shift_bins
     cycles = 1e6 / max(p["inverse_cycles"], 1e-9)
     out = np.empty((n, zones))
-    x = responses.first + responses.step * np.arange(responses.cumulative.shape[1])
+    x = np.asarray(responses.first + responses.step * np.arange(responses.cumulative.shape[1]), dtype=np.float64)
     for zone in range(zones):
         width = model.histogram.bin_width_m * p[f"converter_{model.converters[zone]}"]
         lit = light[zone] != 0
@@ -287,9 +288,9 @@ def _plane_ranges(model: FitModel, p: Parameters, responses: Responses, plane: P
             edges = np.arange(low, high + 1)
             target = signal[low:high] / std
 
-            at = _Misfit(path / width, weight, drift[i], edges, x, responses.cumulative[zone], std, target)
+            misfit = _Misfit(path / width, weight, drift[i], edges, x, responses.cumulative[zone], std, target)
             middle = plane.distance_m[i]
-            out[i, zone] = minimize_scalar(at, bracket=(middle - 0.003, middle + 0.003), tol=1e-7).x
+            out[i, zone] = minimize_scalar(misfit.at, bracket=(middle - 0.003, middle + 0.003), tol=1e-7).x
     return out
 
 
@@ -305,11 +306,13 @@ class _Misfit(NamedTuple):
     std: NDArray[np.float64]
     target: NDArray[np.float64]
 
-    def __call__(self, distance: float) -> float:
-        at = self.edges[:, None] - distance * self.path_bins - self.drift
-        share = np.interp(at, self.delays, self.cumulative, left=0.0, right=1.0)
+    def at(self, distance: float, *_: object) -> float:
+        """Return the squared residual at a distance, metres."""
+        delay = self.edges[:, None] - distance * self.path_bins - self.drift
+        share = np.interp(delay, self.delays, self.cumulative, left=0.0, right=1.0)
         shape = np.diff(share @ self.weight, axis=0) / self.std
-        rest = (shape @ self.target) / max(shape @ shape, 1e-300) * shape - self.target
+        brightness = float(shape @ self.target) / max(float(shape @ shape), 1e-300)
+        rest = brightness * shape - self.target
         return float(rest @ rest)
 
 

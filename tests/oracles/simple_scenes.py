@@ -15,6 +15,7 @@ def block_on_table() -> trimesh.Trimesh:
     block = trimesh.creation.box(extents=(0.06, 0.09, 0.1), transform=_shift(0, 0, 0.05 + 1e-5))
     table = trimesh.creation.box(extents=(2.0, 2.0, 0.1), transform=_shift(0, 0, -0.05))
     scene = trimesh.util.concatenate([table, block])
+    assert isinstance(scene, trimesh.Trimesh)
     scene.face_attributes["part"] = np.repeat(np.array([0, 1], np.int8), 12)
     return scene
 

@@ -88,4 +88,4 @@ def histogram(
     lit = weight > 0
     centre = moment[lit] / weight[lit]
     share = 0.5 * (1 + erf((edges_m[:, None] - centre) / (np.sqrt(2) * irf_std_m)))
-    return np.diff(share, axis=0) @ weight[lit] / points**2
+    return np.asarray(np.diff(share, axis=0) @ weight[lit] / points**2)
