@@ -13,7 +13,7 @@ from oracles.simple_scenes import block_on_table, poses_around
 
 from phasemark.cli import main
 from phasemark.render import Sensor, preset
-from phasemark.render.direct.expected_counts import expected_counts
+from phasemark.render.direct.bin_counts import expected_counts
 from phasemark.render.direct.fit_sensor import zone_orders
 from phasemark.render.direct.footprints import footprint_grid
 from phasemark.render.direct.histogram_frames import capture_histograms

@@ -12,7 +12,7 @@ from phasemark.matcher.histograms.object_pose import POISSON, evidence_of, match
 from phasemark.matcher.histograms.scene_prediction import POSE_PARAMETERS, ObjectScene
 from phasemark.matcher.statistics import nees
 from phasemark.render import Sensor, preset
-from phasemark.render.direct.expected_counts import expected_counts, piled_up
+from phasemark.render.direct.bin_counts import expected_counts, piled_up
 from phasemark.render.direct.histogram_frames import HistogramFrames, capture_histograms
 
 FREE = ("x_m", "z_m", "yaw_rad")

@@ -102,12 +102,13 @@ def _plane(path: Path, sensor: str, nearest_m: float) -> tuple[Sensor, PlaneReco
     log = read_histograms(path, sensor=base)
     if log.distance_m is None:
         raise UsageError(f"{path} must state 'distance_m', the distance of the plane in each frame")
-    if log.frames.reference is not None and base.histogram.reference_peak is None:
-        peak = float(reference_centroid(log.frames.reference.sum(axis=1))[-1])
+    frames, distance_m = log.frames, log.distance_m
+    if frames.reference is not None and base.histogram.reference_peak is None:
+        peak = float(reference_centroid(frames.reference.sum(axis=1))[-1])
         base = base.with_(histogram={**base.histogram.model_dump(), "reference_peak": peak})
-        log = read_histograms(path, sensor=base)
-    far = np.flatnonzero(log.distance_m >= nearest_m)
-    return base, PlaneRecording(log.frames[far], log.distance_m[far])
+        frames = read_histograms(path, sensor=base).frames
+    far = np.flatnonzero(distance_m >= nearest_m)
+    return base, PlaneRecording(frames[far], distance_m[far])
 
 
 def _zone_orders(known: list[str] | None, base: Sensor) -> dict[str, float]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from phasemark import UsageError
-from phasemark.render.direct.expected_counts import bin_response, piled_up, signal_counts
+from phasemark.render.direct.bin_counts import bin_response, piled_up, signal_counts
 from phasemark.render.direct.fit_model import undo_pile_up
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
-    from phasemark.render.direct.expected_counts import expected_counts, piled_up, without_pile_up
+    from phasemark.render.direct.bin_counts import expected_counts, piled_up, without_pile_up
     from phasemark.render.direct.fit_sensor import DirectFit, fit_direct_sensor, score_zone_orders
     from phasemark.render.direct.footprints import footprint_grid
     from phasemark.render.direct.histogram_frames import HistogramFrames, capture_histograms, reference_centroid

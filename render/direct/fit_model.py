@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.render.direct.expected_counts import piled_up
+from phasemark.render.direct.bin_counts import piled_up
 from phasemark.render.direct.footprints import Footprints, footprint_grid, histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.recordings import ObjectRecording, PlaneRecording, turn_about, world2cam

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize_scalar
 
 from phasemark import UsageError
-from phasemark.render.direct.expected_counts import expected_counts
+from phasemark.render.direct.bin_counts import expected_counts
 from phasemark.render.direct.fit_model import (
     FitModel,
     Parameters,
