@@ -20,7 +20,16 @@ from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, 
 
 FIXED = ("distance_m", "delta_rad")
 WALL = Background(wall_m=4.0)
-NO_SEARCH = ("min_returns", "frames_at_once", "same_m", "same_rad", "largest_scale", "tolerated_sigma", "ambiguity")
+NO_SEARCH = (
+    "min_returns",
+    "frames_at_once",
+    "cache_bytes",
+    "same_m",
+    "same_rad",
+    "largest_scale",
+    "tolerated_sigma",
+    "ambiguity",
+)
 """What decides what is searched, or accepted, but not how."""
 
 
@@ -94,20 +103,30 @@ def _frames(setting: Setting, sensor: Sensor, rng: np.random.Generator) -> list[
     return parts
 
 
+_WITH_SLOPES = 2.2
+"""Time of a view with its slopes, over that of the view alone."""
+
+
 @contextmanager
-def _counted() -> Iterator[list[int]]:
+def _counted() -> Iterator[list[float]]:
     """Count the views that are rendered inside."""
-    counts, original = [0], Renderer.render_views
+    counts, plain, with_slopes = [0.0], Renderer.render_views, Renderer.render_with_slopes
 
     def counting(self: Renderer, views: Views, **options: Any) -> PhasorImages:
-        counts[0] += len(views.distance_m)
-        return original(self, views, **options)
+        counts[0] += len(views)
+        return plain(self, views, **options)
 
-    Renderer.render_views = counting  # type: ignore[method-assign]
+    def counting_slopes(
+        self: Renderer, views: Views, *parameters: Any, **options: Any
+    ) -> tuple[PhasorImages, NDArray[np.complex128]]:
+        counts[0] += _WITH_SLOPES * len(views)
+        return with_slopes(self, views, *parameters, **options)
+
+    Renderer.render_views, Renderer.render_with_slopes = counting, counting_slopes  # type: ignore[method-assign,assignment]
     try:
         yield counts
     finally:
-        Renderer.render_views = original  # type: ignore[method-assign]
+        Renderer.render_views, Renderer.render_with_slopes = plain, with_slopes  # type: ignore[method-assign]
 
 
 def _matched(bank: Any, setting: Setting, frames: list[FilteredFrames], search: SearchPolicy) -> tuple[Matches, float]:

@@ -95,7 +95,7 @@ def _room_for(n: int) -> Samples:
 
 def _room_for_borders(n: int, p: int) -> Borders:
     return Borders(
-        count=np.zeros(1, np.int64),
+        placed=np.zeros(1, np.int64),
         points=np.empty((n, 2)),
         weights=np.empty(n),
         regions=np.empty((n, 2), np.int32),
@@ -300,9 +300,9 @@ class Renderer:
 
         It takes two to three times as long as the images alone. Slopes agree with those of :meth:`jacobian` to some
         1e-5 of the largest on plane faces. Beside the limb of a curved mesh, whose shading normals are interpolated
-        between its corners, single pixels differ by one to three percent of it. An edge that lies exactly along a border
-        between pixels counts for neither of them. Open meshes, and views with pixels too full of edges to be split,
-        get differences of whole images.
+        between its corners, single pixels differ by one to three percent of it. An edge that lies exactly along a
+        border between pixels counts for neither of them. Open meshes, and views with pixels too full of edges to be
+        split, get differences of whole images.
 
         Parameters
         ----------
@@ -328,9 +328,9 @@ class Renderer:
         seen = views.in_camera(self.sensor)
         self._check(seen, background, workers)
         whole, p = (0, self.sensor.rows), len(parameters)
-        slope = np.zeros((len(views) * self.sensor.rows * self.sensor.cols, p), np.complex128)
-        images = self._render(seen, background, whole, workers, slope=slope, parameters=parameters)
-        slope = np.moveaxis(slope.reshape(len(views), self.sensor.rows, self.sensor.cols, p), 3, 1)
+        by_pixel = np.zeros((len(views) * self.sensor.rows * self.sensor.cols, p), np.complex128)
+        images = self._render(seen, background, whole, workers, slope=by_pixel, parameters=parameters)
+        slope = by_pixel.reshape(len(views), self.sensor.rows, self.sensor.cols, p).transpose(0, 3, 1, 2)
         unknown = np.isnan(slope).any(axis=(1, 2, 3)) | (not self.topology.closed)
         full = np.flatnonzero(unknown)
         if full.size:
@@ -434,7 +434,7 @@ class Renderer:
         )
         for task in tasks:
             poses, own = _poses(views[task], camera), _of_views(sums, task)
-            motion = _motion(views[task], camera, parameters)
+            motion = _motion(views[task], poses, camera, parameters)
             slopes = None
             if slope is not None:
                 slopes = SlopeSums(slope[_pixels_of(task, sums)], motion, own, turns)
@@ -579,9 +579,11 @@ def _poses(views: Views, camera: Camera) -> Poses:
     )
 
 
-def _motion(views: Views, camera: Camera, parameters: Sequence[str]) -> Motion:
+def _motion(views: Views, poses: Poses, camera: Camera, parameters: Sequence[str]) -> Motion:
     """Return the poses of views, and of each with one parameter after the other moved."""
     p = len(parameters)
+    if not p:
+        return Motion(poses, np.empty(0), np.empty((1, 4)))
     many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_PARAMETERS))
     for k, name in enumerate(parameters):
         getattr(many, name)[k + 1 :: 1 + p] += STEP

@@ -52,7 +52,7 @@ def some_poses(rng, n):
 
 
 def take(mounting, poses, rng, *, sensor=PMD, background=None, n_frames=50, light=True):
-    """Frames of a camera mounted so, labelled with the sensor as it is thought to be."""
+    """Frames of a camera mounted so, labelled with the sensor that the user assumes."""
     there = mounting.on(sensor).with_(bearing_offset_deg=0.0, height_offset_m=0.0)  # they are in the views
     views = Views(
         poses.distance_m, poses.delta_rad, poses.bearing_rad + mounting.bearing_rad, poses.height_m + mounting.height_m

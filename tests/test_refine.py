@@ -87,7 +87,7 @@ def test_a_noise_free_view_is_found_exactly_over_the_seam_and_at_the_quarter_tur
     assert match.class_name == "sphere"
     assert match.distance_m == pytest.approx(1.0234, abs=1e-4)  # a third of the bound of 50 frames
     error = math.remainder(match.delta_rad - math.radians(delta_deg), math.pi)
-    assert abs(error) < math.radians(0.1)  # likewise
+    assert abs(error) < math.radians(0.1)  # a third of the bound of 50 frames
     assert 0 <= match.delta_rad < math.pi
     assert match.chi2 < 2  # what interpolation leaves; noise would leave a hundred
 

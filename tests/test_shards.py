@@ -32,7 +32,7 @@ class Stop(Exception):
 
 
 def stop_after(items):
-    """A progress function that ends the run when so many items are done."""
+    """A progress function that ends the run when a number of items are done."""
 
     def progress(done, total):
         if done >= items:

@@ -54,7 +54,7 @@ _SEARCHED = 3
 _SEARCH_STD = np.array([-6.0, -5.0, -4.0, -3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0])
 """How far along each, standard deviations."""
 _SEARCH_MOST = 1.0
-"""Natural units that a standard deviation is taken for at most, lest nothing is in view any more."""
+"""Cap on a standard deviation that a search goes by (natural units); beyond it the landmark leaves the image."""
 _SEARCH_FROM, _SEARCH_SETTLED = 3, 0.03
 """From how many of these places it descends by slopes over standard deviations, and until steps promise so little."""
 _WIDTHS = (0.5, 1.0, 2.0)

@@ -96,7 +96,7 @@ def profile_of(radii_m: list[float], spacing_m: float) -> Revolution:
 
 
 def neighbours(upper: Upper, steps: int, lattice: Lattice) -> Iterator[Upper]:
-    """Yield the shapes one move of so many steps away: each dimension larger or smaller."""
+    """Yield the shapes one move away: each dimension larger or smaller by a number of steps."""
     move = lattice.metres(steps)
     for sign in (move, -move):
         if isinstance(upper, Revolution):

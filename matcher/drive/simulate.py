@@ -31,7 +31,7 @@ FREE = ("distance_m", "delta_rad", "bearing_rad")
 """The robot points the camera by its own wrong estimate, so the bearing is unknown too."""
 _BANK_STEP_M, _BANK_STEP_DEG, _BANK_MARGIN_M = 0.02, 2.0, 0.3
 _MOST_WAY = 1.5
-"""A robot that has driven so many times the length of its path has lost it."""
+"""A robot that has driven this many times the length of its path has lost it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -160,7 +160,7 @@ def assumed_std_m(range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.fl
 
 
 def noise_free(images: PhasorImages, n_frames: float, returned: NDArray[np.bool_] | None = None) -> FilteredFrames:
-    """Return what filtering so many frames would give if their noise had no effect: exact ranges, honest variances.
+    """Return what filtering frames would give if their noise had no effect: exact ranges, honest variances.
 
     Parameters
     ----------

@@ -92,6 +92,12 @@ class BankModel:
         picked = slope if order == [0, 1] else slope[:, order]
         return ModelImages(phasor, picked, shade[:, 0], shade[:, 1])
 
+    def first_images(
+        self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
+    ) -> ModelImages:
+        """Interpolate; nothing is kept."""
+        return self.images(class_index, view, free)
+
     def reach(
         self,
         class_index: NDArray[np.int64],
@@ -265,7 +271,7 @@ def _conclude(m, first, cubic, straight, behind, behind_intensity, phasor, slope
 
 @njit(cache=True, nogil=True, inline="always")
 def _straight_cell(t):  # type: ignore[no-untyped-def]
-    """Return the first of the two neighbours around t among those at −1, 0, 1, 2, counted from 0, and t's place there."""
+    """Return which of the neighbours at −1, 0, 1, 2 (counted from 0) is the last before t, and how far t is beyond."""
     k = min(max(int(np.floor(t)), -1), 1)
     return k + 1, t - k
 
@@ -304,9 +310,9 @@ def _interpolate(  # type: ignore[no-untyped-def]
                 _along_delta(one, one, one, one, once, never, lines_up[a])
         _along_distance(lines, wd, dwd, cubic)
         k, d = _straight_cell(td)
-        l, a = _straight_cell(ta)
+        kj, a = _straight_cell(ta)
         near, far = lower[cl, i0 + k], lower[cl, i0 + k + 1]
-        ja, jb = (j0 + l) % n_a, (j0 + l + 1) % n_a
+        ja, jb = (j0 + kj) % n_a, (j0 + kj + 1) % n_a
         _between(near[ja], near[jb], far[ja], far[jb], d, a, step_d, step_a, straight)
         if n_up:
             _along_distance(lines_up, wd, dwd, cubic_up)

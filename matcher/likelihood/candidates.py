@@ -119,7 +119,6 @@ def fit_surroundings(setup: Setup, scene: Scene, evidence: Evidence, which: NDAr
     ----------
     setup : Setup
     scene : Scene
-        With a scout.
     evidence : Evidence
     which : (k,) int64
         Frames.
@@ -128,7 +127,7 @@ def fit_surroundings(setup: Setup, scene: Scene, evidence: Evidence, which: NDAr
     """
     order = np.lexsort((fits.cost, fits.frame))
     likely = [k for k in order if fits.frame[k] in which and np.isfinite(fits.covariance[k]).all()]
-    around = _surrounded(fits[_most_likely(setup, fits, likely)])
+    around = _surrounded(setup, fits[_most_likely(setup, fits, likely)])
     close = _close_settings(setup, scene, evidence)
     cost = costs_at(scene.final, evidence, around.frame, around.class_index, around.view, close)
     order = np.lexsort((cost, around.frame))
@@ -178,10 +177,10 @@ def _most_likely(setup: Setup, fits: Fits, likely: list[int]) -> NDArray[np.int6
     return np.array(chosen, np.int64)
 
 
-def _surrounded(fits: Fits) -> Fits:
+def _surrounded(setup: Setup, fits: Fits) -> Fits:
     """Return fits two and four standard deviations away along the axes of the covariances of some."""
     p = fits.covariance.shape[1]
-    columns = np.arange(p)
+    columns = np.array([VIEW.index(name) for name in setup.free[:p]])
     values, vectors = np.linalg.eigh(np.where(np.isfinite(fits.covariance), fits.covariance, 0.0))
     axes = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     parts = []

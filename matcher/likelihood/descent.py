@@ -7,14 +7,21 @@ from numpy.typing import NDArray
 
 from phasemark.matcher.likelihood.problem import Problem, State, picked
 
+_FIRST_DAMPING = 1e-3
+_HOPELESS_DAMPING = 1e5
+_LAST_PROMISE = 100.0
+"""A step that was taken and promised less than this many times a settled cost was the last: the next would promise its
+square."""
+
 
 def descend(problem: Problem, state: State, settled: float) -> State:
     """Run Levenberg–Marquardt, each candidate with its own damping.
 
-    Close to the solution, slopes are those of the step before, until a step with them fails.
+    Where a step promises little, slopes that were rendered before serve again; when a step with them fails, they are
+    rendered anew.
     """
-    damping = np.full(len(state.theta), 1e-3)
-    old = np.zeros(len(state.theta), np.bool_)
+    damping = np.full(len(state.theta), _FIRST_DAMPING)
+    slopes_are_old = np.zeros(len(state.theta), np.bool_)
     active = np.arange(len(state.theta))
     for _ in range(problem.policy.max_iterations):
         sums = state.sums
@@ -28,27 +35,28 @@ def descend(problem: Problem, state: State, settled: float) -> State:
         theta[:, problem.columns] += step
         theta[:, :4] = problem.clipped(theta[:, :4])
         theta[:, 4] = np.maximum(theta[:, 4], 1e-3)
-        close = promise < problem.policy.kept_slopes_cost
-        stays = np.ones(len(active), np.bool_)
-        for which, with_slopes in ((np.flatnonzero(~close), True), (np.flatnonzero(close), False)):
+        promises_little = promise < problem.policy.kept_slopes_cost
+        goes_on = np.ones(len(active), np.bool_)
+        for which, with_slopes in ((np.flatnonzero(~promises_little), True), (np.flatnonzero(promises_little), False)):
             if not which.size:
                 continue
-            k = active[which]
-            slope = None if with_slopes else state.images.slope[k]
-            there = problem.some(k).state(theta[which], state.use[k], slope)
-            better = there.sums.cost <= state.sums.cost[k]
+            tried = active[which]
+            slope = None if with_slopes else state.images.slope[tried]
+            there = problem.some(tried).state(theta[which], state.use[tried], slope)
+            better = there.sums.cost <= state.sums.cost[tried]
+            goes_on[which] = (promise[which] > _LAST_PROMISE * settled) | ~better
+            damping[tried] = np.where(better, np.maximum(damping[tried] * 0.1, 1e-9), damping[tried] * 8)
+            failed_on_old = tried[~better & slopes_are_old[tried]]
             wins = np.flatnonzero(better)
-            # a step that was taken and promised little was the last: the next would promise its square
-            stays[which] = (promise[which] > 100 * settled) | ~better
-            lost = k[~better & old[k]]
-            damping[k] = np.where(better, np.maximum(damping[k] * 0.1, 1e-9), damping[k] * 8)
-            state.update(k[wins], picked(there, wins))
-            old[k[wins]] = not with_slopes
-            if lost.size:
-                again = problem.some(lost).state(state.theta[lost], state.use[lost])
-                state.update(lost, again)
-                old[lost], damping[lost] = False, 1e-3
-        active = active[stays & (damping[active] < 1e5)]
+            state.update(tried[wins], picked(there, wins))
+            slopes_are_old[tried[wins]] = not with_slopes
+            if failed_on_old.size:
+                state.update(
+                    failed_on_old,
+                    problem.some(failed_on_old).state(state.theta[failed_on_old], state.use[failed_on_old]),
+                )
+                slopes_are_old[failed_on_old], damping[failed_on_old] = False, _FIRST_DAMPING
+        active = active[goes_on & (damping[active] < _HOPELESS_DAMPING)]
     return state
 
 

@@ -26,7 +26,7 @@ class Fits:
         Factor on the landmark's brightness; 1 on ranges.
     cost : float64
         Whitened squared residual of all pixels that count, and
-        :data:`~phasemark.matcher.nearest.templates.DISAGREEMENT` for each pixel whose return or lack of it no view
+        :data:`~phasemark.matcher.pixel_agreement.DISAGREEMENT` for each pixel whose return or lack of it no view
         nearby explains.
     capped : float64
         The same with no residual adding more than that: what to compare with a scene that explains nothing.

@@ -44,6 +44,11 @@ class ImageModel(Protocol):
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Return the images of views (m, 4), columns :data:`VIEW`, of a class each."""
 
+    def first_images(
+        self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
+    ) -> ModelImages:
+        """Return the same where a search starts, at views that other frames may start from too."""
+
     def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
         """Return images of views that differ from those of `before` in δ alone, with the slopes of `before`."""
 

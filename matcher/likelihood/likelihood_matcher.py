@@ -33,7 +33,7 @@ from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
 from phasemark.matcher.nearest.bank_minima import Search
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts, pixel_mask
-from phasemark.render import Background, PhasorImages, background_image
+from phasemark.render import Background, PhasorImages, Views, background_image
 from phasemark.render.phasor_images import wrap_difference_m
 
 __all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "LikelihoodMatcher", "Pixels"]
@@ -95,6 +95,8 @@ class LikelihoodMatcher:
         self._auto = background == "auto"
         if self._auto or self._exact is None:
             self._check_distances()
+        if self._stated is not None and self._stated.floor_m is not None and "height_m" not in self._setup.free:
+            self._check_floor(self._stated.floor_m)
         final = self._exact or self._rendered
         self._scene = Scene(self._stated, behind, final, None if self._exact else self._scout, search, wide)
 
@@ -144,7 +146,7 @@ class LikelihoodMatcher:
     @cached_property
     def _rendered(self) -> RenderedModel:
         """What renders the landmarks of the bank, made when it is first needed."""
-        return RenderedModel(self._bank, self._stated)
+        return RenderedModel(self._bank, self._stated, self._setup.policy.cache_bytes)
 
     def _bank_models(self, behind: PhasorImages | None) -> tuple[BankModel | None, BankModel | None]:
         """Return the interpolated images that the answer is taken from, and those of a scout; None where unfit."""
@@ -168,6 +170,12 @@ class LikelihoodMatcher:
                 f" {step_m:g} m and {math.degrees(step_rad):.2g}°, and free"
                 " distance_m and delta_rad alone without a background"
             )
+
+    def _check_floor(self, floor_m: float) -> None:
+        """Check that the landmarks of the bank do not reach below a floor that was stated."""
+        view = Views.broadcast(float(self._bank.distance_m[-1])).in_camera(self._bank.sensor)
+        for c in range(len(self._setup.shapes.names)):
+            Background(floor_m=floor_m).check_behind(self._rendered.renderer(c).topology.vertices, view)
 
     def _search_stride(self) -> tuple[int, int]:
         """Return every how many distances and angles of the bank are searched."""

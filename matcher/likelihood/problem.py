@@ -138,7 +138,7 @@ class Problem:
         if at_first_sight and not self.with_albedo and not self.model.slopes_are_free:
             images = self._images_at_first_sight(theta)
         else:
-            images = self.model.images(self.class_index, view, free)
+            images = self.model.first_images(self.class_index, view, free)
         if self.with_albedo:
             theta[:, 4] = self._brightness(images)
         return self.summed(theta, self.pixels_at(images, theta), self.scaled(images, theta))
@@ -219,7 +219,7 @@ class Problem:
         return counts(phasor, images.intensity, self.evidence.sensor) & trusted
 
     def near_best(self, state: State, margin: float) -> NDArray[np.intp]:
-        """Return the candidates that may be their frame's best, up to some cost above it; with none the best alone."""
+        """Return the candidates that may be their frame's best, up to some cost above it; at 0 the best alone."""
         cost = state.sums.cost
         order = np.lexsort((cost, self.frame))
         first = order[np.flatnonzero(np.diff(self.frame[order], prepend=-1))]

@@ -55,7 +55,7 @@ def refine(
     give_up_above : (m,) float64, optional
         Stop where the cost promises to stay above this.
     rival : (m,) float64, optional
-        Cost of the best explanation of each candidate's frame that is known: what is not near it is not looked at closely.
+        Cost of the best explanation of each candidate's frame that is known; what is not near it is refined roughly.
     roughly : bool
         Whether to stop within a fraction of a standard deviation, with the pixels that counted at the start.
     at_first_sight : bool

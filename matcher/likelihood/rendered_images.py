@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.matcher.likelihood.images import VIEW, ModelImages
+from phasemark.matcher.likelihood.view_cache import ViewCache
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 
 STEP = 1e-5
@@ -27,13 +30,16 @@ class RenderedModel:
     bank : Bank
     background : Background, optional
         What stands behind the landmark.
+    cache_bytes : int
+        Room for images that other frames may start from too.
     """
 
     slopes_are_free = False
 
-    def __init__(self, bank: Bank, background: Background | None = None) -> None:
+    def __init__(self, bank: Bank, background: Background | None = None, cache_bytes: int = 0) -> None:
         self.sensor: Sensor = bank.sensor
         self.background = background
+        self.cache = ViewCache(cache_bytes)
         self._renderers = []
         self._factored = bank.lower is not None
         self._radius_m = 0.0
@@ -84,16 +90,36 @@ class RenderedModel:
             intensity[of] = image.intensity.reshape(len(of), -1)
             coverage[of] = image.coverage.reshape(len(of), -1)
             for k, name in enumerate(free):
-                _, first = self._changing_rows(name, view[of])
                 if slopes is not None and name in smooth:
-                    slope[of, k, first:] = slopes[:, smooth.index(name)].reshape(len(of), -1)[:, first:]
+                    slope[of, k] = slopes[:, smooth.index(name)].reshape(len(of), -1)
                     continue
                 moved = view[of]
                 moved[:, VIEW.index(name)] += STEP
                 width = (moved - view[of])[:, VIEW.index(name)]
                 there = self._render(c, moved).phasor.reshape(len(of), -1)
                 slope[of, k] = (there - phasor[of]) / width[:, None]
+        if self._factored and "delta_rad" in free:  # a body of revolution looks the same from every side
+            level, first = view[:, 3] == 0, self.sensor.lower_rows[0] * self.sensor.cols
+            slope[level, list(free).index("delta_rad"), :first] = 0
         return ModelImages(phasor, slope, intensity, coverage)
+
+    def first_images(
+        self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
+    ) -> ModelImages:
+        """Return images as :meth:`images` does, rendered only where no frame before has asked for them."""
+        keys = [(int(c), one.tobytes(), tuple(free), self.background) for c, one in zip(class_index, view, strict=True)]
+        place = {key: k for k, key in enumerate(keys)}  # of one that asks for it
+        found = {key: self.cache.get(key) for key in place}
+        missing = [k for key, k in place.items() if found[key] is None]
+        new = self.images(class_index[missing], np.ascontiguousarray(view[missing]), free)
+        for k, *arrays in zip(missing, new.phasor, new.slope, new.intensity, new.coverage, strict=True):
+            own = tuple(values.copy() for values in arrays)  # no view of the whole batch, which would stay too
+            found[keys[k]] = own
+            self.cache.put(keys[k], own)
+        rows = [row for row in map(found.get, keys) if row is not None]
+        if not rows:
+            return new
+        return ModelImages(*(np.stack([cast(Any, row[part]) for row in rows]) for part in range(4)))
 
     def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
         """Render the rows that δ changes."""
@@ -167,10 +193,54 @@ class RenderedModel:
     def _render_with_slopes(
         self, class_index: int, view: NDArray[np.float64], free: Sequence[str]
     ) -> tuple[PhasorImages, NDArray[np.complex128]]:
-        return self._renderers[class_index].render_with_slopes(
-            Views(*np.ascontiguousarray(view.T)), free, background=self.background
-        )
+        renderer, parts, slopes = self._renderers[class_index], [], []
+        for which, background in self._backgrounds_of(class_index, view):
+            views = Views(*np.ascontiguousarray(view[which].T))
+            image, slope = renderer.render_with_slopes(views, free, background=background)
+            parts.append((which, image))
+            slopes.append(slope)
+        order = np.argsort(np.concatenate([which for which, _ in parts]), kind="stable")
+        return _joined(parts), np.concatenate(slopes)[order]
 
     def _render(self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None) -> PhasorImages:
-        renderer = self._renderers[class_index]
-        return renderer.render_views(Views(*np.ascontiguousarray(view.T)), background=self.background, rows=rows)
+        renderer, parts = self._renderers[class_index], []
+        for which, background in self._backgrounds_of(class_index, view):
+            views = Views(*np.ascontiguousarray(view[which].T))
+            parts.append((which, renderer.render_views(views, background=background, rows=rows)))
+        return _joined(parts)
+
+    def _backgrounds_of(
+        self, class_index: int, view: NDArray[np.float64]
+    ) -> list[tuple[NDArray[np.intp], Background | None]]:
+        """Return groups of views with the background of each.
+
+        A floor is lowered to where the landmark ends: floors are estimated, and heights are tried.
+        """
+        everything = np.arange(len(view))
+        if self.background is None or self.background.floor_m is None:
+            return [(everything, self.background)]
+        lowest_m = float(self._renderers[class_index].topology.vertices[:, 2].min())
+        height_m = Views(*np.ascontiguousarray(view.T)).in_camera(self.sensor).height_m
+        floor_m = np.maximum(self.background.floor_m, -(lowest_m + height_m))
+        return [
+            (np.flatnonzero(floor_m == own), replace(self.background, floor_m=float(own))) for own in np.unique(floor_m)
+        ] or [(everything, self.background)]
+
+
+def _joined(parts: list[tuple[NDArray[np.intp], PhasorImages]]) -> PhasorImages:
+    """Return images of groups of views in the order of the views."""
+    if len(parts) == 1:
+        return parts[0][1]
+    order = np.argsort(np.concatenate([which for which, _ in parts]), kind="stable")
+    images = [image for _, image in parts]
+
+    def of(name: str) -> Any:
+        return np.concatenate([getattr(image, name) for image in images])[order]
+
+    return PhasorImages(
+        phasor=of("phasor"),
+        intensity=of("intensity"),
+        coverage=of("coverage"),
+        sensor=images[0].sensor,
+        views=Views(*(np.concatenate([getattr(image.views, name) for image in images])[order] for name in VIEW)),
+    )

@@ -102,7 +102,7 @@ class Sums:
     cost : (m,) float64
         Whitened squared residual; with a robust loss twice that loss.
     capped : (m,) float64
-        The same with no residual adding more than :data:`~phasemark.matcher.nearest.templates.DISAGREEMENT`, what one
+        The same with no residual adding more than :data:`~phasemark.matcher.pixel_agreement.DISAGREEMENT`, what one
         costs that nothing explains.
     gradient : (m, p) float64
         Jᵀ W r.

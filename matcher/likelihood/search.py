@@ -38,8 +38,11 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     policy = setup.policy
     n_modes = policy.modes if scene.background is None else policy.modes_before_background
     sides = () if scene.background is None else policy.beside_rad
+    # 1  minima of the bank
     starts = scene.search.starts(seen[which], n_modes, all_classes=evidence.on == "phasors")
+    # 2 to 4  refined on interpolated and on rendered images; other classes
     fits = fit_starts(setup, scene, evidence, which, starts, sides)
+    # 5  doubt: from elsewhere, without what fits worst, and from what looks alike
     fits = _retry_unexplained(setup, scene, evidence, seen, bare, fits)
     if setup.huber is not None and not setup.unknown:
         fits = _retry_trimmed(setup, scene, evidence, seen, bare, fits)
@@ -69,13 +72,15 @@ def _unexplained(
     bare: NDArray[np.float64],
     fits: Fits,
     *,
-    hopeless: bool = False,
+    even_beyond_bare: bool = False,
     p: float | None = None,
+    among: NDArray[np.int64] | None = None,
 ) -> NDArray[np.int64]:
     """Return the frames whose best fit is worse than good ones are, but not beyond hope.
 
     On ranges, that is where it costs more than returns that nothing explains; before a known background every fit may
-    be a side peak. `p` is the share of good frames whose fits are as bad, if not the policy's.
+    be a side peak. `p` is the share of good frames whose fits are as bad, if not the policy's; `among` are the frames
+    that are asked about, if not all.
     """
     best = best_of_frame(fits)
     side_peaks = evidence.on == "phasors" or scene.background is not None
@@ -83,46 +88,77 @@ def _unexplained(
         p = setup.policy.doubtful_p if side_peaks else setup.policy.hopeless_p
     limit = special.chdtri(np.maximum(fits.dof[best], 1), p)
     cost, frame = fits.tested[best], fits.frame[best]
-    certain = evidence.on == "phasors" or setup.background_is_known or hopeless
-    hope = True if certain else cost < bare[frame]
-    return np.asarray(frame[(cost > limit) & hope])
+    bare_cost_decides = not (evidence.on == "phasors" or setup.background_is_known or even_beyond_bare)
+    hope = cost < bare[frame] if bare_cost_decides else True
+    asked = True if among is None else np.isin(frame, among)
+    return np.asarray(frame[(cost > limit) & hope & asked])
 
 
 def _retry_unexplained(
     setup: Setup, scene: Scene, evidence: Evidence, seen: Observation, bare: NDArray[np.float64], fits: Fits
 ) -> Fits:
     """Search again, from many more places, where nothing fits."""
-    policy = setup.policy
     poor = _unexplained(setup, scene, evidence, bare, fits)
     if not poor.size:
         return fits
-    n_modes = policy.modes if scene.background is None else policy.modes_before_background
-    all_classes = evidence.on == "phasors"
-    direct = replace(scene, scout=None)
-    parts = [fits]
-    if setup.prior_std:
-        # a scout knows no bearing: turn its best views, heading kept, and look at shifted images
-        parts.append(_fit_turned(setup, direct, evidence, poor, fits))
-        poor = _unexplained(setup, scene, evidence, bare, Fits.joined(parts))
-        if poor.size:
-            starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=all_classes)
-            parts.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
-        return Fits.joined(parts)
+    retry = _retry_with_prior if setup.prior_std else _retry_without_prior
+    return Fits.joined([fits, *retry(setup, scene, evidence, seen, bare, fits, poor)])
+
+
+def _retry_with_prior(
+    setup: Setup,
+    scene: Scene,
+    evidence: Evidence,
+    seen: Observation,
+    bare: NDArray[np.float64],
+    fits: Fits,
+    poor: NDArray[np.int64],
+) -> list[Fits]:
+    """Turn the best views of poor frames, heading kept, for a scout knows no bearing; then look at shifted images."""
+    policy, direct = setup.policy, replace(scene, scout=None)
+    found = [_fit_turned(setup, direct, evidence, poor, fits)]
+    poor = _unexplained(setup, scene, evidence, bare, Fits.joined([fits, *found]))
+    if poor.size:
+        n_modes = policy.modes if scene.background is None else policy.modes_before_background
+        starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=evidence.on == "phasors")
+        found.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
+    return found
+
+
+def _retry_without_prior(
+    setup: Setup,
+    scene: Scene,
+    evidence: Evidence,
+    seen: Observation,
+    bare: NDArray[np.float64],
+    fits: Fits,
+    poor: NDArray[np.int64],
+) -> list[Fits]:
+    """Search poor frames from more minima and angles; what would still be refused, around its best fits and anew."""
+    policy, all_classes = setup.policy, evidence.on == "phasors"
+
+    def refused(found: list[Fits]) -> NDArray[np.int64]:
+        return _unexplained(setup, scene, evidence, bare, Fits.joined([fits, *found]), p=policy.refused_p, among=poor)
+
     starts = scene.wide_search.starts(seen[poor], policy.modes_again, all_classes=all_classes)
-    parts.append(fit_starts(setup, scene, evidence, poor, starts, policy.beside_again_rad, patient=True))
-    poor = _unexplained(setup, scene, evidence, bare, Fits.joined(parts), p=policy.refused_p)
-    if poor.size and (scene.scout is not None or scene.background is not None):
-        parts.append(fit_surroundings(setup, scene, evidence, poor, Fits.joined(parts)))
-        poor = _unexplained(setup, scene, evidence, bare, Fits.joined(parts), p=policy.refused_p)
-    if poor.size and scene.scout is not None:
+    found = [fit_starts(setup, scene, evidence, poor, starts, policy.beside_again_rad, patient=True)]
+    again = refused(found)
+    if again.size and (scene.scout is not None or scene.background is not None):
+        found.append(fit_surroundings(setup, scene, evidence, again, Fits.joined([fits, *found])))
+        again = refused(found)
+    if not again.size:
+        return found
+    if scene.scout is not None:
         # too little may be smooth for the scout to see the way
-        starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=all_classes)
-        parts.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
-    elif poor.size and scene.background is not None:
+        n_modes = policy.modes if scene.background is None else policy.modes_before_background
+        starts = scene.wide_search.starts(seen[again], n_modes, all_classes=all_classes)
+    elif scene.background is not None:
         # edges between columns before a bright wall: no pixel may decide alone where the search starts
-        starts = scene.wide_search.capped().starts(seen[poor], policy.modes_again, all_classes=True)
-        parts.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
-    return Fits.joined(parts)
+        starts = scene.wide_search.capped().starts(seen[again], policy.modes_again, all_classes=True)
+    else:
+        return found
+    found.append(fit_starts(setup, replace(scene, scout=None), evidence, again, starts, policy.beside_rad))
+    return found
 
 
 def _fit_turned(setup: Setup, scene: Scene, evidence: Evidence, which: NDArray[np.int64], fits: Fits) -> Fits:
@@ -152,7 +188,7 @@ def _retry_trimmed(
     n_modes = policy.modes if scene.background is None else policy.modes_before_background
     sides = () if scene.background is None else policy.beside_rad
     for _ in range(policy.trimmings):
-        poor = _unexplained(setup, scene, evidence, bare, fits, hopeless=True)
+        poor = _unexplained(setup, scene, evidence, bare, fits, even_beyond_bare=True)
         if not poor.size:
             break
         kept = _trimmed(setup, scene, evidence, fits, poor, seen)

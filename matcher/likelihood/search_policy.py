@@ -19,7 +19,7 @@ def _degrees(*angles: float) -> tuple[float, ...]:
     return tuple(math.radians(angle) for angle in angles)
 
 
-_MAY_BE_ZERO = ("settling_rounds", "trimmings", "registrations", "background_rounds")
+_MAY_BE_ZERO = ("cache_bytes", "settling_rounds", "trimmings", "registrations", "background_rounds")
 _PROBABILITIES = ("doubtful_p", "hopeless_p", "refused_p", "ambiguity")
 
 
@@ -36,6 +36,8 @@ class SearchPolicy:
         Returns that a frame needs to be searched at all.
     frames_at_once : int
         Frames that are matched together; memory grows with it.
+    cache_bytes : int
+        Room for rendered images that other frames may start from too; frames taken at one place do. 0 keeps none.
     fine_grid, coarse_grid : (float, float)
         Widest steps of a bank, metres and radians, on which interpolated images are at the bound, and on which they
         lead to the solution.
@@ -57,9 +59,10 @@ class SearchPolicy:
         Longest step in natural units: of a descent, of one that starts where a scout ended, and of one whose scout did
         not know the bearing. Near a solution it is short: where an edge crosses a pixel's border, slopes jump.
     settled_cost, rough_cost : float
-        A step that promises to lower the cost by less is not taken; the second for first comparisons of minima.
+        A step that promises to lower the cost by less is not taken, and one that promised less than a hundred times as
+        much was the last; the second for first comparisons of minima.
     kept_slopes_cost : float
-        Where a step promises less than this, the slopes of the step before serve again.
+        Where a step promises less than this, slopes rendered before serve again, until a step with them fails.
     optimism : float
         A descent gives up where even this many times the promised decrease would not save it.
     first_sight_cost : float
@@ -97,8 +100,7 @@ class SearchPolicy:
         p-values at which the search is repeated more widely: where the likelihood has side peaks, and where
         it is smooth.
     refused_p : float
-        p-value at which, where there are side peaks, it goes on around the best fits and from minima of the bank without
-        a scout.
+        p-value at which a repeated search goes on around the best fits, and from minima of the bank without a scout.
     trimmings : int
         How often a robust search starts again without the returns that fit worst.
     odd_ratio, odd_sigma : float
@@ -147,6 +149,7 @@ class SearchPolicy:
 
     min_returns: int = MIN_RETURNS
     frames_at_once: int = 256
+    cache_bytes: int = 1 << 26
     fine_grid: tuple[float, float] = (0.011, math.radians(1.1))
     coarse_grid: tuple[float, float] = (0.022, math.radians(2.2))
 

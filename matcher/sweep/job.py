@@ -64,7 +64,7 @@ _SHARED_FIELDS: tuple[tuple[str, tuple[int, ...], str, str], ...] = (
     ("confusion", (), "<f8", "bound on the probability of a wrong class; NaN where it was not computed"),
 )
 _CONFUSION_TRIALS = 4
-"""For so many views of a condition, which hardly differ, the bound on class confusion is computed."""
+"""Views of a condition, which hardly differ, for which the bound on class confusion is computed."""
 _WIGGLES = (3, 5, 7)
 _RENDERERS_KEPT = 16
 _TERMINATED = 128 + signal.SIGTERM

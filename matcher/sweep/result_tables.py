@@ -29,7 +29,7 @@ LEVELS = (0.5, 0.9, 0.95, 0.99)
 """Probabilities of the ellipsoids whose coverage is counted."""
 _ROWS_AT_ONCE = 5000
 _HONEST_SIGMA = 5.0
-"""An error within so many standard deviations of the bound is no outlier, however large it is."""
+"""An error within this many standard deviations of the bound is no outlier, however large it is."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,12 +116,12 @@ class Edges(NamedTuple):
 class Borders(NamedTuple):
     """Points on the edges inside pixels, where the light of a pixel changes as the edges move; room for m.
 
-    An integral over a pixel changes with a parameter by what the light changes at fixed points of the image, and by what
-    the edges sweep: ∫ (f_left − f_right) ẋ ds along each (Leibniz's rule).
+    An integral over a pixel changes with a parameter by what the light changes at fixed points of the image, and by
+    what the edges sweep: ∫ (f_left − f_right) ẋ ds along each (Leibniz's rule).
 
     Parameters
     ----------
-    count : (1,) int64
+    placed : (1,) int64
         Points placed; beyond m: there was not room for all.
     points : (m, 2) float64
         u, v.
@@ -143,7 +143,7 @@ class Borders(NamedTuple):
         How fast the edge moves along x, pixels per unit of each parameter.
     """
 
-    count: NDArray[np.int64]
+    placed: NDArray[np.int64]
     points: NDArray[np.float64]
     weights: NDArray[np.float64]
     regions: NDArray[np.int32]

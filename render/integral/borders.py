@@ -1,5 +1,7 @@
 """Points on the edges inside pixels, where the light of a pixel changes as the edges move.
 
+Left of an edge is the side of smaller x, right that of larger x, x being the coordinate across the sweep.
+
 The sweep knows which intervals lie on both sides of an edge; their samples tell later which faces are seen there. What
 becomes of the points stands in :mod:`~phasemark.render.integral.edge_motion` and
 :mod:`~phasemark.render.integral.swept_light`.
@@ -12,7 +14,7 @@ from phasemark.render.integral.quadrature_rules import G2W, G2X, G3W, G3X
 from phasemark.render.kernel import inlined, kernel
 
 _THIN = 1e-4
-"""Strips thinner than this (pixels) say nothing of what is seen beside an edge; the edge lies along the sweep's lines."""
+"""An edge that crosses a strip thinner than this (pixels) runs nearly along x: :func:`_place_level` handles it."""
 _SHORT, _LONG = 0.1, 0.5
 """Pieces of an edge up to the first (pixels) get one point, up to the second two, longer ones three."""
 
@@ -64,8 +66,8 @@ def _node(nodes, g):  # type: ignore[no-untyped-def]
 @inlined
 def _append(x, s, weight, left, right, link, sweep_v, scale, scratch, borders):  # type: ignore[no-untyped-def]
     """Append one point; `sweep_v` says that s is v, the coordinate along which the weight is a length."""
-    n = borders.count[0]
-    borders.count[0] = n + 1
+    n = borders.placed[0]
+    borders.placed[0] = n + 1
     if n >= len(borders.weights):
         return
     borders.points[n, 0] = x if sweep_v else s
@@ -107,7 +109,7 @@ def _place_level(strip, box, scratch, borders):  # type: ignore[no-untyped-def]
             if left >= 0 and right >= 0:
                 for g in range(3):
                     x = begin + G3X[g] * (until - begin)
-                    n = borders.count[0]
+                    n = borders.placed[0]
                     _append(
                         0.5 * (edges[e, 0] + edges[e, 2]), x, G3W[g] * (until - begin), left, right, e,
                         not box.sweep_v, box.scale, scratch, borders,

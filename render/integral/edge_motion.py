@@ -1,4 +1,8 @@
-"""How fast edges move through the image while a parameter of the view changes."""
+"""How fast edges move through the image while a parameter of the view changes.
+
+An edge is one of the mesh, held: at a limb, the fold that makes it does not change. Its speed is that of its place x
+on a line of fixed s, not along its normal.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,7 @@ def follow_borders(view, first, mesh, motion, background, camera, edges, borders
     moved, step, shifted = motion.poses, motion.step, motion.segments
     p = len(step)
     depth_a, depth_b, last = 0.0, 0.0, -1
-    for b in range(first, min(borders.count[0], len(borders.weights))):
+    for b in range(first, min(borders.placed[0], len(borders.weights))):
         e = borders.segment[b]
         start, end = edges.ends[e, 0], edges.ends[e, 1]
         if e != last:

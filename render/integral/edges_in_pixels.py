@@ -79,9 +79,9 @@ def clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
 def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore[no-untyped-def]
     """Clip a pixel's segments to a box, into ``scratch.edges``.
 
-    Its rows are s, x of both ends (s rising), the limb's side, the slope and the segment, sorted by where they begin. The
-    side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number, or
-    −1 if there are too many.
+    Its rows are s, x of both ends (s rising), the limb's side, the slope and the segment, sorted by where they begin.
+    The side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number,
+    or −1 if there are too many.
     """
     segments, limb, link, owner = edges.segments, edges.limb, edges.link, edges.owner
     clipped, order = scratch.clipped, scratch.order
@@ -98,10 +98,10 @@ def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore
             return -1
         if sweep_v:
             sa, xa, sb, xb = va + lo * dv, ua + lo * du, va + hi * dv, ua + hi * du
-            side = 1.0 if dv > 0 else -1.0
+            side = 1.0 if dv >= 0 else -1.0
         else:
             sa, xa, sb, xb = ua + lo * du, va + lo * dv, ua + hi * du, va + hi * dv
-            side = -1.0 if du > 0 else 1.0
+            side = -1.0 if du >= 0 else 1.0
         if sa <= sb:
             clipped[m, 0], clipped[m, 1], clipped[m, 2], clipped[m, 3] = sa, xa, sb, xb
         else:

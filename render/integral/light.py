@@ -108,7 +108,7 @@ def _add_phasor(index, distance, reflected, length, weight, light, sums):  # typ
 
 @inlined
 def phasor_of(distance, reflected, length, light):  # type: ignore[no-untyped-def]
-    """Return the light of one hit at the modulation frequency; arguments as :func:`_add_phasor` takes them."""
+    """Return the light of one hit at the modulation frequency; `reflected` is ρ cos θ, `length` that of (1, y, z)."""
     a = reflected / (distance * distance)
     if light.vignetting:
         a /= length * length * length * length

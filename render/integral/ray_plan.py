@@ -52,7 +52,7 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
     segments, limb, head = edges.segments, edges.limb, edges.head
     rows, cols = camera.stop_row - camera.first_row, camera.cols
     n, region, n_borders, room = 0, 0, 0, len(borders.weights)
-    borders.count[0] = 0
+    borders.placed[0] = 0
     for view in range(first, len(poses.lens)):
         n_edges = project_edges(mesh, poses, view, camera, edges)
         u_low, u_high, v_low, v_high = _extent(edges, n_edges, False)
@@ -77,16 +77,16 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
                 n, region, trusted = sample_pixel(
                     r, c, bent, splits, camera, edges, scratch, samples, borders, n, region
                 )
-                if n < 0 or borders.count[0] > room:
-                    borders.count[0] = first_border
+                if n < 0 or borders.placed[0] > room:
+                    borders.placed[0] = first_border
                     return view, start
                 state[view, row, c] = SPLIT if trusted else UNTRUSTED
                 index = (view * rows + row) * cols + c
                 for k in range(before, n):
                     samples.pixel[k] = index
-                for b in range(n_borders, borders.count[0]):
+                for b in range(n_borders, borders.placed[0]):
                     borders.pixel[b] = index
-                n_borders = borders.count[0]
+                n_borders = borders.placed[0]
         if room > 0:
             follow_borders(view, first_border, mesh, motion, background, camera, edges, borders)
     return len(poses.lens), n

@@ -1,7 +1,8 @@
 """How the phasors of a batch change with the view, from the samples and edges that its images are made of.
 
-∂S/∂p = Σ weights · ∂f/∂p at the samples, the faces they see held, + ∫ (f_left − f_right) ẋ ds along the edges. Both ẋ and
-∂f/∂p are differences over a step of 3e-8 that no edge and no sample notices: nothing is sampled or cast again.
+∂S/∂p = Σ weights · ∂f/∂p at the samples, the faces they see held, + ∫ (f_left − f_right) ẋ ds along the edges. ∂f/∂p is
+taken at fixed points of the image. Both ẋ and ∂f/∂p are differences over a step of 3e-8 that no edge and no sample
+notices: nothing is sampled or cast again.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class SlopeSums:
         camera: Camera,
         light: Light,
     ) -> None:
-        """Add n samples and the points on edges of some of the views, the first and the one after the last."""
+        """Add n samples and the points on edges of some of the views, (first, one past the last)."""
         first_order = light._replace(orders=light.orders[:1])
         per_view = self._own.state[0].size
         pixels = slice(views[0] * per_view, views[1] * per_view)

@@ -41,19 +41,19 @@ def sum_borders(n, samples, first_of, mesh, poses, camera, light, borders, slope
             count = region + 1
     first_of[count] = n
     pixels_per_view = (camera.stop_row - camera.first_row) * camera.cols
-    for b in range(borders.count[0]):
+    for b in range(borders.placed[0]):
         index = borders.pixel[b]
         view = index // pixels_per_view
         y, z = ray_of(camera, borders.points[b, 0], borders.points[b, 1])
-        near, left = _light_beside(b, 0, y, z, view, samples, first_of, mesh, poses, camera, light, borders)
-        far, right = _light_beside(b, 1, y, z, view, samples, first_of, mesh, poses, camera, light, borders)
+        depth_left, left = _light_beside(b, 0, y, z, view, samples, first_of, mesh, poses, camera, light, borders)
+        depth_right, right = _light_beside(b, 1, y, z, view, samples, first_of, mesh, poses, camera, light, borders)
         limit, side = borders.depth[b] * (1.0 - _SAME_DEPTH), borders.side[b]
-        if side > 0.0:  # at a limb its own surface shines no longer; hidden, it changes nothing
-            jump = left if near > limit else 0j
+        if side > 0.0:  # at a limb cos θ of its own surface is 0, and so is its light; hidden, it changes nothing
+            jump = left if depth_left > limit else 0j
         elif side < 0.0:
-            jump = -right if far > limit else 0j
+            jump = -right if depth_right > limit else 0j
         else:
-            jump = left - right if near > limit or far > limit else 0j
+            jump = left - right if depth_left > limit or depth_right > limit else 0j
         for k in range(slope.shape[1]):
             slope[index, k] += borders.weights[b] * borders.rates[b, k] * jump
 

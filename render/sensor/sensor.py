@@ -100,7 +100,7 @@ class Sensor(SensorQuantities):
     blur_share, blur_px : float
         Stray light near its pixel: share of the light that goes there, and the standard deviation of a Gaussian.
     veil_share, veil_px : float
-        Stray light far from its pixel, likewise.
+        Stray light far from its pixel: the same two numbers.
     dead_share, hot_share : float
         Expected share of dead and hot pixels, drawn by `unit_seed`.
     dead_pixels, hot_pixels : tuple of (row, col)

@@ -18,7 +18,7 @@ from phasemark.render.sensor.sensor import Sensor
 
 PIXEL_STD_ERROR = 0.25
 FEWEST_FRAMES = math.ceil(1 + 1 / (2 * PIXEL_STD_ERROR**2))
-"""Frames at each distance that a fit needs: so many tell the noise of one pixel to 25 %."""
+"""Frames at each distance that a fit needs: they tell the noise of one pixel to 25 %."""
 DEAD_SHARE = 0.5  # a pixel that is valid in fewer frames, at every distance, is called dead
 _USED_SHARE = 0.9  # a pixel that drops out more often is a selection of its own noise, and left out
 _BOARD_SHARE = 0.75  # a distance at which fewer of the living pixels can be used is left out
