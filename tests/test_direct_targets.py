@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from phasemark import UsageError
 from phasemark.cli import main
+from phasemark.data import BankPlan
 from phasemark.render import Sensor, preset
 from phasemark.render.direct.histogram_frames import HistogramFrames, capture_histograms
 from phasemark.render.direct.targets import Status, find_targets
@@ -218,3 +219,10 @@ def test_what_sensor_show_prints_of_a_direct_sensor_is_its_file_again(
     assert Sensor.from_toml(path) == preset(name)
     path.write_text(sensor_toml(preset(name), {}, header=(), otherwise="stated"), encoding="utf-8")
     assert Sensor.from_toml(path) == preset(name)
+
+
+def test_a_resolved_plan_without_histograms_needs_no_sensor_file() -> None:
+    stated = preset("pmd-16x16").model_dump(mode="json")
+    assert BankPlan(sensor="gone.toml", sensor_overrides=stated).build_sensor() == preset("pmd-16x16")
+    old = preset("vl53l5cx-8x8").with_(histogram=None)  # as banks of it were before it had a table
+    assert BankPlan(sensor="vl53l5cx-8x8", sensor_overrides=old.model_dump(mode="json")).build_sensor() == old
