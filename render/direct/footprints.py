@@ -32,6 +32,7 @@ _LEAST_BLUR = 0.35
 """Borders that do not lie on cell borders are softened by this share of a cell."""
 
 _ALIGNED = 1e-9
+_AREA_POINTS = 96
 
 
 class Footprints(NamedTuple):
@@ -152,18 +153,10 @@ def footprint_grid(sensor: Sensor, margin_cells: int = 0, cells: int | None = No
     )
 
 
-def footprint_areas(zones: Footprints, points: int = 96) -> NDArray[np.float64]:
+def footprint_areas(zones: Footprints) -> NDArray[np.float64]:
     """Return the weight of each zone's footprint over its tangents, by a fine midpoint rule; (zones,)."""
     areas = np.empty(len(zones.centre))
-    for k, (centre, half) in enumerate(zip(zones.centre, zones.half, strict=True)):
-        profiles = []
-        for axis in range(2):
-            reach = half[axis] + _REACH * zones.blur[axis]
-            x = ((np.arange(points) + 0.5) / points * 2 - 1) * reach
-            value = np.array([border_profile(t, half[axis], zones.blur[axis]) for t in x])
-            glow = np.exp(-0.5 * zones.light[2] * (x + centre[axis] - zones.light[axis]) ** 2)
-            profiles.append(float((value * glow).sum() * 2 * reach / points))
-        areas[k] = profiles[0] * profiles[1]
+    _fill_areas(zones, areas)
     return areas
 
 
@@ -186,3 +179,18 @@ def footprint_weight(zones, k, y, z):  # type: ignore[no-untyped-def]
         ly, lz = y - zones.light[0], z - zones.light[1]
         weight *= math.exp(-0.5 * zones.light[2] * (ly * ly + lz * lz))
     return weight
+
+
+@kernel
+def _fill_areas(zones, areas):  # type: ignore[no-untyped-def]
+    """Fill the areas of all footprints: the profiles along y and z are independent, and so is the light."""
+    for k in range(len(areas)):
+        areas[k] = 1.0
+        for axis in range(2):
+            half, blur, centre = zones.half[k, axis], zones.blur[axis], zones.centre[k, axis] - zones.light[axis]
+            reach = half + _REACH * blur
+            total = 0.0
+            for j in range(_AREA_POINTS):
+                x = ((j + 0.5) / _AREA_POINTS * 2.0 - 1.0) * reach
+                total += border_profile(x, half, blur) * math.exp(-0.5 * zones.light[2] * (x + centre) ** 2)
+            areas[k] *= total * 2.0 * reach / _AREA_POINTS
