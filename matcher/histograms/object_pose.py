@@ -20,7 +20,8 @@ from phasemark.matcher.histograms.scene_prediction import POSE_PARAMETERS, Linea
 from phasemark.render.direct.histogram_frames import HistogramFrames
 
 _MOST_STEPS = 12
-_DONE = 1e-3  # of a standard deviation
+_DONE = 1e-2  # of a standard deviation: what is left of a search that converges quadratically is far less
+_LEAST_SHRINK = 0.05
 _MOST_SUPPORT = 20.0
 _LARGEST_STEP = {"m": 0.02, "rad": 0.15}
 _WEAK = 1e-10  # eigenvalue of the scaled information below which a direction is not observable
@@ -266,9 +267,12 @@ def match_jointly(
     while steps < _MOST_STEPS:
         steps += 1
         step, covariance = solve_jointly(here, limits)
+        std = np.sqrt(np.diag(covariance))
+        if (np.abs(step) <= _DONE * np.where(np.isfinite(std), std, np.inf)).all():
+            break
         step = step / max(1.0, float((np.abs(step) / limits).max()))
         shrink, better = 1.0, None
-        while shrink > 0.05:
+        while shrink > _LEAST_SHRINK:
             values, ratio = stepped(step, shrink)
             there = look(values, ratio)
             if there.chi2.sum() <= here.chi2.sum():
@@ -278,9 +282,6 @@ def match_jointly(
         if better is None:
             break
         move, support, here = better
-        std = np.sqrt(np.diag(covariance))
-        if (np.abs(step) * shrink <= _DONE * np.where(np.isfinite(std), std, np.inf)).all():
-            break
     _, covariance = solve_jointly(here, limits, robust=model_error != POISSON)
     common = {"m": systematic[0], "rad": systematic[1]}
     covariance = covariance + np.diag([common.get(name.rpartition("_")[2], 0.0) ** 2 for name in free])
