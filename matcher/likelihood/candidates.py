@@ -144,7 +144,7 @@ def _close_settings(setup: Setup, scene: Scene, evidence: Evidence) -> Settings:
     side_peaks = evidence.on == "phasors" or scene.behind is not None
     return replace(
         scene.settings(setup),
-        longest_step=policy.step_after_scout_aside if setup.prior_std else policy.step_after_scout,
+        longest_step=policy.step_after_scout if side_peaks and not setup.prior_std else policy.step_after_scout_aside,
         look_beside_rad=policy.close_by_rad if side_peaks else (),
     )
 

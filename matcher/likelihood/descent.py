@@ -22,13 +22,14 @@ def descend(problem: Problem, state: State, settled: float) -> State:
     """
     damping = np.full(len(state.theta), _FIRST_DAMPING)
     slopes_are_old = np.zeros(len(state.theta), np.bool_)
+    reach = np.full(len(state.theta), problem.settings.longest_step)
     active = np.arange(len(state.theta))
     for _ in range(problem.policy.max_iterations):
         sums = state.sums
-        step = _steps(problem, sums.information[active], sums.gradient[active], damping[active])
+        step, limited = _steps(problem, sums.information[active], sums.gradient[active], damping[active], reach[active])
         promise = np.einsum("mp,mp->m", sums.gradient[active], step)
         worth = (promise > settled) & (sums.cost[active] - problem.policy.optimism * promise < problem.limit[active])
-        active, step, promise = active[worth], step[worth], promise[worth]
+        active, step, promise, limited = active[worth], step[worth], promise[worth], limited[worth]
         if not active.size:
             break
         theta = state.theta[active].copy()
@@ -46,6 +47,10 @@ def descend(problem: Problem, state: State, settled: float) -> State:
             better = there.sums.cost <= state.sums.cost[tried]
             goes_on[which] = (promise[which] > _LAST_PROMISE * settled) | ~better
             damping[tried] = np.where(better, np.maximum(damping[tried] * 0.1, 1e-9), damping[tried] * 8)
+            # who still has far to go after a step that was cut short may step further, until one fails
+            farther = np.minimum(2 * reach[tried], problem.policy.longest_step)
+            reach[tried] = np.where(better & limited[which], np.maximum(farther, reach[tried]), reach[tried])
+            reach[tried[~better]] = problem.settings.longest_step
             failed_on_old = tried[~better & slopes_are_old[tried]]
             wins = np.flatnonzero(better)
             state.update(tried[wins], picked(there, wins))
@@ -61,15 +66,18 @@ def descend(problem: Problem, state: State, settled: float) -> State:
 
 
 def _steps(
-    problem: Problem, information: NDArray[np.float64], gradient: NDArray[np.float64], damping: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return damped steps, (m, p), none too long in any parameter."""
+    problem: Problem,
+    information: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    damping: NDArray[np.float64],
+    reach: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return damped steps, (m, p), none longer than its reach in any parameter, and which were cut short."""
     scaled = information * np.outer(problem.scale, problem.scale)
     diagonal = np.einsum("mpp->mp", scaled)
     floor = 1e-12 * diagonal.max(axis=1, initial=0.0) + 1e-300
     held = scaled + np.einsum("mp,pq->mpq", damping[:, None] * diagonal + floor[:, None], np.eye(len(problem.scale)))
     step = np.linalg.solve(held, (gradient * problem.scale)[:, :, None])[:, :, 0]
-    longest = np.abs(step).max(axis=1, keepdims=True)
-    return np.asarray(
-        step * np.minimum(1.0, problem.settings.longest_step / np.maximum(longest, 1e-30)) * problem.scale
-    )
+    longest = np.abs(step).max(axis=1)
+    share = np.minimum(1.0, reach / np.maximum(longest, 1e-30))
+    return np.asarray(step * share[:, None] * problem.scale), share < 1.0

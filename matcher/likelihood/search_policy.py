@@ -56,8 +56,9 @@ class SearchPolicy:
     max_iterations : int
         Steps of one descent.
     longest_step, step_after_scout, step_after_scout_aside : float
-        Longest step in natural units: of a descent, of one that starts where a scout ended, and of one whose scout did
-        not know the bearing. Near a solution it is short: where an edge crosses a pixel's border, slopes jump.
+        Longest step in natural units: of a descent, of one before a background or on phasors that starts where a scout
+        ended, and of others after a scout. Near a solution it is short: where an edge crosses a pixel's border, slopes
+        jump.
     settled_cost, rough_cost : float
         A step that promises to lower the cost by less is not taken, and one that promised less than a hundred times as
         much was the last; the second for first comparisons of minima.
