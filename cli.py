@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from phasemark import PhasemarkError, StorageError, UsageError, __version__
-from phasemark.data.commands import bank, frames, landmark, render, sensor
+from phasemark.data.commands import bank, frames, landmark, render, sensor, sensor_direct
 from phasemark.data.commands.command import Commands
 from phasemark.data.commands.console import report_error, tell, warnings_as_notes
 from phasemark.matcher.commands import calibrate, demo, design, drive, match, plan, sweep, verify
@@ -128,6 +128,7 @@ _add_group(
         "show": sensor.sensor_show,
         "characterise": sensor.sensor_characterise,
         "fit": sensor.sensor_fit,
+        "fit-direct": sensor_direct.sensor_fit_direct,
     },
 )
 _add_group(

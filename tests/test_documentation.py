@@ -79,7 +79,7 @@ def test_the_tutorials_explain_every_example():
         ("phasemark match --me", "--method"),
         ("phasemark match bank.h5 frames.csv --quantity ", "range z"),
         ("phasemark bank build --class c", "cylinder cone"),
-        ("phasemark sensor show v", "vl53l5cx-8x8"),
+        ("phasemark sensor show vl53l5cx-8", "vl53l5cx-8x8"),
         ("phasemark match ban", ""),  # the shell goes on with files
     ],
 )

@@ -342,3 +342,17 @@ def test_an_own_matcher_is_judged_beside_the_papers(tmp_path):
     lines = done.stdout.splitlines()
     assert sum("median range" in line for line in lines) == sum("nearest image" in line for line in lines) == 4
     assert (tmp_path / lines[-1]).stat().st_size > 10_000
+
+
+def test_the_zone_sensor_is_fitted_and_objects_are_located_by_histograms(tmp_path):
+    example = runpy.run_path(str(EXAMPLE.with_name("direct_sensor.py")))
+    found = example["main"](["--out", str(tmp_path), "--rounds", "1", "--draws", "20"])
+    assert max(found["range_rms_mm"]) < 1.2  # one round of the fit; a bin is 14 mm
+    for name in ("block", "wedge"):
+        assert abs(found[f"{name}_centroid_mm"]["median"]) < 1.0
+        assert found[f"{name}_centroid_mm"]["mad"] < 0.6
+        rows = {row["poses"]: row for row in found["poses"][name]}
+        assert rows[16]["median_mm"] < 1.0
+        assert rows[16]["median_mm"] < rows[1]["median_mm"]
+        assert rows[16]["bound_mm"] < rows[4]["bound_mm"] < rows[1]["bound_mm"]
+    assert {path.name for path in tmp_path.glob("*.png")} == {"histograms.png", "error.png"}

@@ -63,17 +63,28 @@ def sensor_show(
         echo_json({"name": name_or_file, **sensor.as_dict()})
         return
     if sensor.kind == "direct":
-        typer.echo("# direct time of flight: no taps, no phasors; its own quantity is z, along the optical axis")
+        axis = "z, along the optical axis" if sensor.quantity == "z" else "the range along the ray"
+        typer.echo(f"# direct time of flight: no taps, no phasors; its own quantity is {axis}")
     else:
         typer.echo(
             f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {sensor.metres_per_radian:.6f} m per radian"
         )
     fields = sensor.model_dump(mode="json")
+    table = fields.pop("histogram", None)  # a table stands behind all fields
     for title, names in sensor.field_groups().items():
         typer.echo(f"\n# {title}")
         for name in names:
-            value = fields[name]
-            typer.echo(f"# {name} is not set" if value is None else f"{name} = {json.dumps(value)}")
+            if name in fields:
+                _echo_field(name, fields[name])
+    if table is not None:
+        typer.echo("\n[histogram]")
+        for name, value in table.items():
+            _echo_field(name, value)
+
+
+def _echo_field(name: str, value: object) -> None:
+    """Print a field as a line of a sensor file."""
+    typer.echo(f"# {name} is not set" if value is None else f"{name} = {json.dumps(value)}")
 
 
 def sensor_characterise(

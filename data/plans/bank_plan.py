@@ -42,6 +42,7 @@ DEFAULT_DISTANCE_M = "0.7:2.1:0.01"
 DEFAULT_DELTA_STEP_DEG = 1.0
 
 _YOUNGER_FIELDS = {
+    "histogram",
     "bearing_offset_deg",
     "height_offset_m",
     "delay_s",

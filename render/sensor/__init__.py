@@ -7,6 +7,7 @@ from phasemark.inputs import on_use
 if TYPE_CHECKING:
     from phasemark.render.sensor.camera_unit import CameraUnit
     from phasemark.render.sensor.correlation import Harmonic, pulse_harmonics, square_harmonics
+    from phasemark.render.sensor.histogram_fields import Histogram
     from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
     from phasemark.render.sensor.sensor import Sensor
     from phasemark.render.sensor.shipped_sensors import preset, preset_names
@@ -16,6 +17,7 @@ else:
 __all__ = [
     "CameraUnit",
     "Harmonic",
+    "Histogram",
     "Sensor",
     "measured_range_std",
     "predicted_range_std",

@@ -124,6 +124,9 @@ class Sensor(SensorQuantities):
     zone_offset_m : tuple of rows of float
         "direct" only: measured offset of each pixel, rows × cols, added to its range beside `range_offset_m`. Empty:
         no offsets.
+    histogram : Histogram, optional
+        "direct" only: what the sensor counts in each zone and makes of it on the chip, a table `[histogram]` in a file;
+        see :class:`~phasemark.render.sensor.Histogram`. None: the sensor is known by its ranges alone.
     delay_s : float
         Added to the time stamp of a frame to get the time at which the camera was where the frame shows it; -0.075
         for frames that show the pose 75 ms before their stamp.

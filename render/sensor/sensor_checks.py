@@ -46,7 +46,8 @@ def check_kind(sensor: SensorQuantities) -> None:
                 if sensor.kind == "direct"
                 else "it belongs to 'kind' = 'direct'"
             )
-            raise ValueError(f"'{name}' must be left out for 'kind' = '{sensor.kind}', got {value}: {why}")
+            shown = "a table" if name == "histogram" else value
+            raise ValueError(f"'{name}' must be left out for 'kind' = '{sensor.kind}', got {shown}: {why}")
     if sensor.kind == "direct" and sensor.modulation_hz > DIRECT_MODULATION_HZ:
         raise ValueError(
             f"'modulation_hz' must be at most {DIRECT_MODULATION_HZ:g} for 'kind' = 'direct', which mixes no "
@@ -165,6 +166,8 @@ def check_threshold(sensor: SensorQuantities) -> None:
 
 def check_tables(sensor: SensorQuantities) -> None:
     """Refuse tables of another size, and a covariance that is none."""
+    if sensor.histogram is not None:
+        sensor.histogram.check_zones(sensor.rows, sensor.cols)
     if sensor.zone_offset_m:
         _check_table("zone_offset_m", sensor.zone_offset_m, sensor.rows, sensor.cols, "rows x cols of the sensor")
     names = sensor.calibration_fields

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+)
 
 from phasemark import UsageError
 from phasemark.inputs import refuse_truth_values
+from phasemark.render.sensor.histogram_fields import Histogram
 
 _LARGEST = 1e12
 """Of any number of a sensor: the square of none overflows, and the reciprocal of none is infinite."""
@@ -90,6 +99,7 @@ DIRECT_ONLY = (
     "range_shot_std_m",
     "range_ambient_std_m",
     "zone_offset_m",
+    "histogram",
 )
 
 # What a calibration leaves: it moves no image and adds no noise to a frame.
@@ -173,6 +183,7 @@ class SensorFields(BaseModel):
     range_shot_std_m: _NonNegative = 0.0
     range_ambient_std_m: _NonNegative = 0.0
     zone_offset_m: tuple[_Row, ...] = ()
+    histogram: Histogram | None = None
     # what a calibration leaves
     calibration_fields: tuple[str, ...] = ()
     calibration_covariance: tuple[_Row, ...] = ()
@@ -191,3 +202,11 @@ class SensorFields(BaseModel):
             if not first["loc"]:  # a finding about several fields names them itself
                 raise UsageError(first["msg"].removeprefix("Value error, ")) from None
             raise UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"]) from None
+
+    @model_serializer(mode="wrap")
+    def _without_absent_histogram(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave `histogram` out where there is none, as files had it before sensors had histograms."""
+        fields: dict[str, Any] = dump(self)
+        if fields.get("histogram", ...) is None:
+            del fields["histogram"]
+        return fields

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pydantic import BaseModel
+
 from phasemark.inputs.toml_file import toml_value
+from phasemark.render.sensor.histogram_fields import Histogram
 from phasemark.render.sensor.sensor import Sensor
 
 _DIGITS = 7  # of a number in a sensor file
@@ -25,18 +28,25 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
         What stands behind the other fields.
     """
     fields = sensor.model_dump(mode="json")
+    table = fields.pop("histogram", None)
     lines = [f"# {line}" for line in header]
     for title, names in Sensor.field_groups().items():
         own = [
             name
             for name in names
             if name in comments
-            or (fields[name] is not None and fields[name] != _plain_default(name))
+            or (fields.get(name) is not None and fields[name] != _plain_default(name))
             or Sensor.model_fields[name].is_required()
         ]
         if own:
             lines += ["", f"# {title}"]
         lines += [f"{name} = {toml_value(fields[name])}  # {comments.get(name, otherwise)}" for name in own]
+    if table is not None:
+        lines += ["", "[histogram]"]
+        for name, value in table.items():
+            comment = comments.get(f"histogram.{name}")
+            if comment is not None or (value is not None and value != _default_of(Histogram, name)):
+                lines.append(f"{name} = {toml_value(value)}  # {comment or otherwise}")
     return "\n".join(lines) + "\n"
 
 
@@ -48,5 +58,9 @@ def rounded(value: Any) -> Any:
 
 
 def _plain_default(name: str) -> object:
-    default = Sensor.model_fields[name].default
+    return _default_of(Sensor, name)
+
+
+def _default_of(model: type[BaseModel], name: str) -> object:
+    default = model.model_fields[name].default
     return list(default) if isinstance(default, tuple) else default

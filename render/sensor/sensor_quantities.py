@@ -60,6 +60,8 @@ class SensorQuantities(SensorFields):
     @property
     def quantity(self) -> Literal["range", "z"]:
         """What the camera itself reports: range along the ray, or the distance z along the optical axis."""
+        if self.histogram is not None:
+            return self.histogram.reports
         return "z" if self.kind == "direct" else "range"
 
     @property

@@ -1,0 +1,138 @@
+"""Command ``phasemark sensor fit-direct``: a direct sensor from histograms of a plane and of known objects."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from phasemark import UsageError
+from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable, tell
+from phasemark.data.commands.inputs import read_sensor
+from phasemark.data.commands.options import Force, Json, SensorName
+from phasemark.data.commands.outputs import refuse_existing
+
+if TYPE_CHECKING:
+    from phasemark.render import Sensor
+    from phasemark.render.direct import DirectFit, ObjectRecording, PlaneRecording
+
+
+def sensor_fit_direct(
+    *,
+    plane: Annotated[
+        Path, typer.Argument(metavar="LOG", help="Histograms of a plane with its distances: NPZ or JSON lines.")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
+    known: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--object", metavar="LOG,MESH", help="Histograms of a known object with poses, and its mesh in metres."
+        ),
+    ] = None,
+    nearest: Annotated[
+        float, typer.Option("--nearest", metavar="M", help="Distances of the plane below this are left out.")
+    ] = 0.06,
+    sensor: SensorName = "tmf8820-3x3",
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Fit a direct sensor to histograms of a plane at known distances and of known objects at known poses.
+
+    The plane tells bin widths, delays, response and pile-up; objects tell where each zone looks, in which order zones
+    are logged, how large they are and how much light strays. Each log holds `histogram`, a plane's `distance_m`, an
+    object's `sensor2world`; an object's mesh holds the table that it stands on.
+    """
+    from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.render.direct import fit_direct_sensor
+    from phasemark.render.sensor.sensor_file import sensor_toml
+
+    if out.suffix.lower() != ".toml":
+        raise UsageError(f"the sensor must be a .toml file, got '{out}'")
+    refuse_existing([out], force)
+    base, recording = _plane(plane, sensor, nearest)
+    objects = [_object(text, base) for text in known or []]
+    scores = _zone_orders(known, base)
+    with LongWork("fitting"):
+        fit = fit_direct_sensor(recording, objects, base=base)
+    header = [f"Fitted by phasemark to {plane.name}" + "".join(f", {one.name}" for one in objects)]
+    text = sensor_toml(fit.sensor, {}, header=header, otherwise="measured or as the sensor it was fitted from")
+    write_atomically(out, text.encode(), force=force)
+    spread = 1e3 * ((fit.plane_range_m(recording) - recording.distance_m[:, None]) ** 2).mean(axis=0) ** 0.5
+    if as_json:
+        echo_json({"file": str(out), **fit.as_dict(), "range_rms_mm": spread.tolist(), "zone_orders": scores})
+        return
+    _echo_fit(fit, spread.tolist())
+    if scores:
+        best, second = sorted(scores, key=lambda name: scores[name])[:2]
+        typer.echo(
+            f"Zones are logged by {best}: the centroid's error is {1e3 * scores[best]:.1f} mm, that of the next order"
+            f" {1e3 * scores[second]:.1f} mm."
+        )
+    else:
+        tell(f"without --object the directions of zones are those of {readable(sensor)}: a plane does not tell them")
+    typer.echo(out)
+
+
+def _echo_fit(fit: DirectFit, spread_mm: list[float]) -> None:
+    """Print the fitted parameters, and how well each zone measures the plane."""
+    names = fit.parameters.names
+    echo_table(
+        ("parameter", "value", "std"),
+        ((n, f"{fit.parameters[n]:.5g}", f"{fit.std[n]:.2g}" if n in fit.std else "fixed") for n in names),
+    )
+    echo_table(
+        ("zone", "range r.m.s. (mm)", "chi2/nu"),
+        ((str(k), f"{s:.2f}", f"{c:.3g}") for k, (s, c) in enumerate(zip(spread_mm, fit.reduced_chi2, strict=True))),
+    )
+
+
+def _plane(path: Path, sensor: str, nearest_m: float) -> tuple[Sensor, PlaneRecording]:
+    """Return the sensor that a fit starts from, and the plane's histograms from `nearest_m` on."""
+    import numpy as np
+
+    from phasemark.data.measured.histogram_logs import read_histograms
+    from phasemark.render.direct import PlaneRecording, reference_centroid
+
+    base = read_sensor(sensor)
+    if base.histogram is None:
+        raise UsageError(f"the sensor '{sensor}' has no [histogram] table: its histograms are not described")
+    log = read_histograms(path, sensor=base)
+    if log.distance_m is None:
+        raise UsageError(f"{path} must state 'distance_m', the distance of the plane in each frame")
+    frames, distance_m = log.frames, log.distance_m
+    if frames.reference is not None and base.histogram.reference_peak is None:
+        peak = float(reference_centroid(frames.reference.sum(axis=1))[-1])
+        base = base.with_(histogram={**base.histogram.model_dump(), "reference_peak": peak})
+        frames = read_histograms(path, sensor=base).frames
+    far = np.flatnonzero(distance_m >= nearest_m)
+    return base, PlaneRecording(frames[far], distance_m[far])
+
+
+def _zone_orders(known: list[str] | None, base: Sensor) -> dict[str, float]:
+    """Return the score of each order of the zones from the first object; nothing without one."""
+    from phasemark.render.direct import score_zone_orders
+
+    if not known or base.histogram is None:
+        return {}
+    plain = base.with_(histogram={**base.histogram.model_dump(), "zone_order": ()})
+    return score_zone_orders(_object(known[0], plain), plain)
+
+
+def _object(text: str, sensor: Sensor) -> ObjectRecording:
+    """Return the recording of an object that an option names as LOG,MESH."""
+    from phasemark.data.measured.histogram_logs import read_histograms
+    from phasemark.landmarks import read_mesh
+    from phasemark.render.direct.recordings import ObjectRecording, label_object, support_height
+
+    log_path, _, mesh_path = text.partition(",")
+    if not mesh_path:
+        raise UsageError(f"--object must be LOG,MESH, got '{text}'")
+    log = read_histograms(log_path, sensor=sensor)
+    if log.sensor2world is None:
+        raise UsageError(f"{log_path} must state 'sensor2world', the pose of the sensor in each frame")
+    mesh = read_mesh(mesh_path, unit="m")
+    name = Path(mesh_path).stem.replace("-", "_")
+    return ObjectRecording(name, log.frames, label_object(mesh, support_height(mesh)), log.sensor2world)

@@ -1,0 +1,249 @@
+"""Logs of direct sensors: histograms from NPZ and JSON lines, and several targets a zone from CSV."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import zipfile
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import InputFileError, PhasemarkError
+from phasemark.data.files.guard import EXPANSION, FREE_BYTES
+from phasemark.inputs.reading import read_whole
+from phasemark.render import Sensor
+from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.direct.targets import Status, Targets
+
+_MOST_BYTES = 1 << 28
+_MOST_VALUES = 1 << 26
+_NAMES = ("histogram", "reference_histogram", "distance_m", "sensor2world", "t_ms", "t_s")
+_SECONDS = {"t_ms": 1e-3, "t_s": 1.0}
+_MOST_LISTED = 16
+_TARGET_COLUMNS = ("mm", "sigma_mm", "signal", "status")
+
+
+@dataclass(frozen=True, eq=False)
+class HistogramLog:
+    """What a log of histograms holds.
+
+    Parameters
+    ----------
+    frames : HistogramFrames
+        One position a frame, zones in image order.
+    distance_m : (n,) float64, optional
+        Distance of a plane, where the log states it.
+    sensor2world : (n, 4, 4) float64, optional
+        Pose of the sensor's optical frame, where the log states it. A last row of zeros becomes 0 0 0 1.
+    """
+
+    frames: HistogramFrames
+    distance_m: NDArray[np.float64] | None
+    sensor2world: NDArray[np.float64] | None
+
+
+def read_histograms(path: str | os.PathLike[str], *, sensor: Sensor) -> HistogramLog:
+    """Read a log of histograms.
+
+    *NPZ*: ``histogram`` (n, zones, bins) or (n, rows, cols, bins), counts; optionally ``reference_histogram``
+    (n, bins), ``distance_m`` (n,), ``sensor2world`` (n, 4, 4), and ``t_ms`` or ``t_s`` (n,). Other arrays are ignored.
+    *JSON lines*: one frame a line, an object with the same keys, each without the n. Zones stand in the order of the
+    log, which `zone_order` of the sensor turns into that of the image.
+
+    Parameters
+    ----------
+    path : path-like
+    sensor : Sensor
+        With a [histogram] table.
+
+    Returns
+    -------
+    HistogramLog
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, is of another number of zones or bins, or holds counts that cannot be.
+    UsageError
+        The sensor has no [histogram] table.
+    """
+    path = Path(path)
+    content = read_whole(path, most_bytes=_MOST_BYTES)
+    arrays = _npz(content, path) if content[:4] == b"PK\x03\x04" else _json_lines(content, path)
+    if "histogram" not in arrays:
+        raise InputFileError(f"{path}: must have 'histogram', got {', '.join(arrays) or 'nothing'}")
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiu":
+            raise InputFileError(f"{path}: '{name}' must hold numbers, got {array.dtype}")
+    counts = arrays["histogram"]
+    n_zones = sensor.rows * sensor.cols
+    if counts.ndim == 4 and counts.shape[1:3] == (sensor.rows, sensor.cols):
+        counts = counts.reshape(len(counts), n_zones, -1)
+    if counts.ndim != 3 or counts.shape[1] != n_zones:
+        raise InputFileError(
+            f"{path}: 'histogram' must have shape (n, {n_zones}, bins), got {arrays['histogram'].shape}"
+        )
+    n = len(counts)
+    for name, shape in (("distance_m", (n,)), ("sensor2world", (n, 4, 4)), ("t_ms", (n,)), ("t_s", (n,))):
+        if name in arrays and arrays[name].shape != shape:
+            raise InputFileError(f"{path}: '{name}' must have shape {shape}, got {arrays[name].shape}")
+    reference = arrays.get("reference_histogram")
+    if reference is not None and (reference.ndim != 2 or len(reference) != n):
+        raise InputFileError(f"{path}: 'reference_histogram' must have shape ({n}, bins), got {reference.shape}")
+    times = [arrays[name] * scale for name, scale in _SECONDS.items() if name in arrays]
+    ordered = np.empty_like(counts)
+    order = sensor.histogram.zone_order if sensor.histogram is not None else ()
+    ordered[:, list(order or range(n_zones))] = counts
+    try:
+        frames = HistogramFrames(
+            ordered.reshape(n, 1, sensor.rows, sensor.cols, -1),
+            sensor=sensor,
+            reference=None if reference is None else reference[:, None],
+            time_s=times[0][:, None] if times else None,
+        )
+    except PhasemarkError as error:
+        if sensor.histogram is None:
+            raise
+        raise InputFileError(f"{path}: {error}") from None
+    poses = arrays.get("sensor2world")
+    if poses is not None:
+        poses = poses.astype(np.float64)
+        poses[(poses[:, 3] == 0).all(axis=1), 3, 3] = 1.0
+    distance = arrays.get("distance_m")
+    return HistogramLog(frames, None if distance is None else distance.astype(np.float64), poses)
+
+
+def read_targets(path: str | os.PathLike[str], *, sensor: Sensor, valid_status: Collection[int] = (5, 9)) -> Targets:
+    """Read targets, several a zone, from CSV.
+
+    The header names the columns ``mm_ZONE_TARGET`` and optionally ``sigma_mm_ZONE_TARGET``, ``signal_ZONE_TARGET`` and
+    ``status_ZONE_TARGET``; zones count from 0 in the order of the log, targets from 0. An empty cell is no target.
+
+    Parameters
+    ----------
+    path : path-like
+    sensor : Sensor
+    valid_status : collection of int
+        Which status codes mark a target; 5 (valid) and 9 (valid, with a wrapped or broad signal) on ST's chips.
+
+    Returns
+    -------
+    Targets
+        (1, frames, rows, cols, targets). What the chip reports is not converted.
+
+    Raises
+    ------
+    InputFileError
+        A column or a cell is not what it should be.
+    """
+    path = Path(path)
+    text = read_whole(path, most_bytes=_MOST_BYTES).decode("utf-8-sig", errors="replace")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    if len(lines) < 2:
+        raise InputFileError(f"{path}: must have a header and at least one frame")
+    header = [name.strip() for name in lines[0].split(",")]
+    n_zones = sensor.rows * sensor.cols
+    places: dict[tuple[str, int, int], int] = {}
+    for column, name in enumerate(header):
+        kind, _, numbers = name.removeprefix("sigma_").partition("_")
+        kind = f"sigma_{kind}" if name.startswith("sigma_") else kind
+        zone, _, target = numbers.partition("_")
+        if kind in _TARGET_COLUMNS and zone.isdigit() and target.isdigit():
+            if int(zone) >= n_zones or int(target) >= _MOST_LISTED:
+                raise InputFileError(
+                    f"{path}: column '{name}' is beyond {n_zones} zones of at most {_MOST_LISTED} targets"
+                )
+            places[kind, int(zone), int(target)] = column
+    if not any(kind == "mm" for kind, *_ in places):
+        raise InputFileError(f"{path}: must have columns mm_0_0 … (zone, target), got {', '.join(header[:4])} …")
+    most = 1 + max(k for _, _, k in places)
+    out = {kind: np.full((len(lines) - 1, n_zones, most), np.nan) for kind in _TARGET_COLUMNS}
+    for row, line in enumerate(lines[1:]):
+        cells = line.split(",")
+        if len(cells) != len(header):
+            raise InputFileError(f"{path}: frame {row} has {len(cells)} cells, the header {len(header)}")
+        for (kind, place, k), column in places.items():
+            out[kind][row, place, k] = _cell(cells[column].strip(), path, row, header[column])
+    has_status = any(kind == "status" for kind, *_ in places)
+    listed = np.isin(out["status"], list(valid_status)) if has_status else np.isfinite(out["mm"])
+    valid = listed & np.isfinite(out["mm"]) & (out["mm"] > 0)
+    order = (sensor.histogram.zone_order if sensor.histogram is not None else ()) or range(n_zones)
+
+    def image(values: NDArray[Any]) -> NDArray[Any]:
+        placed = np.empty_like(values)
+        placed[:, list(order)] = values
+        return placed.reshape(1, len(values), sensor.rows, sensor.cols, most)
+
+    return Targets(
+        image(np.where(valid, out["mm"] / 1000, np.nan)),
+        image(np.where(valid, out["sigma_mm"] / 1000, np.nan)),
+        image(np.where(valid, np.nan_to_num(out["signal"]), 0.0)),
+        image(np.where(valid, int(Status.VALID), int(Status.NO_TARGET)).astype(np.uint8)),
+    )
+
+
+def _cell(text: str, path: Path, row: int, column: str) -> float:
+    """Return the number of a cell, NaN of an empty one."""
+    if not text:
+        return math.nan
+    try:
+        return float(text)
+    except ValueError:
+        raise InputFileError(f"{path}: frame {row}, column '{column}': '{text[:20]}' is no number") from None
+
+
+def _npz(content: bytes, path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an NPZ file that a log has."""
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            declared = sum(member.file_size for member in archive.zip.infolist())
+            if declared > FREE_BYTES + EXPANSION * len(content):
+                raise InputFileError(f"{path}: refused: declares {declared} bytes, far more than its size can hold")
+            return {name: np.asarray(archive[name]) for name in _NAMES if name in archive}
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+        if isinstance(error, PhasemarkError):
+            raise
+        raise InputFileError(f"{path}: not an NPZ file that can be read ({error})") from None
+
+
+def _json_lines(content: bytes, path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of JSON lines, the frames stacked."""
+    rows: list[Mapping[str, Any]] = []
+    for number, line in enumerate(content.decode("utf-8", errors="replace").splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            raise InputFileError(f"{path}: line {number} is no JSON object") from None
+        if not isinstance(row, dict):
+            raise InputFileError(f"{path}: line {number} is no JSON object")
+        rows.append(row)
+    if not rows:
+        raise InputFileError(f"{path}: holds no frame: neither NPZ nor lines of JSON")
+    names = [name for name in _NAMES if name in rows[0]]
+    out = {}
+    for name in names:
+        values = []
+        for k, row in enumerate(rows):
+            if name not in row:
+                raise InputFileError(f"{path}: frame {k} has no '{name}', the first one has")
+            try:
+                values.append(np.asarray(row[name], dtype=np.float64))
+            except (TypeError, ValueError):
+                raise InputFileError(f"{path}: frame {k}: '{name}' must be numbers in rows of one length") from None
+            if values[-1].shape != values[0].shape:
+                raise InputFileError(
+                    f"{path}: frame {k}: '{name}' has shape {values[-1].shape}, the first frame {values[0].shape}"
+                )
+        if sum(v.size for v in values) > _MOST_VALUES:
+            raise InputFileError(f"{path}: '{name}' has more than {_MOST_VALUES} values: give it in parts")
+        out[name] = np.stack(values)
+    return out

@@ -1,0 +1,292 @@
+"""The pose of a known object from several histograms, by maximum likelihood, with covariance and χ² (PHYSICS 7, 11).
+
+Counts are Poisson, so a residual is weighted with 1/λ and the information is Σ_j ∂λ_j ∂λ_jᵀ / λ_j. Brightness and
+ambient light of every histogram are free and are projected out. What the model itself may be off (:class:`ModelError`)
+adds to the variance, and the covariance is then taken from the scatter of the histograms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
+
+from phasemark import UsageError
+from phasemark.matcher.histograms.scene_prediction import POSE_PARAMETERS, Linearised, ObjectScene
+from phasemark.render.direct.histogram_frames import HistogramFrames
+
+_MOST_STEPS = 12
+_DONE = 1e-2  # of a standard deviation: what is left of a search that converges quadratically is far less
+_LEAST_SHRINK = 0.05
+_MOST_SUPPORT = 20.0
+_LARGEST_STEP = {"m": 0.02, "rad": 0.15}
+_WEAK = 1e-10  # eigenvalue of the scaled information below which a direction is not observable
+
+
+class ModelError(NamedTuple):
+    """What the model of a sensor may be off.
+
+    Parameters
+    ----------
+    count_share : float
+        Standard deviation of an expected count, as a share of it.
+    peak_share : float
+        The same as a share of the histogram's highest count, in every bin.
+    """
+
+    count_share: float = 0.0
+    peak_share: float = 0.0
+
+
+MEASURED_ERROR = ModelError(0.05, 0.01)
+"""What a fitted TMF8820 was off before two objects at poses that were not fitted."""
+
+POISSON = ModelError()
+"""Poisson noise alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectPose:
+    """Where an object stands.
+
+    Parameters
+    ----------
+    displacement : (6,) float64
+        From where the mesh's file has it: metres along the world's axes, and a rotation vector, radians, about the
+        object's centre. In the order of `POSE_PARAMETERS`.
+    transform : (4, 4) float64
+        The same as a transform of the mesh.
+    free : tuple of str
+        What was estimated, "support" included if it was.
+    covariance : (p, p) float64
+        Of the free parameters, in their order; infinite variance along directions that nothing tells.
+    support : float
+        Albedo of the support over that of the object.
+    chi2 : float
+    dof : int
+    accepted : bool
+        Whether χ² is one that the object at this pose makes, at the given false-alarm rate.
+    steps : int
+        Steps of the search.
+    """
+
+    displacement: NDArray[np.float64]
+    transform: NDArray[np.float64]
+    free: tuple[str, ...]
+    covariance: NDArray[np.float64]
+    support: float
+    chi2: float
+    dof: int
+    accepted: bool
+    steps: int
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger χ² if the model is right."""
+        return float(chi2.sf(self.chi2, self.dof))
+
+    def std(self, name: str) -> float:
+        """Return the standard deviation of a free parameter."""
+        return float(np.sqrt(self.covariance[self.free.index(name), self.free.index(name)]))
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the pose as plain numbers, for JSON."""
+        return {
+            "displacement": dict(zip(POSE_PARAMETERS, self.displacement.tolist(), strict=True)),
+            "free": list(self.free),
+            "covariance": self.covariance.tolist(),
+            "support": self.support,
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "p_value": self.p_value,
+            "accepted": self.accepted,
+        }
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Information and gradient of every histogram about one object pose.
+
+    Parameters
+    ----------
+    information : (n, zones, p, p) float64
+    gradient : (n, zones, p) float64
+    chi2 : (n, zones) float64
+    dof : (n, zones) int
+    """
+
+    information: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    chi2: NDArray[np.float64]
+    dof: NDArray[np.int64]
+
+    def of_poses(self, poses: NDArray[np.integer]) -> Evidence:
+        """Return the evidence of some sensor poses."""
+        return Evidence(self.information[poses], self.gradient[poses], self.chi2[poses], self.dof[poses])
+
+
+def evidence_of(linear: Linearised, measured: NDArray[np.float64], model_error: ModelError = POISSON) -> Evidence:
+    """Return what histograms tell about an object pose, brightness and ambient light of each projected out.
+
+    Parameters
+    ----------
+    linear : Linearised
+    measured : (n, zones, bins) float64
+    model_error : ModelError
+    """
+    expected = linear.expected
+    peak = expected.max(axis=-1, keepdims=True)
+    variance = expected + (model_error.count_share * expected) ** 2 + (model_error.peak_share * peak) ** 2
+    root = 1 / np.sqrt(variance)
+    residual = (measured - expected) * root
+    slope = linear.slope * root[..., None]
+    nuisance = np.stack([linear.brightness * root, root], axis=-1)
+    q, _ = np.linalg.qr(nuisance)
+    residual = residual - np.einsum("nzbk,nzk->nzb", q, np.einsum("nzbk,nzb->nzk", q, residual))
+    slope = slope - np.einsum("nzbk,nzkp->nzbp", q, np.einsum("nzbk,nzbp->nzkp", q, slope))
+    information = np.einsum("nzbp,nzbq->nzpq", slope, slope, optimize=True)
+    gradient = np.einsum("nzbp,nzb->nzp", slope, residual)
+    chi2_of = (residual**2).sum(axis=2)
+    return Evidence(information, gradient, chi2_of, np.full(residual.shape[:2], residual.shape[2] - 2))
+
+
+def solve_jointly(
+    evidence: Evidence, scales: NDArray[np.float64] | None = None, *, robust: bool = False
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the Gauss-Newton step of all poses together, and its covariance.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    scales : (p,) float64, optional
+        Size of a step of each parameter; None: 1.
+    robust : bool
+        Whether the covariance is taken from how far the histograms' gradients scatter (H⁻¹ Σ g gᵀ H⁻¹, each histogram
+        for itself) rather than from the information alone: for models that are off by more than noise.
+
+    Returns
+    -------
+    step : (p,) float64
+        0 along directions that nothing tells.
+    covariance : (p, p) float64
+        Infinite for parameters that such a direction involves.
+    """
+    p = evidence.gradient.shape[-1]
+    parts, gradients = evidence.information.reshape(-1, p, p), evidence.gradient.reshape(-1, p)
+    information, gradient = parts.sum(axis=0), gradients.sum(axis=0)
+    unit = np.ones(p) if scales is None else scales
+    values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
+    weak = values <= _WEAK * max(values.max(initial=0.0), 1e-300)
+    inverse = np.where(weak, 0.0, 1 / np.where(weak, 1.0, values))
+    covariance = (vectors * inverse) @ vectors.T * np.outer(unit, unit)
+    step = covariance @ gradient
+    if robust:
+        left = gradients - parts @ step
+        n = int((evidence.chi2 > 0).sum())
+        scatter = left.T @ left * (n / max(n - p, 1))
+        covariance = covariance @ scatter @ covariance
+    if weak.any():
+        blind = (vectors[:, weak] ** 2).sum(axis=1) > 1e-6
+        covariance[blind, blind] = np.inf
+    return step, covariance
+
+
+def match_jointly(
+    frames: HistogramFrames,
+    sensor2world: ArrayLike,
+    scene: ObjectScene,
+    *,
+    start: ArrayLike = (0.0,) * 6,
+    free: Sequence[str] = (*POSE_PARAMETERS, "support"),
+    support: float = 1.0,
+    model_error: ModelError = MEASURED_ERROR,
+    systematic: tuple[float, float] = (0.0, 0.0),
+    false_alarm: float = 0.01,
+) -> ObjectPose:
+    """Estimate the pose of an object from histograms of several sensor poses together.
+
+    Parameters
+    ----------
+    frames : HistogramFrames
+        n positions of one sensor.
+    sensor2world : (n, 4, 4) array_like
+        Pose of the optical frame at each.
+    scene : ObjectScene
+    start : (6,) array_like
+        Initial guess of the displacement; within about a bin and ten degrees.
+    free : sequence of str
+        What is estimated.
+    support : float
+        Initial guess of the support's albedo over the object's.
+    model_error : ModelError
+        What the model may be off; `POISSON`: nothing.
+    systematic : (float, float)
+        Standard deviations, metres and radians, of what is common to all poses and noise does not explain: the frame
+        of the arm, the calibration. Added to the covariance.
+    false_alarm : float
+        Probability that the object itself is refused.
+
+    Returns
+    -------
+    ObjectPose
+        ``accepted`` is False where the histograms do not look like the object anywhere near the start.
+
+    Raises
+    ------
+    UsageError
+        Numbers of poses differ, or an unknown parameter is named.
+    """
+    if not 0 < false_alarm < 1:
+        raise UsageError(f"'false_alarm' must lie between 0 and 1, got {false_alarm!r}")
+    move = np.array(start, dtype=np.float64)
+    if move.shape != (6,):
+        raise UsageError(f"'start' must have 6 numbers, got {move.shape}")
+    poses, measured = np.asarray(sensor2world, dtype=np.float64), frames.zone_counts
+    limits = np.array(
+        [_LARGEST_STEP["m" if name.endswith("_m") else "rad"] if name != "support" else 1.0 for name in free]
+    )
+
+    def look(values: NDArray[np.float64], ratio: float) -> Evidence:
+        return evidence_of(scene.linearise(frames, poses, values, ratio, free), measured, model_error)
+
+    def stepped(step: NDArray[np.float64], shrink: float) -> tuple[NDArray[np.float64], float]:
+        values, ratio = move.copy(), support
+        for name, change in zip(free, step * shrink, strict=True):
+            if name == "support":
+                ratio = float(np.clip(support + change, support / 3, min(3 * support, _MOST_SUPPORT)))
+            else:
+                values[POSE_PARAMETERS.index(name)] += change
+        return values, ratio
+
+    here = look(move, support)
+    steps = 0
+    while steps < _MOST_STEPS:
+        steps += 1
+        step, covariance = solve_jointly(here, limits)
+        std = np.sqrt(np.diag(covariance))
+        if (np.abs(step) <= _DONE * np.where(np.isfinite(std), std, np.inf)).all():
+            break
+        step = step / max(1.0, float((np.abs(step) / limits).max()))
+        shrink, better = 1.0, None
+        while shrink > _LEAST_SHRINK:
+            values, ratio = stepped(step, shrink)
+            there = look(values, ratio)
+            if there.chi2.sum() <= here.chi2.sum():
+                better = (values, ratio, there)
+                break
+            shrink /= 3
+        if better is None:
+            break
+        move, support, here = better
+    _, covariance = solve_jointly(here, limits, robust=model_error != POISSON)
+    common = {"m": systematic[0], "rad": systematic[1]}
+    covariance = covariance + np.diag([common.get(name.rpartition("_")[2], 0.0) ** 2 for name in free])
+    total, dof = float(here.chi2.sum()), int(here.dof.sum()) - len(free)
+    return ObjectPose(
+        move, scene.moved(move), tuple(free), covariance, support, total, dof,
+        bool(chi2.sf(total, dof) > false_alarm), steps,
+    )  # fmt: skip

@@ -1,0 +1,48 @@
+"""Direct sensors: from a scene to histograms, and from these to the targets a chip reports (PHYSICS section 11)."""
+
+from typing import TYPE_CHECKING
+
+from phasemark.inputs import on_use
+
+if TYPE_CHECKING:
+    from phasemark.render.direct.bin_counts import expected_counts, piled_up, without_pile_up
+    from phasemark.render.direct.fit_sensor import DirectFit, fit_direct_sensor, score_zone_orders
+    from phasemark.render.direct.footprints import footprint_grid
+    from phasemark.render.direct.histogram_frames import HistogramFrames, capture_histograms, reference_centroid
+    from phasemark.render.direct.recordings import (
+        ObjectRecording,
+        PlaneRecording,
+        label_object,
+        support_height,
+        world2cam,
+    )
+    from phasemark.render.direct.scene_samples import SceneMesh, plane_samples
+    from phasemark.render.direct.targets import Status, Targets, find_targets
+    from phasemark.render.direct.transients import range_axis, zone_transients
+else:
+    __getattr__, __dir__ = on_use.imported_on_use(__name__)
+
+__all__ = [
+    "DirectFit",
+    "HistogramFrames",
+    "ObjectRecording",
+    "PlaneRecording",
+    "SceneMesh",
+    "Status",
+    "Targets",
+    "capture_histograms",
+    "expected_counts",
+    "find_targets",
+    "fit_direct_sensor",
+    "footprint_grid",
+    "label_object",
+    "piled_up",
+    "plane_samples",
+    "range_axis",
+    "reference_centroid",
+    "score_zone_orders",
+    "support_height",
+    "without_pile_up",
+    "world2cam",
+    "zone_transients",
+]

@@ -1,0 +1,153 @@
+"""Expected counts of a histogram: response, ambient light, crosstalk and pile-up (PHYSICS section 11)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
+
+from phasemark import UsageError
+from phasemark.render.direct.footprints import histogram_of
+from phasemark.render.direct.transients import PARTS, RangeAxis
+from phasemark.render.sensor.histogram_fields import Histogram
+from phasemark.render.sensor.sensor import Sensor
+
+
+def response_share(delay_m: ArrayLike, histogram: Histogram, zone: int = 0) -> NDArray[np.float64]:
+    """Return the share of the instrument response that arrives up to a delay: its cumulative distribution.
+
+    Parameters
+    ----------
+    delay_m : array_like
+        Delay as range, metres.
+    histogram : Histogram
+    zone : int
+        Which zone's response, in image order.
+
+    Returns
+    -------
+    ndarray
+        0 … 1. Between samples the response is linear, so its integral is quadratic.
+    """
+    delay = np.asarray(delay_m, dtype=np.float64)
+    if histogram.irf_std_m is not None:
+        return np.asarray(ndtr(delay / histogram.irf_std_m))
+    row = np.array(histogram.irf[zone if len(histogram.irf) > 1 else 0])
+    whole = np.concatenate([[0.0], np.cumsum(0.5 * (row[1:] + row[:-1]))])
+    x = np.clip((delay - histogram.irf_start_m) / (histogram.irf_step_m or 1.0), 0.0, len(row) - 1.0)
+    k = np.minimum(x.astype(np.int64), len(row) - 2)
+    f = x - k
+    return np.asarray((whole[k] + f * (row[k] + 0.5 * f * (row[k + 1] - row[k]))) / whole[-1])
+
+
+@lru_cache(maxsize=16)
+def bin_response(sensor: Sensor, axis: RangeAxis) -> NDArray[np.float64]:
+    """Return how light from each range is shared among the bins.
+
+    Returns
+    -------
+    (zones or 1, nodes, bins) float64
+        One for all zones where they do not differ. Not to be written to.
+    """
+    histogram = histogram_of(sensor)
+    n = sensor.rows * sensor.cols
+    offsets = (sensor.zone_offsets + sensor.range_offset_m).ravel()
+    scales = np.array(histogram.zone_bin_scale or ((1.0,) * sensor.cols,) * sensor.rows).ravel()
+    alike = len(histogram.irf) <= 1 and np.ptp(offsets) == 0 and np.ptp(scales) == 0
+    zones = 1 if alike else n
+    out = np.empty((zones, axis.n, histogram.bins))
+    for zone in range(zones):
+        edges = histogram.start_m + histogram.bin_width_m * scales[zone] * np.arange(histogram.bins + 1)
+        delay = edges[None] - (axis.nodes_m + offsets[zone])[:, None]
+        out[zone] = np.diff(response_share(delay, histogram, zone), axis=1)
+    out.flags.writeable = False
+    return out
+
+
+def signal_counts(
+    transients: NDArray[np.float64], sensor: Sensor, axis: RangeAxis, albedo: ArrayLike = 1.0
+) -> NDArray[np.float64]:
+    """Return the expected signal counts without pile-up, stray light between zones included.
+
+    Parameters
+    ----------
+    transients : (n, parts, zones, nodes) float64
+        From :func:`~phasemark.render.direct.transients.zone_transients`.
+    sensor : Sensor
+    axis : RangeAxis
+    albedo : float or (parts,)
+        Of each part.
+
+    Returns
+    -------
+    (n, zones, bins) float64
+    """
+    histogram = histogram_of(sensor)
+    albedos = np.broadcast_to(np.asarray(albedo, dtype=np.float64), (PARTS,))
+    light = np.einsum("npzr,p->nzr", transients, albedos)
+    response = bin_response(sensor, axis)
+    gain = np.array(histogram.zone_gain or ((1.0,) * sensor.cols,) * sensor.rows).ravel()
+    light = light * gain[:, None]
+    if histogram.stray > 0:
+        light = light + histogram.stray * light.mean(axis=1, keepdims=True)
+    if len(response) == 1:
+        counts = light @ response[0]
+    else:
+        counts = np.einsum("nzr,zrb->nzb", light, response, optimize=True)
+    return np.asarray(histogram.cycles * histogram.photons * counts)
+
+
+def expected_counts(
+    transients: NDArray[np.float64], sensor: Sensor, axis: RangeAxis, albedo: ArrayLike = 1.0
+) -> NDArray[np.float64]:
+    """Return the expected counts λ of every bin, pile-up included (PHYSICS section 11).
+
+    Parameters
+    ----------
+    transients, sensor, axis, albedo
+        As for :func:`signal_counts`.
+
+    Returns
+    -------
+    (n, zones, bins) float64
+    """
+    histogram = histogram_of(sensor)
+    counts = signal_counts(transients, sensor, axis, albedo)
+    counts += histogram.cycles * (histogram.ambient + histogram.dark)
+    if histogram.crosstalk > 0:
+        edges = histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1)
+        counts += histogram.crosstalk * np.diff(response_share(edges - histogram.crosstalk_range_m, histogram))
+    return piled_up(counts, histogram.cycles) if histogram.pile_up else counts
+
+
+def piled_up(counts: NDArray[np.float64], cycles: float) -> NDArray[np.float64]:
+    """Return the counts of first photons, from counts without pile-up.
+
+    p_j = (1 − Σ_{i<j} p_i)(1 − e^{−λ_j / cycles}), the share of cycles whose first photon falls into bin j; that is
+    e^{−Σ_{i<j} λ_i / cycles} − e^{−Σ_{i≤j} λ_i / cycles}.
+
+    Parameters
+    ----------
+    counts : (..., bins) float64
+        Expected counts λ if every photon were counted.
+    cycles : float
+    """
+    before = np.cumsum(counts, axis=-1) - counts
+    return np.asarray(-cycles * np.exp(-before / cycles) * np.expm1(-counts / cycles))
+
+
+def without_pile_up(counts: NDArray[np.float64], cycles: float) -> NDArray[np.float64]:
+    """Return the counts that there would be without pile-up: the inverse of :func:`piled_up` (Coates 1968).
+
+    Raises
+    ------
+    UsageError
+        More first photons than cycles.
+    """
+    before = np.cumsum(counts, axis=-1) - counts
+    left = cycles - before
+    if not (counts < left).all():
+        raise UsageError(f"a histogram has as many counts as there are first photons, {cycles:.4g}: it is saturated")
+    return np.asarray(-cycles * np.log1p(-counts / left))

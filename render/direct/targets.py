@@ -1,0 +1,156 @@
+"""What the chip makes of its histograms: targets with range, sigma, signal and status (PHYSICS section 11)."""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.render.direct.footprints import histogram_of
+from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.kernel import kernel
+from phasemark.render.sensor.sensor import Sensor
+
+_AMBIENT_SHARE = 0.5  # the ambient level is this quantile of a histogram's bins: peaks take fewer
+
+
+class Status(IntEnum):
+    """Why a target is or is not there."""
+
+    VALID = 0
+    """A target."""
+    NO_TARGET = 1
+    """No further peak rises above the threshold."""
+
+
+class Targets(NamedTuple):
+    """Targets of every zone, nearest first; arrays are (n, frames, rows, cols, targets).
+
+    Parameters
+    ----------
+    distance_m : float64
+        Range along the ray, or z where the sensor reports z; NaN where there is no target.
+    sigma_m : float64
+        Standard deviation that the counts of the peak leave.
+    signal : float64
+        Counts of the peak above ambient.
+    status : uint8
+        :class:`Status`.
+    """
+
+    distance_m: NDArray[np.float64]
+    sigma_m: NDArray[np.float64]
+    signal: NDArray[np.float64]
+    status: NDArray[np.uint8]
+
+
+def find_targets(frames: HistogramFrames) -> Targets:
+    """Run the chip's estimator on histograms.
+
+    The ambient level is the median bin. Peaks are local maxima that rise above it by `threshold` standard deviations
+    of a bin; the highest come first, others at least `min_separation_m` away follow, up to `max_targets`. A peak is
+    placed between bins by the centroid of its counts above ambient or by the parabola through its three highest bins.
+
+    Parameters
+    ----------
+    frames : HistogramFrames
+
+    Returns
+    -------
+    Targets
+    """
+    sensor, histogram = frames.sensor, histogram_of(frames.sensor)
+    shape = frames.counts.shape
+    flat = np.ascontiguousarray(frames.counts.reshape(-1, shape[-1]))
+    n, most = len(flat), histogram.max_targets
+    place, sigma, signal = np.full((n, most), np.nan), np.full((n, most), np.nan), np.zeros((n, most))
+    ambient = np.quantile(flat, _AMBIENT_SHARE, axis=1)
+    _find_peaks(
+        flat, ambient, histogram.estimator == "centroid", histogram.estimator_bins, histogram.threshold,
+        histogram.min_separation_m / histogram.bin_width_m, place, sigma, signal,
+    )  # fmt: skip
+    out = (*shape[:-1], most)
+    range_m, slope = place_to_range(place.reshape(out), sensor)
+    status = np.where(np.isfinite(range_m), int(Status.VALID), int(Status.NO_TARGET)).astype(np.uint8)
+    return Targets(range_m, sigma.reshape(out) * slope, signal.reshape(out), status)
+
+
+def place_to_range(place: NDArray[np.float64], sensor: Sensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Turn places in a histogram into what the sensor reports, and the metres per bin there.
+
+    Parameters
+    ----------
+    place : (..., rows, cols, targets) float64
+        In bins; the middle of bin 0 is 0.5.
+    sensor : Sensor
+    """
+    histogram = histogram_of(sensor)
+    scale = np.array(histogram.zone_bin_scale or ((1.0,) * sensor.cols,) * sensor.rows)[..., None]
+    width = histogram.bin_width_m * scale
+    mean_delay = np.array(response_means(sensor)).reshape(sensor.rows, sensor.cols, 1)
+    offset = (sensor.zone_offsets + sensor.range_offset_m)[..., None] + mean_delay
+    cosine = sensor.axis_cosine()[..., None] if histogram.reports == "z" else np.ones((1, 1, 1))
+    return (histogram.start_m + place * width - offset) * cosine, width * cosine
+
+
+def response_means(sensor: Sensor) -> list[float]:
+    """Return the mean delay of each zone's response, metres: what a centroid is late by."""
+    histogram = histogram_of(sensor)
+    n = sensor.rows * sensor.cols
+    if histogram.irf_std_m is not None:
+        return [0.0] * n
+    x = histogram.irf_start_m + (histogram.irf_step_m or 0.0) * np.arange(len(histogram.irf[0]))
+    means = [float(np.dot(row, x) / sum(row)) for row in histogram.irf]
+    return means if len(means) == n else means * n
+
+
+@kernel
+def _find_peaks(counts, ambient, centroid, reach, threshold, separation, place, sigma, signal):  # type: ignore[no-untyped-def]
+    """Fill the targets of each histogram, nearest first."""
+    n_bins, most = counts.shape[1], place.shape[1]
+    for i in range(counts.shape[0]):
+        row, level = counts[i], ambient[i]
+        least = level + threshold * math.sqrt(max(level, 1.0))
+        found = 0
+        while found < most:
+            best, height = -1, least
+            for j in range(1, n_bins - 1):
+                if row[j] <= height or row[j] < row[j - 1] or row[j] < row[j + 1]:
+                    continue
+                apart = True
+                for k in range(found):
+                    apart = apart and abs(j + 0.5 - place[i, k]) >= max(separation, 1.0)
+                if apart:
+                    best, height = j, row[j]
+            if best < 0:
+                break
+            x, variance, total = 0.0, 0.0, 0.0
+            if centroid:
+                low, high = max(best - reach, 0), min(best + reach + 1, n_bins)
+                for j in range(low, high):
+                    total += row[j] - level
+                    x += (row[j] - level) * (j + 0.5)
+                x /= total
+                for j in range(low, high):
+                    variance += row[j] * (j + 0.5 - x) ** 2
+                variance /= total * total
+            else:
+                a, b, c = row[best - 1], row[best], row[best + 1]
+                bend = a - 2 * b + c
+                total = a + b + c - 3 * level
+                x = best + 0.5
+                if bend < 0:
+                    x += 0.5 * (a - c) / bend
+                    # of ½ (a − c) / (a − 2b + c), to first order
+                    da, dc = (c - b) / (bend * bend), (b - a) / (bend * bend)
+                    db = (a - c) / (bend * bend)
+                    variance = da * da * a + db * db * b + dc * dc * c
+            k = found
+            while k > 0 and place[i, k - 1] > x:  # nearest first
+                place[i, k], sigma[i, k], signal[i, k] = place[i, k - 1], sigma[i, k - 1], signal[i, k - 1]
+                k -= 1
+            place[i, k], sigma[i, k], signal[i, k] = x, math.sqrt(variance), total
+            found += 1
