@@ -21,9 +21,10 @@ def fit_look_alikes(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) 
     """Let views that look like the best one explain each frame.
 
     A mesh with a symmetry that its bank does not have looks the same from several sides. A thin landmark looks
-    nearly the same from the front and from the back, its middle seen at the same place. A flat one looks nearly the
-    same under every bearing, its heading kept. Where one of them explains a frame better than its best view did, the
-    search had stopped at a side minimum: then what looks like that one is tried too.
+    nearly the same from the front and from the back, its middle seen at the same place, and something like a box from
+    its next face. A flat one looks nearly the same under every bearing, its heading kept. Where one of them explains a
+    frame better than its best view did, the search had stopped at a side minimum: then what looks like that one is
+    tried too.
     """
     n = len(evidence.weight)
     parts = [fits]
@@ -46,10 +47,12 @@ def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: 
     kinds = [*_other_sides(setup, fits, best), _from_behind(setup, scene, fits, best)]
     if setup.bearing_is_free:
         kinds.append(_other_bearings(setup, scene, fits, best))
-    chosen = [_most_promising(setup, scene.final, evidence, fits, *kind) for kind in kinds]
-    source = np.concatenate([which for which, _ in chosen])
-    view = np.concatenate([views for _, views in chosen])
-    frame, class_index = fits.frame[source], fits.class_index[source]
+    own_class = [(which, fits.class_index[which], views) for which, views in kinds]
+    turns = (0.5 * math.pi, -0.5 * math.pi) if setup.bearing_is_free else ()
+    next_faces = [_next_face(setup, scene, fits, best, turn) for turn in turns]
+    chosen = [_most_promising(setup, scene.final, evidence, fits, *kind) for kind in (*own_class, *next_faces)]
+    source, class_index, view = (np.concatenate(part) for part in zip(*chosen, strict=True))
+    frame = fits.frame[source]
     return refine(
         scene.final,
         evidence,
@@ -59,7 +62,7 @@ def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: 
         scene.settings(setup),
         fits.cost[source] + setup.policy.likely_cost,
         fits.cost[source],
-        at_first_sight=True,
+        at_first_sight=len(setup.free) == 2,
     )
 
 
@@ -69,23 +72,25 @@ def _most_promising(
     evidence: Evidence,
     fits: Fits,
     source: NDArray[np.int64],
+    class_index: NDArray[np.int64],
     view: NDArray[np.float64],
-) -> _Views:
+) -> _OfClasses:
     """Return the views of one kind that explain their frames best once they are at the measured distance.
 
     Parameters
     ----------
     source : (k,) int64
         The fits that they look like.
+    class_index : (k,) int64
     view : (k, 4) float64
     """
     most = setup.policy.slides_refined
     if not source.size or np.bincount(source).max() <= most:
-        return source, view
+        return source, class_index, view
     view = view.copy()
     view[:, 0] = np.clip(view[:, 0], *model.limits())
     frame = fits.frame[source]
-    phasor = model.images(fits.class_index[source], np.ascontiguousarray(view), ()).phasor
+    phasor = model.images(class_index, np.ascontiguousarray(view), ()).phasor
     residual = evidence.sensor.metres_per_radian * np.angle(evidence.value[frame] * phasor.conj())
     weight, dark = evidence.weight[frame], phasor == 0
     residual[dark | (weight == 0)] = np.nan
@@ -96,13 +101,15 @@ def _most_promising(
     order = np.lexsort((cost, source))
     rank = np.arange(len(order)) - np.searchsorted(source[order], source[order])
     kept = np.sort(order[rank < most])
-    return source[kept], view[kept]
+    return source[kept], class_index[kept], view[kept]
 
 
 _BETTER = 1.0
 """By how much a cost must be lower: below that both views remain, and the answer is ambiguous anyway."""
 _Views = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Indices of fits, and as many views to try instead of theirs."""
+_OfClasses = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
+"""The same, with the class of each view between them."""
 
 
 def _other_sides(setup: Setup, fits: Fits, best: NDArray[np.int64]) -> list[_Views]:
@@ -131,6 +138,22 @@ def _from_behind(setup: Setup, scene: Scene, fits: Fits, best: NDArray[np.int64]
     view[:, 2] += np.arctan2(here[:, 1], fits.view[odd, 0] + here[:, 0])
     view[:, 2] -= np.arctan2(there[:, 1], view[:, 0] + there[:, 0])
     return _slid(setup, scene, odd, view, (0.0, *_slides(setup)))
+
+
+def _next_face(setup: Setup, scene: Scene, fits: Fits, best: NDArray[np.int64], turn_rad: float) -> _OfClasses:
+    """Return views of every class a quarter turn away, under several bearings: the next face of something like a box.
+
+    With the bearing fixed the search in the bank compares these sides itself.
+    """
+    n_class = len(setup.shapes.names)
+    which, class_index = np.repeat(best, n_class), np.tile(np.arange(n_class), len(best))
+    same = np.array([setup.shapes.symmetry[c] % 4 == 0 for c in class_index], np.bool_)
+    which, class_index = which[~same], class_index[~same]
+    view = fits.view[which].copy()
+    view[:, 1] += turn_rad
+    slides = (0.0, *setup.policy.slides_with_prior)
+    source, views = _slid(setup, scene, which, view, slides)
+    return source, np.tile(class_index, len(slides)), views
 
 
 def _other_bearings(setup: Setup, scene: Scene, fits: Fits, best: NDArray[np.int64]) -> _Views:
