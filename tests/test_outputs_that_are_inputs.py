@@ -23,6 +23,7 @@ def given(tmp_path, monkeypatch, capsys):
     (tmp_path / "part.stl").write_bytes(export_mesh(build_mesh(catalog()["post"]), "stl"))
     (tmp_path / "cam.toml").write_text(SENSOR)
     (tmp_path / "frames.csv").write_text("1,2\n")
+    (tmp_path / "ladder.npz").write_bytes(b"")
     (tmp_path / "frames.toml").write_text("views = 1\n")
     (tmp_path / "bank.toml").write_text('classes = ["cone"]\n')
     (tmp_path / "sweep.toml").write_text(SWEEP)
@@ -37,6 +38,7 @@ def given(tmp_path, monkeypatch, capsys):
 CASES = {
     "sensor characterise": ("cam.toml", "dir/points.csv", "cam.toml --out dir"),
     "sensor fit": ("frames.csv", "out.toml", "frames.csv --distance 1 --out out.toml"),
+    "sensor fit-direct": ("frames.csv", "out.toml", "ladder.npz --object frames.csv,part.stl --out out.toml"),
     "landmark show": ("part.stl", "dir/part.png", "part.stl --unit m --out dir"),
     "landmark export": ("cone", "out.stl", "cone --out out.stl"),
     "landmark design": ("design.toml", "dir/pareto.csv", "design.toml --out dir"),

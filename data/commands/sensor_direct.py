@@ -46,11 +46,13 @@ def sensor_fit_direct(
     object's `sensor2world`; an object's mesh holds the table that it stands on.
     """
     from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.data.files.same_file import refuse_inputs
     from phasemark.render.direct import fit_direct_sensor
     from phasemark.render.sensor.sensor_file import sensor_toml
 
     if out.suffix.lower() != ".toml":
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")
+    refuse_inputs([out], [Path(part) for text in known or [] for part in text.split(",")])
     refuse_existing([out], force)
     base, recording = _plane(plane, sensor, nearest)
     objects = [_object(text, base) for text in known or []]
@@ -60,11 +62,12 @@ def sensor_fit_direct(
     header = [f"Fitted by phasemark to {plane.name}" + "".join(f", {one.name}" for one in objects)]
     text = sensor_toml(fit.sensor, {}, header=header, otherwise="measured or as the sensor it was fitted from")
     write_atomically(out, text.encode(), force=force)
-    spread = 1e3 * ((fit.plane_range_m(recording) - recording.distance_m[:, None]) ** 2).mean(axis=0) ** 0.5
+    squared = (fit.plane_range_m(recording) - recording.distance_m[:, None]) ** 2
+    spread_mm = (1e3 * squared.mean(axis=0) ** 0.5).tolist()
     if as_json:
-        echo_json({"file": str(out), **fit.as_dict(), "range_rms_mm": spread.tolist(), "zone_orders": scores})
+        echo_json({"file": str(out), **fit.as_dict(), "range_rms_mm": spread_mm, "zone_orders": scores})
         return
-    _echo_fit(fit, spread.tolist())
+    _echo_fit(fit, spread_mm)
     if scores:
         best, second = sorted(scores, key=lambda name: scores[name])[:2]
         typer.echo(

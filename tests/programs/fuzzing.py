@@ -164,8 +164,16 @@ def _good_plan(kind: str) -> Callable[[Path], list[bytes]]:
 
 def _good_sensor(folder: Path) -> list[bytes]:
     fields = [preset(name).model_dump() for name in ("vl53l5cx-8x8", "pmd-16x16-wiggle")]
-    stated = [{name: value for name, value in one.items() if value not in (None, [], ())} for one in fields]
-    return ["".join(f"{name} = {json.dumps(value)}\n" for name, value in one.items()).encode() for one in stated]
+
+    def lines(table: dict[str, Any]) -> str:
+        stated = {name: value for name, value in table.items() if value not in (None, [], ())}
+        return "".join(f"{name} = {json.dumps(value)}\n" for name, value in stated.items())
+
+    files = []
+    for one in fields:
+        histogram = one.pop("histogram", None)
+        files.append(lines(one) + (f"[histogram]\n{lines(histogram)}" if histogram else ""))
+    return [text.encode() for text in files]
 
 
 def _good_map(folder: Path) -> list[bytes]:
