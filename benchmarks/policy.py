@@ -131,7 +131,8 @@ def _counted() -> Iterator[list[float]]:
 
 def _matched(bank: Any, setting: Setting, frames: list[FilteredFrames], search: SearchPolicy) -> tuple[Matches, float]:
     """Return the answers, and the views rendered for a frame."""
-    matcher = Matcher(bank, "refine", policy=search, **setting.options)
+    # in one thread: views are counted
+    matcher = Matcher(bank, "refine", policy=search, workers=1, **setting.options)
     with _counted() as counts:
         answers = Matches([match for part in frames for match in matcher.match(part)])
     return answers, counts[0] / len(answers)
