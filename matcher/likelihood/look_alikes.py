@@ -62,7 +62,7 @@ def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: 
         scene.settings(setup),
         fits.cost[source] + setup.policy.likely_cost,
         fits.cost[source],
-        at_first_sight=len(setup.free) == 2,
+        at_first_sight=True,
     )
 
 

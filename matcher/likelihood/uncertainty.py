@@ -74,6 +74,11 @@ def std_without_one_pixel(
     inverse = covariance_of(information, problem.scale)
     moved = np.einsum("kab,kbqr->kaqr", inverse, rows)
     kept = (1 + 1e-12) * np.eye(rows.shape[3]) - np.einsum("kaqr,kaqs->kqrs", rows, moved)
+    # a pixel that alone tells a direction leaves nothing known of it
+    determinant = kept[..., 0, 0]
+    if kept.shape[-1] == 2:
+        determinant = determinant * kept[..., 1, 1] - kept[..., 0, 1] * kept[..., 1, 0]
+    kept[~(determinant > 1e-14)] = 1e-12 * np.eye(rows.shape[3])
     moved = moved[:, :p]
     more = np.einsum("kaqr,kqrs,kaqs->kaq", moved, np.linalg.inv(kept), moved).max(axis=2)
     own = np.einsum("kaa->ka", inverse)[:, :p]
