@@ -26,20 +26,33 @@ def fit_look_alikes(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) 
     frame better than its best view did, the search had stopped at a side minimum: then what looks like that one is
     tried too.
     """
-    n = len(evidence.weight)
-    parts = [fits]
     best = best_of_frame(fits)
-    best = best[np.isfinite(fits.cost[best])]
+    found = _rounds(setup, scene, evidence, fits, best[np.isfinite(fits.cost[best])])
+    if not setup.bearing_is_free:
+        return found
+    together = Fits.joined([fits, found])
+    best = best_of_frame(together)
+    best = best[np.isfinite(together.cost[best])]
+    kinds = [_next_face(setup, scene, together, best, turn) for turn in (0.5 * math.pi, -0.5 * math.pi)]
+    faces = _refined(setup, scene, evidence, together, kinds)
+    ahead = best_of_frame(faces)
+    ahead = ahead[faces.cost[ahead] < least_of_frame(together, len(evidence.weight))[faces.frame[ahead]] - _BETTER]
+    return Fits.joined([found, faces, _rounds(setup, scene, evidence, faces, ahead)])
+
+
+def _rounds(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: NDArray[np.int64]) -> Fits:
+    """Fit what looks like some fits, and what looks like that where it is better."""
+    parts = [fits[:0]]
     for _ in range(setup.policy.look_alike_rounds):
-        least = least_of_frame(fits, n)
+        if not best.size:
+            break
         found = _fit_once(setup, scene, evidence, fits, best)
+        least = least_of_frame(fits, len(evidence.weight))
         parts.append(found)
         best = best_of_frame(found)
         best = best[found.cost[best] < least[found.frame[best]] - _BETTER]
         fits = found
-        if not best.size:
-            break
-    return Fits.joined(parts[1:])
+    return Fits.joined(parts)
 
 
 def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: NDArray[np.int64]) -> Fits:
@@ -47,10 +60,13 @@ def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: 
     kinds = [*_other_sides(setup, fits, best), _from_behind(setup, scene, fits, best)]
     if setup.bearing_is_free:
         kinds.append(_other_bearings(setup, scene, fits, best))
-    own_class = [(which, fits.class_index[which], views) for which, views in kinds]
-    turns = (0.5 * math.pi, -0.5 * math.pi) if setup.bearing_is_free else ()
-    next_faces = [_next_face(setup, scene, fits, best, turn) for turn in turns]
-    chosen = [_most_promising(setup, scene.final, evidence, fits, *kind) for kind in (*own_class, *next_faces)]
+    of_class = [(which, fits.class_index[which], views) for which, views in kinds]
+    return _refined(setup, scene, evidence, fits, of_class)
+
+
+def _refined(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, kinds: list[_OfClasses]) -> Fits:
+    """Refine the most promising views of each kind; `fits` are what they look like."""
+    chosen = [_most_promising(setup, scene.final, evidence, fits, *kind) for kind in kinds]
     source, class_index, view = (np.concatenate(part) for part in zip(*chosen, strict=True))
     frame = fits.frame[source]
     return refine(
