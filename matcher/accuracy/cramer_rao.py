@@ -78,7 +78,6 @@ def cramer_rao(
     pixels: str | NDArray[np.bool_] = "all",
     background: Background | None = None,
     nuisances: Sequence[str] | None = None,
-    image: PhasorImages | None = None,
     systematic: Collection[str] = (),
     workers: int = 1,
 ) -> Bound:
@@ -101,8 +100,6 @@ def cramer_rao(
     background : Background, optional
     nuisances : sequence of str, optional
         Which of :data:`NUISANCES` are unknown too; None: the albedo on phasors, nothing on ranges.
-    image : PhasorImages, optional
-        What is seen at the views, where it has been rendered already: of the same landmark, optics and background.
     systematic : collection of {"calibration", "declared"}
         Which errors of the sensor that all frames share are added: what its calibration leaves, and what it declares.
     workers : int
@@ -135,8 +132,7 @@ def cramer_rao(
     if (background is None or background.wall_m is None) and set(nuisances) & {"wall_m", "wall_albedo"}:
         raise UsageError("a wall can be a nuisance only where there is one: give 'background' a wall")
     sensor = renderer.sensor
-    rendered, slope = _image_and_slopes(renderer, views, free, background, workers)
-    image = rendered if image is None else image
+    image, slope = _image_and_slopes(renderer, views, free, background, workers)
     columns = [slope]
     if nuisances:
         alone = renderer.render_views(views, workers=workers).phasor if background else image.phasor

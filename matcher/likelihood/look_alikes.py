@@ -78,7 +78,7 @@ def _refined(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, kinds: 
         scene.settings(setup),
         fits.cost[source] + setup.policy.likely_cost,
         fits.cost[source],
-        at_first_sight=True,
+        at_first_sight=len(setup.free) == 2,
     )
 
 

@@ -280,7 +280,7 @@ class SweepJob:
         found = cramer_rao(
             self.renderer(number, self.true_sensor(number).with_(modulation="sine", harmonics=())), image.views,
             free=free, n_frames=self.all_conditions[number].n_frames, on=method.on, pixels=method.pixels,
-            background=self.background(number), image=image,
+            background=self.background(number),
         )  # fmt: skip
         return _spread(found.covariance, free, len(image))
 

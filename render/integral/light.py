@@ -108,10 +108,8 @@ def _add_phasor(index, distance, reflected, length, weight, light, sums):  # typ
 
 @inlined
 def phasor_of(distance, reflected, length, light):  # type: ignore[no-untyped-def]
-    """Return the light of one hit at the modulation frequency; `reflected` is ρ cos θ, `length` that of (1, y, z)."""
-    a = reflected / (distance * distance)
-    if light.vignetting:
-        a /= length * length * length * length
+    """Return the light of one hit at the modulation frequency; see :func:`_amplitude`."""
+    a = _amplitude(distance, reflected, length, light.vignetting)
     phase = light.radians_per_metre * distance
     return complex(a * math.cos(phase), a * math.sin(phase))
 

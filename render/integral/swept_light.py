@@ -76,10 +76,10 @@ def _light_beside(b, which, y, z, view, samples, first_of, mesh, poses, camera, 
             g, t = find_face(mesh.search, mesh.grid, face, lens[0], lens[1], lens[2], dx, dy, dz)
             face = g if g >= 0 else face
         t, cos_theta = landmark_hit(mesh, face, lens, matrix, y, z)
-        return t, phasor_of(t * length, light.albedo * cos_theta / length, length, light)
+        return t, phasor_of(t * length, light.albedo * cos_theta, length, light)
     dx, dy, dz = towards_level(camera.level, y, z)
     bearing = poses.bearing[view]
     t, rho, cos_theta = background_hit(light.background, math.cos(bearing), math.sin(bearing), dx, dy, dz)
     if t == 0.0:
         return math.inf, 0j
-    return t, phasor_of(t * length, rho * cos_theta / length, length, light)
+    return t, phasor_of(t * length, rho * cos_theta, length, light)
