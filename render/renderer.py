@@ -30,7 +30,7 @@ from phasemark.render.integral.slopes import STEP, SlopeSums
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.sensor.sensor import Sensor
-from phasemark.render.view import Views
+from phasemark.render.view import VIEW_FIELDS, Views
 
 Variant = Literal["exact", "hard"]
 """The area integral, or what the centre ray of each pixel sees."""
@@ -40,6 +40,8 @@ _RETURNS = 1 << 9
 _BORDERS = 1 << 14
 _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
+_TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
+"""Parameters that turn what stands behind the landmark."""
 _LARGE = 1 << 13
 """Faces above which a mesh is more than the processor's cache holds."""
 
@@ -185,6 +187,8 @@ class Renderer:
         delta_rad: ArrayLike = 0.0,
         bearing_rad: ArrayLike = 0.0,
         height_m: ArrayLike = 0.0,
+        pitch_rad: ArrayLike = 0.0,
+        roll_rad: ArrayLike = 0.0,
         *,
         background: Background | None = None,
         rows: tuple[int, int] | None = None,
@@ -195,8 +199,8 @@ class Renderer:
 
         Parameters
         ----------
-        distance_m, delta_rad, bearing_rad, height_m : array_like
-            The views, PHYSICS section 1.
+        distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : array_like
+            The views, PHYSICS sections 1 and 9.
         background : Background, optional
             What stands behind the landmark; None: nothing.
         rows : (first, stop), optional
@@ -217,7 +221,7 @@ class Renderer:
         UsageError
             A view that is not finite, a lens inside the landmark, a wall before it or a floor above its foot.
         """
-        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m)
+        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad)
         return self.render_views(views, background=background, rows=rows, variant=variant, workers=workers)
 
     def render_views(
@@ -245,6 +249,8 @@ class Renderer:
         delta_rad: ArrayLike = 0.0,
         bearing_rad: ArrayLike = 0.0,
         height_m: ArrayLike = 0.0,
+        pitch_rad: ArrayLike = 0.0,
+        roll_rad: ArrayLike = 0.0,
         *,
         background: Background | None = None,
         parameters: Sequence[str] = VIEW_PARAMETERS,
@@ -258,10 +264,10 @@ class Renderer:
 
         Parameters
         ----------
-        distance_m, delta_rad, bearing_rad, height_m, background, workers
+        distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad, background, workers
             As for :meth:`render`.
         parameters : sequence of str
-            Which derivatives, in this order.
+            Which derivatives, in this order; "pitch_rad" and "roll_rad" too may be asked for.
 
         Returns
         -------
@@ -284,7 +290,9 @@ class Renderer:
         ((1, 1, 16, 16), np.float64(2.04))
         """
         check_parameters(parameters)
-        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m).in_camera(self.sensor)
+        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad).in_camera(
+            self.sensor
+        )
         self._check(views, background, workers)
         return self._differences(views, background, parameters, workers)
 
@@ -309,7 +317,7 @@ class Renderer:
         views : Views
             n views.
         parameters : sequence of str
-            Which derivatives, in this order.
+            Which derivatives, in this order; "pitch_rad" and "roll_rad" too may be asked for.
         background, workers
             As for :meth:`render`.
 
@@ -425,7 +433,7 @@ class Renderer:
     ) -> None:
         """Render slices of the views into `sums`, in one thread; with `slope`, (pixels, p), how they change too."""
         mesh = self.topology
-        turns = np.array([name == "bearing_rad" for name in parameters], np.bool_) & light.background[:2].any()
+        turns = np.array([name in _TURNING for name in parameters], np.bool_) & light.background[:2].any()
         buffers = _Buffers(
             len(mesh.creases) + len(mesh.folds),
             (camera.rows, camera.cols),
@@ -576,6 +584,7 @@ def _poses(views: Views, camera: Camera) -> Poses:
         np.ascontiguousarray(camera.level.T @ rotation),
         np.ascontiguousarray(translation @ camera.level),
         views.bearing_rad,
+        np.ascontiguousarray(views.tilt2level() @ camera.level),
     )
 
 
@@ -584,7 +593,7 @@ def _motion(views: Views, poses: Poses, camera: Camera, parameters: Sequence[str
     p = len(parameters)
     if not p:
         return Motion(poses, np.empty(0), np.empty((1, 4)))
-    many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_PARAMETERS))
+    many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_FIELDS))
     for k, name in enumerate(parameters):
         getattr(many, name)[k + 1 :: 1 + p] += STEP
     return Motion(_poses(many, camera), np.full(p, STEP), np.empty((1 + p, 4)))

@@ -58,7 +58,7 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
         u_low, u_high, v_low, v_high = _extent(edges, n_edges, False)
         bent_low_u, bent_high_u, bent_low_v, bent_high_v = _extent(edges, n_edges, True)
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
-        if background_edge(background, cos_b, sin_b, camera, segments[n_edges]):
+        if background_edge(background, cos_b, sin_b, poses.level[view], camera, segments[n_edges]):
             limb[n_edges] = 0
             edges.ends[n_edges, 0] = -1
             n_edges += 1
