@@ -202,7 +202,8 @@ class LikelihoodMatcher:
         widest = widest_rad if self._setup.bearing_is_free else 0.0
         setup = self._setup
         upward = Upward(setup.std_before("height_m"), setup.std_before("pitch_rad"), setup.policy.prior_sigma)
-        return Search(self._bank, behind, self._stride, widest, upward, capped=setup.unknown)
+        capped = setup.unknown or not setup.is_upright  # edges between rows: no pixel may decide alone where it starts
+        return Search(self._bank, behind, self._stride, widest, upward, capped=capped)
 
     def _scene_before(self, background: Background | None, together: bool) -> Scene:
         """Return the scene of an estimated background; see :class:`AutoBackground`."""

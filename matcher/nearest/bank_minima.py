@@ -32,7 +32,7 @@ _UNDECIDED, _SHARE = 300.0, 0.5
 grid's points none of them fits."""
 _GRID_STD_M = 0.01
 """What half a step of the thinned grid changes in a range."""
-_MOST_UP = 2
+_MOST_UP = 4
 """Number of shifts upwards, and downwards, that are compared."""
 _FRAMES_TIMES_SHIFTS = 1 << 12
 """Frames are searched in groups of this over the number of shifts: the costs of a group are kept."""
