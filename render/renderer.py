@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
@@ -242,6 +243,57 @@ class Renderer:
         seen = views.in_camera(self.sensor)
         self._check(seen, background, workers)
         return replace(self._render(seen, background, (first, stop), workers, variant), views=views)
+
+    def turned_out_of_view(self, views: Views) -> NDArray[np.intp]:
+        """Return which views are tilted so far that none of the landmark's bounding box is in the image.
+
+        Parameters
+        ----------
+        views : Views
+        """
+        tilted = np.flatnonzero((views.pitch_rad != 0) | (views.roll_rad != 0))
+        if not tilted.size or not len(self.topology.faces):
+            return tilted[:0]
+        sensor = self.sensor
+        rotation, translation = views[tilted].in_camera(sensor).landmark2cam()
+        box = np.array(list(itertools.product(*zip(self.topology.low, self.topology.high, strict=True))))
+        corners = (np.einsum("nij,kj->nki", rotation, box) + translation[:, None]) @ sensor.cam2level
+        v, u = np.mgrid[: sensor.rows + 1, : sensor.cols + 1].astype(float)
+        edge = (v % sensor.rows == 0) | (u % sensor.cols == 0)
+        x, y, z = sensor.ray_directions(u[edge], v[edge]).T
+        beyond = (corners[..., 0] <= 0).all(axis=1)
+        ahead = sensor.cam2level.T @ [x, y, z]
+        if (ahead[0] > 0).all():
+            for axis in (1, 2):
+                slope = ahead[axis] / ahead[0]
+                beyond |= (corners[..., axis] > slope.max() * corners[..., 0]).all(axis=1)
+                beyond |= (corners[..., axis] < slope.min() * corners[..., 0]).all(axis=1)
+        return tilted[beyond]
+
+    def check_in_view(self, views: Views) -> None:
+        """Refuse views that are tilted so far that the landmark is out of the image.
+
+        Parameters
+        ----------
+        views : Views
+
+        Raises
+        ------
+        UsageError
+            Naming the view, its tilt, and the pitch that would have the landmark in the middle.
+        """
+        lost = self.turned_out_of_view(views)
+        if not lost.size:
+            return
+        k = int(lost[0])
+        seen = views[k : k + 1].in_camera(self.sensor)
+        middle = float(seen.height_m[0]) + 0.5 * float(self.topology.low[2] + self.topology.high[2])
+        elevation = math.degrees(math.atan2(middle, float(seen.distance_m[0])))
+        pitch, roll = (math.degrees(float(values[k])) for values in (views.pitch_rad, views.roll_rad))
+        raise UsageError(
+            f"in view {k} a pitch of {pitch:.4g}° and a roll of {roll:.4g}° turn the landmark out of the image: at roll"
+            f" 0 a pitch of about {-elevation - self.sensor.pitch_deg:.3g}° has it in the middle"
+        )
 
     def jacobian(
         self,
