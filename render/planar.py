@@ -205,9 +205,11 @@ def _refuse_out_of_plane(sensor: Sensor, views: Views) -> None:
     for name in ("pitch_deg", "roll_deg"):
         if getattr(sensor, name):
             raise UsageError(f"{needs} '{name}' = 0, got {getattr(sensor, name)}")
-    off = np.flatnonzero(views.height_m)
-    if off.size:
-        raise UsageError(f"{needs} 'height_m' = 0, got {views.height_m[off[0]]} in view {off[0]}")
+    for name in ("height_m", "pitch_rad", "roll_rad"):
+        values = getattr(views, name)
+        off = np.flatnonzero(values)
+        if off.size:
+            raise UsageError(f"{needs} '{name}' = 0, got {values[off[0]]} in view {off[0]}")
 
 
 def _refuse_inside(inside: NDArray[np.bool_], views: Views) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
@@ -32,7 +33,7 @@ from phasemark.render.integral.slopes import STEP, SlopeSums
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.sensor.sensor import Sensor
-from phasemark.render.view import Views
+from phasemark.render.view import VIEW_FIELDS, Views
 
 Variant = Literal["exact", "hard"]
 """The area integral, or what the centre ray of each pixel sees."""
@@ -44,6 +45,8 @@ _LINKS = 1 << 10
 """Further segments that a view is given room for when edges become chains behind a lens with distortion."""
 _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
+_TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
+"""Parameters that turn what stands behind the landmark."""
 _LARGE = 1 << 13
 """Faces above which a mesh is more than the processor's cache holds."""
 
@@ -208,6 +211,8 @@ class Renderer:
         delta_rad: ArrayLike = 0.0,
         bearing_rad: ArrayLike = 0.0,
         height_m: ArrayLike = 0.0,
+        pitch_rad: ArrayLike = 0.0,
+        roll_rad: ArrayLike = 0.0,
         *,
         background: Background | None = None,
         rows: tuple[int, int] | None = None,
@@ -218,8 +223,8 @@ class Renderer:
 
         Parameters
         ----------
-        distance_m, delta_rad, bearing_rad, height_m : array_like
-            The views, PHYSICS section 1.
+        distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : array_like
+            The views, PHYSICS sections 1 and 9.
         background : Background, optional
             What stands behind the landmark; None: nothing.
         rows : (first, stop), optional
@@ -240,7 +245,7 @@ class Renderer:
         UsageError
             A view that is not finite, a lens inside the landmark, a wall before it or a floor above its foot.
         """
-        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m)
+        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad)
         return self.render_views(views, background=background, rows=rows, variant=variant, workers=workers)
 
     def render_views(
@@ -262,12 +267,65 @@ class Renderer:
         self._check(seen, background, workers)
         return replace(self._render(seen, background, (first, stop), workers, variant), views=views)
 
+    def turned_out_of_view(self, views: Views) -> NDArray[np.intp]:
+        """Return which views are tilted so far that none of the landmark's bounding box is in the image.
+
+        Parameters
+        ----------
+        views : Views
+        """
+        tilted = np.flatnonzero((views.pitch_rad != 0) | (views.roll_rad != 0))
+        if not tilted.size or not len(self.topology.faces):
+            return tilted[:0]
+        sensor = self.sensor
+        rotation, translation = views[tilted].in_camera(sensor).landmark2cam()
+        box = np.array(list(itertools.product(*zip(self.topology.low, self.topology.high, strict=True))))
+        corners = (np.einsum("nij,kj->nki", rotation, box) + translation[:, None]) @ sensor.cam2level
+        v, u = np.mgrid[: sensor.rows + 1, : sensor.cols + 1].astype(float)
+        edge = (v % sensor.rows == 0) | (u % sensor.cols == 0)
+        x, y, z = sensor.ray_directions(u[edge], v[edge]).T
+        beyond = (corners[..., 0] <= 0).all(axis=1)
+        ahead = sensor.cam2level.T @ [x, y, z]
+        if (ahead[0] > 0).all():
+            for axis in (1, 2):
+                slope = ahead[axis] / ahead[0]
+                beyond |= (corners[..., axis] > slope.max() * corners[..., 0]).all(axis=1)
+                beyond |= (corners[..., axis] < slope.min() * corners[..., 0]).all(axis=1)
+        return tilted[beyond]
+
+    def check_in_view(self, views: Views) -> None:
+        """Refuse views that are tilted so far that the landmark is out of the image.
+
+        Parameters
+        ----------
+        views : Views
+
+        Raises
+        ------
+        UsageError
+            Naming the view, its tilt, and the pitch that would have the landmark in the middle.
+        """
+        lost = self.turned_out_of_view(views)
+        if not lost.size:
+            return
+        k = int(lost[0])
+        seen = views[k : k + 1].in_camera(self.sensor)
+        middle = float(seen.height_m[0]) + 0.5 * float(self.topology.low[2] + self.topology.high[2])
+        elevation = math.degrees(math.atan2(middle, float(seen.distance_m[0])))
+        pitch, roll = (math.degrees(float(values[k])) for values in (views.pitch_rad, views.roll_rad))
+        raise UsageError(
+            f"in view {k} a pitch of {pitch:.4g}° and a roll of {roll:.4g}° turn the landmark out of the image: at roll"
+            f" 0 a pitch of about {-elevation - self.sensor.pitch_deg:.3g}° has it in the middle"
+        )
+
     def jacobian(
         self,
         distance_m: ArrayLike,
         delta_rad: ArrayLike = 0.0,
         bearing_rad: ArrayLike = 0.0,
         height_m: ArrayLike = 0.0,
+        pitch_rad: ArrayLike = 0.0,
+        roll_rad: ArrayLike = 0.0,
         *,
         background: Background | None = None,
         parameters: Sequence[str] = VIEW_PARAMETERS,
@@ -281,10 +339,10 @@ class Renderer:
 
         Parameters
         ----------
-        distance_m, delta_rad, bearing_rad, height_m, background, workers
+        distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad, background, workers
             As for :meth:`render`.
         parameters : sequence of str
-            Which derivatives, in this order.
+            Which derivatives, in this order; "pitch_rad" and "roll_rad" too may be asked for.
 
         Returns
         -------
@@ -307,7 +365,9 @@ class Renderer:
         ((1, 1, 16, 16), np.float64(2.04))
         """
         check_parameters(parameters)
-        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m).in_camera(self.sensor)
+        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad).in_camera(
+            self.sensor
+        )
         self._check(views, background, workers)
         return self._differences(views, background, parameters, workers)
 
@@ -332,7 +392,7 @@ class Renderer:
         views : Views
             n views.
         parameters : sequence of str
-            Which derivatives, in this order.
+            Which derivatives, in this order; "pitch_rad" and "roll_rad" too may be asked for.
         background, workers
             As for :meth:`render`.
 
@@ -449,7 +509,7 @@ class Renderer:
     ) -> None:
         """Render slices of the views into `sums`, in one thread; with `slope`, (pixels, p), how they change too."""
         mesh = self.topology
-        turns = np.array([name == "bearing_rad" for name in parameters], np.bool_) & light.background[:2].any()
+        turns = np.array([name in _TURNING for name in parameters], np.bool_) & light.background[:2].any()
         buffers = _Buffers(
             len(mesh.creases) + len(mesh.folds),
             (camera.rows, camera.cols),
@@ -603,6 +663,7 @@ def _poses(views: Views, camera: Camera) -> Poses:
         np.ascontiguousarray(camera.level.T @ rotation),
         np.ascontiguousarray(translation @ camera.level),
         views.bearing_rad,
+        np.ascontiguousarray(views.tilt2level() @ camera.level),
     )
 
 
@@ -611,7 +672,7 @@ def _motion(views: Views, poses: Poses, camera: Camera, parameters: Sequence[str
     p = len(parameters)
     if not p:
         return Motion(poses, np.empty(0), np.empty((1, 4)))
-    many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_PARAMETERS))
+    many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_FIELDS))
     for k, name in enumerate(parameters):
         getattr(many, name)[k + 1 :: 1 + p] += STEP
     return Motion(_poses(many, camera), np.full(p, STEP), np.empty((1 + p, 4)))

@@ -21,7 +21,7 @@ from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.files.same_file import named_files
 from phasemark.data.frames.frame_set_file import FORMAT, SCHEMA_VERSION, FrameSet, open_frames
 from phasemark.data.plans.arrays import FRAME_FIELDS, VIEW_FIELDS, frame_set_fields
-from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.data.plans.frame_plan import TILT, FramePlan
 from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
@@ -152,7 +152,8 @@ class FrameJob:
         step = 1 << 16
         for first in range(0, self.plan.views, step):
             truth = self.plan.draw_truth(first, min(first + step, self.plan.views))
-            views = _views(truth).in_camera(self.sensor)
+            stated = _views(truth)
+            views = stated.in_camera(self.sensor)
             for k, renderer in enumerate(self._renderers):
                 of_class = np.flatnonzero(truth["class_index"] == k)
                 vertices = renderer.topology.vertices
@@ -163,12 +164,15 @@ class FrameJob:
                 # NaN (no wall, no floor) compares as false
                 before = truth["wall_m"][of_class] < views.distance_m[of_class] + reach
                 above = -truth["floor_m"][of_class] > vertices[:, 2].min() + views.height_m[of_class]
-                for view in of_class[inside | before | above]:
+                unseen = np.zeros(len(of_class), np.bool_)
+                unseen[renderer.turned_out_of_view(stated[of_class])] = True
+                for view in of_class[inside | before | above | unseen]:
                     one = slice(int(view), int(view) + 1)
                     try:
                         background = _background(truth["wall_m"][view], truth["floor_m"][view], self.plan)
                         if background is not None:
                             background.check_behind(vertices, views[one])
+                        renderer.check_in_view(stated[one])
                         if inside[np.searchsorted(of_class, view)]:
                             raise UsageError(
                                 "the lens is inside the landmark's bounding box: 'distance_m' is too small"
@@ -239,6 +243,8 @@ class FrameJob:
             },
         )  # fmt: skip
         for name, key, units, long_name in _TRUTH:
+            if key in TILT and getattr(self.plan, key) is None:
+                continue
             yield name, truth[key].astype("<f8"), ("view",), {"units": units, "long_name": long_name}
         yield (
             "split", truth["split_index"], ("view",),
@@ -332,6 +338,8 @@ _TRUTH = (
     ("delta", "delta_deg", "degree", "angle from which the landmark is seen"),
     ("bearing", "bearing_deg", "degree", "azimuth of the landmark's axis in the camera frame"),
     ("height", "height_m", "m", "height of the landmark's origin above the optical axis"),
+    ("pitch", "pitch_deg", "degree", "pitch of the camera, positive looking down"),
+    ("roll", "roll_deg", "degree", "roll of the camera"),
     ("albedo", "albedo", "1", "share of light that the landmark returns"),
     ("wall", "wall_m", "m", "distance of the wall behind, NaN if there is none"),
     ("floor", "floor_m", "m", "how far the floor lies below the lens, NaN if there is none"),
@@ -340,7 +348,12 @@ _TRUTH = (
 
 def _views(truth: dict[str, NDArray[Any]]) -> Views:
     return Views.broadcast(
-        truth["distance_m"], np.deg2rad(truth["delta_deg"]), np.deg2rad(truth["bearing_deg"]), truth["height_m"]
+        truth["distance_m"],
+        np.deg2rad(truth["delta_deg"]),
+        np.deg2rad(truth["bearing_deg"]),
+        truth["height_m"],
+        np.deg2rad(truth["pitch_deg"]),
+        np.deg2rad(truth["roll_deg"]),
     )
 
 

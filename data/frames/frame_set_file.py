@@ -40,7 +40,9 @@ SCHEMA_VERSION = 1
 _MOST = 1e12
 """More electrons than any pixel holds."""
 
-_TRUTH = ("distance", "delta", "bearing", "height", "albedo", "wall", "floor")
+_TRUTH = ("distance", "delta", "bearing", "height", "pitch", "roll", "albedo", "wall", "floor")
+_TILT = ("pitch", "roll")
+"""Absent from files of a level camera."""
 
 Sample = dict[str, Any]
 
@@ -68,8 +70,8 @@ class FrameSet:
     splits : tuple of str
     versions : dict of str to str
     truth : dict of str to (views,) array
-        ``class_index``, ``distance_m``, ``delta_rad``, ``bearing_rad``, ``height_m``, ``albedo``, ``wall_m``,
-        ``floor_m``, ``split_index``.
+        ``class_index``, ``distance_m``, ``delta_rad``, ``bearing_rad``, ``height_m``, ``pitch_rad``,
+        ``roll_rad``, ``albedo``, ``wall_m``, ``floor_m``, ``split_index``.
     view_index : (frames,) int64
         Which view each frame shows.
     """
@@ -137,12 +139,15 @@ class FrameSet:
             if truth[name].min() < 0 or truth[name].max() >= count:
                 raise InputFileError(f"{self.path}: '{name}' has numbers outside 0 … {count - 1}")
         for name in _TRUTH:
+            if name in _TILT and name not in file:
+                truth[f"{name}_rad"] = np.zeros(n)
+                continue
             values = self._column(file, name, n).astype(np.float64)
             if name not in ("wall", "floor") and not np.isfinite(values).all():
                 raise InputFileError(f"{self.path}: '{name}' must be finite")
             if name == "distance" and not (values > 0).all():
                 raise InputFileError(f"{self.path}: 'distance' must be positive, got {values.min():g}")
-            if name in ("delta", "bearing"):
+            if name in ("delta", "bearing", *_TILT):
                 truth[f"{name}_rad"] = np.deg2rad(values)
             else:
                 truth[name if name == "albedo" else f"{name}_m"] = values

@@ -19,6 +19,7 @@ from phasemark.data.files.atomic_write import replacing, write_atomically
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.data.seeds import stream
 from phasemark.render import Background, Flag, Frames, Renderer, Sensor, Views, capture
+from phasemark.render.view import VIEW_FIELDS
 
 STATUS_VALID = 5
 STATUS_NO_TARGET = 255
@@ -90,10 +91,11 @@ def simulate_recording(
     if not 1 <= len(views) <= MOST_FRAMES:
         raise UsageError(f"a simulated recording must have 1 … {MOST_FRAMES} frames, got {len(views)}")
     renderer = Renderer(mesh, sensor, albedo=albedo)
+    renderer.check_in_view(views)
     taken, image, rendered = [], None, None
     for k in range(len(views)):
         view = views[k : k + 1]
-        at = (float(view.distance_m[0]), float(view.delta_rad[0]), float(view.bearing_rad[0]), float(view.height_m[0]))
+        at = tuple(float(getattr(view, name)[0]) for name in VIEW_FIELDS)
         if image is None or at != rendered:
             behind = background
             if background is not None and background.wall_m is not None:
@@ -190,6 +192,11 @@ def _truth(recording: SimulatedRecording) -> dict[str, NDArray[np.float64]]:
         "truth_delta_deg": np.degrees(views.delta_rad),
         "truth_bearing_deg": np.degrees(views.bearing_rad),
         "truth_height_m": views.height_m,
+        **(
+            {"truth_pitch_deg": np.degrees(views.pitch_rad), "truth_roll_deg": np.degrees(views.roll_rad)}
+            if views.are_tilted
+            else {}
+        ),
     }
 
 

@@ -26,6 +26,8 @@ _COLUMNS = {
     "delta_rad": ("delta", "_deg", _DEGREES),
     "bearing_rad": ("bearing", "_deg", _DEGREES),
     "height_m": ("height", "_m", 1.0),
+    "pitch_rad": ("pitch", "_deg", _DEGREES),
+    "roll_rad": ("roll", "_deg", _DEGREES),
 }
 """Parameters of a view: name, unit and scale of their columns."""
 

@@ -65,7 +65,7 @@ def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # typ
             if mesh.part[face]:
                 upper += weights[k]
         elif has_background:
-            dx, dy, dz = towards_level(camera.level, y, z)
+            dx, dy, dz = towards_level(poses.level[view], y, z)
             bearing = poses.bearing[view]
             t, rho, cos_theta = background_hit(light.background, math.cos(bearing), math.sin(bearing), dx, dy, dz)
             reflected = rho * cos_theta
@@ -202,7 +202,7 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
                         else:
                             y, z = ray_of(camera, u, v)
                         length = math.sqrt(1.0 + y * y + z * z)
-                        dx, dy, dz = towards_level(camera.level, y, z)
+                        dx, dy, dz = towards_level(poses.level[view], y, z)
                         t, rho, cos_theta = background_hit(light.background, cos_b, sin_b, dx, dy, dz)
                         if t == 0.0:
                             continue

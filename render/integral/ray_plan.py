@@ -67,7 +67,7 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
         u_low, u_high, v_low, v_high = _extent(edges, n_edges, False, bent_lens)
         bent_low_u, bent_high_u, bent_low_v, bent_high_v = _extent(edges, n_edges, True, bent_lens)
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
-        n_edges = _add_background(background, cos_b, sin_b, camera, edges, n_edges)
+        n_edges = _add_background(background, cos_b, sin_b, poses.level[view], camera, edges, n_edges)
         if n_edges < 0:
             return SHORT_SEGMENTS, n
         if bin_segments(n_edges, camera, edges) < 0:
@@ -105,17 +105,17 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
 
 
 @kernel
-def _add_background(background, cos_b, sin_b, camera, edges, n):  # type: ignore[no-untyped-def]
+def _add_background(background, cos_b, sin_b, level, camera, edges, n):  # type: ignore[no-untyped-def]
     """Append the line where wall and floor meet, or the horizon; return the number of segments, −1 without room."""
     lens = camera.distortion
     if lens.model == 0:
-        if background_edge(background, cos_b, sin_b, camera, edges.segments[n]):
+        if background_edge(background, cos_b, sin_b, level, camera, edges.segments[n]):
             edges.limb[n], edges.ends[n, 0] = 0, -1
             n += 1
         return n
     if background[1] == 0.0:
         return n
-    tx, ty, tz = background_line(background, cos_b, sin_b, camera.level)
+    tx, ty, tz = background_line(background, cos_b, sin_b, level)
     if abs(tz) >= abs(ty) and tz != 0.0:
         ya, yb = lens.low_y, lens.high_y
         za, zb = -(tx + ty * ya) / tz, -(tx + ty * yb) / tz
