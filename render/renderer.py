@@ -120,7 +120,8 @@ class Renderer:
     albedo : float
         Of the Lambertian landmark, in (0, 1].
     harmonics : sequence of int, optional
-        Harmonic orders k > 1 wanted beside the signal; None: those that the sensor's taps need.
+        Harmonic orders k > 1 wanted beside the signal, of every modulation frequency; None: those that the sensor's
+        taps need.
     intersector : {"auto", "embree", "float64"}
         What finds the face a ray meets; "auto" is Embree where the package embreex is installed.
     splits : int
@@ -163,7 +164,7 @@ class Renderer:
         self.albedo = float(albedo)
         self.splits = int(splits)
         self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
-        self._orders = np.array([1, *harmonics], dtype=np.int64)
+        self._harmonics = tuple(int(order) for order in harmonics)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
         self.untrusted_pixels = 0
         """How many pixels, of all rendered so far, had too many edges to be split exactly."""
@@ -266,7 +267,7 @@ class Renderer:
         Returns
         -------
         (n, len(parameters), rows, cols) complex128
-            Per metre or per radian.
+            Per metre or per radian. Of a sensor with m > 1 frequencies (n, len(parameters), m, rows, cols).
 
         Raises
         ------
@@ -317,7 +318,8 @@ class Renderer:
         -------
         images : PhasorImages
         slope : (n, len(parameters), rows, cols) complex128
-            ∂S/∂parameter, per metre or radian; see :mod:`phasemark.render.integral.slopes`.
+            ∂S/∂parameter, per metre or radian; of a sensor with m > 1 frequencies (n, len(parameters), m, rows, cols);
+            see :mod:`phasemark.render.integral.slopes`.
 
         Raises
         ------
@@ -328,10 +330,12 @@ class Renderer:
         seen = views.in_camera(self.sensor)
         self._check(seen, background, workers)
         whole, p = (0, self.sensor.rows), len(parameters)
-        by_pixel = np.zeros((len(views) * self.sensor.rows * self.sensor.cols, p), np.complex128)
+        m, shape = len(self.sensor.frequencies_hz), (self.sensor.rows, self.sensor.cols)
+        by_pixel = np.zeros((m, len(views) * math.prod(shape), p), np.complex128)
         images = self._render(seen, background, whole, workers, slope=by_pixel, parameters=parameters)
-        slope = by_pixel.reshape(len(views), self.sensor.rows, self.sensor.cols, p).transpose(0, 3, 1, 2)
-        unknown = np.isnan(slope).any(axis=(1, 2, 3)) | (not self.topology.closed)
+        slope = by_pixel.reshape(m, len(views), *shape, p).transpose(1, 4, 0, 2, 3)
+        slope = slope[:, :, 0] if m == 1 else slope
+        unknown = np.isnan(slope).any(axis=tuple(range(1, slope.ndim))) | (not self.topology.closed)
         full = np.flatnonzero(unknown)
         if full.size:
             slope[full] = self._differences(seen[full], background, parameters, workers)
@@ -343,7 +347,13 @@ class Renderer:
         """Return slopes as differences of images; `seen` as the camera itself has the views."""
         # a step may take a landmark that stands on the floor a hair into it
         whole = (0, self.sensor.rows)
-        return differentiate(lambda v: self._render(v, background, whole, workers).phasor, seen, parameters)
+        one = len(self.sensor.frequencies_hz) == 1
+
+        def phasor_of(moved: Views) -> NDArray[np.complex128]:
+            images = self._render(moved, background, whole, workers)
+            return images.phasor if one else images.phasors
+
+        return differentiate(phasor_of, seen, parameters)
 
     def _check(self, views: Views, background: Background | None, workers: int) -> None:
         """Refuse what cannot be rendered."""
@@ -365,7 +375,8 @@ class Renderer:
     ) -> PhasorImages:
         """Render rows of views that have been checked, as the camera itself has them.
 
-        With `slope`, (pixels of all views, p), it is filled with how the phasors change with `parameters`.
+        With `slope`, (m, pixels of all views, p), it is filled with how the phasors at each of the sensor's m
+        frequencies change with `parameters`.
         """
         run = self._render_tasks if variant == "exact" else self._cast_centres
         order = self._by_direction(views) if slope is None else slice(None)
@@ -374,13 +385,14 @@ class Renderer:
             run = partial(self._render_tasks, slope=slope, parameters=parameters)
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)
-        sums = _no_light(shape, len(self._orders))
+        first_hz, columns_hz = self.sensor.frequencies_hz[0], _columns_hz(self.sensor, self._harmonics)
+        sums = _no_light(shape, len(columns_hz))
         camera = _camera(self.sensor, rows)
         light = Light(
             (background or Background()).parameters(),
             self.albedo,
             1 / self.sensor.metres_per_radian,
-            self._orders,
+            np.array(columns_hz) / first_hz,
             self.sensor.vignetting,
         )
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
@@ -402,8 +414,9 @@ class Renderer:
             upper_coverage=np.minimum(upper, 1.0),
             sensor=self.sensor,
             views=views,
-            harmonics={
-                int(order): np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._orders) if order > 1
+            harmonics={order: np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._harmonics, start=1)},
+            by_hz={
+                hz: np.ascontiguousarray(phasor[..., k]) for k, hz in enumerate(columns_hz) if k > len(self._harmonics)
             },
         )
 
@@ -423,7 +436,7 @@ class Renderer:
         slope: NDArray[np.complex128] | None = None,
         parameters: Sequence[str] = (),
     ) -> None:
-        """Render slices of the views into `sums`, in one thread; with `slope`, (pixels, p), how they change too."""
+        """Render slices of the views into `sums`, in one thread; with `slope`, (m, pixels, p), how they change too."""
         mesh = self.topology
         turns = np.array([name == "bearing_rad" for name in parameters], np.bool_) & light.background[:2].any()
         buffers = _Buffers(
@@ -437,7 +450,9 @@ class Renderer:
             motion = _motion(views[task], poses, camera, parameters)
             slopes = None
             if slope is not None:
-                slopes = SlopeSums(slope[_pixels_of(task, sums)], motion, own, turns)
+                columns_hz = _columns_hz(self.sensor, self._harmonics)
+                columns = np.array([columns_hz.index(hz) for hz in self.sensor.frequencies_hz])
+                slopes = SlopeSums(slope[:, _pixels_of(task, sums)], columns, motion, own, turns)
             view = 0
             while view < len(poses.lens):
                 reached, n = plan_rays(
@@ -500,6 +515,16 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
             )
+
+
+def _columns_hz(sensor: Sensor, harmonics: Sequence[int]) -> list[float]:
+    """Return at which frequencies phasors are wanted: the first with its harmonics, then the others with theirs."""
+    first_hz, *others = sensor.frequencies_hz
+    columns = [k * first_hz for k in (1, *harmonics)]
+    for hz in (k * other for other in others for k in (1, *harmonics)):
+        if hz not in columns:
+            columns.append(hz)
+    return columns
 
 
 def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:

@@ -71,16 +71,17 @@ class Light(NamedTuple):
     albedo : float
         Of the landmark.
     radians_per_metre : float
-        4πf / c.
-    orders : (k,) int64
-        Harmonic orders; the first is 1.
+        4πf / c of the first frequency f.
+    orders : (k,) float64
+        Which multiples of f phasors are wanted at: harmonic orders, other frequencies and their harmonics; the first
+        is 1.
     vignetting : bool
     """
 
     background: NDArray[np.float64]
     albedo: float
     radians_per_metre: float
-    orders: NDArray[np.int64]
+    orders: NDArray[np.float64]
     vignetting: bool
 
 
