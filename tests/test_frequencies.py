@@ -14,12 +14,22 @@ from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import (
     Background,
+    Flag,
+    Frames,
+    PhasorImages,
     Renderer,
     Sensor,
+    Views,
+    camera_unit,
+    capture,
+    predicted_range_std,
     preset,
+    unwrap_frames,
     unwrap_ranges,
     unwrapping_error_probability,
 )
+from phasemark.render.exposure import Motion, capture_moving, render_moving
+from phasemark.render.exposure.motion import phase_image_times_s
 
 PMD = preset("pmd-16x16")
 TWO = PMD.with_(modulation_hz=[20e6, 60e6])
@@ -242,3 +252,155 @@ def test_unwrapping_refuses_ranges_of_other_frequencies():
         unwrap_ranges(np.ones((3, 4)), 0.1, TWO)
     with pytest.raises(UsageError, match="'std_m' must not be negative, got -1"):
         unwrap_ranges(np.ones((2, 4)), -1.0, TWO)
+
+
+# Frames
+
+
+def plain(range_m, sensor, amplitude=0.5):
+    """Images (1, rows, cols) of unmixed pixels at given ranges, at every frequency."""
+    distance = np.broadcast_to(np.asarray(range_m, float), (1, sensor.rows, sensor.cols))
+    first_hz, *others = sensor.frequencies_hz
+    s = {hz: amplitude * np.exp(4j * math.pi * hz / C * distance) for hz in sensor.frequencies_hz}
+    return PhasorImages(
+        s[first_hz],
+        np.full(distance.shape, amplitude),
+        np.ones(distance.shape),
+        sensor,
+        Views.broadcast(1.0),
+        by_hz={hz: s[hz] for hz in others},
+    )
+
+
+def take(image, sensor, seed=1, n_frames=1, **options):
+    return capture(image, sensor, rng=np.random.default_rng(seed), n_frames=n_frames, **options)
+
+
+def test_each_frequency_has_the_noise_of_the_law_and_none_of_the_others():
+    sensor = FOUR.with_(read_noise_e=20, ambient_e=3000)
+    frames = take(plain(3.2, sensor), sensor, n_frames=200)
+    phases = []
+    for hz, part in zip(sensor.frequencies_hz, frames.by_frequency, strict=True):
+        law = (
+            C
+            / (4 * math.pi * hz)
+            * math.sqrt(sensor.signal_e * 0.5 + 3000 + 2 * 400)
+            / (math.sqrt(2) * 0.5 * sensor.signal_e * 0.5)
+        )
+        error = wrapped(part.range_m.ravel() - 3.2 % part.sensor.unambiguous_range_m, part.sensor)
+        low, high = stats.chi2.interval(1 - 0.001 / 4, error.size)  # 99.9 %, four cells
+        assert low <= np.sum(error**2) / law**2 <= high
+        phases.append(error)
+    correlation = np.corrcoef(phases)[np.triu_indices(4, 1)]
+    assert np.abs(correlation).max() < 4.5 / math.sqrt(phases[0].size)  # six normal deviates: 99.99 %
+
+
+def test_the_range_of_a_frame_has_the_combined_variance():
+    frames = take(plain(6.3, TWO), TWO, n_frames=400)
+    law = sum(predicted_range_std(0.5, 0.5, camera) ** -2.0 for camera in TWO.by_frequency)
+    error = frames.range_m[frames.valid] - 6.3
+    low, high = stats.chi2.interval(0.999, error.size)
+    assert low <= np.sum(error**2) * law <= high
+    flagged = frames.flags[~frames.valid]
+    assert (flagged == Flag.INCONSISTENT | Flag.MISSING).all()
+    low, high = stats.binom.interval(0.999, frames.flags.size, 1e-4)
+    assert low <= flagged.size <= high
+
+
+def test_one_frequency_keeps_the_noise_it_has_alone():
+    alone = PMD.with_(modulation_hz=20e6)
+    frames = take(plain(3.0, TWO), TWO, n_frames=3)
+    single = take(plain(3.0, alone), alone, n_frames=3)
+    np.testing.assert_array_equal(frames.by_frequency[0].range_m, single.range_m)
+    np.testing.assert_array_equal(frames.amplitude_e, single.amplitude_e)
+
+
+def test_a_run_captured_piece_by_piece_has_the_same_bytes():
+    whole = take(plain(3.0, TWO), TWO, n_frames=4)
+    part = take(plain(3.0, TWO), TWO, n_frames=2, first_frame=2)
+    np.testing.assert_array_equal(whole.range_m[:, 2:], part.range_m)
+
+
+def test_taps_are_kept_in_the_order_of_the_phase_images():
+    frames = take(plain(3.0, TWO), TWO, keep_taps=True)
+    assert frames.taps_e.shape == (1, 1, 8, 2, 16, 16)
+    for j, part in enumerate(frames.by_frequency):
+        d = frames.taps_e[:, :, 4 * j : 4 * j + 4, 0] - frames.taps_e[:, :, 4 * j : 4 * j + 4, 1]
+        phase = np.arctan2(d[:, :, 3] - d[:, :, 1], d[:, :, 0] - d[:, :, 2])
+        np.testing.assert_allclose(
+            wrapped(phase * part.sensor.metres_per_radian - part.range_m, part.sensor), 0, atol=1e-9
+        )
+
+
+def test_every_frequency_has_a_pattern_of_phase_offsets_and_the_range_offset_is_one_delay():
+    sensor = TWO.with_(phase_offset_std_rad=0.02, range_offset_m=0.3, shot_noise=False)
+    frames = take(plain(3.0, sensor), sensor)
+    patterns = []
+    for j, part in enumerate(frames.by_frequency):
+        error = wrapped(part.range_m[0, 0] - 3.3, part.sensor)
+        expected = camera_unit(sensor, j).delay_rad[0] * part.sensor.metres_per_radian - 0.3
+        np.testing.assert_allclose(error, expected, atol=1e-9)
+        patterns.append(expected / part.sensor.metres_per_radian)
+        assert np.std(patterns[-1]) == pytest.approx(0.02, rel=0.15)  # 256 pixels: 3 σ
+    assert abs(np.corrcoef(patterns[0].ravel(), patterns[1].ravel())[0, 1]) < 0.25
+    # the patterns are known to the camera: what they make of the ranges is no sign of mixing
+    assert frames.valid.all()
+
+
+def test_phase_images_of_a_moving_camera_are_eight_about_the_middle():
+    assert np.allclose(phase_image_times_s(TWO), (np.arange(8) - 3.5) / 24)
+    renderer, motion = Renderer(None, TWO), Motion(forward_m_s=0.2)
+    views = Views.broadcast(1.0)
+    images = render_moving(renderer, views, motion, background=Background(wall_m=3.0))
+    assert len(images) == 8
+    quiet = TWO.with_(shot_noise=False)
+    frames = capture_moving(
+        Renderer(None, quiet), views, quiet, motion, rng=np.random.default_rng(1), background=Background(wall_m=3.0)
+    )
+    for j, part in enumerate(frames.by_frequency):
+        distance = 3.0 - 0.2 * (np.arange(8) - 3.5)[4 * j : 4 * j + 4] / 24  # of the wall, straight ahead
+        s = np.exp(1j * distance / part.sensor.metres_per_radian) / distance**2
+        d = (s * np.exp(0.5j * math.pi * np.arange(4))).real
+        expected = math.atan2(d[3] - d[1], d[0] - d[2]) * part.sensor.metres_per_radian
+        # the pixel beside the axis sees the wall 0.2 mm further out
+        assert wrapped(part.range_m[0, 0, 8, 8] - expected, part.sensor) == pytest.approx(0, abs=1e-3)
+
+
+def test_a_mixed_pixel_is_flagged_inconsistent():
+    image = Renderer(CYLINDER, TWO).render(1.0, 0.3, background=Background(wall_m=3.0))
+    frames = take(image, TWO)
+    mixed = (image.coverage[0] > 0.1) & (image.coverage[0] < 0.9)
+    inconsistent = (frames.flags[0, 0] & Flag.INCONSISTENT) > 0
+    assert inconsistent[mixed].mean() > 0.8
+    assert np.isnan(frames.range_m[0, 0][inconsistent]).all()
+    assert inconsistent[image.coverage[0] == 0].sum() <= 1
+    for part in frames.by_frequency:  # each frequency keeps what it measured
+        assert part.valid[0, 0][mixed].mean() > 0.9
+
+
+def test_flags_of_several_frequencies_say_what_all_of_them_say():
+    def part(camera, flags):
+        return Frames(np.ones((1, 4)), np.full((1, 4), 1e4), np.full((1, 4), 1e4), flags=flags, sensor=camera)
+
+    cameras = TWO.with_(rows=1, cols=4)
+    none, saturated = Flag.NO_RETURN, Flag.MISSING | Flag.SATURATED
+    first = part(cameras.by_frequency[0], [[none, none, 0, 0]])
+    second = part(cameras.by_frequency[1], [[none, 0, saturated, 0]])
+    flags = unwrap_frames([first, second], cameras).flags[0, 0, 0]
+    assert flags.tolist() == [none, Flag.INCONSISTENT | Flag.MISSING, saturated, 0]
+
+
+def test_frames_of_other_frequencies_are_refused():
+    frames = take(plain(3.0, TWO), TWO)
+    with pytest.raises(UsageError, match="'by_frequency' must follow the order"):
+        Frames(frames.range_m, sensor=TWO, by_frequency=frames.by_frequency[::-1])
+    with pytest.raises(UsageError, match="of 2 frequencies, got 1"):
+        unwrap_frames(frames.by_frequency[:1], TWO)
+    with pytest.raises(UsageError, match="'modulation_hz' is"):
+        take(plain(3.0, TWO), FOUR)
+
+
+def test_some_frames_keep_what_each_frequency_measured():
+    frames = take(plain(3.0, TWO), TWO, n_frames=3)
+    for some in (frames[:1], frames.each_a_position()):
+        assert [part.range_m.shape for part in some.by_frequency] == [some.range_m.shape] * 2
