@@ -222,6 +222,52 @@ class Frames:
             by_frequency=[part.each_a_position() for part in self._by_frequency],
         )
 
+    def taken_by(self, sensor: Sensor) -> Self:
+        """Return the same ranges, amplitudes and flags as frames of another camera, without taps and stamps.
+
+        Parameters
+        ----------
+        sensor : Sensor
+            With as many pixels and the same modulation frequencies.
+        """
+        parts = zip(self._by_frequency, sensor.by_frequency, strict=True) if self._by_frequency else ()
+        return type(self)(
+            self.range_m,
+            self.amplitude_e,
+            self.intensity_e,
+            flags=self.flags,
+            sensor=sensor,
+            by_frequency=[part.taken_by(camera) for part, camera in parts],
+        )
+
+    def some_frames(self, start: int, stop: int) -> Self:
+        """Return frames `start` to `stop` of every position, without taps and stamps."""
+        part = slice(start, stop)
+        return type(self)(
+            self.range_m[:, part],
+            None if self.amplitude_e is None else self.amplitude_e[:, part],
+            None if self.intensity_e is None else self.intensity_e[:, part],
+            sensor=self.sensor,
+            flags=self.flags[:, part],
+            by_frequency=[one.some_frames(start, stop) for one in self._by_frequency],
+        )
+
+    def as_one_position(self) -> Self:
+        """Return positions of one frame each as the frames of one position, (1, n, rows, cols)."""
+        n = len(self) * self.n_frames
+        whole = (1, n, self.sensor.rows, self.sensor.cols)
+        taps = self.taps_e
+        return type(self)(
+            self.range_m.reshape(whole),
+            None if self.amplitude_e is None else self.amplitude_e.reshape(whole),
+            None if self.intensity_e is None else self.intensity_e.reshape(whole),
+            sensor=self.sensor,
+            flags=self.flags.reshape(whole),
+            taps_e=None if taps is None else taps.reshape(1, n, *taps.shape[2:]),
+            time_s=None if self.time_s is None else self.time_s.reshape(1, n),
+            by_frequency=[part.as_one_position() for part in self._by_frequency],
+        )
+
     @property
     def valid(self) -> NDArray[np.bool_]:
         """True where the range may be used, (n, frames, rows, cols)."""

@@ -29,6 +29,7 @@ from phasemark.render.integral.shells import unite_shells
 from phasemark.render.integral.slopes import STEP, SlopeSums
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
@@ -385,14 +386,14 @@ class Renderer:
             run = partial(self._render_tasks, slope=slope, parameters=parameters)
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)
-        first_hz, columns_hz = self.sensor.frequencies_hz[0], _columns_hz(self.sensor, self._harmonics)
+        columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
         sums = _no_light(shape, len(columns_hz))
         camera = _camera(self.sensor, rows)
         light = Light(
             (background or Background()).parameters(),
             self.albedo,
             1 / self.sensor.metres_per_radian,
-            np.array(columns_hz) / first_hz,
+            np.array(columns_hz) / columns_hz[0],
             self.sensor.vignetting,
         )
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
@@ -450,7 +451,7 @@ class Renderer:
             motion = _motion(views[task], poses, camera, parameters)
             slopes = None
             if slope is not None:
-                columns_hz = _columns_hz(self.sensor, self._harmonics)
+                columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
                 columns = np.array([columns_hz.index(hz) for hz in self.sensor.frequencies_hz])
                 slopes = SlopeSums(slope[:, _pixels_of(task, sums)], columns, motion, own, turns)
             view = 0
@@ -515,16 +516,6 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
             )
-
-
-def _columns_hz(sensor: Sensor, harmonics: Sequence[int]) -> list[float]:
-    """Return at which frequencies phasors are wanted: the first with its harmonics, then the others with theirs."""
-    first_hz, *others = sensor.frequencies_hz
-    columns = [k * first_hz for k in (1, *harmonics)]
-    for hz in (k * other for other in others for k in (1, *harmonics)):
-        if hz not in columns:
-            columns.append(hz)
-    return columns
 
 
 def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:

@@ -26,6 +26,16 @@ def common_divisor_hz(frequencies_hz: Sequence[float]) -> float:
     return float(math.gcd(*(round(hz) for hz in frequencies_hz)))
 
 
+def phasor_frequencies_hz(frequencies_hz: Sequence[float], harmonics: Sequence[int]) -> list[float]:
+    """Return at which frequencies phasors are wanted: the first with its harmonics, then the others with theirs."""
+    first_hz, *others = frequencies_hz
+    found = [k * first_hz for k in (1, *harmonics)]
+    for hz in (k * other for other in others for k in (1, *harmonics)):
+        if hz not in found:
+            found.append(hz)
+    return found
+
+
 def check_frequencies(frequencies_hz: Sequence[float]) -> None:
     """Refuse frequencies that no range can be unwrapped from.
 
