@@ -45,6 +45,8 @@ _LINKS = 1 << 10
 """Further segments that a view is given room for when edges become chains behind a lens with distortion."""
 _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
+_RADIANS_PER_SPLIT = 1.1
+"""Radians per metre, those of 26 MHz, for which a pixel that sees a floor beside something else is cut once more."""
 _LARGE = 1 << 13
 """Faces above which a mesh is more than the processor's cache holds."""
 
@@ -419,6 +421,7 @@ class Renderer:
             1 / self.sensor.metres_per_radian,
             np.array(columns_hz) / columns_hz[0],
             self.sensor.vignetting,
+            _fastest(self.sensor),
         )
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
         if workers == 1 or len(tasks) <= 1:
@@ -462,7 +465,7 @@ class Renderer:
         parameters: Sequence[str] = (),
     ) -> None:
         """Render slices of the views into `sums`, in one thread; with `slope`, (m, pixels, p), how they change too."""
-        mesh = self.topology
+        mesh, splits = self.topology, self._splits_before(light)
         turns = np.array([name == "bearing_rad" for name in parameters], np.bool_) & light.background[:2].any()
         buffers = _Buffers(
             len(mesh.creases) + len(mesh.folds),
@@ -481,7 +484,7 @@ class Renderer:
             view = 0
             while view < len(poses.lens):
                 reached, n = plan_rays(
-                    view, mesh, poses, camera, self.splits, light.background, buffers.edges, buffers.scratch,
+                    view, mesh, poses, camera, splits, light.background, buffers.edges, buffers.scratch,
                     buffers.samples, own.state, motion, buffers.borders,
                 )  # fmt: skip
                 if reached <= view:
@@ -496,6 +499,12 @@ class Renderer:
                 view = reached
             if slopes is not None:
                 slopes.conclude()
+
+    def _splits_before(self, light: Light) -> int:
+        """Return into how many boxes a side pixels are cut: more where fast phases turn along a floor."""
+        if light.fastest == 0.0 or not light.background[1] > 0.0:
+            return self.splits
+        return max(self.splits, min(math.ceil(light.fastest / _RADIANS_PER_SPLIT), _MAX_SPLITS))
 
     def _cast_centres(self, tasks: Iterable[slice], views: Views, camera: Camera, light: Light, sums: Sums) -> None:
         """Render slices of the views with one ray a pixel into `sums`, in one thread."""
@@ -538,6 +547,13 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
             )
+
+
+def _fastest(sensor: Sensor) -> float:
+    """Return the radians per metre of the highest of several modulation frequencies, 0 of one."""
+    if len(sensor.frequencies_hz) == 1:
+        return 0.0
+    return max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
 
 
 def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:

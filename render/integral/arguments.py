@@ -120,6 +120,9 @@ class Light(NamedTuple):
         Which multiples of f phasors are wanted at: harmonic orders, other frequencies and their harmonics; the first
         is 1.
     vignetting : bool
+    fastest : float
+        4πf / c of the highest of several modulation frequencies, for which the background's pixels are cut finely
+        enough; 0 of one frequency, whose pixels are not cut.
     """
 
     background: NDArray[np.float64]
@@ -127,6 +130,7 @@ class Light(NamedTuple):
     radians_per_metre: float
     orders: NDArray[np.float64]
     vignetting: bool
+    fastest: float
 
 
 class Edges(NamedTuple):
