@@ -56,8 +56,8 @@ def landmark_region(
     rows, cols = (
         _whole_blocks(first, stop, size, centre, binning)
         for (first, stop), size, centre in (
-            (_extent(seen.any(axis=1)), sensor.rows, sensor.centre_px[1]),
-            (_extent(seen.any(axis=0)), sensor.cols, sensor.centre_px[0]),
+            (_extent(np.asarray(seen.any(axis=1))), sensor.rows, sensor.centre_px[1]),
+            (_extent(np.asarray(seen.any(axis=0))), sensor.cols, sensor.centre_px[0]),
         )
     )
     return Region(*rows, *cols, binning)
