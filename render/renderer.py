@@ -465,8 +465,8 @@ class Renderer:
             view = 0
             while view < len(poses.lens):
                 reached, n = plan_rays(
-                    view, mesh, poses, camera, self.splits, light.background, buffers.edges, buffers.scratch,
-                    buffers.samples, own.state, motion, buffers.borders,
+                    view, mesh, poses, camera, self.splits, light.background, light.radians_per_metre,
+                    buffers.edges, buffers.scratch, buffers.samples, own.state, motion, buffers.borders,
                 )  # fmt: skip
                 if reached <= view:
                     buffers.make_room(reached)

@@ -11,6 +11,7 @@ from phasemark.render.background import background_hit
 from phasemark.render.integral.arguments import towards_landmark, towards_level
 from phasemark.render.integral.circular import turn
 from phasemark.render.integral.face_search import plane_hit
+from phasemark.render.integral.floor_phase import parts_of_pixel
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.quadrature_rules import G3W, G3X, G4W, G4X
 from phasemark.render.integral.ray_plan import SKIPPED
@@ -168,6 +169,10 @@ def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def
     return t, max(cos_theta, 0.0)
 
 
+_PARTS_OF_ONE_RULE = 2
+"""Of the parts that a floor's phase asks for, what 4 × 4 Gauss points integrate as they are."""
+
+
 def points_a_side(background: NDArray[np.float64]) -> int:
     """Return how many Gauss points a side :func:`add_background` takes; 0 where there is nothing to add."""
     if background[1] > 0.0:
@@ -179,7 +184,8 @@ def points_a_side(background: NDArray[np.float64]) -> int:
 def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-untyped-def]
     """Integrate the background over the skipped pixels of views `start` to `stop`.
 
-    A wall takes 3 × 3 Gauss points a pixel. A floor, whose range changes fast towards the horizon, takes 4 × 4.
+    A wall takes 3 × 3 Gauss points a pixel. A floor, whose range changes fast towards the horizon, takes 4 × 4, or as
+    many for each part of a pixel that its phase asks for.
     """
     order = 4 if light.background[1] > 0.0 else 3
     rows, cols = camera.stop_row - camera.first_row, camera.cols
@@ -191,14 +197,19 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
                 if sums.state[view, r, c] != SKIPPED:
                     continue
                 index = (view * rows + r) * cols + c
-                for i in range(order):
-                    at = G4X[i] if order == 4 else G3X[i]
+                parts = parts_of_pixel(
+                    r + camera.first_row, c, light.background, light.radians_per_metre, cos_b, sin_b, camera
+                )
+                parts = parts if parts > _PARTS_OF_ONE_RULE else 1
+                for i in range(order * parts):
+                    at = (i // order + (G4X[i % order] if order == 4 else G3X[i % order])) / parts
                     v = r + camera.first_row + 0.5 + camera.fill_v * (at - 0.5)
-                    for j in range(order):
-                        at = G4X[j] if order == 4 else G3X[j]
+                    for j in range(order * parts):
+                        at = (j // order + (G4X[j % order] if order == 4 else G3X[j % order])) / parts
                         u = c + 0.5 + camera.fill_u * (at - 0.5)
-                        if bent_lens:
-                            y, z = rule[r + camera.first_row, c, i * order + j]
+                        if bent_lens and parts == 1:
+                            ray = rule[r + camera.first_row, c, i * order + j]
+                            y, z = ray[0], ray[1]
                         else:
                             y, z = ray_of(camera, u, v)
                         length = math.sqrt(1.0 + y * y + z * z)
@@ -206,5 +217,7 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
                         t, rho, cos_theta = background_hit(light.background, cos_b, sin_b, dx, dy, dz)
                         if t == 0.0:
                             continue
-                        weight = G4W[i] * G4W[j] if order == 4 else G3W[i] * G3W[j]
+                        weight = (
+                            G4W[i % order] * G4W[j % order] if order == 4 else G3W[i % order] * G3W[j % order]
+                        ) / (parts * parts)
                         _add_phasor(index, t * length, rho * cos_theta, length, weight, light, sums)
