@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
@@ -31,8 +32,9 @@ from phasemark.render.integral.shells import unite_shells
 from phasemark.render.integral.slopes import STEP, SlopeSums
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
-from phasemark.render.view import Views
+from phasemark.render.view import VIEW_FIELDS, Views
 
 Variant = Literal["exact", "hard"]
 """The area integral, or what the centre ray of each pixel sees."""
@@ -44,6 +46,8 @@ _LINKS = 1 << 10
 """Further segments that a view is given room for when edges become chains behind a lens with distortion."""
 _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
+_TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
+"""Parameters that turn what stands behind the landmark."""
 _LARGE = 1 << 13
 """Faces above which a mesh is more than the processor's cache holds."""
 
@@ -143,7 +147,8 @@ class Renderer:
     albedo : float
         Of the Lambertian landmark, in (0, 1].
     harmonics : sequence of int, optional
-        Harmonic orders k > 1 wanted beside the signal; None: those that the sensor's taps need.
+        Harmonic orders k > 1 wanted beside the signal, of every modulation frequency; None: those that the sensor's
+        taps need.
     intersector : {"auto", "embree", "float64"}
         What finds the face a ray meets; "auto" is Embree where the package embreex is installed.
     splits : int
@@ -186,7 +191,7 @@ class Renderer:
         self.albedo = float(albedo)
         self.splits = int(splits)
         self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
-        self._orders = np.array([1, *harmonics], dtype=np.int64)
+        self._harmonics = tuple(int(order) for order in harmonics)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
         self.untrusted_pixels = 0
         """How many pixels, of all rendered so far, had too many edges to be split exactly."""
@@ -208,6 +213,8 @@ class Renderer:
         delta_rad: ArrayLike = 0.0,
         bearing_rad: ArrayLike = 0.0,
         height_m: ArrayLike = 0.0,
+        pitch_rad: ArrayLike = 0.0,
+        roll_rad: ArrayLike = 0.0,
         *,
         background: Background | None = None,
         rows: tuple[int, int] | None = None,
@@ -218,8 +225,8 @@ class Renderer:
 
         Parameters
         ----------
-        distance_m, delta_rad, bearing_rad, height_m : array_like
-            The views, PHYSICS section 1.
+        distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : array_like
+            The views, PHYSICS sections 1 and 9.
         background : Background, optional
             What stands behind the landmark; None: nothing.
         rows : (first, stop), optional
@@ -240,7 +247,7 @@ class Renderer:
         UsageError
             A view that is not finite, a lens inside the landmark, a wall before it or a floor above its foot.
         """
-        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m)
+        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad)
         return self.render_views(views, background=background, rows=rows, variant=variant, workers=workers)
 
     def render_views(
@@ -262,12 +269,65 @@ class Renderer:
         self._check(seen, background, workers)
         return replace(self._render(seen, background, (first, stop), workers, variant), views=views)
 
+    def turned_out_of_view(self, views: Views) -> NDArray[np.intp]:
+        """Return which views are tilted so far that none of the landmark's bounding box is in the image.
+
+        Parameters
+        ----------
+        views : Views
+        """
+        tilted = np.flatnonzero((views.pitch_rad != 0) | (views.roll_rad != 0))
+        if not tilted.size or not len(self.topology.faces):
+            return tilted[:0]
+        sensor = self.sensor
+        rotation, translation = views[tilted].in_camera(sensor).landmark2cam()
+        box = np.array(list(itertools.product(*zip(self.topology.low, self.topology.high, strict=True))))
+        corners = (np.einsum("nij,kj->nki", rotation, box) + translation[:, None]) @ sensor.cam2level
+        v, u = np.mgrid[: sensor.rows + 1, : sensor.cols + 1].astype(float)
+        edge = (v % sensor.rows == 0) | (u % sensor.cols == 0)
+        x, y, z = sensor.ray_directions(u[edge], v[edge]).T
+        beyond = (corners[..., 0] <= 0).all(axis=1)
+        ahead = sensor.cam2level.T @ [x, y, z]
+        if (ahead[0] > 0).all():
+            for axis in (1, 2):
+                slope = ahead[axis] / ahead[0]
+                beyond |= (corners[..., axis] > slope.max() * corners[..., 0]).all(axis=1)
+                beyond |= (corners[..., axis] < slope.min() * corners[..., 0]).all(axis=1)
+        return tilted[beyond]
+
+    def check_in_view(self, views: Views) -> None:
+        """Refuse views that are tilted so far that the landmark is out of the image.
+
+        Parameters
+        ----------
+        views : Views
+
+        Raises
+        ------
+        UsageError
+            Naming the view, its tilt, and the pitch that would have the landmark in the middle.
+        """
+        lost = self.turned_out_of_view(views)
+        if not lost.size:
+            return
+        k = int(lost[0])
+        seen = views[k : k + 1].in_camera(self.sensor)
+        middle = float(seen.height_m[0]) + 0.5 * float(self.topology.low[2] + self.topology.high[2])
+        elevation = math.degrees(math.atan2(middle, float(seen.distance_m[0])))
+        pitch, roll = (math.degrees(float(values[k])) for values in (views.pitch_rad, views.roll_rad))
+        raise UsageError(
+            f"in view {k} a pitch of {pitch:.4g}° and a roll of {roll:.4g}° turn the landmark out of the image: at roll"
+            f" 0 a pitch of about {-elevation - self.sensor.pitch_deg:.3g}° has it in the middle"
+        )
+
     def jacobian(
         self,
         distance_m: ArrayLike,
         delta_rad: ArrayLike = 0.0,
         bearing_rad: ArrayLike = 0.0,
         height_m: ArrayLike = 0.0,
+        pitch_rad: ArrayLike = 0.0,
+        roll_rad: ArrayLike = 0.0,
         *,
         background: Background | None = None,
         parameters: Sequence[str] = VIEW_PARAMETERS,
@@ -281,15 +341,15 @@ class Renderer:
 
         Parameters
         ----------
-        distance_m, delta_rad, bearing_rad, height_m, background, workers
+        distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad, background, workers
             As for :meth:`render`.
         parameters : sequence of str
-            Which derivatives, in this order.
+            Which derivatives, in this order; "pitch_rad" and "roll_rad" too may be asked for.
 
         Returns
         -------
         (n, len(parameters), rows, cols) complex128
-            Per metre or per radian.
+            Per metre or per radian. Of a sensor with m > 1 frequencies (n, len(parameters), m, rows, cols).
 
         Raises
         ------
@@ -307,7 +367,9 @@ class Renderer:
         ((1, 1, 16, 16), np.float64(2.04))
         """
         check_parameters(parameters)
-        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m).in_camera(self.sensor)
+        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad).in_camera(
+            self.sensor
+        )
         self._check(views, background, workers)
         return self._differences(views, background, parameters, workers)
 
@@ -332,7 +394,7 @@ class Renderer:
         views : Views
             n views.
         parameters : sequence of str
-            Which derivatives, in this order.
+            Which derivatives, in this order; "pitch_rad" and "roll_rad" too may be asked for.
         background, workers
             As for :meth:`render`.
 
@@ -340,7 +402,8 @@ class Renderer:
         -------
         images : PhasorImages
         slope : (n, len(parameters), rows, cols) complex128
-            ∂S/∂parameter, per metre or radian; see :mod:`phasemark.render.integral.slopes`.
+            ∂S/∂parameter, per metre or radian; of a sensor with m > 1 frequencies (n, len(parameters), m, rows, cols);
+            see :mod:`phasemark.render.integral.slopes`.
 
         Raises
         ------
@@ -351,10 +414,12 @@ class Renderer:
         seen = views.in_camera(self.sensor)
         self._check(seen, background, workers)
         whole, p = (0, self.sensor.rows), len(parameters)
-        by_pixel = np.zeros((len(views) * self.sensor.rows * self.sensor.cols, p), np.complex128)
+        m, shape = len(self.sensor.frequencies_hz), (self.sensor.rows, self.sensor.cols)
+        by_pixel = np.zeros((m, len(views) * math.prod(shape), p), np.complex128)
         images = self._render(seen, background, whole, workers, slope=by_pixel, parameters=parameters)
-        slope = by_pixel.reshape(len(views), self.sensor.rows, self.sensor.cols, p).transpose(0, 3, 1, 2)
-        unknown = np.isnan(slope).any(axis=(1, 2, 3)) | (not self.topology.closed)
+        slope = by_pixel.reshape(m, len(views), *shape, p).transpose(1, 4, 0, 2, 3)
+        slope = slope[:, :, 0] if m == 1 else slope
+        unknown = np.isnan(slope).any(axis=tuple(range(1, slope.ndim))) | (not self.topology.closed)
         full = np.flatnonzero(unknown)
         if full.size:
             slope[full] = self._differences(seen[full], background, parameters, workers)
@@ -366,7 +431,13 @@ class Renderer:
         """Return slopes as differences of images; `seen` as the camera itself has the views."""
         # a step may take a landmark that stands on the floor a hair into it
         whole = (0, self.sensor.rows)
-        return differentiate(lambda v: self._render(v, background, whole, workers).phasor, seen, parameters)
+        one = len(self.sensor.frequencies_hz) == 1
+
+        def phasor_of(moved: Views) -> NDArray[np.complex128]:
+            images = self._render(moved, background, whole, workers)
+            return images.phasor if one else images.phasors
+
+        return differentiate(phasor_of, seen, parameters)
 
     def _check(self, views: Views, background: Background | None, workers: int) -> None:
         """Refuse what cannot be rendered."""
@@ -388,7 +459,8 @@ class Renderer:
     ) -> PhasorImages:
         """Render rows of views that have been checked, as the camera itself has them.
 
-        With `slope`, (pixels of all views, p), it is filled with how the phasors change with `parameters`.
+        With `slope`, (m, pixels of all views, p), it is filled with how the phasors at each of the sensor's m
+        frequencies change with `parameters`.
         """
         run = self._render_tasks if variant == "exact" else self._cast_centres
         order = self._by_direction(views) if slope is None else slice(None)
@@ -397,15 +469,17 @@ class Renderer:
             run = partial(self._render_tasks, slope=slope, parameters=parameters)
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)
-        sums = _no_light(shape, len(self._orders))
+        columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
+        sums = _no_light(shape, len(columns_hz))
         behind = (background or Background()).parameters()
         camera = _camera(self.sensor, rows, points_a_side(behind))
         light = Light(
             behind,
             self.albedo,
             1 / self.sensor.metres_per_radian,
-            self._orders,
+            np.array(columns_hz) / columns_hz[0],
             self.sensor.vignetting,
+            _fastest(self.sensor),
         )
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
         if workers == 1 or len(tasks) <= 1:
@@ -426,8 +500,9 @@ class Renderer:
             upper_coverage=np.minimum(upper, 1.0),
             sensor=self.sensor,
             views=views,
-            harmonics={
-                int(order): np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._orders) if order > 1
+            harmonics={order: np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._harmonics, start=1)},
+            by_hz={
+                hz: np.ascontiguousarray(phasor[..., k]) for k, hz in enumerate(columns_hz) if k > len(self._harmonics)
             },
         )
 
@@ -447,9 +522,9 @@ class Renderer:
         slope: NDArray[np.complex128] | None = None,
         parameters: Sequence[str] = (),
     ) -> None:
-        """Render slices of the views into `sums`, in one thread; with `slope`, (pixels, p), how they change too."""
+        """Render slices of the views into `sums`, in one thread; with `slope`, (m, pixels, p), how they change too."""
         mesh = self.topology
-        turns = np.array([name == "bearing_rad" for name in parameters], np.bool_) & light.background[:2].any()
+        turns = np.array([name in _TURNING for name in parameters], np.bool_) & light.background[:2].any()
         buffers = _Buffers(
             len(mesh.creases) + len(mesh.folds),
             (camera.rows, camera.cols),
@@ -461,12 +536,14 @@ class Renderer:
             motion = _motion(views[task], poses, camera, parameters)
             slopes = None
             if slope is not None:
-                slopes = SlopeSums(slope[_pixels_of(task, sums)], motion, own, turns)
+                columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
+                columns = np.array([columns_hz.index(hz) for hz in self.sensor.frequencies_hz])
+                slopes = SlopeSums(slope[:, _pixels_of(task, sums)], columns, motion, own, turns)
             view = 0
             while view < len(poses.lens):
                 reached, n = plan_rays(
-                    view, mesh, poses, camera, self.splits, light.background, light.radians_per_metre,
-                    buffers.edges, buffers.scratch, buffers.samples, own.state, motion, buffers.borders,
+                    view, mesh, poses, camera, self.splits, light.background, light.fastest, buffers.edges,
+                    buffers.scratch, buffers.samples, own.state, motion, buffers.borders,
                 )  # fmt: skip
                 if reached <= view:
                     buffers.make_room(reached)
@@ -522,6 +599,13 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
             )
+
+
+def _fastest(sensor: Sensor) -> float:
+    """Return the radians per metre of the highest modulation frequency, 0 of a single one behind an ideal lens."""
+    if len(sensor.frequencies_hz) == 1 and sensor.lens is None:
+        return 0.0
+    return max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
 
 
 def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:
@@ -603,6 +687,7 @@ def _poses(views: Views, camera: Camera) -> Poses:
         np.ascontiguousarray(camera.level.T @ rotation),
         np.ascontiguousarray(translation @ camera.level),
         views.bearing_rad,
+        np.ascontiguousarray(views.tilt2level() @ camera.level),
     )
 
 
@@ -611,7 +696,7 @@ def _motion(views: Views, poses: Poses, camera: Camera, parameters: Sequence[str
     p = len(parameters)
     if not p:
         return Motion(poses, np.empty(0), np.empty((1, 4)))
-    many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_PARAMETERS))
+    many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_FIELDS))
     for k, name in enumerate(parameters):
         getattr(many, name)[k + 1 :: 1 + p] += STEP
     return Motion(_poses(many, camera), np.full(p, STEP), np.empty((1 + p, 4)))

@@ -13,7 +13,6 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from phasemark import UsageError
 from phasemark.render.integral.arguments import Camera, Motion, Poses
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.light import landmark_hit
@@ -24,6 +23,7 @@ from phasemark.render.integral.shells import unite_shells
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.kernel import kernel
 from phasemark.render.renderer import _Buffers
+from phasemark.render.rigid import rigid_transforms
 
 _NO_BACKGROUND = np.zeros(4)
 _SAMPLES = 1 << 15
@@ -100,6 +100,7 @@ class SceneMesh:
             np.ascontiguousarray(grid.level.T @ rotation),
             np.ascontiguousarray(translation @ grid.level),
             np.zeros(len(transforms)),
+            np.repeat(grid.level[None], len(transforms), axis=0),
         )
         found = [self._of_pose(poses._replace(**_only(poses, k)), grid) for k in range(len(transforms))]
         counts = [len(one[1]) for one in found]
@@ -179,30 +180,6 @@ def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float]
         (cosine * area / range_m**2).ravel(),
         np.zeros(n * len(points), np.int8),
     )
-
-
-def rigid_transforms(transforms: ArrayLike) -> NDArray[np.float64]:
-    """Return (n, 4, 4) float64 transforms that are rigid.
-
-    Raises
-    ------
-    UsageError
-        A matrix is not finite, or not a rotation with a translation.
-    """
-    array = np.asarray(transforms, dtype=np.float64)
-    if array.ndim == 2:
-        array = array[None]
-    if array.shape[1:] != (4, 4):
-        raise UsageError(f"'landmark2cam' must have shape (n, 4, 4), got {array.shape}")
-    if not np.isfinite(array).all():
-        raise UsageError("'landmark2cam' must be finite")
-    square = np.einsum("nij,nkj->nik", array[:, :3, :3], array[:, :3, :3])
-    off = np.abs(square - np.eye(3)).max(axis=(1, 2))
-    bottom = np.abs(array[:, 3] - [0, 0, 0, 1]).max(axis=1)
-    wrong = (off > 1e-4) | (bottom > 1e-9) | (np.linalg.det(array[:, :3, :3]) < 0)
-    if wrong.any():
-        raise UsageError(f"'landmark2cam' must be a rotation and a translation, matrix {int(wrong.argmax())} is not")
-    return array
 
 
 def _only(poses: Poses, k: int) -> dict[str, NDArray[np.float64]]:

@@ -67,7 +67,7 @@ class Camera(NamedTuple):
     fill_u, fill_v : float
         Fill factor.
     level : (3, 3) float64
-        Tilted to level camera frame.
+        Camera frame to that of its mount, which is level unless the view is tilted.
     distortion : Distortion
     """
 
@@ -97,12 +97,15 @@ class Poses(NamedTuple):
     matrix, offset : (n, 3, 3), (n, 3) float64
         p_image = matrix · p' + offset: landmark frame to the tilted camera's frame (x along the axis).
     bearing : (n,) float64
+    level : (n, 3, 3) float64
+        Tilted to level camera frame: mount and view together.
     """
 
     lens: NDArray[np.float64]
     matrix: NDArray[np.float64]
     offset: NDArray[np.float64]
     bearing: NDArray[np.float64]
+    level: NDArray[np.float64]
 
 
 class Light(NamedTuple):
@@ -115,17 +118,22 @@ class Light(NamedTuple):
     albedo : float
         Of the landmark.
     radians_per_metre : float
-        4πf / c.
-    orders : (k,) int64
-        Harmonic orders; the first is 1.
+        4πf / c of the first frequency f.
+    orders : (k,) float64
+        Which multiples of f phasors are wanted at: harmonic orders, other frequencies and their harmonics; the first
+        is 1.
     vignetting : bool
+    fastest : float
+        4πf / c of the highest modulation frequency, for which the background's pixels are cut finely enough; 0 of a
+        single frequency behind an ideal lens, whose pixels are not cut.
     """
 
     background: NDArray[np.float64]
     albedo: float
     radians_per_metre: float
-    orders: NDArray[np.int64]
+    orders: NDArray[np.float64]
     vignetting: bool
+    fastest: float
 
 
 class Edges(NamedTuple):
@@ -312,7 +320,7 @@ def towards_landmark(matrix, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def towards_level(level, y, z):  # type: ignore[no-untyped-def]
-    """Return the ray (1, y, z) in the level camera frame."""
+    """Return the ray (1, y, z) in the level camera frame; `level` as in :class:`Poses`, of one view."""
     return (
         level[0, 0] + level[0, 1] * y + level[0, 2] * z,
         level[1, 0] + level[1, 1] * y + level[1, 2] * z,

@@ -45,7 +45,8 @@ def follow_borders(view, first, mesh, motion, background, camera, edges, borders
                 pose = view * (p + 1) + k
                 if start < 0:
                     bearing = moved.bearing[pose]
-                    background_edge(background, math.cos(bearing), math.sin(bearing), camera, shifted[k])
+                    cos_b, sin_b = math.cos(bearing), math.sin(bearing)
+                    background_edge(background, cos_b, sin_b, moved.level[pose], camera, shifted[k])
                 else:
                     project(mesh.vertices, start, end, moved.matrix[pose], moved.offset[pose], camera, shifted[k])
             if start >= 0:
@@ -81,7 +82,7 @@ def _follow_bent_borders(view, first, mesh, motion, background, camera, edges, b
                 pose = view * (p + 1) + k
                 if start < 0:
                     bearing = moved.bearing[pose]
-                    tx, ty, tz = background_line(background, math.cos(bearing), math.sin(bearing), camera.level)
+                    tx, ty, tz = background_line(background, math.cos(bearing), math.sin(bearing), moved.level[pose])
                     size = math.sqrt(ty * ty + tz * tz)
                     shifted[k, 0], shifted[k, 1], shifted[k, 2] = tx / size, ty / size, tz / size
                 else:

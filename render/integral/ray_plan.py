@@ -31,7 +31,7 @@ SHORT_SEGMENTS = -2
 
 @kernel
 def plan_rays(  # type: ignore[no-untyped-def]
-    first, mesh, poses, camera, splits, background, radians_per_metre, edges, scratch, samples, state, motion, borders
+    first, mesh, poses, camera, splits, background, fastest, edges, scratch, samples, state, motion, borders
 ):
     """Place the samples of as many views as fit into the buffers, from view `first` on.
 
@@ -44,8 +44,8 @@ def plan_rays(  # type: ignore[no-untyped-def]
     splits : int
         Boxes a side that every pixel is cut into, at least.
     background : (4,) float64
-    radians_per_metre : float
-        4πf / c.
+    fastest : float
+        As :class:`~phasemark.render.integral.arguments.Light` has it.
     edges : Edges
     scratch : Scratch
     samples : Samples
@@ -73,7 +73,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
         u_low, u_high, v_low, v_high = _extent(edges, n_edges, False, bent_lens)
         bent_low_u, bent_high_u, bent_low_v, bent_high_v = _extent(edges, n_edges, True, bent_lens)
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
-        n_edges = _add_background(background, cos_b, sin_b, camera, edges, n_edges)
+        n_edges = _add_background(background, cos_b, sin_b, poses.level[view], camera, edges, n_edges)
         if n_edges < 0:
             return SHORT_SEGMENTS, n
         if bin_segments(n_edges, camera, edges) < 0:
@@ -91,7 +91,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
                     continue
                 before = n
                 bent = left < bent_high_u and right > bent_low_u and top < bent_high_v and bottom > bent_low_v
-                parts = parts_of_pixel(r, c, background, radians_per_metre, cos_b, sin_b, camera)
+                parts = parts_of_pixel(r, c, background, fastest, cos_b, sin_b, poses.level[view], camera)
                 parts = max(splits, parts if parts > 1 and not _near_limb(r + 1, c + 1, edges) else 1)
                 n, region, trusted = sample_pixel(
                     r, c, bent, parts, camera, edges, scratch, samples, borders, n, region
@@ -113,17 +113,17 @@ def plan_rays(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _add_background(background, cos_b, sin_b, camera, edges, n):  # type: ignore[no-untyped-def]
+def _add_background(background, cos_b, sin_b, level, camera, edges, n):  # type: ignore[no-untyped-def]
     """Append the line where wall and floor meet, or the horizon; return the number of segments, −1 without room."""
     lens = camera.distortion
     if lens.model == 0:
-        if background_edge(background, cos_b, sin_b, camera, edges.segments[n]):
+        if background_edge(background, cos_b, sin_b, level, camera, edges.segments[n]):
             edges.limb[n], edges.ends[n, 0] = 0, -1
             n += 1
         return n
     if background[1] == 0.0:
         return n
-    tx, ty, tz = background_line(background, cos_b, sin_b, camera.level)
+    tx, ty, tz = background_line(background, cos_b, sin_b, level)
     if abs(tz) >= abs(ty) and tz != 0.0:
         ya, yb = lens.low_y, lens.high_y
         za, zb = -(tx + ty * ya) / tz, -(tx + ty * yb) / tz
@@ -139,13 +139,10 @@ def _add_background(background, cos_b, sin_b, camera, edges, n):  # type: ignore
 def _near_limb(i, j, edges):  # type: ignore[no-untyped-def]
     """Return whether a limb runs through a pixel or one beside it; the rules beside a limb belong to whole pixels."""
     head = edges.head
-    beside = lists_limb(head[i, j - 1], edges) or lists_limb(head[i, j + 1], edges)
-    return (
-        beside
-        or lists_limb(head[i, j], edges)
-        or lists_limb(head[i - 1, j], edges)
-        or lists_limb(head[i + 1, j], edges)
-    )
+    for entry in (head[i, j], head[i, j - 1], head[i, j + 1], head[i - 1, j], head[i + 1, j]):
+        if lists_limb(entry, edges):
+            return True
+    return False
 
 
 @kernel
