@@ -78,6 +78,9 @@ class SearchPolicy:
     slope_width : float
         Least half width, in natural units, over which final slopes are differenced, so that a kink narrower than this
         does not make the covariance.
+    axis_rounds : int
+        Where height, pitch or roll is free, slopes are differenced along the axes of the covariance, which they make
+        in turn: how often.
     close_cost : float
         A fit whose cost is above its frame's best by more will not become the best: its surroundings are not looked at.
     recount_cost : float
@@ -175,6 +178,7 @@ class SearchPolicy:
     parabola_share: float = 0.5
     promising_cost: float = 20.0
     slope_width: float = 0.05
+    axis_rounds: int = 3
     close_cost: float = 50.0
     recount_cost: float = 25.0
     settling_rounds: int = 3
