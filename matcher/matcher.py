@@ -10,6 +10,7 @@ from typing import Any, Literal, Protocol
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.filters.region import read_region
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import (
     BEARING_STD_RAD,
@@ -199,7 +200,32 @@ class Matcher:
         UsageError
             The frames come from another camera than the bank.
         """
-        difference = frames.sensor.optics_difference(self.bank.sensor)
-        if difference is not None:
-            raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
+        frames = self.read_out(frames)
         return Matches(self._method.match(frames.without_offset().with_pooled_noise()))
+
+    def read_out(self, frames: FilteredFrames) -> FilteredFrames:
+        """Return frames as the bank has its images: those of the whole camera cut down to the bank's region.
+
+        Parameters
+        ----------
+        frames : FilteredFrames
+            Of the bank's camera, or of one that reads the region itself.
+
+        Returns
+        -------
+        FilteredFrames
+
+        Raises
+        ------
+        UsageError
+            The frames come from another camera, or pixels are to be added up whose amplitudes are unknown.
+        """
+        bank = self.bank
+        difference = frames.sensor.optics_difference(bank.sensor)
+        if difference is None:
+            return frames
+        if bank.region is not None:
+            difference = frames.sensor.optics_difference(bank.camera)
+            if difference is None:
+                return read_region(frames, bank.region)
+        raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")

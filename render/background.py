@@ -159,6 +159,23 @@ def hit_of_plane(parameters, plane, cos_b, sin_b, dx, dy, dz):  # type: ignore[n
     return 0.0, 0.0, 0.0
 
 
+@inlined
+def background_line(parameters, cos_b, sin_b, level):  # type: ignore[no-untyped-def]
+    """Return the line where wall and floor meet, or the floor's horizon, as (tx, ty, tz): tx + ty · y + tz · z = 0.
+
+    The rays (1, y, z) are those of the tilted camera; parameters as for :func:`background_edge`, with a floor.
+    """
+    # points of the line satisfy normal · ray = 0 in the level frame
+    nx, ny, nz = parameters[1] * cos_b, parameters[1] * sin_b, parameters[0]
+    if parameters[0] == 0.0:
+        nx, ny, nz = 0.0, 0.0, 1.0
+    # the normal in the tilted frame
+    tx = nx * level[0, 0] + ny * level[1, 0] + nz * level[2, 0]
+    ty = nx * level[0, 1] + ny * level[1, 1] + nz * level[2, 1]
+    tz = nx * level[0, 2] + ny * level[1, 2] + nz * level[2, 2]
+    return tx, ty, tz
+
+
 @kernel
 def background_edge(parameters, cos_b, sin_b, level, camera, out):  # type: ignore[no-untyped-def]
     """Project the line where wall and floor meet, or the floor's horizon, across the image.
@@ -183,14 +200,7 @@ def background_edge(parameters, cos_b, sin_b, level, camera, out):  # type: igno
     """
     if parameters[1] == 0.0:
         return False
-    # points of the line satisfy normal · ray = 0 in the level frame
-    nx, ny, nz = parameters[1] * cos_b, parameters[1] * sin_b, parameters[0]
-    if parameters[0] == 0.0:
-        nx, ny, nz = 0.0, 0.0, 1.0
-    # the normal in the tilted frame
-    tx = nx * level[0, 0] + ny * level[1, 0] + nz * level[2, 0]
-    ty = nx * level[0, 1] + ny * level[1, 1] + nz * level[2, 1]
-    tz = nx * level[0, 2] + ny * level[1, 2] + nz * level[2, 2]
+    tx, ty, tz = background_line(parameters, cos_b, sin_b, level)
     # in image coordinates: k0 + ku · u + kv · v = 0
     ku, kv = -ty / camera.scale_u, -tz / camera.scale_v
     k0 = tx + ty * camera.centre_u / camera.scale_u + tz * camera.centre_v / camera.scale_v

@@ -198,6 +198,8 @@ def _refuse_out_of_plane(sensor: Sensor, views: Views) -> None:
     needs = "the planar model needs"
     if sensor.rows % 2:
         raise UsageError(f"{needs} an even number of rows, got {sensor.rows}")
+    if sensor.lens is not None:
+        raise UsageError(f"{needs} an ideal lens, got a sensor with 'lens'")
     if sensor.centre_px != (sensor.cols / 2, sensor.rows / 2):
         raise UsageError(f"{needs} a centred principal point, got {sensor.centre_px}")
     for name in ("pitch_deg", "roll_deg"):

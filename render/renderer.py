@@ -21,11 +21,13 @@ from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
 from phasemark.render.integral.arguments import Borders, Camera, Edges, Light, Motion, Poses, Returns, Samples, Sums
+from phasemark.render.integral.image_rays import trace
 from phasemark.render.integral.intersect import make_intersector
-from phasemark.render.integral.light import add_background, sum_samples
+from phasemark.render.integral.lens_tables import distortion_of
+from phasemark.render.integral.light import add_background, points_a_side, sum_samples
 from phasemark.render.integral.mesh_topology import CLUSTER, MeshTopology
 from phasemark.render.integral.pixel_splitting import Scratch
-from phasemark.render.integral.ray_plan import UNTRUSTED, plan_rays
+from phasemark.render.integral.ray_plan import SHORT_LINKS, SHORT_SEGMENTS, UNTRUSTED, plan_rays
 from phasemark.render.integral.shells import unite_shells
 from phasemark.render.integral.slopes import STEP, SlopeSums
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
@@ -39,6 +41,8 @@ Variant = Literal["exact", "hard"]
 _SAMPLES = 1 << 17
 _RETURNS = 1 << 9
 _BORDERS = 1 << 14
+_LINKS = 1 << 10
+"""Further segments that a view is given room for when edges become chains behind a lens with distortion."""
 _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
 _TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
@@ -60,18 +64,36 @@ class _Buffers:
 
     def __post_init__(self) -> None:
         rows, cols = self.shape
+        self.n_segments = self.n_edges + 1
         self.scratch = Scratch.empty()
         self.edges = Edges(
-            segments=np.empty((self.n_edges + 1, 4)),
-            limb=np.empty(self.n_edges + 1, np.int8),
+            segments=np.empty((self.n_segments, 4)),
+            limb=np.empty(self.n_segments, np.int8),
             head=np.empty((rows + 2, cols + 2), np.int32),
             link=np.empty(self.n_links, np.int32),
             owner=np.empty(self.n_links, np.int32),
             heights=np.empty(CLUSTER),
-            ends=np.empty((self.n_edges + 1, 2), np.int32),
+            ends=np.empty((self.n_segments, 2), np.int32),
+            extent=np.empty((2, 4)),
+            line=np.empty(4),
         )
         self.samples = _room_for(self.n_samples)
         self.borders = _room_for_borders(self.n_borders, self.n_parameters)
+
+    def make_room(self, reached: int) -> None:
+        """Grow what was too short, as :func:`plan_rays` says in place of the next view."""
+        if reached == SHORT_LINKS:
+            self.grow_links()
+        elif reached == SHORT_SEGMENTS:
+            self.grow_segments()
+        else:
+            self.grow_samples()
+
+    def grow_segments(self) -> None:
+        n = self.n_segments = 2 * self.n_segments + _LINKS
+        self.edges = self.edges._replace(
+            segments=np.empty((n, 4)), limb=np.empty(n, np.int8), ends=np.empty((n, 2), np.int32)
+        )
 
     def grow_links(self) -> None:
         n = 2 * len(self.edges.link)
@@ -85,6 +107,7 @@ class _Buffers:
 def _room_for(n: int) -> Samples:
     return Samples(
         points=np.empty((n, 2)),
+        rays=np.empty((n, 2)),
         weights=np.empty(n),
         regions=np.empty(n, np.int32),
         pixel=np.empty(n, np.int64),
@@ -435,9 +458,10 @@ class Renderer:
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)
         sums = _no_light(shape, len(self._orders))
-        camera = _camera(self.sensor, rows)
+        behind = (background or Background()).parameters()
+        camera = _camera(self.sensor, rows, points_a_side(behind))
         light = Light(
-            (background or Background()).parameters(),
+            behind,
             self.albedo,
             1 / self.sensor.metres_per_radian,
             self._orders,
@@ -504,11 +528,8 @@ class Renderer:
                     view, mesh, poses, camera, self.splits, light.background, buffers.edges, buffers.scratch,
                     buffers.samples, own.state, motion, buffers.borders,
                 )  # fmt: skip
-                if reached == -1:
-                    buffers.grow_links()
-                    continue
-                if reached == view:
-                    buffers.grow_samples()
+                if reached <= view:
+                    buffers.make_room(reached)
                     continue
                 self._find_faces(n, buffers.samples, own.state, poses, camera)
                 sum_samples(n, buffers.samples, mesh, poses, camera, light, own)
@@ -531,6 +552,7 @@ class Renderer:
             samples.points[:] = np.tile(centres, (len(poses.lens), 1))
             samples.weights[:] = 1.0
             samples.pixel[:] = samples.chosen[:] = np.arange(n)
+            trace(0, n, samples, camera)
             aim(n, samples, poses, camera)
             samples.face[:] = self._intersector.first_face(samples.origins, samples.directions)
             sum_samples(n, samples, self.topology, poses, camera, light, _of_views(sums, task))
@@ -609,16 +631,20 @@ def _topology(mesh: trimesh.Trimesh) -> MeshTopology:
     return found
 
 
-def _camera(sensor: Sensor, rows: tuple[int, int]) -> Camera:
-    """Return a camera as the kernels take it, and which rows to render."""
+def _camera(sensor: Sensor, rows: tuple[int, int], rule: int) -> Camera:
+    """Return a camera as the kernels take it, which rows to render, and how a background is integrated over a pixel."""
     tan_h, tan_v = sensor.tan_half_angles
+    scale = sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v)
+    slope = 2 * tan_h / sensor.cols, 2 * tan_v / sensor.rows
+    if sensor.lens is not None:
+        scale, slope = (sensor.lens.fx, sensor.lens.fy), (1 / sensor.lens.fx, 1 / sensor.lens.fy)
     return Camera(
-        scale_u=sensor.cols / (2 * tan_h),
-        scale_v=sensor.rows / (2 * tan_v),
+        scale_u=scale[0],
+        scale_v=scale[1],
         centre_u=float(sensor.centre_px[0]),
         centre_v=float(sensor.centre_px[1]),
-        slope_u=2 * tan_h / sensor.cols,
-        slope_v=2 * tan_v / sensor.rows,
+        slope_u=slope[0],
+        slope_v=slope[1],
         rows=sensor.rows,
         cols=sensor.cols,
         first_row=rows[0],
@@ -626,6 +652,7 @@ def _camera(sensor: Sensor, rows: tuple[int, int]) -> Camera:
         fill_u=float(sensor.fill_factor[0]),
         fill_v=float(sensor.fill_factor[1]),
         level=np.ascontiguousarray(sensor.cam2level),
+        distortion=distortion_of(sensor, rule),
     )
 
 

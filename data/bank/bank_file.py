@@ -165,6 +165,11 @@ class Bank:
     Attributes
     ----------
     sensor : Sensor
+        The camera that sees the images; with a region, `camera` read in it.
+    camera : Sensor
+        The whole camera, whose frames are matched.
+    region : Region or None
+        Which pixels of it the images hold, and in what blocks; None: every one.
     plan : BankPlan
         The resolved plan the bank was made from.
     layout : {"factored", "full"}
@@ -185,6 +190,8 @@ class Bank:
         check_format(file, path, "bank", FORMAT, SCHEMA_VERSION)
         self.sensor = Sensor(**json_attribute(file, path, "sensor"))
         self.plan = BankPlan(**json_attribute(file, path, "plan"))
+        self.region = self.plan.pixel_region()
+        self.camera = self.sensor if self.region is None else self.plan.build_sensor()
         self.versions: dict[str, str] = json_attribute(file, path, "versions")
         self.layout = self.plan.layout
         groups: dict[str, BankGroup] = {
@@ -289,9 +296,21 @@ class Bank:
             "sensor": self.plan.sensor,
             "rows": self.sensor.rows,
             "cols": self.sensor.cols,
+            **self._region_info(),
             "modulation_hz": self.sensor.modulation_hz,
             "mesh_sha256": hashes,
             "versions": self.versions,
+        }
+
+    def _region_info(self) -> dict[str, Any]:
+        """Return which pixels of the camera the images hold; nothing where it is every one."""
+        if self.region is None:
+            return {}
+        region = self.region
+        return {
+            "region": f"rows {region.first_row} … {region.stop_row}, columns {region.first_col} … {region.stop_col}"
+            f" of {self.camera.rows} × {self.camera.cols}",
+            "binning": region.binning,
         }
 
     def _image(self, field: str, class_name: str, i: int, j: int) -> NDArray[Any]:

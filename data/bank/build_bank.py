@@ -159,6 +159,8 @@ def rebuild_bank(
         The grid or the camera cannot be rendered, with the reason.
     """
     old = bank.plan.model_dump(mode="json")
+    if sensor is not None:  # it sees the images themselves
+        old |= {"region": "whole", "binning": 1}
     kept = set(bank.classes if classes is None else classes)
     plan = BankPlan(
         **{
@@ -166,7 +168,7 @@ def rebuild_bank(
             **{key: [part for part in old[key] if part["name"] in kept] for key in ("landmarks", "meshes")},
             "distance_m": tuple(distance_m),
             "delta_deg": tuple(delta_deg),
-            "sensor_overrides": (sensor or bank.sensor).model_dump(mode="json"),
+            "sensor_overrides": (sensor or bank.camera).model_dump(mode="json"),
             "layout": "full",
         }
     )
@@ -199,7 +201,7 @@ class BankJob:
     def __init__(self, plan: BankPlan, stored_mesh: StoredMesh | None = None) -> None:
         self.plan = plan.resolve()
         _refuse_impossible(self.plan)
-        self.sensor = self.plan.build_sensor()
+        self.sensor = self.plan.image_sensor()
         self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
         self._slabs = list(_slabs(self.plan, self.sensor, self.landmarks))
 

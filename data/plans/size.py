@@ -59,8 +59,9 @@ def planned_size(plan: BankPlan | FramePlan) -> dict[str, int]:
     {'images': 54, 'bytes': 221184}
     """
     plan = plan.resolve()
-    sensor = plan.build_sensor()
-    return _bank_size(plan, sensor) if isinstance(plan, BankPlan) else _frames_size(plan, sensor)
+    if isinstance(plan, BankPlan):
+        return _bank_size(plan, plan.image_sensor())
+    return _frames_size(plan, plan.build_sensor())
 
 
 def too_many(counts: Mapping[str, int]) -> str | None:

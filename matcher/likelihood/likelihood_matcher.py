@@ -164,10 +164,10 @@ class LikelihoodMatcher:
         is_exact = fixed and setup.on == "ranges" and self._stated is None
         is_exact = is_exact and BankModel.fits(self._bank, *policy.fine_grid)
         scouts = (fixed or setup.bearing_has_prior) and BankModel.fits(self._bank, *policy.coarse_grid)
-        return (
-            BankModel(self._bank) if is_exact else None,
-            BankModel(self._bank, behind, smooth_only=True) if scouts else None,
-        )
+        if not (is_exact or scouts):
+            return None, None
+        model = BankModel(self._bank)
+        return model if is_exact else None, model.smooth(behind) if scouts else None
 
     def _check_distances(self) -> None:
         """Check that the bank has distances at which views are rendered."""

@@ -36,7 +36,7 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     """
     which = _worth_a_search(setup, evidence, bare)
     policy = setup.policy
-    n_modes = policy.modes if scene.background is None else policy.modes_before_background
+    n_modes = setup.modes_before(scene.background)
     sides = () if scene.background is None else policy.beside_rad
     # 1  minima of the bank
     starts = scene.search.starts(seen[which], n_modes, all_classes=evidence.on == "phasors")
@@ -122,7 +122,7 @@ def _retry_with_prior(
     found = [_fit_turned(setup, direct, evidence, poor, fits)]
     poor = _unexplained(setup, scene, evidence, bare, Fits.joined([fits, *found]))
     if poor.size:
-        n_modes = policy.modes if scene.background is None else policy.modes_before_background
+        n_modes = setup.modes_before(scene.background)
         starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=evidence.on == "phasors")
         found.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
         poor = _unexplained(
@@ -167,7 +167,7 @@ def _retry_without_prior(
         return found
     if scene.scout is not None:
         # too little may be smooth for the scout to see the way
-        n_modes = policy.modes if scene.background is None else policy.modes_before_background
+        n_modes = setup.modes_before(scene.background)
         starts = scene.wide_search.starts(seen[again], n_modes, all_classes=all_classes)
     elif scene.background is not None:
         # edges between columns before a bright wall: no pixel may decide alone where the search starts
@@ -202,7 +202,7 @@ def _retry_trimmed(
 ) -> Fits:
     """Search again without the returns that fit worst, as a robust matcher does where nothing fits."""
     policy = setup.policy
-    n_modes = policy.modes if scene.background is None else policy.modes_before_background
+    n_modes = setup.modes_before(scene.background)
     sides = () if scene.background is None else policy.beside_rad
     for _ in range(policy.trimmings):
         poor = _unexplained(setup, scene, evidence, bare, fits, even_beyond_bare=True)

@@ -73,7 +73,7 @@ def match_in_batches(
     MatchedBatch
     """
     for start in range(0, len(frames), at_once):
-        filtered = filter_frames(frames[start : start + at_once])
+        filtered = matcher.read_out(filter_frames(frames[start : start + at_once]))
         yield MatchedBatch(start, filtered, matcher.match(filtered))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from phasemark.render.integral.arguments import Camera, Motion, Poses, ray_of
+from phasemark.render.integral.arguments import Camera, Motion, Poses
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.light import landmark_hit
 from phasemark.render.integral.mesh_topology import MeshTopology
@@ -121,10 +121,7 @@ class SceneMesh:
             )  # fmt: skip
             if reached == 1:
                 break
-            if reached == -1:
-                buffers.grow_links()
-            else:
-                buffers.grow_samples()
+            buffers.make_room(reached)
         samples = buffers.samples
 
         def cast(count: int) -> NDArray[np.int32]:
@@ -198,7 +195,7 @@ def _hits(n, samples, mesh, poses, camera, tangents, range_m, amplitude, part): 
         face = samples.face[k]
         if face < 0:
             continue
-        y, z = ray_of(camera, samples.points[k, 0], samples.points[k, 1])
+        y, z = samples.rays[k, 0], samples.rays[k, 1]
         length = math.sqrt(1.0 + y * y + z * z)
         t, cos_theta = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], y, z)
         if not t > 0.0:

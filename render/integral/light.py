@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from phasemark.render.background import background_hit
-from phasemark.render.integral.arguments import ray_of, towards_landmark, towards_level
+from phasemark.render.integral.arguments import towards_landmark, towards_level
 from phasemark.render.integral.circular import turn
 from phasemark.render.integral.face_search import plane_hit
+from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.quadrature_rules import G3W, G3X, G4W, G4X
 from phasemark.render.integral.ray_plan import SKIPPED
 from phasemark.render.kernel import inlined, kernel
@@ -40,7 +44,7 @@ def sum_samples(n, samples, mesh, poses, camera, light, sums):  # type: ignore[n
 @kernel
 def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # type: ignore[no-untyped-def]
     """Write the returns of some samples, and add them to intensity and coverage."""
-    points, weights, returns = samples.points, samples.weights, samples.returns
+    rays, weights, returns = samples.rays, samples.weights, samples.returns
     pixels_per_view = (camera.stop_row - camera.first_row) * camera.cols
     index, view, intensity, coverage, upper = samples.pixel[start], 0, 0.0, 0.0, 0.0
     has_background = light.background[0] > 0.0 or light.background[1] > 0.0
@@ -51,7 +55,7 @@ def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # typ
             index = samples.pixel[k]
             view = index // pixels_per_view
             intensity, coverage, upper = sums.intensity[index], sums.coverage[index], sums.upper[index]
-        y, z = ray_of(camera, points[k, 0], points[k, 1])
+        y, z = rays[k, 0], rays[k, 1]
         length = math.sqrt(1.0 + y * y + z * z)
         face = samples.face[k]
         if face >= 0:
@@ -164,6 +168,13 @@ def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def
     return t, max(cos_theta, 0.0)
 
 
+def points_a_side(background: NDArray[np.float64]) -> int:
+    """Return how many Gauss points a side :func:`add_background` takes; 0 where there is nothing to add."""
+    if background[1] > 0.0:
+        return 4
+    return 3 if background[0] > 0.0 else 0
+
+
 @kernel
 def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-untyped-def]
     """Integrate the background over the skipped pixels of views `start` to `stop`.
@@ -172,6 +183,7 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
     """
     order = 4 if light.background[1] > 0.0 else 3
     rows, cols = camera.stop_row - camera.first_row, camera.cols
+    rule, bent_lens = camera.distortion.rule, camera.distortion.model != 0
     for view in range(start, stop):
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
         for r in range(rows):
@@ -185,7 +197,10 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
                     for j in range(order):
                         at = G4X[j] if order == 4 else G3X[j]
                         u = c + 0.5 + camera.fill_u * (at - 0.5)
-                        y, z = ray_of(camera, u, v)
+                        if bent_lens:
+                            y, z = rule[r + camera.first_row, c, i * order + j]
+                        else:
+                            y, z = ray_of(camera, u, v)
                         length = math.sqrt(1.0 + y * y + z * z)
                         dx, dy, dz = towards_level(poses.level[view], y, z)
                         t, rho, cos_theta = background_hit(light.background, cos_b, sin_b, dx, dy, dz)

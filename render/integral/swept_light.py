@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 from phasemark.render.background import hit_of_plane, nearer_plane
-from phasemark.render.integral.arguments import ray_of, towards_landmark, towards_level
+from phasemark.render.integral.arguments import towards_landmark, towards_level
 from phasemark.render.integral.face_search import find_face
+from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.light import landmark_hit, phasor_of
 from phasemark.render.kernel import inlined, kernel
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import model_validator
 
 from phasemark import UsageError
 from phasemark.inputs.toml_file import read_toml
+from phasemark.render.sensor.lens_fields import DERIVED, Lens
 from phasemark.render.sensor.sensor_checks import check_fields
 from phasemark.render.sensor.sensor_fields import CALIBRATION, OPTICS
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
@@ -37,8 +40,14 @@ class Sensor(SensorQuantities):
         pixel is the light-weighted mean over its footprint.
     rows, cols : int
         Size of the image, pixels.
+    lens : Lens, optional
+        Intrinsics and distortion as OpenCV or ROS state them, a table `[lens]` in a file; see
+        :class:`~phasemark.render.sensor.Lens`. Half angles and principal point follow from it and are left out. None:
+        an ideal lens.
     half_angle_h_deg, half_angle_v_deg : float
-        Half angle from the optical axis to the left/right and top/bottom *edge* of the image, degrees.
+        Half angle from the optical axis to the left/right and top/bottom *edge* of the image, degrees. With a lens:
+        the angle whose tangent is half the image's width or height in tangents, along the row or column of the
+        principal point.
     principal_point_px : (u0, v0), optional
         Where the optical axis meets the image, pixels from the top left corner. None: the centre.
     pitch_deg, roll_deg : float
@@ -154,8 +163,11 @@ class Sensor(SensorQuantities):
         return self
 
     def with_(self, **changes: Any) -> Sensor:
-        """Return a copy with some fields changed, validated again."""
-        return Sensor(**{**self.model_dump(), **changes})
+        """Return a copy with some fields changed, validated again; what follows from a lens follows it."""
+        fields = self.model_dump()
+        if {**fields, **changes}.get("lens") is not None:
+            fields = {name: value for name, value in fields.items() if name not in DERIVED}
+        return Sensor(**{**fields, **changes})
 
     def without_errors(self, *, shot_noise: bool = False) -> Sensor:
         """Return the camera without its errors: optics, modulation frequency, contrast and signal alone.
@@ -213,6 +225,57 @@ class Sensor(SensorQuantities):
         )
 
     @classmethod
+    def from_opencv(
+        cls,
+        camera_matrix: ArrayLike,
+        distortion: ArrayLike = (),
+        *,
+        size: tuple[int, int],
+        model: Literal["opencv", "fisheye"] = "opencv",
+        **fields: Any,
+    ) -> Sensor:
+        """Build a sensor from what OpenCV's calibration returns.
+
+        Parameters
+        ----------
+        camera_matrix : (3, 3) array_like
+            [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, counted from the centre of the first pixel, as OpenCV does.
+        distortion : array_like
+            Coefficients in OpenCV's order, any shape: 4, 5 or 8 for "opencv", 4 for "fisheye", none for no distortion.
+        size : (cols, rows)
+            Of the image, in OpenCV's order.
+        model : {"opencv", "fisheye"}
+        **fields
+            Any other field of the sensor.
+
+        Raises
+        ------
+        UsageError
+            The matrix is no camera matrix, or the lens does not belong to an image of this size.
+
+        Examples
+        --------
+        >>> sensor = Sensor.from_opencv([[200, 0, 111.5], [0, 200, 85], [0, 0, 1]], [-0.2, 0.05, 0, 0], size=(224, 171))
+        >>> sensor.centre_px
+        (112.0, 85.5)
+        """
+        matrix = _numbers("camera_matrix", camera_matrix)
+        pattern = np.array([[True, False, True], [False, True, True], [False, False, True]])
+        if matrix.shape != (3, 3) or matrix[~pattern].any() or matrix[2, 2] != 1:
+            shown = " ".join(str(camera_matrix).split())
+            raise UsageError(f"'camera_matrix' must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {shown}")
+        cols, rows = size
+        lens = Lens(
+            model=model,
+            fx=float(matrix[0, 0]),
+            fy=float(matrix[1, 1]),
+            cx=float(matrix[0, 2]),
+            cy=float(matrix[1, 2]),
+            distortion=tuple(float(one) for one in _numbers("distortion", distortion).ravel()),
+        )
+        return cls(rows=rows, cols=cols, lens=lens, **fields)
+
+    @classmethod
     def from_toml(cls, path: str | Path) -> Sensor:
         """Read a sensor file.
 
@@ -266,3 +329,13 @@ class Sensor(SensorQuantities):
             title = titles.get(name, title)
             groups[title] = (*groups.get(title, ()), name)
         return groups
+
+
+def _numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    try:
+        numbers = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise UsageError(f"'{name}' must be numbers, got {value!r}") from None
+    if not np.isfinite(numbers).all():
+        raise UsageError(f"'{name}' must be finite, got {' '.join(str(value).split())}")
+    return numbers

@@ -37,6 +37,10 @@ def check_principal_point(sensor: SensorQuantities) -> None:
 
 def check_kind(sensor: SensorQuantities) -> None:
     """Refuse fields of the other kind of camera."""
+    if sensor.histogram is not None and sensor.lens is not None:
+        raise ValueError(
+            "'lens' must be left out beside 'histogram': the zones of a direct sensor are rectangles of tangents"
+        )
     foreign = PHASE_ONLY if sensor.kind == "direct" else DIRECT_ONLY
     for name in foreign:
         value = getattr(sensor, name)

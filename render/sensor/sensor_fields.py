@@ -17,6 +17,7 @@ from pydantic import (
 from phasemark import UsageError
 from phasemark.inputs import refuse_truth_values
 from phasemark.render.sensor.histogram_fields import Histogram
+from phasemark.render.sensor.lens_fields import Lens, with_geometry_of_lens
 
 _LARGEST = 1e12
 """Of any number of a sensor: the square of none overflows, and the reciprocal of none is infinite."""
@@ -47,6 +48,7 @@ _PulseShape = tuple[_NonNegative, ...]
 OPTICS = (
     "rows",
     "cols",
+    "lens",
     "half_angle_h_deg",
     "half_angle_v_deg",
     "centre_px",
@@ -58,6 +60,9 @@ OPTICS = (
     "vignetting",
     "modulation_hz",
 )
+
+# What is a table of its own in a sensor file, and left out where there is none.
+TABLES = ("lens", "histogram")
 
 # What only a camera with taps has, and what only a direct one has.
 PHASE_ONLY = (
@@ -123,6 +128,7 @@ class SensorFields(BaseModel):
     # geometry
     rows: _PixelCount
     cols: _PixelCount
+    lens: Lens | None = None
     half_angle_h_deg: _HalfAngleDeg
     half_angle_v_deg: _HalfAngleDeg
     principal_point_px: tuple[float, float] | None = None
@@ -195,6 +201,7 @@ class SensorFields(BaseModel):
 
     def __init__(self, **data: Any) -> None:
         refuse_truth_values(data, type(self).model_fields)
+        data = with_geometry_of_lens(data)
         try:
             super().__init__(**data)
         except ValidationError as error:
@@ -204,9 +211,10 @@ class SensorFields(BaseModel):
             raise UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"]) from None
 
     @model_serializer(mode="wrap")
-    def _without_absent_histogram(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave `histogram` out where there is none, as files had it before sensors had histograms."""
+    def _without_absent_tables(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave `histogram` and `lens` out where there is none, as files had it before sensors had these tables."""
         fields: dict[str, Any] = dump(self)
-        if fields.get("histogram", ...) is None:
-            del fields["histogram"]
+        for name in TABLES:
+            if fields.get(name, ...) is None:
+                del fields[name]
         return fields

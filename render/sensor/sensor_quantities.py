@@ -19,7 +19,7 @@ class SensorQuantities(SensorFields):
 
     @property
     def tan_half_angles(self) -> tuple[float, float]:
-        """Tangents of the horizontal and vertical half angle."""
+        """Tangents of the horizontal and vertical half angle; with a lens, half the width and height as tangents."""
         return math.tan(math.radians(self.half_angle_h_deg)), math.tan(math.radians(self.half_angle_v_deg))
 
     @property
@@ -143,6 +143,40 @@ class SensorQuantities(SensorFields):
         shown = f"it shows at about {distance_m % period_m:.3g} m"
         return f"{name} at {distance_m:g} m is beyond c / 2f = {period_m:.4g} m, where ranges wrap: {shown}"
 
+    def tangents(
+        self, u: NDArray[np.float64] | float, v: NDArray[np.float64] | float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return y and z of the rays (1, y, z) of image points, frame of the tilted camera.
+
+        Parameters
+        ----------
+        u, v : float or ndarray
+            Image coordinates, pixels; they broadcast against each other. With a lens they lie in the image.
+        """
+        if self.lens is not None:
+            return self.lens.before(self.rows, self.cols).rays(np.asarray(u, float), np.asarray(v, float))
+        tan_h, tan_v = self.tan_half_angles
+        u0, v0 = self.centre_px
+        y = 2 * tan_h * (u0 - np.asarray(u, float)) / self.cols
+        z = 2 * tan_v * (v0 - np.asarray(v, float)) / self.rows
+        return y, z
+
+    def image_points(
+        self, y: NDArray[np.float64] | float, z: NDArray[np.float64] | float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return where rays (1, y, z), frame of the tilted camera, meet the image: u and v, pixels.
+
+        Parameters
+        ----------
+        y, z : float or ndarray
+            Tangents to the left and upwards. With a lens they belong to image points; farther out it may fold.
+        """
+        if self.lens is not None:
+            return self.lens.before(self.rows, self.cols).project(np.asarray(y, float), np.asarray(z, float))
+        tan_h, tan_v = self.tan_half_angles
+        u0, v0 = self.centre_px
+        return u0 - np.asarray(y, float) * self.cols / (2 * tan_h), v0 - np.asarray(z, float) * self.rows / (2 * tan_v)
+
     def ray_directions(self, u: NDArray[np.float64] | float, v: NDArray[np.float64] | float) -> NDArray[np.float64]:
         """Return unit ray directions of image points, level camera frame (PHYSICS section 2).
 
@@ -155,10 +189,7 @@ class SensorQuantities(SensorFields):
         -------
         ndarray, shape (..., 3)
         """
-        tan_h, tan_v = self.tan_half_angles
-        u0, v0 = self.centre_px
-        y = 2 * tan_h * (u0 - np.asarray(u, float)) / self.cols
-        z = 2 * tan_v * (v0 - np.asarray(v, float)) / self.rows
+        y, z = self.tangents(u, v)
         d = np.stack(np.broadcast_arrays(1.0, y, z), axis=-1) @ self.cam2level.T
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 
