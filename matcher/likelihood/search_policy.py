@@ -52,6 +52,8 @@ class SearchPolicy:
         about so far away (PHYSICS section 7).
     beside_again_rad : tuple of float
         The same where nothing fits.
+    sways_rad : tuple of float
+        Where height, pitch or roll is free and nothing fits: turns by which the best view is moved to start again.
 
     max_iterations : int
         Steps of one descent.
@@ -163,6 +165,7 @@ class SearchPolicy:
     prior_sigma: float = 3.0
     beside_rad: tuple[float, ...] = _degrees(-1.0, 1.0)
     beside_again_rad: tuple[float, ...] = _degrees(-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0)
+    sways_rad: tuple[float, ...] = _degrees(-12.0, -6.0, 6.0, 12.0)
 
     max_iterations: int = 30
     longest_step: float = 3.0
