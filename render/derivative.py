@@ -75,11 +75,12 @@ def _derivative(
     # the width is what the floats have between them, not what was asked for
     high, low = value + STEP, value - STEP
     up, down = at(everywhere, high), at(everywhere, low)
-    slope = (up - down) / (high - low)[:, None, None]
+    each = (slice(None), *(None,) * (up.ndim - 1))
+    slope = (up - down) / (high - low)[each]
     kinked = np.flatnonzero(np.abs(value) < STEP) if name == "height_m" else np.empty(0, np.int64)
     if kinked.size:
         side = np.where(value[kinked] >= 0, STEP, -STEP)
-        near = np.where((side > 0)[:, None, None], up[kinked], down[kinked])
+        near = np.where((side > 0)[each], up[kinked], down[kinked])
         middle, far = (at(kinked, value[kinked] + k * side) for k in (2, 3))
-        slope[kinked] = (8 * middle - 5 * near - 3 * far) / (2 * side)[:, None, None]
+        slope[kinked] = (8 * middle - 5 * near - 3 * far) / (2 * side)[each]
     return slope

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
@@ -183,6 +184,7 @@ def planar_images(
     if sensor.vignetting:
         intensity *= sensor.pixel_directions()[first:stop, :, 0] ** 4
     phase = np.where(seen, distance, 0.0) / sensor.metres_per_radian
+    first_hz, all_hz = sensor.frequencies_hz[0], phasor_frequencies_hz(sensor.frequencies_hz, harmonics)
     return PhasorImages(
         phasor=intensity * np.exp(1j * phase),
         intensity=intensity,
@@ -190,6 +192,7 @@ def planar_images(
         sensor=sensor,
         views=asked,
         harmonics={int(order): intensity * np.exp(1j * order * phase) for order in harmonics},
+        by_hz={hz: intensity * np.exp(1j * hz / first_hz * phase) for hz in all_hz[1 + len(harmonics) :]},
     )
 
 

@@ -32,6 +32,7 @@ from phasemark.render.integral.shells import unite_shells
 from phasemark.render.integral.slopes import STEP, SlopeSums
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import VIEW_FIELDS, Views
 
@@ -47,6 +48,8 @@ _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
 _TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
 """Parameters that turn what stands behind the landmark."""
+_RADIANS_PER_SPLIT = 1.1
+"""Radians per metre, those of 26 MHz, for which a pixel that sees a floor beside something else is cut once more."""
 _LARGE = 1 << 13
 """Faces above which a mesh is more than the processor's cache holds."""
 
@@ -146,7 +149,8 @@ class Renderer:
     albedo : float
         Of the Lambertian landmark, in (0, 1].
     harmonics : sequence of int, optional
-        Harmonic orders k > 1 wanted beside the signal; None: those that the sensor's taps need.
+        Harmonic orders k > 1 wanted beside the signal, of every modulation frequency; None: those that the sensor's
+        taps need.
     intersector : {"auto", "embree", "float64"}
         What finds the face a ray meets; "auto" is Embree where the package embreex is installed.
     splits : int
@@ -189,7 +193,7 @@ class Renderer:
         self.albedo = float(albedo)
         self.splits = int(splits)
         self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
-        self._orders = np.array([1, *harmonics], dtype=np.int64)
+        self._harmonics = tuple(int(order) for order in harmonics)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
         self.untrusted_pixels = 0
         """How many pixels, of all rendered so far, had too many edges to be split exactly."""
@@ -348,7 +352,7 @@ class Renderer:
         Returns
         -------
         (n, len(parameters), rows, cols) complex128
-            Per metre or per radian.
+            Per metre or per radian. Of a sensor with m > 1 frequencies (n, len(parameters), m, rows, cols).
 
         Raises
         ------
@@ -401,7 +405,8 @@ class Renderer:
         -------
         images : PhasorImages
         slope : (n, len(parameters), rows, cols) complex128
-            ∂S/∂parameter, per metre or radian; see :mod:`phasemark.render.integral.slopes`.
+            ∂S/∂parameter, per metre or radian; of a sensor with m > 1 frequencies (n, len(parameters), m, rows, cols);
+            see :mod:`phasemark.render.integral.slopes`.
 
         Raises
         ------
@@ -412,10 +417,12 @@ class Renderer:
         seen = views.in_camera(self.sensor)
         self._check(seen, background, workers)
         whole, p = (0, self.sensor.rows), len(parameters)
-        by_pixel = np.zeros((len(views) * self.sensor.rows * self.sensor.cols, p), np.complex128)
+        m, shape = len(self.sensor.frequencies_hz), (self.sensor.rows, self.sensor.cols)
+        by_pixel = np.zeros((m, len(views) * math.prod(shape), p), np.complex128)
         images = self._render(seen, background, whole, workers, slope=by_pixel, parameters=parameters)
-        slope = by_pixel.reshape(len(views), self.sensor.rows, self.sensor.cols, p).transpose(0, 3, 1, 2)
-        unknown = np.isnan(slope).any(axis=(1, 2, 3)) | (not self.topology.closed)
+        slope = by_pixel.reshape(m, len(views), *shape, p).transpose(1, 4, 0, 2, 3)
+        slope = slope[:, :, 0] if m == 1 else slope
+        unknown = np.isnan(slope).any(axis=tuple(range(1, slope.ndim))) | (not self.topology.closed)
         full = np.flatnonzero(unknown)
         if full.size:
             slope[full] = self._differences(seen[full], background, parameters, workers)
@@ -427,7 +434,13 @@ class Renderer:
         """Return slopes as differences of images; `seen` as the camera itself has the views."""
         # a step may take a landmark that stands on the floor a hair into it
         whole = (0, self.sensor.rows)
-        return differentiate(lambda v: self._render(v, background, whole, workers).phasor, seen, parameters)
+        one = len(self.sensor.frequencies_hz) == 1
+
+        def phasor_of(moved: Views) -> NDArray[np.complex128]:
+            images = self._render(moved, background, whole, workers)
+            return images.phasor if one else images.phasors
+
+        return differentiate(phasor_of, seen, parameters)
 
     def _check(self, views: Views, background: Background | None, workers: int) -> None:
         """Refuse what cannot be rendered."""
@@ -449,7 +462,8 @@ class Renderer:
     ) -> PhasorImages:
         """Render rows of views that have been checked, as the camera itself has them.
 
-        With `slope`, (pixels of all views, p), it is filled with how the phasors change with `parameters`.
+        With `slope`, (m, pixels of all views, p), it is filled with how the phasors at each of the sensor's m
+        frequencies change with `parameters`.
         """
         run = self._render_tasks if variant == "exact" else self._cast_centres
         order = self._by_direction(views) if slope is None else slice(None)
@@ -458,15 +472,17 @@ class Renderer:
             run = partial(self._render_tasks, slope=slope, parameters=parameters)
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)
-        sums = _no_light(shape, len(self._orders))
+        columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
+        sums = _no_light(shape, len(columns_hz))
         behind = (background or Background()).parameters()
         camera = _camera(self.sensor, rows, points_a_side(behind))
         light = Light(
             behind,
             self.albedo,
             1 / self.sensor.metres_per_radian,
-            self._orders,
+            np.array(columns_hz) / columns_hz[0],
             self.sensor.vignetting,
+            _fastest(self.sensor),
         )
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
         if workers == 1 or len(tasks) <= 1:
@@ -487,8 +503,9 @@ class Renderer:
             upper_coverage=np.minimum(upper, 1.0),
             sensor=self.sensor,
             views=views,
-            harmonics={
-                int(order): np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._orders) if order > 1
+            harmonics={order: np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._harmonics, start=1)},
+            by_hz={
+                hz: np.ascontiguousarray(phasor[..., k]) for k, hz in enumerate(columns_hz) if k > len(self._harmonics)
             },
         )
 
@@ -508,8 +525,8 @@ class Renderer:
         slope: NDArray[np.complex128] | None = None,
         parameters: Sequence[str] = (),
     ) -> None:
-        """Render slices of the views into `sums`, in one thread; with `slope`, (pixels, p), how they change too."""
-        mesh = self.topology
+        """Render slices of the views into `sums`, in one thread; with `slope`, (m, pixels, p), how they change too."""
+        mesh, splits = self.topology, self._splits_before(light)
         turns = np.array([name in _TURNING for name in parameters], np.bool_) & light.background[:2].any()
         buffers = _Buffers(
             len(mesh.creases) + len(mesh.folds),
@@ -522,11 +539,13 @@ class Renderer:
             motion = _motion(views[task], poses, camera, parameters)
             slopes = None
             if slope is not None:
-                slopes = SlopeSums(slope[_pixels_of(task, sums)], motion, own, turns)
+                columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
+                columns = np.array([columns_hz.index(hz) for hz in self.sensor.frequencies_hz])
+                slopes = SlopeSums(slope[:, _pixels_of(task, sums)], columns, motion, own, turns)
             view = 0
             while view < len(poses.lens):
                 reached, n = plan_rays(
-                    view, mesh, poses, camera, self.splits, light.background, buffers.edges, buffers.scratch,
+                    view, mesh, poses, camera, splits, light.background, buffers.edges, buffers.scratch,
                     buffers.samples, own.state, motion, buffers.borders,
                 )  # fmt: skip
                 if reached <= view:
@@ -541,6 +560,12 @@ class Renderer:
                 view = reached
             if slopes is not None:
                 slopes.conclude()
+
+    def _splits_before(self, light: Light) -> int:
+        """Return into how many boxes a side pixels are cut: more where fast phases turn along a floor."""
+        if light.fastest == 0.0 or not light.background[1] > 0.0:
+            return self.splits
+        return max(self.splits, min(math.ceil(light.fastest / _RADIANS_PER_SPLIT), _MAX_SPLITS))
 
     def _cast_centres(self, tasks: Iterable[slice], views: Views, camera: Camera, light: Light, sums: Sums) -> None:
         """Render slices of the views with one ray a pixel into `sums`, in one thread."""
@@ -583,6 +608,13 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
             )
+
+
+def _fastest(sensor: Sensor) -> float:
+    """Return the radians per metre of the highest of several modulation frequencies, 0 of one."""
+    if len(sensor.frequencies_hz) == 1:
+        return 0.0
+    return max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
 
 
 def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:

@@ -36,9 +36,19 @@ def frames_of(sensor, amplitude, phase, std_rad=0.01, state=None, n=10.0):
     )
 
 
-@pytest.mark.parametrize("principal_point_px", [None, (50.25, 44.5)])
-def test_a_region_is_a_camera_with_the_same_rays(principal_point_px):
-    sensor = LARGE.with_(principal_point_px=principal_point_px, pitch_deg=3.0, roll_deg=-2.0)
+LENS = {
+    "model": "opencv",
+    "fx": 92.0,
+    "fy": 93.0,
+    "cx": 55.1,
+    "cy": 42.2,
+    "distortion": [-0.2, 0.05, 1e-3, -5e-4, 0.01],
+}
+
+
+@pytest.mark.parametrize("geometry", [{}, {"principal_point_px": (50.25, 44.5)}, {"lens": LENS}])
+def test_a_region_is_a_camera_with_the_same_rays(geometry):
+    sensor = LARGE.with_(**geometry, pitch_deg=3.0, roll_deg=-2.0)
     region = Region(12, 60, 20, 92, 4)
     camera = region.camera(sensor)
     assert (camera.rows, camera.cols) == region.shape == (12, 18)
@@ -47,12 +57,14 @@ def test_a_region_is_a_camera_with_the_same_rays(principal_point_px):
     np.testing.assert_allclose(camera.ray_directions(u, v), there, atol=1e-12)
 
 
-def test_an_image_of_the_region_is_the_mean_of_its_blocks():
+@pytest.mark.parametrize("geometry", [{}, {"lens": LENS}])
+def test_an_image_of_the_region_is_the_mean_of_its_blocks(geometry):
     region = Region(2, 82, 6, 106, 4)
-    renderer = Renderer(build_mesh(catalog()["cone"]), LARGE)
+    sensor = LARGE.with_(**geometry)
+    renderer = Renderer(build_mesh(catalog()["cone"]), sensor)
     views = Views.broadcast([1.0, 1.4], [0.3, 1.1], [0.02, -0.05], [0.01, -0.02])
     whole = renderer.render_views(views)
-    binned = renderer.seen_by(region.camera(LARGE)).render_views(views)
+    binned = renderer.seen_by(region.camera(sensor)).render_views(views)
     # both are exact to 1e-4 of the brightest pixel; a shift of a tenth of a pixel would be 0.1
     brightest = np.abs(binned.phasor).max()
     assert np.abs(region.blocks(whole.phasor).mean(axis=-1) - binned.phasor).max() < 1e-4 * brightest

@@ -23,7 +23,15 @@ from phasemark.data.files.json_text import json_text
 from phasemark.data.files.narrow import narrowed
 from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.files.same_file import named_files
-from phasemark.data.plans.arrays import IMAGE_DIMS, LAYOUT_GROUPS, PHASOR_DIMS, VIEW_DIMS, GroupName, group_rows
+from phasemark.data.plans.arrays import (
+    IMAGE_DIMS,
+    LAYOUT_GROUPS,
+    PHASOR_DIMS,
+    VIEW_DIMS,
+    GroupName,
+    bank_frequencies_hz,
+    group_rows,
+)
 from phasemark.data.plans.bank_plan import BankPlan, MeshPlan, factored_refusal
 from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
@@ -363,8 +371,9 @@ def _top_view(spec: LandmarkSpec) -> PlanarLandmark:
 
 def _stored(images: PhasorImages) -> dict[str, NDArray[np.float32]]:
     """Return images as the bank's datasets hold them, views first."""
-    orders = [images.phasor, *(images.harmonics[k] for k in sorted(images.harmonics))]
-    phasor = np.stack(orders, axis=1).astype("<c8")
+    orders = sorted(images.harmonics)
+    frequencies = bank_frequencies_hz(images.sensor, orders)
+    phasor = np.stack([images.at_frequency(hz) for hz in frequencies], axis=1).astype("<c8")
     stored = {
         "phasor": phasor.view("<f4").reshape(*phasor.shape, 2),
         "intensity": images.intensity.astype("<f4"),
@@ -417,7 +426,7 @@ def _coordinates(
         "distance": (np.array(plan.distance_m), "m", "horizontal distance from the lens to the landmark's axis"),
         "delta": (np.array(plan.delta_deg), "degree", "angle from which the landmark is seen"),
         "frequency": (
-            np.array([1, *plan.harmonics]) * sensor.modulation_hz,
+            np.array(bank_frequencies_hz(sensor, plan.harmonics)),
             "Hz",
             "harmonic order times modulation frequency",
         ),

@@ -100,6 +100,8 @@ def _write_image(image: PhasorImages, out: Path, data: Path, force: bool) -> Non
         "unit": "m",
         "quantity": "range",
     }
+    if len(image.sensor.frequencies_hz) > 1:
+        arrays |= {"frequency": np.array(image.sensor.frequencies_hz), "frequency_phasor": image.phasors[0]}
     buffer, figure = bytes_io.BytesIO(), bytes_io.BytesIO()
     np.savez(buffer, **arrays)
     image.plot().savefig(figure, format="png", dpi=120)

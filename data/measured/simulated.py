@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -103,21 +104,30 @@ def simulate_recording(
             image, rendered = renderer.render_views(view, background=behind), at
         taken.append(capture(image, sensor, rng=stream(seed, "simulated recording", 0), first_frame=k))
 
+    stamps = np.round(np.arange(len(views)) / sensor.frame_rate_hz, 3)[None]
+    frames = _one_after_the_other(taken, stamps)
+    return SimulatedRecording(frames, views, class_name)
+
+
+def _one_after_the_other(taken: Sequence[Frames], time_s: NDArray[np.float64] | None = None) -> Frames:
+    """Return frames of one position from single ones."""
+
     def joined(name: str) -> NDArray[Any] | None:
         parts = [getattr(frame, name) for frame in taken]
         return None if parts[0] is None else np.concatenate(parts, axis=1)
 
-    range_m, flags = joined("range_m"), joined("flags")
+    range_m = joined("range_m")
     assert range_m is not None
-    frames = Frames(
+    own = [frame.by_frequency for frame in taken] if len(taken[0].sensor.frequencies_hz) > 1 else []
+    return Frames(
         range_m,
         joined("amplitude_e"),
         joined("intensity_e"),
-        flags=flags,
-        sensor=sensor,
-        time_s=np.round(np.arange(len(views)) / sensor.frame_rate_hz, 3)[None],
+        flags=joined("flags"),
+        sensor=taken[0].sensor,
+        time_s=time_s,
+        by_frequency=[_one_after_the_other(parts) for parts in zip(*own, strict=True)],
     )
-    return SimulatedRecording(frames, views, class_name)
 
 
 def write_recording(

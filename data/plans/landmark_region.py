@@ -48,16 +48,17 @@ def landmark_region(
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for mesh in meshes:
         for nearest in (min(distance_m), max(distance_m)):
-            u, v = _rims_in_image(sensor, mesh, nearest)
-            low, high = np.minimum(low, [u.min(), v.min()]), np.maximum(high, [u.max(), v.max()])
-    tan_h, tan_v = sensor.tan_half_angles
-    margin = math.tan(margin_rad) * np.array([sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v)])
-    size = np.array([sensor.cols, sensor.rows])
-    if (high <= 0).any() or (low >= size).any():
+            rims = _rims_in_tangents(sensor, mesh, nearest)
+            low, high = np.minimum(low, rims.min(axis=0)), np.maximum(high, rims.max(axis=0))
+    if not _pixels_within(sensor, low, high).any():
         raise UsageError("'region' must be 'whole' or four numbers here: no landmark is in view at any distance")
-    cols, rows = (
-        _whole_blocks(low[k] - margin[k], high[k] + margin[k], int(size[k]), sensor.centre_px[k], binning)
-        for k in range(2)
+    seen = _pixels_within(sensor, np.tan(np.arctan(low) - margin_rad), np.tan(np.arctan(high) + margin_rad))
+    rows, cols = (
+        _whole_blocks(first, stop, size, centre, binning)
+        for (first, stop), size, centre in (
+            (_extent(np.asarray(seen.any(axis=1))), sensor.rows, sensor.centre_px[1]),
+            (_extent(np.asarray(seen.any(axis=0))), sensor.cols, sensor.centre_px[0]),
+        )
     )
     return Region(*rows, *cols, binning)
 
@@ -78,10 +79,8 @@ def whole_region(sensor: Sensor, binning: int) -> Region:
     return Region(*rows, *_whole_blocks(0, sensor.cols, sensor.cols, sensor.centre_px[0], binning), binning)
 
 
-def _rims_in_image(
-    sensor: Sensor, mesh: trimesh.Trimesh, distance_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where the rims of the cylinder that encloses a landmark lie in the image of a view straight ahead."""
+def _rims_in_tangents(sensor: Sensor, mesh: trimesh.Trimesh, distance_m: float) -> NDArray[np.float64]:
+    """Return the rims of the cylinder that encloses a landmark straight ahead, tangents (y, z) of the camera."""
     points = np.asarray(mesh.vertices)
     radius = float(np.hypot(points[:, 0], points[:, 1]).max())
     angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
@@ -90,11 +89,22 @@ def _rims_in_image(
     corners = np.concatenate([np.column_stack([rim, np.full(_AROUND, z)]) for z in heights])
     rotation, translation = Views.broadcast(distance_m).in_camera(sensor).landmark2cam()
     seen = (corners @ rotation[0].T + translation[0]) @ sensor.cam2level
-    ahead = np.maximum(seen[:, 0], 1e-3)  # a rim that reaches behind the lens fills the image
-    (tan_h, tan_v), (u0, v0) = sensor.tan_half_angles, sensor.centre_px
-    u = u0 - seen[:, 1] / ahead * sensor.cols / (2 * tan_h)
-    v = v0 - seen[:, 2] / ahead * sensor.rows / (2 * tan_v)
-    return u, v
+    ahead = np.maximum(seen[:, :1], 1e-3)  # a rim that reaches behind the lens fills the image
+    return np.asarray(seen[:, 1:] / ahead)
+
+
+def _pixels_within(sensor: Sensor, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which pixels reach into a rectangle of tangents (y, z), (rows, cols)."""
+    v, u = np.mgrid[: sensor.rows + 1, : sensor.cols + 1].astype(np.float64)
+    tangents = np.stack(sensor.tangents(u, v), axis=-1)
+    corners = np.stack([tangents[:-1, :-1], tangents[:-1, 1:], tangents[1:, :-1], tangents[1:, 1:]])
+    return np.asarray(((corners.max(axis=0) > low) & (corners.min(axis=0) < high)).all(axis=-1))
+
+
+def _extent(seen: NDArray[np.bool_]) -> tuple[int, int]:
+    """Return first and stop of what is true."""
+    where = np.flatnonzero(seen)
+    return int(where[0]), int(where[-1]) + 1
 
 
 def _whole_blocks(low: float, high: float, size: int, centre: float, n: int) -> tuple[int, int]:

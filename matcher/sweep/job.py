@@ -267,9 +267,7 @@ class SweepJob:
         rng = stream(self.plan.seed, "sweep.noise", number)
         n_frames = self.all_conditions[number].n_frames
         frames = capture(image, true, rng=rng, n_frames=n_frames, first_view=first)
-        if true == believed:
-            return frames
-        return Frames(frames.range_m, frames.amplitude_e, frames.intensity_e, flags=frames.flags, sensor=believed)
+        return frames if true == believed else frames.taken_by(believed)
 
     def bound(self, number: int, method: Method, image: PhasorImages) -> NDArray[np.float64]:
         """Return the Cramér–Rao bound of the true world at the views of an image of it.

@@ -118,17 +118,22 @@ class Light(NamedTuple):
     albedo : float
         Of the landmark.
     radians_per_metre : float
-        4πf / c.
-    orders : (k,) int64
-        Harmonic orders; the first is 1.
+        4πf / c of the first frequency f.
+    orders : (k,) float64
+        Which multiples of f phasors are wanted at: harmonic orders, other frequencies and their harmonics; the first
+        is 1.
     vignetting : bool
+    fastest : float
+        4πf / c of the highest of several modulation frequencies, for which the background's pixels are cut finely
+        enough; 0 of one frequency, whose pixels are not cut.
     """
 
     background: NDArray[np.float64]
     albedo: float
     radians_per_metre: float
-    orders: NDArray[np.int64]
+    orders: NDArray[np.float64]
     vignetting: bool
+    fastest: float
 
 
 class Edges(NamedTuple):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 
 if TYPE_CHECKING:
+    from phasemark.render.sensor.lens_fields import Lens
     from phasemark.render.sensor.sensor import Sensor
 
 MOST_BINNING = 64
@@ -95,18 +96,14 @@ class Region(NamedTuple):
         """
         self.check(sensor)
         rows, cols = self.shape
-        (tan_h, tan_v), (u0, v0), n = sensor.tan_half_angles, sensor.centre_px, self.binning
-        centre = (u0 - self.first_col) / n, (v0 - self.first_row) / n
         changes: dict[str, Any] = {
             "rows": rows,
             "cols": cols,
-            "half_angle_h_deg": math.degrees(math.atan(tan_h * (cols * n / sensor.cols))),
-            "half_angle_v_deg": math.degrees(math.atan(tan_v * (rows * n / sensor.rows))),
-            "principal_point_px": None if centre == (cols / 2, rows / 2) else centre,
             "dead_pixels": self._moved(sensor.dead_pixels),
             "hot_pixels": self._moved(sensor.hot_pixels),
         }
-        return sensor.with_(**changes, **(_added_up(sensor, n) if n > 1 else {}))
+        changes |= self._ideal_geometry(sensor) if sensor.lens is None else {"lens": self._of_lens(sensor.lens)}
+        return sensor.with_(**changes, **(_added_up(sensor, self.binning) if self.binning > 1 else {}))
 
     def blocks(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return the pixels of each block of images (…, rows, cols) along the last axis, (…, rows, cols, binning²)."""
@@ -114,6 +111,23 @@ class Region(NamedTuple):
         cut = values[..., self.first_row : self.stop_row, self.first_col : self.stop_col]
         parts = cut.reshape(*values.shape[:-2], rows, n, cols, n)
         return np.moveaxis(parts, -3, -2).reshape(*values.shape[:-2], rows, cols, n * n)
+
+    def _ideal_geometry(self, sensor: Sensor) -> dict[str, Any]:
+        """Return half angles and principal point of a camera without distortion that reads this region."""
+        (rows, cols), n = self.shape, self.binning
+        (tan_h, tan_v), (u0, v0) = sensor.tan_half_angles, sensor.centre_px
+        centre = (u0 - self.first_col) / n, (v0 - self.first_row) / n
+        return {
+            "half_angle_h_deg": math.degrees(math.atan(tan_h * (cols * n / sensor.cols))),
+            "half_angle_v_deg": math.degrees(math.atan(tan_v * (rows * n / sensor.rows))),
+            "principal_point_px": None if centre == (cols / 2, rows / 2) else centre,
+        }
+
+    def _of_lens(self, lens: Lens) -> dict[str, Any]:
+        """Return the intrinsics of a lens before this region."""
+        n = self.binning
+        centres = (lens.cx + 0.5 - self.first_col) / n - 0.5, (lens.cy + 0.5 - self.first_row) / n - 0.5
+        return {**lens.model_dump(), "fx": lens.fx / n, "fy": lens.fy / n, "cx": centres[0], "cy": centres[1]}
 
     def _moved(self, pixels: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
         """Return the blocks that some pixels lie in."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -60,12 +61,14 @@ class Sensor(SensorQuantities):
         Light-sensitive share of the pixel's pitch, a centred rectangle.
     vignetting : bool
         Whether brightness falls as cos⁴ of the angle off the axis.
-    modulation_hz : float
-        Modulation frequency f; the range wraps at c / 2f.
+    modulation_hz : float or tuple of float
+        Modulation frequency f; the range wraps at c / 2f. Several of them, in whole hertz and in the order in which a
+        frame has their phase images: the range wraps at c / (2 · gcd) (PHYSICS section 10). A list of one is that
+        number.
     frame_rate_hz : float
-        Frames a second, four phase images each.
+        Frames a second, four phase images at each of the m modulation frequencies. All phase images take the same time.
     phase_interval_s : float, optional
-        Time T from one phase image to the next; None: 1 / (4 · frame rate), the most there can be.
+        Time T from one phase image to the next; None: 1 / (4 m · frame rate), the most there can be.
     contrast : float
         Demodulation contrast K, in (0, 1].
     modulation : {"sine", "square", "harmonics", "pulse"}
@@ -78,7 +81,7 @@ class Sensor(SensorQuantities):
     emitted_pulse, reference_pulse : tuple of float
         One period of light and reference for "pulse", evenly sampled, of one length, at least 8 samples, any unit.
     signal_e : float
-        Electrons N₀ per phase image, both taps, that intensity 1 produces.
+        Electrons N₀ per phase image, both taps, that intensity 1 produces, at every frequency.
     ambient_e, dark_e : float
         Unmodulated electrons per phase image, both taps: ambient light and dark current.
     shot_noise : bool
@@ -99,7 +102,7 @@ class Sensor(SensorQuantities):
     black_level : float
         Code of no electrons; needs `adc_bits`.
     phase_offset_std_rad : float
-        Phase offset of each pixel, a pattern.
+        Phase offset of each pixel, a pattern; every frequency has its own.
     tap_phase_offset_std_rad : float
         Phase offset of each tap beside its pixel's, a pattern.
     range_offset_m : float
@@ -168,6 +171,15 @@ class Sensor(SensorQuantities):
         if {**fields, **changes}.get("lens") is not None:
             fields = {name: value for name, value in fields.items() if name not in DERIVED}
         return Sensor(**{**fields, **changes})
+
+    @property
+    def by_frequency(self) -> tuple[Sensor, ...]:
+        """The camera during the phase images of each frequency: cameras of one frequency, in the order of the frame.
+
+        They differ in `modulation_hz` alone, and take their phase images as fast as this camera; a `wrap_guard_m`
+        belongs to the unwrapped range and not to them. A camera of one frequency is its own only one.
+        """
+        return (self,) if len(self.frequencies_hz) == 1 else _cameras_of_one_frequency(self)
 
     def without_errors(self, *, shot_noise: bool = False) -> Sensor:
         """Return the camera without its errors: optics, modulation frequency, contrast and signal alone.
@@ -329,6 +341,13 @@ class Sensor(SensorQuantities):
             title = titles.get(name, title)
             groups[title] = (*groups.get(title, ()), name)
         return groups
+
+
+@lru_cache(maxsize=32)
+def _cameras_of_one_frequency(sensor: Sensor) -> tuple[Sensor, ...]:
+    # the guard is about the wrap of the unwrapped range, which no frequency has alone
+    same = {"phase_interval_s": sensor.phase_image_interval_s, "wrap_guard_m": 0.0}
+    return tuple(sensor.with_(modulation_hz=hz, **same) for hz in sensor.frequencies_hz)
 
 
 def _numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:

@@ -7,9 +7,12 @@ from typing import Annotated, Any, Literal
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
     SerializerFunctionWrapHandler,
+    Tag,
     ValidationError,
     model_serializer,
 )
@@ -43,6 +46,22 @@ _Order = Annotated[int, Field(ge=2, le=199)]
 _Pixel = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 _Row = tuple[_Finite, ...]
 _PulseShape = tuple[_NonNegative, ...]
+
+_ONE, _SEVERAL = "one frequency", "several frequencies"
+_MOST_FREQUENCIES = 16
+
+
+def _without_list_of_one(value: Any) -> Any:
+    """Return the one number of a list of one, which means the same."""
+    return value[0] if isinstance(value, list | tuple) and len(value) == 1 else value
+
+
+_Frequencies = Annotated[
+    Annotated[_Positive, Tag(_ONE)]
+    | Annotated[tuple[_Positive, ...], Field(min_length=1, max_length=_MOST_FREQUENCIES), Tag(_SEVERAL)],
+    Discriminator(lambda value: _SEVERAL if isinstance(value, list | tuple) else _ONE),
+    BeforeValidator(_without_list_of_one),
+]
 
 # What an image's rays and phases depend on: cameras that agree in these see the same noise-free image.
 OPTICS = (
@@ -139,7 +158,7 @@ class SensorFields(BaseModel):
     fill_factor: tuple[_Fraction, _Fraction] = (1.0, 1.0)
     vignetting: bool = False
     # modulation and timing
-    modulation_hz: _Positive = 10e6
+    modulation_hz: _Frequencies = 10e6
     frame_rate_hz: _Positive = 3.0
     phase_interval_s: _Positive | None = None
     delay_s: Annotated[float, Field(ge=-10, le=10)] = 0.0
@@ -208,7 +227,8 @@ class SensorFields(BaseModel):
             first = error.errors()[0]
             if not first["loc"]:  # a finding about several fields names them itself
                 raise UsageError(first["msg"].removeprefix("Value error, ")) from None
-            raise UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"]) from None
+            location = tuple(part for part in first["loc"] if part not in (_ONE, _SEVERAL))
+            raise UsageError.of_field(location, first["type"], first["msg"], first["input"]) from None
 
     @model_serializer(mode="wrap")
     def _without_absent_tables(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
