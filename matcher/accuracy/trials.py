@@ -47,6 +47,8 @@ class TrialSetup:
         the brighter ones of a weak pixel count.
     free : tuple of str
         What the matcher estimates, for the bound.
+    height_m, pitch_rad, roll_rad : float
+        True heights and tilts, uniform within ± these.
     nuisances : tuple of str, optional
         See :func:`~phasemark.matcher.accuracy.cramer_rao.cramer_rao`.
     """
@@ -58,6 +60,9 @@ class TrialSetup:
     on: ResidualKind = "ranges"
     free: tuple[str, ...] = VIEW[:2]
     nuisances: tuple[str, ...] | None = None
+    height_m: float = 0.0
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
 
     def views(self, n: int, rng: np.random.Generator, delta_period_rad: float) -> Views:
         """Draw true views, uniform, off the grid."""
@@ -65,8 +70,13 @@ class TrialSetup:
             rng.uniform(*self.distance_m, n),
             rng.uniform(0, delta_period_rad, n),
             rng.uniform(-1, 1, n) * self.bearing_rad,
-            0.0,
+            # a level camera's draws are not followed by others
+            *(rng.uniform(-1, 1, n) * width if width else 0.0 for width in self._upright),
         )
+
+    @property
+    def _upright(self) -> tuple[float, float, float]:
+        return self.height_m, self.pitch_rad, self.roll_rad
 
 
 @dataclass(frozen=True, eq=False)
