@@ -5,6 +5,7 @@ import importlib.util
 import json
 import re
 import sys
+import tomllib
 import unicodedata
 from pathlib import Path
 
@@ -213,3 +214,13 @@ def test_the_citation_has_the_programs_version():
 def test_no_page_of_a_release_names_an_index_of_packages(name):
     text = (ROOT / name).read_text(encoding="utf-8").lower()
     assert [word for word in ("pypi", "conda-forge", "docker.io", "anaconda") if word in text] == []
+
+
+def test_the_conda_recipe_asks_for_what_the_project_asks_for():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    recipe = (ROOT / "packaging" / "conda" / "recipe.yaml").read_text(encoding="utf-8")
+    stated = set(re.findall(r"^    - ([\w-]+) >=([\w.]+)$", recipe.partition("  run:\n")[2], flags=re.MULTILINE))
+    asked = {tuple(re.match(r"([\w-]+)>=([\w.]+)", each).groups()) for each in project["dependencies"]}
+    names = {"matplotlib": "matplotlib-base"}  # matplotlib without windows
+    assert stated - {("python", "3.11")} == {(names.get(name, name), version) for name, version in asked}
+    assert f'version: "{phasemark.__version__}"' in recipe

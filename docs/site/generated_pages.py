@@ -142,7 +142,7 @@ def plans_page() -> str:
     lines = [
         "# Plans",
         "",
-        "Generated from the program by `make pages`; do not edit. A plan is a TOML file that says what is built or run. "
+        "Generated from the program by `make pages`; do not edit. A plan is a TOML file: what is built or run. "
         "`phasemark plan example KIND` prints one, `phasemark plan check FILE` says what is wrong with one, and "
         "`phasemark plan schema KIND` prints the JSON Schema from which this page is made.",
         "",
