@@ -6,8 +6,7 @@ if (location.protocol === "file:") {
       const frame = document.createElement("iframe");
       frame.hidden = true;
       this.ready = new Promise(done => {
-        addEventListener("DOMContentLoaded", () => document.body.append(frame));
-        if (document.body) document.body.append(frame);
+        document.body.append(frame);  // this script stands in the body
         const inside = frame.contentWindow;
         inside.document.open();
         inside.document.write("<!doctype html><html><body></body></html>");
