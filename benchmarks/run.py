@@ -27,6 +27,7 @@ import numpy as np
 from matching import matching
 from mounting import design, mounting
 from policy import policy
+from regions import regions
 from tolerance import tolerance
 
 from phasemark.data import BankPlan, build_bank, open_bank
@@ -503,6 +504,7 @@ SECTIONS: dict[str, tuple[str, Callable[[], Table]]] = {
     "design": ("Designing a set of landmarks", design),
     "matching": ("Errors over the Cramér–Rao bound", partial(matching, SENSOR, SEED)),
     "tolerance": ("In a world that is not the model's", partial(tolerance, SENSOR, SEED)),
+    "regions": ("A large camera, binned", partial(regions, SENSOR, SEED)),
     "policy": ("What the tuning numbers of the search do", partial(policy, SENSOR, SEED)),
 }
 

@@ -120,15 +120,16 @@ def _check_values(file: h5py.File, path: Path) -> int:
         nonlocal count
         if not isinstance(item, h5py.Dataset) or item.dtype.kind != "f":
             return
-        may_be_nan = name.startswith("range") or name in ("wall", "floor")
+        may_be_nan = name.startswith(("range", "frequency_range")) or name in ("wall", "floor")
         per_row = max(1, item.nbytes // max(1, len(item)))
         step = max(1, _BLOCK_BYTES // per_row)
         for start in range(0, len(item), step):
             block = item[start : start + step]
             count += block.size
             wrong = np.isinf(block) if may_be_nan else ~np.isfinite(block)
-            if name == "range" and "flags" in file:
-                wrong |= np.isnan(block) != (file["flags"][start : start + step] != 0)
+            flags = {"range": "flags", "frequency_range": "frequency_flags"}.get(name, "")
+            if flags in file:
+                wrong |= np.isnan(block) != (file[flags][start : start + step] != 0)
             if wrong.any():
                 place = np.argwhere(wrong)[0]
                 where = ", ".join(str(int(k)) for k in (place[0] + start, *place[1:]))

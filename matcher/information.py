@@ -27,6 +27,8 @@ NATURAL_UNITS: dict[str, float] = {
     "delta_rad": math.radians(1),
     "bearing_rad": math.radians(1),
     "height_m": 0.01,
+    "pitch_rad": math.radians(1),
+    "roll_rad": math.radians(1),
 }
 """Lengths in centimetres and angles in degrees make a condition number that means something."""
 

@@ -32,7 +32,7 @@ class Candidate:
         Whitened squared distance of the frame from the candidate's image.
     weight : float
         Its share of the likelihood, among all explanations with the match itself and "none".
-    bearing_rad, height_m : float
+    bearing_rad, height_m, pitch_rad, roll_rad : float
     """
 
     class_name: str
@@ -42,6 +42,8 @@ class Candidate:
     weight: float = 0.0
     bearing_rad: float = 0.0
     height_m: float = 0.0
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +56,8 @@ class Match:
         The landmark's class; None: no landmark.
     accepted : bool
         Whether there is a landmark and the fit passes its test at the matcher's false-alarm rate.
-    distance_m, delta_rad, bearing_rad, height_m : float
-        The view, PHYSICS section 1; NaN if too few pixels returned to tell.
+    distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : float
+        The view, PHYSICS sections 1 and 9; NaN if too few pixels returned to tell.
     free : tuple of str
         Which of these were estimated; the others are assumptions.
     covariance : ndarray or None
@@ -105,6 +107,8 @@ class Match:
     background: Background | None = None
     reason: Reason = ""
     systematic: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers and text, angles in degrees too; NaN as None, so that it is valid JSON."""
@@ -120,6 +124,11 @@ class Match:
             "delta_deg": plain(math.degrees(self.delta_rad)),
             "bearing_deg": plain(math.degrees(self.bearing_rad)),
             "height_m": plain(self.height_m),
+            **{
+                name.replace("_rad", "_deg"): plain(math.degrees(getattr(self, name)))
+                for name in ("pitch_rad", "roll_rad")
+                if name in self.free or getattr(self, name)
+            },
             "free": list(self.free),
             "covariance": None if self.covariance is None else self.covariance.tolist(),
             "systematic": {name: part.tolist() for name, part in self.systematic.items()},
@@ -186,7 +195,8 @@ class Matches(Sequence[Match]):
         Names, None where there is no landmark.
     reason : (n,) object
     accepted : (n,) bool
-    distance_m, delta_rad, bearing_rad, height_m, chi2, p_value, condition_number : (n,) float64
+    distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : (n,) float64
+    chi2, p_value, condition_number : (n,) float64
     dof : (n,) int64
     covariance : (n, p, p) float64, or None
     class_probability : dict of str to (n,) float64
@@ -249,6 +259,16 @@ class Matches(Sequence[Match]):
     def height_m(self) -> NDArray[np.float64]:
         """Heights; (n,)."""
         return self._floats("height_m")
+
+    @property
+    def pitch_rad(self) -> NDArray[np.float64]:
+        """Pitch angles of the camera; (n,)."""
+        return self._floats("pitch_rad")
+
+    @property
+    def roll_rad(self) -> NDArray[np.float64]:
+        """Roll angles of the camera; (n,)."""
+        return self._floats("roll_rad")
 
     @property
     def chi2(self) -> NDArray[np.float64]:

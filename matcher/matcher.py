@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal, Protocol
@@ -9,9 +10,11 @@ from typing import Any, Literal, Protocol
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.filters.region import read_region
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import (
     BEARING_STD_RAD,
+    TILT_STD_RAD,
     LikelihoodMatcher,
     Pixels,
 )
@@ -43,9 +46,10 @@ class Matcher:
         bank the lower pixels choose distance and angle, and the upper pixels the class at that distance; in a full
         bank all pixels choose all three. "refine" is maximum likelihood over a continuous view, with its covariance.
     free : sequence of str, optional
-        What "refine" estimates: distance_m and delta_rad, and on request bearing_rad and height_m; what is not free
-        is 0. None: distance, delta and the bearing, whose Gaussian prior has mean 0 and the standard deviation
-        `bearing_std_rad` before the frame is seen. ``("distance_m", "delta_rad")`` fixes the bearing at 0.
+        What "refine" estimates: distance_m and delta_rad, and on request any of bearing_rad, height_m, pitch_rad and
+        roll_rad; what is not free is 0. None: distance, delta and the bearing, whose Gaussian prior has mean 0 and the
+        standard deviation `bearing_std_rad` before the frame is seen. ``("distance_m", "delta_rad")`` fixes the
+        bearing at 0.
     background : Background, "auto", "unknown" or None
         What stands behind the landmark. None: nothing is expected to return beside it. "auto", with "refine": wall and
         floor are estimated from each frame's own far pixels. "unknown", with "refine" on ranges: other things may stand
@@ -62,6 +66,10 @@ class Matcher:
         Whether "refine" counts residuals beyond 3 σ linearly (Huber); the covariance is then the sandwich.
     bearing_std_rad : float
         How well the mount points at the landmark, where `free` is None: the standard deviation of a Gaussian prior.
+    height_std_m, pitch_std_rad, roll_std_rad : float
+        How well height, pitch and roll are known where they are free: standard deviations of Gaussian priors with mean
+        0; infinite where nothing is known. Starts are looked for up to three of them away, within a quarter of the
+        image.
     systematic : collection of {"calibration", "declared", "motion"}
         Which errors that all frames of the camera share are added to the covariance of "refine": what the calibration
         of the frames' sensor leaves, what the sensor declares of a pose, and what the jitter of its stamps makes of
@@ -108,6 +116,9 @@ class Matcher:
         pixels: Pixels = "all",
         robust: bool = False,
         bearing_std_rad: float = BEARING_STD_RAD,
+        height_std_m: float = math.inf,
+        pitch_std_rad: float = TILT_STD_RAD,
+        roll_std_rad: float = TILT_STD_RAD,
         systematic: Collection[str] = SYSTEMATICS,
         tolerance_m: float = TOLERANCE_M,
         tolerance_rad: float = TOLERANCE_RAD,
@@ -118,7 +129,14 @@ class Matcher:
             raise UsageError(f"unknown method {method!r}: the methods are {', '.join(METHODS)}")
         if isinstance(background, str) and background not in ("auto", "unknown"):
             raise UsageError(f'\'background\' must be a Background, "auto", "unknown" or None, got {background!r}')
-        stated = {"bearing_std_rad": bearing_std_rad, "tolerance_m": tolerance_m, "tolerance_rad": tolerance_rad}
+        stated = {
+            "bearing_std_rad": bearing_std_rad,
+            "height_std_m": height_std_m,
+            "pitch_std_rad": pitch_std_rad,
+            "roll_std_rad": roll_std_rad,
+            "tolerance_m": tolerance_m,
+            "tolerance_rad": tolerance_rad,
+        }
         for name, value in stated.items():
             if not value > 0:
                 raise UsageError(f"'{name}' must be positive, got {value!r}")
@@ -141,6 +159,9 @@ class Matcher:
                 pixels=pixels,
                 robust=robust,
                 bearing_std_rad=bearing_std_rad,
+                height_std_m=height_std_m,
+                pitch_std_rad=pitch_std_rad,
+                roll_std_rad=roll_std_rad,
                 systematic=check_systematic(systematic),
                 tolerance_m=tolerance_m,
                 tolerance_rad=tolerance_rad,
@@ -179,7 +200,32 @@ class Matcher:
         UsageError
             The frames come from another camera than the bank.
         """
-        difference = frames.sensor.optics_difference(self.bank.sensor)
-        if difference is not None:
-            raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
+        frames = self.read_out(frames)
         return Matches(self._method.match(frames.without_offset().with_pooled_noise()))
+
+    def read_out(self, frames: FilteredFrames) -> FilteredFrames:
+        """Return frames as the bank has its images: those of the whole camera cut down to the bank's region.
+
+        Parameters
+        ----------
+        frames : FilteredFrames
+            Of the bank's camera, or of one that reads the region itself.
+
+        Returns
+        -------
+        FilteredFrames
+
+        Raises
+        ------
+        UsageError
+            The frames come from another camera, or pixels are to be added up whose amplitudes are unknown.
+        """
+        bank = self.bank
+        difference = frames.sensor.optics_difference(bank.sensor)
+        if difference is None:
+            return frames
+        if bank.region is not None:
+            difference = frames.sensor.optics_difference(bank.camera)
+            if difference is None:
+                return read_region(frames, bank.region)
+        raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")

@@ -137,8 +137,47 @@ def background_hit(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-unt
     return t, albedo, facing
 
 
+@inlined
+def background_line(parameters, cos_b, sin_b, level):  # type: ignore[no-untyped-def]
+    """Return the line where wall and floor meet, or the floor's horizon, as (tx, ty, tz): tx + ty · y + tz · z = 0.
+
+    The rays (1, y, z) are those of the tilted camera; parameters as for :func:`background_edge`, with a floor.
+    """
+    # points of the line satisfy normal · ray = 0 in the level frame
+    nx, ny, nz = parameters[1] * cos_b, parameters[1] * sin_b, parameters[0]
+    if parameters[0] == 0.0:
+        nx, ny, nz = 0.0, 0.0, 1.0
+    # the normal in the tilted frame
+    tx = nx * level[0, 0] + ny * level[1, 0] + nz * level[2, 0]
+    ty = nx * level[0, 1] + ny * level[1, 1] + nz * level[2, 1]
+    tz = nx * level[0, 2] + ny * level[1, 2] + nz * level[2, 2]
+    return tx, ty, tz
+
+
+@inlined
+def nearer_plane(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Return which plane a ray meets first: 1 the wall, 2 the floor, 0 neither; see :func:`background_hit`."""
+    forward, plane, t = dx * cos_b + dy * sin_b, 0, 0.0
+    if parameters[0] > 0.0 and forward > 0.0:
+        plane, t = 1, parameters[0] / forward
+    if parameters[1] > 0.0 and dz < 0.0 and (plane == 0 or -parameters[1] / dz < t):
+        plane = 2
+    return plane
+
+
+@inlined
+def hit_of_plane(parameters, plane, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Return what :func:`background_hit` does, of one plane, whether it is the nearer one or not."""
+    forward = dx * cos_b + dy * sin_b
+    if plane == 1 and forward > 0.0:
+        return parameters[0] / forward, parameters[2], forward
+    if plane == 2 and dz < 0.0:
+        return -parameters[1] / dz, parameters[3], -dz
+    return 0.0, 0.0, 0.0
+
+
 @kernel
-def background_edge(parameters, cos_b, sin_b, camera, out):  # type: ignore[no-untyped-def]
+def background_edge(parameters, cos_b, sin_b, level, camera, out):  # type: ignore[no-untyped-def]
     """Project the line where wall and floor meet, or the floor's horizon, across the image.
 
     Parameters
@@ -147,6 +186,8 @@ def background_edge(parameters, cos_b, sin_b, camera, out):  # type: ignore[no-u
         As :meth:`Background.parameters` returns them.
     cos_b, sin_b : float
         Of the bearing.
+    level : (3, 3)
+        Tilted to level camera frame.
     camera : Camera
         :class:`~phasemark.render.integral.arguments.Camera`.
     out : (4,), overwritten
@@ -159,15 +200,7 @@ def background_edge(parameters, cos_b, sin_b, camera, out):  # type: ignore[no-u
     """
     if parameters[1] == 0.0:
         return False
-    # points of the line satisfy normal · ray = 0 in the level frame
-    nx, ny, nz = parameters[1] * cos_b, parameters[1] * sin_b, parameters[0]
-    if parameters[0] == 0.0:
-        nx, ny, nz = 0.0, 0.0, 1.0
-    # the normal in the tilted frame
-    level = camera.level
-    tx = nx * level[0, 0] + ny * level[1, 0] + nz * level[2, 0]
-    ty = nx * level[0, 1] + ny * level[1, 1] + nz * level[2, 1]
-    tz = nx * level[0, 2] + ny * level[1, 2] + nz * level[2, 2]
+    tx, ty, tz = background_line(parameters, cos_b, sin_b, level)
     # in image coordinates: k0 + ku · u + kv · v = 0
     ku, kv = -ty / camera.scale_u, -tz / camera.scale_v
     k0 = tx + ty * camera.centre_u / camera.scale_u + tz * camera.centre_v / camera.scale_v

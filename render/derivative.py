@@ -1,4 +1,4 @@
-"""How a view's phasors change with the view: ∂S/∂(D, δ, b, h) by differences of the area integral.
+"""How a view's phasors change with the view: ∂S/∂(D, δ, b, h, pitch, roll) by differences of the area integral.
 
 The integral is smooth in the view except where an edge passes a corner of a pixel or lies along its border: there its
 slope jumps. Differences of a point-sampled image would be noise; those of the exact integral converge.
@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render.view import Views
+from phasemark.render.view import VIEW_FIELDS, Views
 
 VIEW_PARAMETERS = ("distance_m", "delta_rad", "bearing_rad", "height_m")
-"""What a view is made of, in the order of PHYSICS section 1."""
+"""What a level view is made of, in the order of PHYSICS section 1: the derivatives that are given unless others are
+asked for."""
 
 STEP = 1e-5
 """Half the width of a difference, metres or radians.
@@ -30,8 +31,8 @@ magnify what is left of the quadrature's jumps.
 def check_parameters(parameters: Sequence[str]) -> None:
     """Refuse names that are no parameters of a view, and repeated ones."""
     for name in parameters:
-        if name not in VIEW_PARAMETERS:
-            raise UsageError(f"'parameters' must be among {', '.join(VIEW_PARAMETERS)}, got {name!r}")
+        if name not in VIEW_FIELDS:
+            raise UsageError(f"'parameters' must be among {', '.join(VIEW_FIELDS)}, got {name!r}")
     if not parameters or len(set(parameters)) < len(parameters):
         raise UsageError(f"'parameters' must name one or more parameters, each once, got {tuple(parameters)!r}")
 
@@ -52,7 +53,7 @@ def differentiate(
         From n views to (n, rows, cols) phasors.
     views : Views
     parameters : sequence of str
-        Among :data:`VIEW_PARAMETERS`.
+        Among :data:`~phasemark.render.view.VIEW_FIELDS`.
 
     Returns
     -------
@@ -74,11 +75,12 @@ def _derivative(
     # the width is what the floats have between them, not what was asked for
     high, low = value + STEP, value - STEP
     up, down = at(everywhere, high), at(everywhere, low)
-    slope = (up - down) / (high - low)[:, None, None]
+    each = (slice(None), *(None,) * (up.ndim - 1))
+    slope = (up - down) / (high - low)[each]
     kinked = np.flatnonzero(np.abs(value) < STEP) if name == "height_m" else np.empty(0, np.int64)
     if kinked.size:
         side = np.where(value[kinked] >= 0, STEP, -STEP)
-        near = np.where((side > 0)[:, None, None], up[kinked], down[kinked])
+        near = np.where((side > 0)[each], up[kinked], down[kinked])
         middle, far = (at(kinked, value[kinked] + k * side) for k in (2, 3))
-        slope[kinked] = (8 * middle - 5 * near - 3 * far) / (2 * side)[:, None, None]
+        slope[kinked] = (8 * middle - 5 * near - 3 * far) / (2 * side)[each]
     return slope

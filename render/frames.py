@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntFlag
 from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar
 
@@ -16,7 +16,7 @@ from phasemark.render.sensor.sensor import Sensor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_TAPS = (4, 2)  # phase images, taps
+_TAPS_PER_PHASE_IMAGE = 2
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
@@ -36,6 +36,8 @@ class Flag(IntFlag):
     """The pixel is known to be hot; also MISSING."""
     NEAR_WRAP = 32
     """The range may be on the wrong side of the wrap at 0 and c / 2f; also MISSING."""
+    INCONSISTENT = 64
+    """The modulation frequencies agree on no range: a mixed pixel, or one that returns at some alone; also MISSING."""
 
 
 class Frames:
@@ -44,9 +46,10 @@ class Frames:
     Parameters
     ----------
     range_m : array_like, (n, frames, rows, cols), (frames, rows, cols) or (rows, cols)
-        Range along the ray, metres; NaN where the camera gave none.
+        Range along the ray, metres; NaN where the camera gave none. Of several modulation frequencies it is unwrapped.
     amplitude_e, intensity_e : array_like, optional
-        Measured amplitude and intensity, electrons per phase image, in the shape of `range_m`.
+        Measured amplitude and intensity, electrons per phase image, in the shape of `range_m`; of several frequencies
+        those at the first.
     valid : array_like of bool, optional
         False where the range must not be used; what is NaN is invalid in any case.
     flags : array_like of int, optional
@@ -54,12 +57,16 @@ class Frames:
     sensor : Sensor
         The camera that took the frames.
     taps_e : array_like, optional
-        What each tap reported in each phase image, electrons; in the shape of `range_m` with (4, 2) before the rows.
+        What each tap reported in each phase image, electrons; in the shape of `range_m` with (4, 2) before the rows,
+        (4 m, 2) for m modulation frequencies.
     invalid_means : {"missing", "no-return"}
         What an invalid pixel without flags stands for. Unknown cause is "missing".
     time_s : array_like, optional
         Time stamp of each frame in the recorder's clock, seconds; `range_m` without its rows and columns gives the
         shape. Real stamps may repeat or run backwards.
+    by_frequency : sequence of Frames, optional
+        What each of several modulation frequencies measured alone: frames of ``sensor.by_frequency``, with the range
+        wrapped at c / 2f of each. :func:`~phasemark.render.unwrap_frames` makes frames from these.
 
     Raises
     ------
@@ -83,6 +90,7 @@ class Frames:
         taps_e: ArrayLike | None = None,
         invalid_means: Literal["missing", "no-return"] = "missing",
         time_s: ArrayLike | None = None,
+        by_frequency: Sequence[Frames] = (),
     ) -> None:
         given = ranges = np.array(range_m, dtype=np.float64)
         if ranges.ndim not in (2, 3, 4):
@@ -133,10 +141,11 @@ class Frames:
         self.taps_e: NDArray[np.float64] | None = None
         if taps_e is not None:
             taps: NDArray[np.float64] = np.array(taps_e, dtype=np.float64)
-            expected = (*given.shape[:-2], *_TAPS, *given.shape[-2:])
+            of_pixel = (sensor.n_phase_images, _TAPS_PER_PHASE_IMAGE)
+            expected = (*given.shape[:-2], *of_pixel, *given.shape[-2:])
             if taps.shape != expected:
                 raise UsageError(f"'taps_e' has shape {taps.shape}, but must have {expected}")
-            self.taps_e = taps.reshape(*shape[:2], *_TAPS, *shape[2:])
+            self.taps_e = taps.reshape(*shape[:2], *of_pixel, *shape[2:])
         self.time_s: NDArray[np.float64] | None = None
         """Time stamps, (n, frames) seconds, or None."""
         if time_s is not None:
@@ -148,6 +157,7 @@ class Frames:
                 raise UsageError(f"'time_s' must be finite, got {times.ravel()[k]} at frame {k}")
             self.time_s = times.reshape(shape[:2])
         self.sensor = sensor
+        self._by_frequency = _checked_parts(by_frequency, shape, sensor)
 
     @classmethod
     def as_measured(
@@ -159,6 +169,7 @@ class Frames:
         sensor: Sensor,
         *,
         taps_e: NDArray[np.float64] | None = None,
+        by_frequency: Sequence[Frames] = (),
     ) -> Self:
         """Return frames that hold the arrays of a camera model themselves: nothing is copied, and nothing checked.
 
@@ -169,7 +180,16 @@ class Frames:
         range_m[flags != 0] = np.nan
         frames.range_m, frames.amplitude_e, frames.intensity_e, frames.flags = range_m, amplitude_e, intensity_e, flags
         frames.taps_e, frames.time_s, frames.sensor = taps_e, None, sensor
+        frames._by_frequency = tuple(by_frequency)
         return frames
+
+    @property
+    def by_frequency(self) -> tuple[Frames, ...]:
+        """What each modulation frequency measured alone, its range wrapped at c / 2f; of one frequency the frames.
+
+        Empty where several frequencies were unwrapped elsewhere, and their own ranges are not known.
+        """
+        return (self,) if len(self.sensor.frequencies_hz) == 1 else self._by_frequency
 
     def __len__(self) -> int:
         return len(self.range_m)
@@ -184,6 +204,7 @@ class Frames:
             flags=self.flags[index],
             taps_e=None if self.taps_e is None else self.taps_e[index],
             time_s=None if self.time_s is None else self.time_s[index],
+            by_frequency=[part[index] for part in self._by_frequency],
         )
 
     def each_a_position(self) -> Self:
@@ -198,6 +219,53 @@ class Frames:
             flags=self.flags.reshape(flat),
             taps_e=None if taps is None else taps.reshape(-1, 1, *taps.shape[2:]),
             time_s=None if self.time_s is None else self.time_s.reshape(-1, 1),
+            by_frequency=[part.each_a_position() for part in self._by_frequency],
+        )
+
+    def taken_by(self, sensor: Sensor) -> Self:
+        """Return the same ranges, amplitudes and flags as frames of another camera, without taps and stamps.
+
+        Parameters
+        ----------
+        sensor : Sensor
+            With as many pixels and the same modulation frequencies.
+        """
+        parts = zip(self._by_frequency, sensor.by_frequency, strict=True) if self._by_frequency else ()
+        return type(self)(
+            self.range_m,
+            self.amplitude_e,
+            self.intensity_e,
+            flags=self.flags,
+            sensor=sensor,
+            by_frequency=[part.taken_by(camera) for part, camera in parts],
+        )
+
+    def some_frames(self, start: int, stop: int) -> Self:
+        """Return frames `start` to `stop` of every position, without taps and stamps."""
+        part = slice(start, stop)
+        return type(self)(
+            self.range_m[:, part],
+            None if self.amplitude_e is None else self.amplitude_e[:, part],
+            None if self.intensity_e is None else self.intensity_e[:, part],
+            sensor=self.sensor,
+            flags=self.flags[:, part],
+            by_frequency=[one.some_frames(start, stop) for one in self._by_frequency],
+        )
+
+    def as_one_position(self) -> Self:
+        """Return positions of one frame each as the frames of one position, (1, n, rows, cols)."""
+        n = len(self) * self.n_frames
+        whole = (1, n, self.sensor.rows, self.sensor.cols)
+        taps = self.taps_e
+        return type(self)(
+            self.range_m.reshape(whole),
+            None if self.amplitude_e is None else self.amplitude_e.reshape(whole),
+            None if self.intensity_e is None else self.intensity_e.reshape(whole),
+            sensor=self.sensor,
+            flags=self.flags.reshape(whole),
+            taps_e=None if taps is None else taps.reshape(1, n, *taps.shape[2:]),
+            time_s=None if self.time_s is None else self.time_s.reshape(1, n),
+            by_frequency=[part.as_one_position() for part in self._by_frequency],
         )
 
     @property
@@ -222,3 +290,21 @@ class Frames:
     def _repr_png_(self) -> bytes | None:
         """Show the first frame in a notebook; nothing where there is none."""
         return figure_png(self.plot()) if self.range_m.size else None
+
+
+def _checked_parts(parts: Sequence[Frames], shape: tuple[int, ...], sensor: Sensor) -> tuple[Frames, ...]:
+    """Refuse frames of single frequencies that are not those of a camera of several."""
+    if not parts:
+        return ()
+    m = len(sensor.frequencies_hz)
+    if m == 1 or len(parts) != m:
+        raise UsageError(f"'by_frequency' must have frames of each of several frequencies, got {len(parts)} for {m}")
+    for camera, part in zip(sensor.by_frequency, parts, strict=True):
+        if part.sensor.modulation_hz != camera.modulation_hz:
+            raise UsageError(
+                f"'by_frequency' must follow the order of 'modulation_hz', got frames of {part.sensor.modulation_hz}"
+                f" Hz for {camera.modulation_hz} Hz"
+            )
+        if part.range_m.shape != shape:
+            raise UsageError(f"'by_frequency' has frames of shape {part.range_m.shape}, but 'range_m' has {shape}")
+    return tuple(parts)

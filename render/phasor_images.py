@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -10,8 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
+from phasemark.inputs.numbers import in_words
 from phasemark.render.png import figure_png
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.unwrapping import unwrap_ranges
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:
@@ -26,7 +29,7 @@ def phasor_to_range_m(phasor: NDArray[np.complexfloating], sensor: Sensor) -> ND
     phasor : (...) complex
         S_1.
     sensor : Sensor
-        The camera; its modulation frequency f is what counts.
+        The camera; its modulation frequency f, the first of several, is what counts.
 
     Returns
     -------
@@ -38,14 +41,20 @@ def phasor_to_range_m(phasor: NDArray[np.complexfloating], sensor: Sensor) -> ND
         imag, real = np.ascontiguousarray(imag), np.ascontiguousarray(real)
     signed_m = sensor.metres_per_radian * np.arctan2(imag, real)
     # what wrap_range_m does, which for ± c/4f needs no division
-    range_m = np.asarray(signed_m + np.where(signed_m < 0, sensor.unambiguous_range_m, 0.0))
-    np.copyto(range_m, 0.0, where=range_m >= sensor.unambiguous_range_m)
+    range_m = np.asarray(signed_m + np.where(signed_m < 0, sensor.period_m, 0.0))
+    np.copyto(range_m, 0.0, where=range_m >= sensor.period_m)
     np.copyto(range_m, np.nan, where=phasor == 0)
     return range_m
 
 
+def _orders_of(hz: float, frequencies_hz: Sequence[float]) -> set[int]:
+    """Return which harmonic orders k > 1 of some frequencies a frequency is."""
+    orders = (round(hz / own) for own in frequencies_hz)
+    return {k for k, own in zip(orders, frequencies_hz, strict=True) if k > 1 and k * own == hz}
+
+
 def wrap_range_m(range_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
-    """Bring ranges into [0, c/2f).
+    """Bring ranges into [0, c/2f), of several frequencies into [0, c / (2 · gcd)).
 
     Parameters
     ----------
@@ -64,7 +73,7 @@ def wrap_range_m(range_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
 
 
 def wrap_difference_m(difference_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
-    """Bring differences of ranges into [−c/4f, c/4f).
+    """Bring differences of ranges into [−c/4f, c/4f), of several frequencies into ± c / (4 · gcd).
 
     Parameters
     ----------
@@ -89,7 +98,7 @@ class PhasorImages:
     Parameters
     ----------
     phasor : (n, rows, cols) complex128
-        S_1: mean over the pixel's active area of amplitude · exp(iφ).
+        S_1: mean over the pixel's active area of amplitude · exp(iφ), at the first modulation frequency.
     intensity : (n, rows, cols) float64
         Mean amplitude, at least ``abs(phasor)``.
     coverage : (n, rows, cols) float64
@@ -100,7 +109,9 @@ class PhasorImages:
         Share of the active area that sees the landmark's upper part; the rest of `coverage` sees the lower one. None
         where parts are not told apart.
     harmonics : mapping of int to (n, rows, cols) complex128
-        S_k for the orders k > 1 that were asked for.
+        S_k for the orders k > 1 that were asked for, of the first modulation frequency.
+    by_hz : mapping of float to (n, rows, cols) complex128
+        S at further frequencies, in hertz: the sensor's other modulation frequencies and the harmonics of each.
     """
 
     figure: ClassVar[Callable[..., Figure]]
@@ -113,14 +124,72 @@ class PhasorImages:
     views: Views
     upper_coverage: NDArray[np.float64] | None = None
     harmonics: Mapping[int, NDArray[np.complex128]] = field(default_factory=dict)
+    by_hz: Mapping[float, NDArray[np.complex128]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.phasor)
 
     @property
     def range_m(self) -> NDArray[np.float64]:
-        """Range along the ray, in [0, c/2f), NaN where nothing returns; (n, rows, cols)."""
-        return phasor_to_range_m(self.phasor, self.sensor)
+        """Range along the ray, in [0, c/2f), NaN where nothing returns; (n, rows, cols).
+
+        Of several frequencies it is what :func:`~phasemark.render.unwrap_ranges` finds, in [0, c / (2 · gcd)).
+        """
+        if len(self.sensor.frequencies_hz) == 1:
+            return phasor_to_range_m(self.phasor, self.sensor)
+        wrapped = np.stack([image.range_m for image in self.by_frequency])
+        # noise falls as 1 / (f · amplitude); one factor for all changes nothing
+        amplitude = np.stack([image.amplitude for image in self.by_frequency])
+        scale = np.array([camera.metres_per_radian for camera in self.sensor.by_frequency])
+        std = np.divide(scale[:, None, None, None], amplitude, out=np.ones_like(amplitude), where=amplitude > 0)
+        return unwrap_ranges(wrapped, std, self.sensor).range_m
+
+    @property
+    def phasors(self) -> NDArray[np.complex128]:
+        """S at each of the sensor's m modulation frequencies, (n, m, rows, cols)."""
+        return np.stack([self.at_frequency(hz) for hz in self.sensor.frequencies_hz], axis=1)
+
+    @property
+    def by_frequency(self) -> tuple[PhasorImages, ...]:
+        """The images that the camera sees at each of its modulation frequencies; of one frequency the images alone."""
+        if len(self.sensor.frequencies_hz) == 1:
+            return (self,)
+        known = self._known_hz()
+        orders = {k for hz in known for k in _orders_of(hz, self.sensor.frequencies_hz)}
+        return tuple(
+            replace(
+                self,
+                phasor=self.at_frequency(hz),
+                sensor=camera,
+                harmonics={k: known[k * hz] for k in sorted(orders) if k * hz in known},
+                by_hz={},
+            )
+            for hz, camera in zip(self.sensor.frequencies_hz, self.sensor.by_frequency, strict=True)
+        )
+
+    def at_frequency(self, hz: float) -> NDArray[np.complex128]:
+        """Return S at one modulation frequency, (n, rows, cols).
+
+        Parameters
+        ----------
+        hz : float
+            One of the sensor's frequencies, or a harmonic of one that was rendered.
+
+        Raises
+        ------
+        UsageError
+            The images do not have the frequency.
+        """
+        known = self._known_hz()
+        found = next((values for own, values in known.items() if math.isclose(own, hz, rel_tol=1e-9)), None)
+        if found is None:
+            raise UsageError(f"the images have no phasor at {hz:.12g} Hz, only at {in_words(sorted(known))} Hz")
+        return found
+
+    def _known_hz(self) -> dict[float, NDArray[np.complex128]]:
+        """Return all phasors by their frequency, hertz."""
+        first_hz = self.sensor.frequencies_hz[0]
+        return {first_hz: self.phasor} | {k * first_hz: s for k, s in self.harmonics.items()} | dict(self.by_hz)
 
     @property
     def amplitude(self) -> NDArray[np.float64]:
@@ -192,6 +261,7 @@ class PhasorImages:
                 for order, s in self.harmonics.items()
                 if order in behind.harmonics
             },
+            by_hz={hz: s + free * behind.by_hz[hz] for hz, s in self.by_hz.items() if hz in behind.by_hz},
         )
 
     def plot(self, index: int = 0) -> Figure:

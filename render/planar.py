@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
@@ -183,6 +184,7 @@ def planar_images(
     if sensor.vignetting:
         intensity *= sensor.pixel_directions()[first:stop, :, 0] ** 4
     phase = np.where(seen, distance, 0.0) / sensor.metres_per_radian
+    first_hz, all_hz = sensor.frequencies_hz[0], phasor_frequencies_hz(sensor.frequencies_hz, harmonics)
     return PhasorImages(
         phasor=intensity * np.exp(1j * phase),
         intensity=intensity,
@@ -190,6 +192,7 @@ def planar_images(
         sensor=sensor,
         views=asked,
         harmonics={int(order): intensity * np.exp(1j * order * phase) for order in harmonics},
+        by_hz={hz: intensity * np.exp(1j * hz / first_hz * phase) for hz in all_hz[1 + len(harmonics) :]},
     )
 
 
@@ -198,14 +201,18 @@ def _refuse_out_of_plane(sensor: Sensor, views: Views) -> None:
     needs = "the planar model needs"
     if sensor.rows % 2:
         raise UsageError(f"{needs} an even number of rows, got {sensor.rows}")
+    if sensor.lens is not None:
+        raise UsageError(f"{needs} an ideal lens, got a sensor with 'lens'")
     if sensor.centre_px != (sensor.cols / 2, sensor.rows / 2):
         raise UsageError(f"{needs} a centred principal point, got {sensor.centre_px}")
     for name in ("pitch_deg", "roll_deg"):
         if getattr(sensor, name):
             raise UsageError(f"{needs} '{name}' = 0, got {getattr(sensor, name)}")
-    off = np.flatnonzero(views.height_m)
-    if off.size:
-        raise UsageError(f"{needs} 'height_m' = 0, got {views.height_m[off[0]]} in view {off[0]}")
+    for name in ("height_m", "pitch_rad", "roll_rad"):
+        values = getattr(views, name)
+        off = np.flatnonzero(values)
+        if off.size:
+            raise UsageError(f"{needs} '{name}' = 0, got {values[off[0]]} in view {off[0]}")
 
 
 def _refuse_inside(inside: NDArray[np.bool_], views: Views) -> None:

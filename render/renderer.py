@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
@@ -20,17 +21,20 @@ from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
 from phasemark.render.integral.arguments import Borders, Camera, Edges, Light, Motion, Poses, Returns, Samples, Sums
+from phasemark.render.integral.image_rays import trace
 from phasemark.render.integral.intersect import make_intersector
-from phasemark.render.integral.light import add_background, sum_samples
+from phasemark.render.integral.lens_tables import distortion_of
+from phasemark.render.integral.light import add_background, points_a_side, sum_samples
 from phasemark.render.integral.mesh_topology import CLUSTER, MeshTopology
 from phasemark.render.integral.pixel_splitting import Scratch
-from phasemark.render.integral.ray_plan import UNTRUSTED, plan_rays
+from phasemark.render.integral.ray_plan import SHORT_LINKS, SHORT_SEGMENTS, UNTRUSTED, plan_rays
 from phasemark.render.integral.shells import unite_shells
 from phasemark.render.integral.slopes import STEP, SlopeSums
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
-from phasemark.render.view import Views
+from phasemark.render.view import VIEW_FIELDS, Views
 
 Variant = Literal["exact", "hard"]
 """The area integral, or what the centre ray of each pixel sees."""
@@ -38,8 +42,14 @@ Variant = Literal["exact", "hard"]
 _SAMPLES = 1 << 17
 _RETURNS = 1 << 9
 _BORDERS = 1 << 14
+_LINKS = 1 << 10
+"""Further segments that a view is given room for when edges become chains behind a lens with distortion."""
 _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
+_TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
+"""Parameters that turn what stands behind the landmark."""
+_RADIANS_PER_SPLIT = 1.1
+"""Radians per metre, those of 26 MHz, for which a pixel that sees a floor beside something else is cut once more."""
 _LARGE = 1 << 13
 """Faces above which a mesh is more than the processor's cache holds."""
 
@@ -57,18 +67,36 @@ class _Buffers:
 
     def __post_init__(self) -> None:
         rows, cols = self.shape
+        self.n_segments = self.n_edges + 1
         self.scratch = Scratch.empty()
         self.edges = Edges(
-            segments=np.empty((self.n_edges + 1, 4)),
-            limb=np.empty(self.n_edges + 1, np.int8),
+            segments=np.empty((self.n_segments, 4)),
+            limb=np.empty(self.n_segments, np.int8),
             head=np.empty((rows + 2, cols + 2), np.int32),
             link=np.empty(self.n_links, np.int32),
             owner=np.empty(self.n_links, np.int32),
             heights=np.empty(CLUSTER),
-            ends=np.empty((self.n_edges + 1, 2), np.int32),
+            ends=np.empty((self.n_segments, 2), np.int32),
+            extent=np.empty((2, 4)),
+            line=np.empty(4),
         )
         self.samples = _room_for(self.n_samples)
         self.borders = _room_for_borders(self.n_borders, self.n_parameters)
+
+    def make_room(self, reached: int) -> None:
+        """Grow what was too short, as :func:`plan_rays` says in place of the next view."""
+        if reached == SHORT_LINKS:
+            self.grow_links()
+        elif reached == SHORT_SEGMENTS:
+            self.grow_segments()
+        else:
+            self.grow_samples()
+
+    def grow_segments(self) -> None:
+        n = self.n_segments = 2 * self.n_segments + _LINKS
+        self.edges = self.edges._replace(
+            segments=np.empty((n, 4)), limb=np.empty(n, np.int8), ends=np.empty((n, 2), np.int32)
+        )
 
     def grow_links(self) -> None:
         n = 2 * len(self.edges.link)
@@ -82,6 +110,7 @@ class _Buffers:
 def _room_for(n: int) -> Samples:
     return Samples(
         points=np.empty((n, 2)),
+        rays=np.empty((n, 2)),
         weights=np.empty(n),
         regions=np.empty(n, np.int32),
         pixel=np.empty(n, np.int64),
@@ -120,7 +149,8 @@ class Renderer:
     albedo : float
         Of the Lambertian landmark, in (0, 1].
     harmonics : sequence of int, optional
-        Harmonic orders k > 1 wanted beside the signal; None: those that the sensor's taps need.
+        Harmonic orders k > 1 wanted beside the signal, of every modulation frequency; None: those that the sensor's
+        taps need.
     intersector : {"auto", "embree", "float64"}
         What finds the face a ray meets; "auto" is Embree where the package embreex is installed.
     splits : int
@@ -163,7 +193,7 @@ class Renderer:
         self.albedo = float(albedo)
         self.splits = int(splits)
         self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
-        self._orders = np.array([1, *harmonics], dtype=np.int64)
+        self._harmonics = tuple(int(order) for order in harmonics)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
         self.untrusted_pixels = 0
         """How many pixels, of all rendered so far, had too many edges to be split exactly."""
@@ -185,6 +215,8 @@ class Renderer:
         delta_rad: ArrayLike = 0.0,
         bearing_rad: ArrayLike = 0.0,
         height_m: ArrayLike = 0.0,
+        pitch_rad: ArrayLike = 0.0,
+        roll_rad: ArrayLike = 0.0,
         *,
         background: Background | None = None,
         rows: tuple[int, int] | None = None,
@@ -195,8 +227,8 @@ class Renderer:
 
         Parameters
         ----------
-        distance_m, delta_rad, bearing_rad, height_m : array_like
-            The views, PHYSICS section 1.
+        distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : array_like
+            The views, PHYSICS sections 1 and 9.
         background : Background, optional
             What stands behind the landmark; None: nothing.
         rows : (first, stop), optional
@@ -217,7 +249,7 @@ class Renderer:
         UsageError
             A view that is not finite, a lens inside the landmark, a wall before it or a floor above its foot.
         """
-        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m)
+        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad)
         return self.render_views(views, background=background, rows=rows, variant=variant, workers=workers)
 
     def render_views(
@@ -239,12 +271,65 @@ class Renderer:
         self._check(seen, background, workers)
         return replace(self._render(seen, background, (first, stop), workers, variant), views=views)
 
+    def turned_out_of_view(self, views: Views) -> NDArray[np.intp]:
+        """Return which views are tilted so far that none of the landmark's bounding box is in the image.
+
+        Parameters
+        ----------
+        views : Views
+        """
+        tilted = np.flatnonzero((views.pitch_rad != 0) | (views.roll_rad != 0))
+        if not tilted.size or not len(self.topology.faces):
+            return tilted[:0]
+        sensor = self.sensor
+        rotation, translation = views[tilted].in_camera(sensor).landmark2cam()
+        box = np.array(list(itertools.product(*zip(self.topology.low, self.topology.high, strict=True))))
+        corners = (np.einsum("nij,kj->nki", rotation, box) + translation[:, None]) @ sensor.cam2level
+        v, u = np.mgrid[: sensor.rows + 1, : sensor.cols + 1].astype(float)
+        edge = (v % sensor.rows == 0) | (u % sensor.cols == 0)
+        x, y, z = sensor.ray_directions(u[edge], v[edge]).T
+        beyond = (corners[..., 0] <= 0).all(axis=1)
+        ahead = sensor.cam2level.T @ [x, y, z]
+        if (ahead[0] > 0).all():
+            for axis in (1, 2):
+                slope = ahead[axis] / ahead[0]
+                beyond |= (corners[..., axis] > slope.max() * corners[..., 0]).all(axis=1)
+                beyond |= (corners[..., axis] < slope.min() * corners[..., 0]).all(axis=1)
+        return tilted[beyond]
+
+    def check_in_view(self, views: Views) -> None:
+        """Refuse views that are tilted so far that the landmark is out of the image.
+
+        Parameters
+        ----------
+        views : Views
+
+        Raises
+        ------
+        UsageError
+            Naming the view, its tilt, and the pitch that would have the landmark in the middle.
+        """
+        lost = self.turned_out_of_view(views)
+        if not lost.size:
+            return
+        k = int(lost[0])
+        seen = views[k : k + 1].in_camera(self.sensor)
+        middle = float(seen.height_m[0]) + 0.5 * float(self.topology.low[2] + self.topology.high[2])
+        elevation = math.degrees(math.atan2(middle, float(seen.distance_m[0])))
+        pitch, roll = (math.degrees(float(values[k])) for values in (views.pitch_rad, views.roll_rad))
+        raise UsageError(
+            f"in view {k} a pitch of {pitch:.4g}° and a roll of {roll:.4g}° turn the landmark out of the image: at roll"
+            f" 0 a pitch of about {-elevation - self.sensor.pitch_deg:.3g}° has it in the middle"
+        )
+
     def jacobian(
         self,
         distance_m: ArrayLike,
         delta_rad: ArrayLike = 0.0,
         bearing_rad: ArrayLike = 0.0,
         height_m: ArrayLike = 0.0,
+        pitch_rad: ArrayLike = 0.0,
+        roll_rad: ArrayLike = 0.0,
         *,
         background: Background | None = None,
         parameters: Sequence[str] = VIEW_PARAMETERS,
@@ -258,15 +343,15 @@ class Renderer:
 
         Parameters
         ----------
-        distance_m, delta_rad, bearing_rad, height_m, background, workers
+        distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad, background, workers
             As for :meth:`render`.
         parameters : sequence of str
-            Which derivatives, in this order.
+            Which derivatives, in this order; "pitch_rad" and "roll_rad" too may be asked for.
 
         Returns
         -------
         (n, len(parameters), rows, cols) complex128
-            Per metre or per radian.
+            Per metre or per radian. Of a sensor with m > 1 frequencies (n, len(parameters), m, rows, cols).
 
         Raises
         ------
@@ -284,7 +369,9 @@ class Renderer:
         ((1, 1, 16, 16), np.float64(2.04))
         """
         check_parameters(parameters)
-        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m).in_camera(self.sensor)
+        views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad).in_camera(
+            self.sensor
+        )
         self._check(views, background, workers)
         return self._differences(views, background, parameters, workers)
 
@@ -309,7 +396,7 @@ class Renderer:
         views : Views
             n views.
         parameters : sequence of str
-            Which derivatives, in this order.
+            Which derivatives, in this order; "pitch_rad" and "roll_rad" too may be asked for.
         background, workers
             As for :meth:`render`.
 
@@ -317,7 +404,8 @@ class Renderer:
         -------
         images : PhasorImages
         slope : (n, len(parameters), rows, cols) complex128
-            ∂S/∂parameter, per metre or radian; see :mod:`phasemark.render.integral.slopes`.
+            ∂S/∂parameter, per metre or radian; of a sensor with m > 1 frequencies (n, len(parameters), m, rows, cols);
+            see :mod:`phasemark.render.integral.slopes`.
 
         Raises
         ------
@@ -328,10 +416,12 @@ class Renderer:
         seen = views.in_camera(self.sensor)
         self._check(seen, background, workers)
         whole, p = (0, self.sensor.rows), len(parameters)
-        by_pixel = np.zeros((len(views) * self.sensor.rows * self.sensor.cols, p), np.complex128)
+        m, shape = len(self.sensor.frequencies_hz), (self.sensor.rows, self.sensor.cols)
+        by_pixel = np.zeros((m, len(views) * math.prod(shape), p), np.complex128)
         images = self._render(seen, background, whole, workers, slope=by_pixel, parameters=parameters)
-        slope = by_pixel.reshape(len(views), self.sensor.rows, self.sensor.cols, p).transpose(0, 3, 1, 2)
-        unknown = np.isnan(slope).any(axis=(1, 2, 3)) | (not self.topology.closed)
+        slope = by_pixel.reshape(m, len(views), *shape, p).transpose(1, 4, 0, 2, 3)
+        slope = slope[:, :, 0] if m == 1 else slope
+        unknown = np.isnan(slope).any(axis=tuple(range(1, slope.ndim))) | (not self.topology.closed)
         full = np.flatnonzero(unknown)
         if full.size:
             slope[full] = self._differences(seen[full], background, parameters, workers)
@@ -343,7 +433,13 @@ class Renderer:
         """Return slopes as differences of images; `seen` as the camera itself has the views."""
         # a step may take a landmark that stands on the floor a hair into it
         whole = (0, self.sensor.rows)
-        return differentiate(lambda v: self._render(v, background, whole, workers).phasor, seen, parameters)
+        one = len(self.sensor.frequencies_hz) == 1
+
+        def phasor_of(moved: Views) -> NDArray[np.complex128]:
+            images = self._render(moved, background, whole, workers)
+            return images.phasor if one else images.phasors
+
+        return differentiate(phasor_of, seen, parameters)
 
     def _check(self, views: Views, background: Background | None, workers: int) -> None:
         """Refuse what cannot be rendered."""
@@ -365,7 +461,8 @@ class Renderer:
     ) -> PhasorImages:
         """Render rows of views that have been checked, as the camera itself has them.
 
-        With `slope`, (pixels of all views, p), it is filled with how the phasors change with `parameters`.
+        With `slope`, (m, pixels of all views, p), it is filled with how the phasors at each of the sensor's m
+        frequencies change with `parameters`.
         """
         run = self._render_tasks if variant == "exact" else self._cast_centres
         order = self._by_direction(views) if slope is None else slice(None)
@@ -374,14 +471,17 @@ class Renderer:
             run = partial(self._render_tasks, slope=slope, parameters=parameters)
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)
-        sums = _no_light(shape, len(self._orders))
-        camera = _camera(self.sensor, rows)
+        columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
+        sums = _no_light(shape, len(columns_hz))
+        behind = (background or Background()).parameters()
+        camera = _camera(self.sensor, rows, points_a_side(behind))
         light = Light(
-            (background or Background()).parameters(),
+            behind,
             self.albedo,
             1 / self.sensor.metres_per_radian,
-            self._orders,
+            np.array(columns_hz) / columns_hz[0],
             self.sensor.vignetting,
+            _fastest(self.sensor),
         )
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
         if workers == 1 or len(tasks) <= 1:
@@ -402,8 +502,9 @@ class Renderer:
             upper_coverage=np.minimum(upper, 1.0),
             sensor=self.sensor,
             views=views,
-            harmonics={
-                int(order): np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._orders) if order > 1
+            harmonics={order: np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._harmonics, start=1)},
+            by_hz={
+                hz: np.ascontiguousarray(phasor[..., k]) for k, hz in enumerate(columns_hz) if k > len(self._harmonics)
             },
         )
 
@@ -423,9 +524,9 @@ class Renderer:
         slope: NDArray[np.complex128] | None = None,
         parameters: Sequence[str] = (),
     ) -> None:
-        """Render slices of the views into `sums`, in one thread; with `slope`, (pixels, p), how they change too."""
-        mesh = self.topology
-        turns = np.array([name == "bearing_rad" for name in parameters], np.bool_) & light.background[:2].any()
+        """Render slices of the views into `sums`, in one thread; with `slope`, (m, pixels, p), how they change too."""
+        mesh, splits = self.topology, self._splits_before(light)
+        turns = np.array([name in _TURNING for name in parameters], np.bool_) & light.background[:2].any()
         buffers = _Buffers(
             len(mesh.creases) + len(mesh.folds),
             (camera.rows, camera.cols),
@@ -437,18 +538,17 @@ class Renderer:
             motion = _motion(views[task], poses, camera, parameters)
             slopes = None
             if slope is not None:
-                slopes = SlopeSums(slope[_pixels_of(task, sums)], motion, own, turns)
+                columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
+                columns = np.array([columns_hz.index(hz) for hz in self.sensor.frequencies_hz])
+                slopes = SlopeSums(slope[:, _pixels_of(task, sums)], columns, motion, own, turns)
             view = 0
             while view < len(poses.lens):
                 reached, n = plan_rays(
-                    view, mesh, poses, camera, self.splits, light.background, buffers.edges, buffers.scratch,
+                    view, mesh, poses, camera, splits, light.background, buffers.edges, buffers.scratch,
                     buffers.samples, own.state, motion, buffers.borders,
                 )  # fmt: skip
-                if reached == -1:
-                    buffers.grow_links()
-                    continue
-                if reached == view:
-                    buffers.grow_samples()
+                if reached <= view:
+                    buffers.make_room(reached)
                     continue
                 self._find_faces(n, buffers.samples, own.state, poses, camera)
                 sum_samples(n, buffers.samples, mesh, poses, camera, light, own)
@@ -459,6 +559,12 @@ class Renderer:
                 view = reached
             if slopes is not None:
                 slopes.conclude()
+
+    def _splits_before(self, light: Light) -> int:
+        """Return into how many boxes a side pixels are cut: more where fast phases turn along a floor."""
+        if light.fastest == 0.0 or not light.background[1] > 0.0:
+            return self.splits
+        return max(self.splits, min(math.ceil(light.fastest / _RADIANS_PER_SPLIT), _MAX_SPLITS))
 
     def _cast_centres(self, tasks: Iterable[slice], views: Views, camera: Camera, light: Light, sums: Sums) -> None:
         """Render slices of the views with one ray a pixel into `sums`, in one thread."""
@@ -471,6 +577,7 @@ class Renderer:
             samples.points[:] = np.tile(centres, (len(poses.lens), 1))
             samples.weights[:] = 1.0
             samples.pixel[:] = samples.chosen[:] = np.arange(n)
+            trace(0, n, samples, camera)
             aim(n, samples, poses, camera)
             samples.face[:] = self._intersector.first_face(samples.origins, samples.directions)
             sum_samples(n, samples, self.topology, poses, camera, light, _of_views(sums, task))
@@ -500,6 +607,13 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
             )
+
+
+def _fastest(sensor: Sensor) -> float:
+    """Return the radians per metre of the highest of several modulation frequencies, 0 of one."""
+    if len(sensor.frequencies_hz) == 1:
+        return 0.0
+    return max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
 
 
 def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:
@@ -549,16 +663,20 @@ def _topology(mesh: trimesh.Trimesh) -> MeshTopology:
     return found
 
 
-def _camera(sensor: Sensor, rows: tuple[int, int]) -> Camera:
-    """Return a camera as the kernels take it, and which rows to render."""
+def _camera(sensor: Sensor, rows: tuple[int, int], rule: int) -> Camera:
+    """Return a camera as the kernels take it, which rows to render, and how a background is integrated over a pixel."""
     tan_h, tan_v = sensor.tan_half_angles
+    scale = sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v)
+    slope = 2 * tan_h / sensor.cols, 2 * tan_v / sensor.rows
+    if sensor.lens is not None:
+        scale, slope = (sensor.lens.fx, sensor.lens.fy), (1 / sensor.lens.fx, 1 / sensor.lens.fy)
     return Camera(
-        scale_u=sensor.cols / (2 * tan_h),
-        scale_v=sensor.rows / (2 * tan_v),
+        scale_u=scale[0],
+        scale_v=scale[1],
         centre_u=float(sensor.centre_px[0]),
         centre_v=float(sensor.centre_px[1]),
-        slope_u=2 * tan_h / sensor.cols,
-        slope_v=2 * tan_v / sensor.rows,
+        slope_u=slope[0],
+        slope_v=slope[1],
         rows=sensor.rows,
         cols=sensor.cols,
         first_row=rows[0],
@@ -566,6 +684,7 @@ def _camera(sensor: Sensor, rows: tuple[int, int]) -> Camera:
         fill_u=float(sensor.fill_factor[0]),
         fill_v=float(sensor.fill_factor[1]),
         level=np.ascontiguousarray(sensor.cam2level),
+        distortion=distortion_of(sensor, rule),
     )
 
 
@@ -576,6 +695,7 @@ def _poses(views: Views, camera: Camera) -> Poses:
         np.ascontiguousarray(camera.level.T @ rotation),
         np.ascontiguousarray(translation @ camera.level),
         views.bearing_rad,
+        np.ascontiguousarray(views.tilt2level() @ camera.level),
     )
 
 
@@ -584,7 +704,7 @@ def _motion(views: Views, poses: Poses, camera: Camera, parameters: Sequence[str
     p = len(parameters)
     if not p:
         return Motion(poses, np.empty(0), np.empty((1, 4)))
-    many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_PARAMETERS))
+    many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_FIELDS))
     for k, name in enumerate(parameters):
         getattr(many, name)[k + 1 :: 1 + p] += STEP
     return Motion(_poses(many, camera), np.full(p, STEP), np.empty((1 + p, 4)))

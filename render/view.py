@@ -1,4 +1,4 @@
-"""Where the landmark is seen from: equation (9) of the paper with bearing and height (PHYSICS section 1)."""
+"""Where the landmark is seen from: distance, side, bearing, height, pitch and roll (PHYSICS sections 1 and 9)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
+from phasemark.render.rigid import rigid_transforms, tilt2level
 
 if TYPE_CHECKING:
     from phasemark.render.sensor.sensor import Sensor
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
 
 FARTHEST_M = 1e6
 """No distance and no height is larger: beyond it float32 images and squared ranges lose their meaning."""
+VIEW_FIELDS = ("distance_m", "delta_rad", "bearing_rad", "height_m", "pitch_rad", "roll_rad")
+"""What a view is made of."""
+_PLUMB = 1e-9
+"""A landmark's axis nearer to the optical axis than this (sine of an angle) leaves roll and bearing open."""
 
 
 def delta_period_rad(symmetry: int) -> float:
@@ -70,7 +75,7 @@ def wrap_delta_difference_rad(difference_rad: ArrayLike, period_rad: ArrayLike) 
 
 @dataclass(frozen=True)
 class Views:
-    """A batch of views of the landmark; four arrays of one length.
+    """A batch of views of the landmark; six arrays of one length.
 
     Parameters
     ----------
@@ -81,7 +86,10 @@ class Views:
     bearing_rad : (n,) float64
         Azimuth b of the landmark's axis in the camera frame.
     height_m : (n,) float64
-        Height h of the landmark's origin above the optical axis.
+        Height h of the landmark's origin above the lens, along the vertical.
+    pitch_rad, roll_rad : (n,) float64, optional
+        Tilt of what the camera is mounted on: d_level = Ry(pitch) · Rx(roll) · d, a positive pitch looking down. The
+        mount's own tilt (`pitch_deg` and `roll_deg` of the sensor) comes before it. None: level.
 
     Notes
     -----
@@ -92,6 +100,13 @@ class Views:
     delta_rad: NDArray[np.float64]
     bearing_rad: NDArray[np.float64]
     height_m: NDArray[np.float64]
+    pitch_rad: NDArray[np.float64] = None  # type: ignore[assignment]
+    roll_rad: NDArray[np.float64] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        for name in VIEW_FIELDS[4:]:
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.zeros(len(self.distance_m)))
 
     @classmethod
     def broadcast(
@@ -100,17 +115,20 @@ class Views:
         delta_rad: ArrayLike = 0.0,
         bearing_rad: ArrayLike = 0.0,
         height_m: ArrayLike = 0.0,
+        pitch_rad: ArrayLike = 0.0,
+        roll_rad: ArrayLike = 0.0,
     ) -> Views:
         """Broadcast the arguments against each other and flatten them in C order.
 
         Raises
         ------
         UsageError
-            A value is not finite, a distance is not positive or above 1e6 m, or the shapes do not broadcast.
+            A value is not finite, a distance is not positive or above 1e6 m, a pitch is beyond ± 90° or a roll beyond
+            ± 180°, or the shapes do not broadcast.
         """
-        names = ("distance_m", "delta_rad", "bearing_rad", "height_m")
+        names = VIEW_FIELDS
         values = []
-        for name, given in zip(names, (distance_m, delta_rad, bearing_rad, height_m), strict=True):
+        for name, given in zip(names, (distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad), strict=True):
             try:
                 values.append(np.asarray(given, dtype=float))
             except (TypeError, ValueError, OverflowError):
@@ -125,6 +143,10 @@ class Views:
             if value.size and np.abs(value).max() > FARTHEST_M:
                 largest = value.flat[np.abs(value).argmax()]
                 raise UsageError(f"'{name}' must be at most {FARTHEST_M:g} m, got {largest:g}")
+        for name, value, most in (("pitch_rad", values[4], math.pi / 2), ("roll_rad", values[5], math.pi)):
+            if value.size and np.abs(value).max() > most:
+                largest = value.flat[np.abs(value).argmax()]
+                raise UsageError(f"'{name}' must be within ± {most:.5g} (± {math.degrees(most):g}°), got {largest:g}")
         try:
             arrays = np.broadcast_arrays(*values)
         except ValueError:
@@ -137,10 +159,21 @@ class Views:
         return len(self.distance_m)
 
     def __getitem__(self, index: slice | NDArray[np.integer]) -> Views:
-        return Views(self.distance_m[index], self.delta_rad[index], self.bearing_rad[index], self.height_m[index])
+        return Views(*(getattr(self, name)[index] for name in VIEW_FIELDS))
+
+    @property
+    def are_tilted(self) -> bool:
+        """Whether any view has a pitch or a roll."""
+        return bool(self.pitch_rad.any() or self.roll_rad.any())
+
+    def tilt2level(self) -> NDArray[np.float64]:
+        """Return the rotations Ry(pitch) · Rx(roll), (n, 3, 3)."""
+        return tilt2level(self.pitch_rad, self.roll_rad)
 
     def in_camera(self, sensor: Sensor) -> Views:
         """Return the views as a camera itself has them: the offsets of its mounting added to bearing and height.
+
+        They are offsets in the level frame, about and along the vertical, also where the view is tilted.
 
         Parameters
         ----------
@@ -157,7 +190,8 @@ class Views:
     def landmark2cam(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return rotations (n, 3, 3) and translations (n, 3) with p_cam = R · p' + t.
 
-        R = Rz(b) · R(δ) and t = Rz(b) · (D, 0, 0) + (0, 0, h).
+        With the tilt T = Ry(pitch) · Rx(roll), R = Tᵀ · Rz(b) · R(δ) and t = Tᵀ · (Rz(b) · (D, 0, 0) + (0, 0, h)). The
+        camera's frame is that of its mount: what `pitch_deg` and `roll_deg` of a sensor turn comes after it.
         """
         angle = self.bearing_rad - self.delta_rad  # R(δ) is Rz(−δ), so the two rotations add
         rotation = np.zeros((len(self), 3, 3))
@@ -173,7 +207,61 @@ class Views:
             ],
             axis=-1,
         )
-        return rotation, translation
+        if not self.are_tilted:
+            return rotation, translation
+        tilt = self.tilt2level()
+        return np.einsum("nji,njk->nik", tilt, rotation), np.einsum("nji,nj->ni", tilt, translation)
+
+    @classmethod
+    def from_landmark2cam(cls, landmark2cam: ArrayLike) -> Views:
+        """Return the views of rigid transforms: the inverse of :meth:`landmark2cam`.
+
+        Parameters
+        ----------
+        landmark2cam : (n, 4, 4) array_like
+            Landmark frame to camera frame (x along the axis, y left, z up).
+
+        Returns
+        -------
+        Views
+            δ in [0, 2π), bearing and roll in (−π, π], pitch between −π/2 and π/2.
+
+        Raises
+        ------
+        UsageError
+            A matrix is not a rotation with a translation. Or the lens is on the landmark's axis (D = 0), where bearing
+            and δ cannot be told from each other, or the optical axis is vertical (pitch = ± 90°), where bearing and
+            roll cannot.
+
+        Examples
+        --------
+        >>> pose = np.eye(4)
+        >>> pose[:3, 3] = 1.5, 0.0, 0.1
+        >>> views = Views.from_landmark2cam(pose)
+        >>> float(views.distance_m[0]), float(views.height_m[0])
+        (1.5, 0.1)
+        """
+        pose = rigid_transforms(landmark2cam)
+        up = pose[:, :3, 2]  # Tᵀ · (0, 0, 1) = (−sin pitch, cos pitch · sin roll, cos pitch · cos roll)
+        level = np.hypot(up[:, 1], up[:, 2])
+        if (level < _PLUMB).any():
+            raise UsageError(
+                f"'landmark2cam' must not look straight up or down, where bearing and roll are one:"
+                f" matrix {int((level < _PLUMB).argmax())} does"
+            )
+        pitch, roll = np.arctan2(-up[:, 0], level), np.arctan2(up[:, 1], up[:, 2])
+        tilt = tilt2level(pitch, roll)
+        x, y, height = np.einsum("nij,nj->in", tilt, pose[:, :3, 3])
+        distance = np.hypot(x, y)
+        if (distance == 0).any():
+            raise UsageError(
+                f"'landmark2cam' must not have the lens on the landmark's axis, where bearing and δ are one:"
+                f" matrix {int((distance == 0).argmax())} has"
+            )
+        forward, left = np.einsum("nij,nj->in", tilt, pose[:, :3, 0])[:2]
+        bearing = np.arctan2(y, x)
+        delta = wrap_delta_rad(bearing - np.arctan2(left, forward), 2 * math.pi)
+        return cls.broadcast(distance, delta, bearing, height, pitch, roll)
 
     def lens_in_landmark(self) -> NDArray[np.float64]:
         """Return the lens in the landmark frame, (−D cos δ, −D sin δ, −h), as (n, 3)."""

@@ -285,6 +285,12 @@ def _write_workshop(path: Path) -> None:
     np.savez(path, range=ranges, amplitude=amplitude, intensity=intensity, unit="m", quantity="range")
 
 
+def _write_large_sensor(path: Path) -> None:
+    """Write a phase camera of many pixels."""
+    fields = {"rows": 171, "cols": 224, "half_angle_h_deg": 31.0, "half_angle_v_deg": 22.5, "max_phase_std_rad": 0.2}
+    path.write_text("".join(f"{name} = {value}\n" for name, value in fields.items()), encoding="utf-8")
+
+
 def _copy_example(path: Path) -> None:
     """Copy a file of the examples of that name."""
     path.write_bytes((Path(__file__).parent.parent / "examples" / path.name).read_bytes())
@@ -294,6 +300,7 @@ GIVEN: dict[str, Callable[[Path], None]] = {
     "board_1m.npz": _write_board,
     "board_2m.npz": _write_board,
     "board_3m.npz": _write_board,
+    "large.toml": _write_large_sensor,
     "measured.csv": _write_measured,
     "my_part.stl": _write_part,
     "own_matcher.py": _copy_example,

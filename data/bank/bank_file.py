@@ -28,6 +28,7 @@ from phasemark.data.pages.notebook import facts_html
 from phasemark.data.plans.arrays import IMAGE_DIMS, LAYOUT_GROUPS, PHASOR_DIMS, VIEW_DIMS, GroupName, group_rows
 from phasemark.data.plans.bank_plan import BankPlan
 from phasemark.data.plans.grid_axis import format_grid
+from phasemark.inputs.numbers import in_words
 from phasemark.render import PhasorImages, Sensor, Views
 
 FORMAT = "phasemark-bank"
@@ -56,8 +57,10 @@ class BankGroup:
         The grids; `delta_rad` is empty in `upper`, which does not depend on it.
     row, col : (rows,), (cols,) int64
         Which pixels of the sensor the images hold.
+    frequency_hz : (k,) float64
+        At which frequencies phasors are held, rising.
     order : (k,) int64
-        Harmonic orders, 1 first.
+        Harmonic orders, 1 first: these frequencies as multiples of the sensor's first one. 0 where one is none.
     classes : tuple of str
         Class names; empty in `lower`, which all classes share.
     """
@@ -80,13 +83,18 @@ class BankGroup:
         self.delta_rad: NDArray[np.float64] = frozen(np.deg2rad(coordinates.get("delta", np.empty(0))))
         self.row: NDArray[np.int64] = frozen(coordinates["row"].astype(np.int64))
         self.col: NDArray[np.int64] = frozen(coordinates["col"].astype(np.int64))
-        self.order: NDArray[np.int64] = frozen(np.rint(coordinates["frequency"] / sensor.modulation_hz).astype(int))
+        self.frequency_hz: NDArray[np.float64] = frozen(coordinates["frequency"])
+        multiple = self.frequency_hz / sensor.frequencies_hz[0]
+        order = np.rint(multiple).astype(int)
+        if len(sensor.frequencies_hz) > 1:
+            order = np.where(np.isclose(multiple, order, rtol=1e-9), order, 0)
+        self.order: NDArray[np.int64] = frozen(order)
         self.classes: tuple[str, ...] = tuple(coordinates.get("landmark_class", np.empty(0)).tolist())
         self._check_coordinates(sensor)
 
     @property
     def phasor(self) -> NDArray[np.complex64]:
-        """S_1 (PHYSICS section 3), (views, row, col)."""
+        """S_1 (PHYSICS section 3) at the sensor's first modulation frequency, (views, row, col)."""
         return self.harmonic(1)
 
     def harmonic(self, order: int) -> NDArray[np.complex64]:
@@ -99,7 +107,21 @@ class BankGroup:
         """
         index = np.flatnonzero(self.order == order)
         if not index.size:
-            raise UsageError(f"{self._path}: has no harmonic {order}, only {', '.join(map(str, self.order))}")
+            known = ", ".join(str(k) for k in self.order if k)
+            raise UsageError(f"{self._path}: has no harmonic {order}, only {known}")
+        return self._phasors[..., index[0], :, :]
+
+    def at_frequency(self, hz: float) -> NDArray[np.complex64]:
+        """Return S at one frequency, (views, row, col).
+
+        Raises
+        ------
+        UsageError
+            The bank does not hold the frequency.
+        """
+        index = np.flatnonzero(np.isclose(self.frequency_hz, hz, rtol=1e-9, atol=0))
+        if not index.size:
+            raise UsageError(f"{self._path}: has no phasors at {hz:.12g} Hz, only at {in_words(self.frequency_hz)} Hz")
         return self._phasors[..., index[0], :, :]
 
     @cached_property
@@ -143,13 +165,21 @@ class BankGroup:
             "delta": not _increases(self.delta_rad),
             "row": not np.array_equal(self.row, np.arange(*rows)),
             "col": not np.array_equal(self.col, np.arange(sensor.cols)),
-            "frequency": self.order[0] != 1 or not _increases(self.order),
+            "frequency": self._lacks_frequencies(sensor),
             "iq": self._group["iq"].shape != (2,),
             "landmark_class": len(set(self.classes)) < len(self.classes),
         }
         for name, is_wrong in wrong.items():
             if is_wrong:
                 raise InputFileError(f"{self._path}: the values of '{self.name}/{name}' do not belong in a bank")
+
+    def _lacks_frequencies(self, sensor: Sensor) -> bool:
+        """Return whether the phasors are not those of the sensor's modulation frequencies and of some harmonics."""
+        if len(sensor.frequencies_hz) == 1:
+            return bool(self.order[0] != 1 or not _increases(self.order))
+        held = self.frequency_hz
+        missing = [hz for hz in sensor.frequencies_hz if not np.isclose(held, hz, rtol=1e-9, atol=0).any()]
+        return bool(missing) or not _increases(held)
 
 
 class Bank:
@@ -165,6 +195,11 @@ class Bank:
     Attributes
     ----------
     sensor : Sensor
+        The camera that sees the images; with a region, `camera` read in it.
+    camera : Sensor
+        The whole camera, whose frames are matched.
+    region : Region or None
+        Which pixels of it the images hold, and in what blocks; None: every one.
     plan : BankPlan
         The resolved plan the bank was made from.
     layout : {"factored", "full"}
@@ -185,6 +220,8 @@ class Bank:
         check_format(file, path, "bank", FORMAT, SCHEMA_VERSION)
         self.sensor = Sensor(**json_attribute(file, path, "sensor"))
         self.plan = BankPlan(**json_attribute(file, path, "plan"))
+        self.region = self.plan.pixel_region()
+        self.camera = self.sensor if self.region is None else self.plan.build_sensor()
         self.versions: dict[str, str] = json_attribute(file, path, "versions")
         self.layout = self.plan.layout
         groups: dict[str, BankGroup] = {
@@ -228,9 +265,22 @@ class Bank:
             },
         )
 
-    def phasor(self, class_name: str, i: int, j: int) -> NDArray[np.complex64]:
-        """Return S_1 of one model image, (rows, cols), at ``distance_m[i]`` and ``delta_rad[j]``."""
-        return self._image("phasor", class_name, i, j)
+    def phasor(self, class_name: str, i: int, j: int, hz: float | None = None) -> NDArray[np.complex64]:
+        """Return S of one model image, (rows, cols), at ``distance_m[i]`` and ``delta_rad[j]``.
+
+        Parameters
+        ----------
+        class_name : str
+        i, j : int
+        hz : float, optional
+            Modulation frequency; None: the sensor's first.
+
+        Raises
+        ------
+        UsageError
+            The bank does not have the class or the frequency.
+        """
+        return self._image("phasor", class_name, i, j, hz)
 
     def image(self, class_name: str, i: int, j: int) -> PhasorImages:
         """Return one model image with intensity and coverage, at ``distance_m[i]`` and ``delta_rad[j]``.
@@ -246,6 +296,10 @@ class Bank:
             coverage=self._image("coverage", class_name, i, j)[None].astype(np.float64),
             sensor=self.sensor,
             views=Views.broadcast(self.distance_m[i], self.delta_rad[j]),
+            by_hz={
+                hz: self._image("phasor", class_name, i, j, hz)[None].astype(np.complex128)
+                for hz in self.sensor.frequencies_hz[1:]
+            },
         )
 
     def mesh(self, class_name: str) -> trimesh.Trimesh:
@@ -285,20 +339,36 @@ class Bank:
             "delta_deg": format_grid(self.plan.delta_deg or ()),
             "n_delta": len(self.delta_rad),
             "images": views,
-            "harmonics": groups[0].order.tolist(),
+            "harmonics": [k for k in groups[0].order.tolist() if k],
             "sensor": self.plan.sensor,
             "rows": self.sensor.rows,
             "cols": self.sensor.cols,
+            **self._region_info(),
             "modulation_hz": self.sensor.modulation_hz,
             "mesh_sha256": hashes,
             "versions": self.versions,
         }
 
-    def _image(self, field: str, class_name: str, i: int, j: int) -> NDArray[Any]:
+    def _region_info(self) -> dict[str, Any]:
+        """Return which pixels of the camera the images hold; nothing where it is every one."""
+        if self.region is None:
+            return {}
+        region = self.region
+        return {
+            "region": f"rows {region.first_row} … {region.stop_row}, columns {region.first_col} … {region.stop_col}"
+            f" of {self.camera.rows} × {self.camera.cols}",
+            "binning": region.binning,
+        }
+
+    def _image(self, field: str, class_name: str, i: int, j: int, hz: float | None = None) -> NDArray[Any]:
         k = self._class_index(class_name)
+
+        def images(group: BankGroup | None) -> NDArray[Any]:
+            return np.asarray(getattr(group, field) if hz is None or group is None else group.at_frequency(hz))
+
         if self.full is not None:
-            return np.asarray(getattr(self.full, field)[k, i, j])
-        return np.concatenate([getattr(self.upper, field)[k, i], getattr(self.lower, field)[i, j]])
+            return np.asarray(images(self.full)[k, i, j])
+        return np.concatenate([images(self.upper)[k, i], images(self.lower)[i, j]])
 
     def _class_index(self, class_name: str) -> int:
         if class_name not in self.classes:

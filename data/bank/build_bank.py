@@ -23,7 +23,15 @@ from phasemark.data.files.json_text import json_text
 from phasemark.data.files.narrow import narrowed
 from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.files.same_file import named_files
-from phasemark.data.plans.arrays import IMAGE_DIMS, LAYOUT_GROUPS, PHASOR_DIMS, VIEW_DIMS, GroupName, group_rows
+from phasemark.data.plans.arrays import (
+    IMAGE_DIMS,
+    LAYOUT_GROUPS,
+    PHASOR_DIMS,
+    VIEW_DIMS,
+    GroupName,
+    bank_frequencies_hz,
+    group_rows,
+)
 from phasemark.data.plans.bank_plan import BankPlan, MeshPlan, factored_refusal
 from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
@@ -159,6 +167,8 @@ def rebuild_bank(
         The grid or the camera cannot be rendered, with the reason.
     """
     old = bank.plan.model_dump(mode="json")
+    if sensor is not None:  # it sees the images themselves
+        old |= {"region": "whole", "binning": 1}
     kept = set(bank.classes if classes is None else classes)
     plan = BankPlan(
         **{
@@ -166,7 +176,7 @@ def rebuild_bank(
             **{key: [part for part in old[key] if part["name"] in kept] for key in ("landmarks", "meshes")},
             "distance_m": tuple(distance_m),
             "delta_deg": tuple(delta_deg),
-            "sensor_overrides": (sensor or bank.sensor).model_dump(mode="json"),
+            "sensor_overrides": (sensor or bank.camera).model_dump(mode="json"),
             "layout": "full",
         }
     )
@@ -199,7 +209,7 @@ class BankJob:
     def __init__(self, plan: BankPlan, stored_mesh: StoredMesh | None = None) -> None:
         self.plan = plan.resolve()
         _refuse_impossible(self.plan)
-        self.sensor = self.plan.build_sensor()
+        self.sensor = self.plan.image_sensor()
         self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
         self._slabs = list(_slabs(self.plan, self.sensor, self.landmarks))
 
@@ -361,8 +371,9 @@ def _top_view(spec: LandmarkSpec) -> PlanarLandmark:
 
 def _stored(images: PhasorImages) -> dict[str, NDArray[np.float32]]:
     """Return images as the bank's datasets hold them, views first."""
-    orders = [images.phasor, *(images.harmonics[k] for k in sorted(images.harmonics))]
-    phasor = np.stack(orders, axis=1).astype("<c8")
+    orders = sorted(images.harmonics)
+    frequencies = bank_frequencies_hz(images.sensor, orders)
+    phasor = np.stack([images.at_frequency(hz) for hz in frequencies], axis=1).astype("<c8")
     stored = {
         "phasor": phasor.view("<f4").reshape(*phasor.shape, 2),
         "intensity": images.intensity.astype("<f4"),
@@ -415,7 +426,7 @@ def _coordinates(
         "distance": (np.array(plan.distance_m), "m", "horizontal distance from the lens to the landmark's axis"),
         "delta": (np.array(plan.delta_deg), "degree", "angle from which the landmark is seen"),
         "frequency": (
-            np.array([1, *plan.harmonics]) * sensor.modulation_hz,
+            np.array(bank_frequencies_hz(sensor, plan.harmonics)),
             "Hz",
             "harmonic order times modulation frequency",
         ),

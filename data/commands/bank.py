@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -62,6 +63,18 @@ def bank_build(
     full: Annotated[
         bool, typer.Option("--full", help="Every class at every D and δ; taken where nothing less will do.")
     ] = False,
+    region: Annotated[
+        str | None,
+        typer.Option(
+            "--region",
+            metavar="whole|landmark|R0:R1,C0:C1",
+            help="Pixels to keep: all, those that a landmark can reach, or rows R0 … R1 and columns C0 … C1.",
+        ),
+    ] = None,
+    margin: Annotated[
+        float | None, typer.Option("--margin", help="Degrees around the landmark that --region landmark keeps too.")
+    ] = None,
+    binning: Annotated[int | None, typer.Option("--binning", metavar="N", help="N × N pixels become one.")] = None,
     building: Building,
 ) -> None:
     """Build a bank of noise-free model images."""
@@ -75,7 +88,8 @@ def bank_build(
     layout_stated = full or "layout" in plan.model_fields_set
     options: dict[str, Any] = {
         "sensor": sensor, "distance_m": distance, "delta_deg": delta, "model": model, "albedo": albedo,
-        "layout": "full" if full else None,
+        "layout": "full" if full else None, "region": None if region is None else _parsed_region(region),
+        "binning": binning, "margin_deg": margin,
     }  # fmt: skip
     changes = {key: value for key, value in options.items() if value is not None}
     if classes or meshes:
@@ -83,6 +97,16 @@ def bank_build(
         changes |= {"classes": tuple(classes or ()), "landmarks": (), "meshes": stated}
     plan = _completed(BankPlan(**{**plan.model_dump(), **changes}), layout_stated)
     build_or_estimate(build_bank, plan, out, building)
+
+
+def _parsed_region(text: str) -> str | tuple[int, ...]:
+    """Return a region as a plan has it."""
+    if text in ("whole", "landmark"):
+        return text
+    found = re.fullmatch(r"(\d{1,5}):(\d{1,5}),(\d{1,5}):(\d{1,5})", text)
+    if found is None:
+        raise UsageError(f"--region must be whole, landmark or R0:R1,C0:C1 such as 20:140,50:170, got '{text[:40]}'")
+    return tuple(map(int, found.groups()))
 
 
 def _mesh_plan(name_and_path: str, reading: MeshReading, symmetry: int | None) -> MeshPlan:

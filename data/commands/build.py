@@ -88,7 +88,9 @@ def _note_large(
     counts = ", ".join(f"{n} {name}" for name, n in size.items() if name != "bytes")
     described = f"{out}: {counts}, {format_size(n_bytes)}"
     if n_bytes > limit:
-        smaller = "thin 'distance_m' or 'delta_deg'" if "images" in size else "take fewer 'views' or 'frames_per_view'"
+        smaller = "take fewer 'views' or 'frames_per_view'"
+        if "images" in size:
+            smaller = "thin 'distance_m' or 'delta_deg', keep fewer pixels (--region landmark, --binning N)"
         raise UsageError(
             f"{described}, would be larger than --max-size {format_size(limit)}: {smaller}, or allow"
             f" --max-size {format_size(n_bytes * 11 // 10).replace(' ', '')}"

@@ -28,8 +28,10 @@ from phasemark.data.commands.options import (
     FrameReading,
     Json,
     MeshReading,
+    Pitch,
     QuantityWord,
     Resume,
+    Roll,
     Sample,
     Seed,
     SensorName,
@@ -156,7 +158,9 @@ def frames_simulate(
         float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen, in the first frame.")
     ] = 0.0,
     bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
-    height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the optical axis.")] = 0.0,
+    height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the lens.")] = 0.0,
+    pitch: Pitch = 0.0,
+    roll: Roll = 0.0,
     wall: Wall = None,
     floor: Floor = None,
     moving: Annotated[
@@ -194,7 +198,7 @@ def frames_simulate(
         if moving
         else (distance, delta)
     )
-    views = _views_between((distance, delta), last, n_frames, bearing, height)
+    views = _views_between((distance, delta), last, n_frames, bearing, height, pitch, roll)
     recording = simulate_recording(
         mesh,
         readable(name),
@@ -210,7 +214,13 @@ def frames_simulate(
 
 
 def _views_between(
-    first: tuple[float, float], last: tuple[float, float], n: int, bearing_deg: float, height_m: float
+    first: tuple[float, float],
+    last: tuple[float, float],
+    n: int,
+    bearing_deg: float,
+    height_m: float,
+    pitch_deg: float,
+    roll_deg: float,
 ) -> Views:
     """Return views whose distance (m) and δ (degrees) change evenly from the first to the last."""
     import numpy as np
@@ -219,7 +229,8 @@ def _views_between(
 
     way = np.linspace(0.0, 1.0, n)
     distance_m, delta_deg = (start + way * (end - start) for start, end in zip(first, last, strict=True))
-    return Views.broadcast(distance_m, np.radians(delta_deg), math.radians(bearing_deg), height_m)
+    bearing, pitch, roll = (math.radians(angle) for angle in (bearing_deg, pitch_deg, roll_deg))
+    return Views.broadcast(distance_m, np.radians(delta_deg), bearing, height_m, pitch, roll)
 
 
 def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:

@@ -13,6 +13,7 @@ from phasemark import InputFileError, UsageError
 from phasemark.data.commands.console import tell
 from phasemark.data.commands.options import MeshReading
 from phasemark.inputs import vouching_begun
+from phasemark.inputs.numbers import in_words
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -102,9 +103,23 @@ def background_of(wall: float | None, floor: float | None) -> Background | None:
 
 
 def note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None]) -> None:
-    """Write a note for each distance that the sensor shows wrapped, or not at all."""
+    """Write a note for each distance that the sensor shows wrapped, or not at all.
+
+    Raises
+    ------
+    UsageError
+        The sensor has several modulation frequencies, which are there to tell such a distance, and they do not.
+    """
+    from phasemark.render.sensor.sensor_quantities import SPEED_OF_LIGHT_M_S
+
     for name, distance_m in distances_m.items():
         described = None if distance_m is None else sensor.describe_beyond_range(name, distance_m)
+        if described is not None and distance_m is not None and len(sensor.frequencies_hz) > 1:
+            divisor_hz = SPEED_OF_LIGHT_M_S / (2 * distance_m)
+            raise UsageError(
+                f"{described}; put it nearer, or give 'modulation_hz' = {in_words(sensor.frequencies_hz)} a common"
+                f" divisor below {divisor_hz:.4g} Hz"
+            )
         if described is not None:
             tell(f"note: {described}")
 

@@ -55,6 +55,8 @@ SensorName = Annotated[
     typer.Option("--sensor", metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=a_preset),
 ]
 Wall = Annotated[float | None, typer.Option("--wall", metavar="M", help="Distance of a wall behind the landmark.")]
+Pitch = Annotated[float, typer.Option("--pitch", metavar="DEG", help="The camera's pitch, positive looking down.")]
+Roll = Annotated[float, typer.Option("--roll", metavar="DEG", help="The camera's roll.")]
 Floor = Annotated[float | None, typer.Option("--floor", metavar="M", help="How far a floor lies below the lens.")]
 FramesUnit = Annotated[
     FramesUnitWord | None,

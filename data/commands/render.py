@@ -19,7 +19,7 @@ from phasemark.data.commands.inputs import (
     read_sensor,
     refuse_unless_one,
 )
-from phasemark.data.commands.options import Floor, Force, MeshReading, SensorName, Wall, a_class
+from phasemark.data.commands.options import Floor, Force, MeshReading, Pitch, Roll, SensorName, Wall, a_class
 from phasemark.data.commands.outputs import refuse_existing
 
 if TYPE_CHECKING:
@@ -34,7 +34,9 @@ def render_frame(
     ] = 1.0,
     delta: Annotated[float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen.")] = 0.0,
     bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
-    height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the optical axis.")] = 0.0,
+    height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the lens.")] = 0.0,
+    pitch: Pitch = 0.0,
+    roll: Roll = 0.0,
     class_name: Annotated[
         str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=a_class)
     ] = None,
@@ -53,7 +55,7 @@ def render_frame(
     force: Force = False,
 ) -> None:
     """Render one noise-free frame: a figure, the phasors, and a sketch in the terminal."""
-    from phasemark.render import Renderer
+    from phasemark.render import Renderer, Views
     from phasemark.render.figures import terminal_figure
 
     refuse_unless_one(class_name, mesh_file, mesh_reading, "render")
@@ -64,11 +66,12 @@ def render_frame(
     _, mesh = read_class_or_mesh(class_name, mesh_file, mesh_reading)
     camera = read_sensor(sensor)
     note_too_far(camera, {"--distance": distance, "--wall": wall})
-    image = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8)).render(
-        distance,
-        math.radians(delta),
-        math.radians(bearing),
-        height,
+    renderer = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8))
+    angles = {name: math.radians(value) for name, value in (("pitch_rad", pitch), ("roll_rad", roll))}
+    views = Views.broadcast(distance, math.radians(delta), math.radians(bearing), height, **angles)
+    renderer.check_in_view(views)
+    image = renderer.render_views(
+        views,
         background=background_of(wall, floor),
         variant=variant,
     )
@@ -97,6 +100,8 @@ def _write_image(image: PhasorImages, out: Path, data: Path, force: bool) -> Non
         "unit": "m",
         "quantity": "range",
     }
+    if len(image.sensor.frequencies_hz) > 1:
+        arrays |= {"frequency": np.array(image.sensor.frequencies_hz), "frequency_phasor": image.phasors[0]}
     buffer, figure = bytes_io.BytesIO(), bytes_io.BytesIO()
     np.savez(buffer, **arrays)
     image.plot().savefig(figure, format="png", dpi=120)

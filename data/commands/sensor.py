@@ -25,6 +25,7 @@ from phasemark.data.commands.options import (
 from phasemark.data.commands.outputs import output_folder, refuse_existing
 
 if TYPE_CHECKING:
+    from phasemark.render import Sensor
     from phasemark.render.bench.fit.fitted_sensor import FittedField
 
 
@@ -43,12 +44,18 @@ def sensor_list(as_json: Json = False) -> None:
                 name,
                 f"{sensor.rows} × {sensor.cols}",
                 f"{2 * sensor.half_angle_v_deg:g}° × {2 * sensor.half_angle_h_deg:g}°",
-                "direct" if sensor.kind == "direct" else f"{sensor.modulation_hz / 1e6:g} MHz",
+                "direct"
+                if sensor.kind == "direct"
+                else " + ".join(f"{hz / 1e6:g}" for hz in sensor.frequencies_hz) + " MHz",
                 "" if sensor.kind == "direct" else f"{sensor.unambiguous_range_m:.3f} m",
             )
             for name, sensor in sensors.items()
         ),
     )
+
+
+def _in_mhz(sensor: Sensor) -> str:
+    return " + ".join(f"{hz / 1e6:g}" for hz in sensor.frequencies_hz)
 
 
 def sensor_show(
@@ -66,9 +73,8 @@ def sensor_show(
         axis = "z, along the optical axis" if sensor.quantity == "z" else "the range along the ray"
         typer.echo(f"# direct time of flight: no taps, no phasors; its own quantity is {axis}")
     else:
-        typer.echo(
-            f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {sensor.metres_per_radian:.6f} m per radian"
-        )
+        scales = ", ".join(f"{camera.metres_per_radian:.6f}" for camera in sensor.by_frequency)
+        typer.echo(f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {scales} m per radian")
     fields = sensor.model_dump(mode="json")
     table = fields.pop("histogram", None)  # a table stands behind all fields
     for title, names in sensor.field_groups().items():

@@ -23,6 +23,7 @@ from phasemark.data.export.samples import CAM2OPTICAL, blocks, pinhole, quantity
 from phasemark.data.frames.frame_set_file import FrameSet
 from phasemark.data.measured.reading import RangeOrZ
 from phasemark.render import Views
+from phasemark.render.view import VIEW_FIELDS
 
 IMAGES_PER_SCENE = 1000
 _SPLITS = ("train", "val", "test")
@@ -143,7 +144,7 @@ def _pose(
     frames: FrameSet, sample: dict[str, Any], k: int, centre_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotation and translation from a model's frame to the optical one."""
-    view = Views.broadcast(*(sample[name][k] for name in ("distance_m", "delta_rad", "bearing_rad", "height_m")))
+    view = Views.broadcast(*(sample[name][k] for name in VIEW_FIELDS))
     rotation, translation = view.in_camera(frames.sensor).landmark2cam()
     to_optical = CAM2OPTICAL @ frames.sensor.cam2level.T
     turned = to_optical @ rotation[0]

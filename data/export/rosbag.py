@@ -16,12 +16,12 @@ from phasemark.data.frames.frame_set_file import FrameSet
 from phasemark.data.measured.bags import AMPLITUDE_TOPIC, INFO_TOPIC, RANGE_TOPIC, Z_TOPIC, ros_types
 from phasemark.data.measured.reading import RangeOrZ
 from phasemark.render import Views
+from phasemark.render.view import VIEW_FIELDS
 
 NAME = "frames"
 """What the file in a bag's folder is called."""
 
 _OPTICAL, _CAMERA, _LANDMARK = "camera_optical_frame", "camera_link", "landmark"
-_VIEW = ("distance_m", "delta_rad", "bearing_rad", "height_m")
 
 
 def write_rosbag(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
@@ -72,7 +72,7 @@ def _messages(frames: FrameSet, store: Any) -> Iterator[tuple[str, int, Any]]:
             if "amplitude_e" in sample:
                 yield AMPLITUDE_TOPIC, time_ns, _image(types, header, sample["amplitude_e"][k])
             yield INFO_TOPIC, time_ns, _camera_info(types, header, frames)
-            view = Views.broadcast(*(sample[name][k] for name in _VIEW))
+            view = Views.broadcast(*(sample[name][k] for name in VIEW_FIELDS))
             rotation, translation = view.in_camera(sensor).landmark2cam()
             landmark = f"{_LANDMARK}_{sample['class_name'][k]}"
             pose = _transform(types, time_ns, _CAMERA, landmark, rotation[0], translation[0])

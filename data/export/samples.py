@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from phasemark.data.frames.frame_set_file import FrameSet, Sample
 from phasemark.data.measured.reading import RangeOrZ
+from phasemark.data.plans.frame_plan import TILT
 
 BLOCK = 1024
 """Frames read at a time."""
@@ -20,6 +21,8 @@ TRUTH = {
     "delta_deg": "delta_rad",
     "bearing_deg": "bearing_rad",
     "height_m": "height_m",
+    "pitch_deg": "pitch_rad",
+    "roll_deg": "roll_rad",
     "albedo": "albedo",
     "wall_m": "wall_m",
     "floor_m": "floor_m",
@@ -46,6 +49,8 @@ def truth_columns(frames: FrameSet, sample: Sample) -> dict[str, NDArray[Any]]:
         "split": np.array(frames.splits)[sample["split_index"]],
     }
     for name, key in TRUTH.items():
+        if name in TILT and getattr(frames.plan, name) is None:
+            continue
         values = np.asarray(sample[key], float)
         columns[name] = np.rad2deg(values) if name.endswith("_deg") else values
     return columns

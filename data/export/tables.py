@@ -14,18 +14,28 @@ from phasemark.data.measured.reading import RangeOrZ
 
 
 def write_npz(frames: FrameSet, path: Path, quantity: RangeOrZ) -> None:
-    """Write one NPZ file that :func:`phasemark.data.read_frames` reads without being told anything."""
+    """Write one NPZ file that :func:`phasemark.data.read_frames` reads without being told anything.
+
+    What each of several modulation frequencies measured goes into it as ``frequency_*``, always as range along the ray.
+    """
     found: dict[str, list[Any]] = {}
     for _, sample in blocks(frames):
         columns: dict[str, Any] = {"range": quantity_m(frames, sample, quantity).astype(np.float32)}
         for name in ("amplitude", "intensity"):
             if f"{name}_e" in sample:
                 columns[name] = sample[f"{name}_e"]
-        columns |= {"flags": sample["flags"], "valid": sample["flags"] == 0, **truth_columns(frames, sample)}
+        for name in (key for key in sample if key.startswith("frequency_")):
+            columns[name.removesuffix("_m").removesuffix("_e")] = sample[name]
+        columns["flags"] = sample["flags"]
+        if len(frames.sensor.frequencies_hz) == 1:  # of several, each has NaN where it has no range
+            columns["valid"] = sample["flags"] == 0
+        columns |= truth_columns(frames, sample)
         for name, values in columns.items():
             found.setdefault(name, []).append(values)
     with path.open("wb") as file:
         arrays: dict[str, Any] = {name: np.concatenate(values) for name, values in found.items()}
+        if len(frames.sensor.frequencies_hz) > 1:
+            arrays["frequency"] = np.array(frames.sensor.frequencies_hz)
         np.savez(file, **arrays, unit="m", quantity=quantity)
 
 

@@ -21,14 +21,15 @@ from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.files.same_file import named_files
 from phasemark.data.frames.frame_set_file import FORMAT, SCHEMA_VERSION, FrameSet, open_frames
 from phasemark.data.plans.arrays import FRAME_FIELDS, VIEW_FIELDS, frame_set_fields
-from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.data.plans.frame_plan import TILT, FramePlan
 from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
 from phasemark.data.shards.run import produce, refuse_unwritable_output
-from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture
+from phasemark.render import Background, Flag, Frames, PhasorImages, Renderer, Sensor, Views, capture
 
+_FLAGS = tuple(Flag)
 _KEYS = ("class_index", "albedo", "wall_m", "floor_m")
 
 
@@ -152,7 +153,8 @@ class FrameJob:
         step = 1 << 16
         for first in range(0, self.plan.views, step):
             truth = self.plan.draw_truth(first, min(first + step, self.plan.views))
-            views = _views(truth).in_camera(self.sensor)
+            stated = _views(truth)
+            views = stated.in_camera(self.sensor)
             for k, renderer in enumerate(self._renderers):
                 of_class = np.flatnonzero(truth["class_index"] == k)
                 vertices = renderer.topology.vertices
@@ -163,12 +165,15 @@ class FrameJob:
                 # NaN (no wall, no floor) compares as false
                 before = truth["wall_m"][of_class] < views.distance_m[of_class] + reach
                 above = -truth["floor_m"][of_class] > vertices[:, 2].min() + views.height_m[of_class]
-                for view in of_class[inside | before | above]:
+                unseen = np.zeros(len(of_class), np.bool_)
+                unseen[renderer.turned_out_of_view(stated[of_class])] = True
+                for view in of_class[inside | before | above | unseen]:
                     one = slice(int(view), int(view) + 1)
                     try:
                         background = _background(truth["wall_m"][view], truth["floor_m"][view], self.plan)
                         if background is not None:
                             background.check_behind(vertices, views[one])
+                        renderer.check_in_view(stated[one])
                         if inside[np.searchsorted(of_class, view)]:
                             raise UsageError(
                                 "the lens is inside the landmark's bounding box: 'distance_m' is too small"
@@ -207,12 +212,12 @@ class FrameJob:
                     dataset.dims[axis].attach_scale(scales[dim])
                 dataset.attrs["long_name"] = long_name
                 dataset.attrs["units"] = units
-                if name in ("range", "range_shot", "range_hard", "range_mixed"):
+                if name in ("range", "range_shot", "range_hard", "range_mixed", "frequency_range"):
                     dataset.attrs["quantity"] = "range"
-                if name == "flags":
-                    masks = [1, 2, 4, 8, 16, 32]
-                    dataset.attrs["flag_masks"] = np.array(masks, np.uint8)
-                    dataset.attrs["flag_meanings"] = "no_return missing saturated dead hot near_wrap"
+                if name in ("flags", "frequency_flags"):
+                    known = _FLAGS if len(sensor.frequencies_hz) > 1 else _FLAGS[:-1]
+                    dataset.attrs["flag_masks"] = np.array([int(flag) for flag in known], np.uint8)
+                    dataset.attrs["flag_meanings"] = " ".join(str(flag.name).lower() for flag in known)
                 rows_of_item = per if dims[0] == "frame" else 1
                 places.append(Place(offset, rows_of_item * int(np.prod(shape[1:])) * np.dtype(kind).itemsize))
             for landmark in self.landmarks:
@@ -239,6 +244,8 @@ class FrameJob:
             },
         )  # fmt: skip
         for name, key, units, long_name in _TRUTH:
+            if key in TILT and getattr(self.plan, key) is None:
+                continue
             yield name, truth[key].astype("<f8"), ("view",), {"units": units, "long_name": long_name}
         yield (
             "split", truth["split_index"], ("view",),
@@ -268,6 +275,8 @@ class FrameJob:
         if frames.amplitude_e is not None and frames.intensity_e is not None:
             stored["amplitude"] = frames.amplitude_e.astype("<f4")
             stored["intensity"] = frames.intensity_e.astype("<f4")
+        if len(self.sensor.frequencies_hz) > 1:
+            stored |= _of_each_frequency(frames)
         if frames.taps_e is not None:
             stored["taps"] = frames.taps_e.astype("<f4")
         if self._shot_sensor is not None:
@@ -315,11 +324,14 @@ class FrameJob:
                     sensor=self.sensor,
                     views=views,
                     harmonics={order: np.empty(shape, np.complex128) for order in part.harmonics},
+                    by_hz={hz: np.empty(shape, np.complex128) for hz in part.by_hz},
                 )
             image.phasor[members], image.intensity[members] = part.phasor, part.intensity
             image.coverage[members] = part.coverage
             for order, values in part.harmonics.items():
                 image.harmonics[order][members] = values
+            for hz, values in part.by_hz.items():
+                image.by_hz[hz][members] = values
             if hard is not None:
                 centre = renderer.render_views(views[members], background=background, variant="hard")
                 hard[members] = centre.range_m
@@ -332,15 +344,37 @@ _TRUTH = (
     ("delta", "delta_deg", "degree", "angle from which the landmark is seen"),
     ("bearing", "bearing_deg", "degree", "azimuth of the landmark's axis in the camera frame"),
     ("height", "height_m", "m", "height of the landmark's origin above the optical axis"),
+    ("pitch", "pitch_deg", "degree", "pitch of the camera, positive looking down"),
+    ("roll", "roll_deg", "degree", "roll of the camera"),
     ("albedo", "albedo", "1", "share of light that the landmark returns"),
     ("wall", "wall_m", "m", "distance of the wall behind, NaN if there is none"),
     ("floor", "floor_m", "m", "how far the floor lies below the lens, NaN if there is none"),
 )
 
 
+def _of_each_frequency(frames: Frames) -> dict[str, NDArray[Any]]:
+    """Return what each frequency measured, (n, frames, frequency, rows, cols)."""
+    parts = frames.by_frequency
+
+    def stacked(name: str, kind: str) -> NDArray[Any]:
+        return np.stack([getattr(part, name) for part in parts], axis=2).astype(kind)
+
+    return {
+        "frequency_range": stacked("range_m", "<f4"),
+        "frequency_amplitude": stacked("amplitude_e", "<f4"),
+        "frequency_intensity": stacked("intensity_e", "<f4"),
+        "frequency_flags": stacked("flags", "|u1"),
+    }
+
+
 def _views(truth: dict[str, NDArray[Any]]) -> Views:
     return Views.broadcast(
-        truth["distance_m"], np.deg2rad(truth["delta_deg"]), np.deg2rad(truth["bearing_deg"]), truth["height_m"]
+        truth["distance_m"],
+        np.deg2rad(truth["delta_deg"]),
+        np.deg2rad(truth["bearing_deg"]),
+        truth["height_m"],
+        np.deg2rad(truth["pitch_deg"]),
+        np.deg2rad(truth["roll_deg"]),
     )
 
 
@@ -358,8 +392,16 @@ def _background(wall_m: float, floor_m: float, plan: FramePlan) -> Background | 
 def _coordinates(plan: FramePlan, sensor: Sensor) -> Iterator[tuple[str, Any, str, str]]:
     yield "frame", np.arange(plan.views * plan.frames_per_view, dtype="<i8"), "1", "frame"
     yield "view", np.arange(plan.views, dtype="<i8"), "1", "view, shown by one frame or more"
+    if len(sensor.frequencies_hz) > 1:
+        yield (
+            "frequency",
+            np.array(sensor.frequencies_hz, "<f8"),
+            "Hz",
+            "modulation frequency, in the order of the frame",
+        )
     if plan.keep_taps:
-        yield "phase", np.arange(4, dtype="<i4") * 90, "degree", "phase image τ"
+        tau_deg = np.tile(np.arange(4, dtype="<i4") * 90, len(sensor.frequencies_hz))
+        yield "phase", tau_deg, "degree", "phase image τ"
         yield "tap", ["a", "b"], "", "tap of the pixel"
     yield "row", np.arange(sensor.rows, dtype="<i4"), "1", "pixel row, 0 at the top"
     yield "col", np.arange(sensor.cols, dtype="<i4"), "1", "pixel column, 0 on the left"

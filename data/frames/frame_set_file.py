@@ -28,8 +28,9 @@ from phasemark.data.files.hdf5_reading import (
     whole_numbers,
 )
 from phasemark.data.pages.notebook import facts_html
-from phasemark.data.plans.arrays import FRAME_FIELDS, VIEW_FIELDS
+from phasemark.data.plans.arrays import FRAME_FIELDS, FREQUENCY_FIELDS, VIEW_FIELDS, dimension_sizes
 from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.inputs.numbers import in_words
 from phasemark.render import Frames, Sensor
 
 FORMAT = "phasemark-frames"
@@ -40,7 +41,9 @@ SCHEMA_VERSION = 1
 _MOST = 1e12
 """More electrons than any pixel holds."""
 
-_TRUTH = ("distance", "delta", "bearing", "height", "albedo", "wall", "floor")
+_TRUTH = ("distance", "delta", "bearing", "height", "pitch", "roll", "albedo", "wall", "floor")
+_TILT = ("pitch", "roll")
+"""Absent from files of a level camera."""
 
 Sample = dict[str, Any]
 
@@ -68,8 +71,8 @@ class FrameSet:
     splits : tuple of str
     versions : dict of str to str
     truth : dict of str to (views,) array
-        ``class_index``, ``distance_m``, ``delta_rad``, ``bearing_rad``, ``height_m``, ``albedo``, ``wall_m``,
-        ``floor_m``, ``split_index``.
+        ``class_index``, ``distance_m``, ``delta_rad``, ``bearing_rad``, ``height_m``, ``pitch_rad``,
+        ``roll_rad``, ``albedo``, ``wall_m``, ``floor_m``, ``split_index``.
     view_index : (frames,) int64
         Which view each frame shows.
     """
@@ -86,7 +89,7 @@ class FrameSet:
         self.classes = tuple(self.plan.landmark_names())
         self.splits = tuple(self.plan.splits)
         sizes = {dim: len(dataset_of(file, dim, path)) for dim in ("frame", "view", "row", "col")}
-        sizes |= {"phase": 4, "tap": 2}
+        sizes = {**dimension_sizes(self.sensor), **sizes}
         if (sizes["row"], sizes["col"]) != (self.sensor.rows, self.sensor.cols):
             raise InputFileError(f"{path}: has {sizes['row']} × {sizes['col']} pixels, but its sensor has others")
         if sizes["view"] != self.plan.views or sizes["frame"] != self.plan.views * self.plan.frames_per_view:
@@ -95,6 +98,9 @@ class FrameSet:
             )
         wanted = ["range", "flags", "coverage"] + [name for name in ("amplitude", "intensity", "taps") if name in file]
         wanted += [f"range_{name}" for name in self.plan.variants]
+        if len(self.sensor.frequencies_hz) > 1:
+            self._check_frequencies(file)
+            wanted += FREQUENCY_FIELDS
         self._fields = {name: self._field(file, name, sizes) for name in wanted}
         self.view_index = frozen(self._whole(file, "view_index", sizes["frame"]))
         if self.view_index.min() < 0 or self.view_index.max() >= sizes["view"]:
@@ -102,6 +108,15 @@ class FrameSet:
         self.truth = self._read_truth(file, sizes["view"])
         for name in self.classes:
             group_of(file, f"meshes/{name}", path)
+
+    def _check_frequencies(self, file: h5py.File) -> None:
+        """Refuse frames of other frequencies than those of the sensor."""
+        own = self.sensor.frequencies_hz
+        found = self._column(file, "frequency", len(own))
+        if not np.array_equal(found, own):
+            raise InputFileError(
+                f"{self.path}: 'frequency' must be {in_words(own)} Hz as its sensor has them, got {in_words(found)}"
+            )
 
     def _field(self, file: h5py.File, name: str, sizes: dict[str, int]) -> tuple[tuple[int, ...], np.dtype[Any], int]:
         """Return shape, type and offset of a dataset; the offset is −1 if its values are not in one piece."""
@@ -137,12 +152,15 @@ class FrameSet:
             if truth[name].min() < 0 or truth[name].max() >= count:
                 raise InputFileError(f"{self.path}: '{name}' has numbers outside 0 … {count - 1}")
         for name in _TRUTH:
+            if name in _TILT and name not in file:
+                truth[f"{name}_rad"] = np.zeros(n)
+                continue
             values = self._column(file, name, n).astype(np.float64)
             if name not in ("wall", "floor") and not np.isfinite(values).all():
                 raise InputFileError(f"{self.path}: '{name}' must be finite")
             if name == "distance" and not (values > 0).all():
                 raise InputFileError(f"{self.path}: 'distance' must be positive, got {values.min():g}")
-            if name in ("delta", "bearing"):
+            if name in ("delta", "bearing", *_TILT):
                 truth[f"{name}_rad"] = np.deg2rad(values)
             else:
                 truth[name if name == "albedo" else f"{name}_m"] = values
@@ -190,7 +208,9 @@ class FrameSet:
         """Return the arrays and the truth of a frame, or of several with one more axis in front.
 
         Keys are ``range_m``, ``amplitude_e``, ``intensity_e``, ``flags``, ``taps_e``, ``range_shot_m``, ``coverage``,
-        ``range_hard_m``, ``range_mixed_m`` (those that the file has), ``view``, ``class_name`` and the truth.
+        ``range_hard_m``, ``range_mixed_m`` (those that the file has), ``view``, ``class_name`` and the truth; of
+        several modulation frequencies also ``frequency_range_m``, ``frequency_amplitude_e``, ``frequency_intensity_e``
+        and ``frequency_flags``, with an axis of frequencies before the rows.
         """
         one = isinstance(index, int | np.integer)
         if one:
@@ -221,7 +241,10 @@ class FrameSet:
         """Refuse values that no run writes, as soon as they are read: other programs would take them for measured."""
         if values.dtype.kind != "f":
             return values
-        if name.startswith("range"):
+        if name == "frequency_range":
+            periods = np.array([camera.unambiguous_range_m for camera in self.sensor.by_frequency])[:, None, None]
+            wrong, limits = (values < 0) | (values > periods * (1 + 1e-6)), "NaN or from 0 to c / 2f"
+        elif name.startswith("range"):
             wrong = (values < 0) | (values > self.sensor.unambiguous_range_m * (1 + 1e-6))  # float32 may round up
             limits = f"NaN or in 0 … {self.sensor.unambiguous_range_m:.4g} m"
         else:
@@ -258,12 +281,18 @@ class FrameSet:
         """Return frames as the matcher takes them, one position each, (n, 1, rows, cols)."""
         sample = self[index]
         amplitude, intensity = sample.get("amplitude_e"), sample.get("intensity_e")
+        parts = []
+        if len(self.sensor.frequencies_hz) > 1:
+            for j, camera in enumerate(self.sensor.by_frequency):
+                range_m, amplitude_e, intensity_e, flags = (sample[_key(name)][:, None, j] for name in FREQUENCY_FIELDS)
+                parts.append(Frames(range_m, amplitude_e, intensity_e, flags=flags, sensor=camera))
         return Frames(
             sample["range_m"][:, None],
             None if amplitude is None else amplitude[:, None],
             None if intensity is None else intensity[:, None],
             flags=sample["flags"][:, None],
             sensor=self.sensor,
+            by_frequency=parts,
         )
 
     def view(self, number: int) -> Frames:
@@ -276,14 +305,7 @@ class FrameSet:
         """
         if not 0 <= number < self.plan.views:
             raise UsageError(f"view {number} is not there: {self.path} has {self.plan.views}")
-        frames = self.frames(np.flatnonzero(self.view_index == number))
-        return Frames(
-            frames.range_m[:, 0][None],
-            None if frames.amplitude_e is None else frames.amplitude_e[:, 0][None],
-            None if frames.intensity_e is None else frames.intensity_e[:, 0][None],
-            flags=frames.flags[:, 0][None],
-            sensor=self.sensor,
-        )
+        return self.frames(np.flatnonzero(self.view_index == number)).as_one_position()
 
     def split(self, name: str) -> NDArray[np.int64]:
         """Return the numbers of the frames of a split, ``train`` for instance.
@@ -396,6 +418,9 @@ def _key(name: str) -> str:
         "taps": "taps_e",
         "flags": "flags",
         "coverage": "coverage",
+        "frequency_amplitude": "frequency_amplitude_e",
+        "frequency_intensity": "frequency_intensity_e",
+        "frequency_flags": "frequency_flags",
     }.get(name, f"{name}_m")
 
 

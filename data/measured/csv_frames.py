@@ -66,7 +66,7 @@ class _Text:
     names: Mapping[int, str] = field(default_factory=dict)  # by column
 
 
-def parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> CsvFrames:
+def parse_csv(content: bytes, shape: tuple[int, int], path: Path, n_frequencies: int = 1) -> CsvFrames:
     """Read the frames of a text file.
 
     Parameters
@@ -76,6 +76,9 @@ def parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> CsvFrames:
         Pixels of a frame in the file's own orientation.
     path : Path
         For messages.
+    n_frequencies : int
+        Modulation frequencies of the sensor. A line that has so many values for each pixel holds one frequency after
+        the other, and its arrays are called ``frequency_range`` and so on.
 
     Raises
     ------
@@ -106,12 +109,16 @@ def parse_csv(content: bytes, shape: tuple[int, int], path: Path) -> CsvFrames:
     for mark in (*_SEPARATORS, None):  # a header that names columns has the separator of the values
         names = [name.lower() for name in _cells(lines[0][1], mark)] if lines else []
         if any(name in SECONDS_PER_TIME_UNIT or _group_of(name) for name in names):
-            return _parse_named(names, lines, mark, stated, shape, path)
+            return _parse_named(names, lines, mark, stated, shape, path, n_frequencies)
     # quotation marks aside: one that is not closed would make a single cell, and so a header, of a frame
     header = bool(lines) and _is_header(_cells(lines[0][1].replace('"', ""), separator), separator)
     pixels = f"{shape[0]} × {shape[1]} pixels"
-    body = _Text(path, lines[1 if header else 0 :], separator, math.prod(shape), pixels)
-    return CsvFrames({"range": _numbers(body, range(body.expected))}, stated)
+    expected, name = math.prod(shape), "range"
+    if n_frequencies > 1 and len(_cells(first_frame, separator)) != expected:
+        expected, name = n_frequencies * expected, "frequency_range"
+        pixels = f"{pixels} at each of {n_frequencies} frequencies"
+    body = _Text(path, lines[1 if header else 0 :], separator, expected, pixels)
+    return CsvFrames({name: _numbers(body, range(body.expected))}, stated)
 
 
 def _parse_named(
@@ -121,10 +128,11 @@ def _parse_named(
     stated: dict[str, str],
     shape: tuple[int, int],
     path: Path,
+    n_frequencies: int,
 ) -> CsvFrames:
     """Read a file whose header names its columns."""
     place = f"{path}: line {lines[0][0]}"
-    groups = _groups(names, shape, place)
+    groups = _groups(names, shape, place, n_frequencies)
     pixels = next((prefix for prefix in _PIXELS if prefix in groups), None)
     if pixels is None:
         last = math.prod(shape) - 1
@@ -146,14 +154,19 @@ def _parse_named(
     time_s = _times_s(numbers[:, 0], times[0], body) if times else None
     arrays, start = {}, len(times)
     for prefix, group in groups.items():
-        arrays["range" if prefix in _PIXELS else prefix] = numbers[:, start : start + len(group)]
+        name = "range" if prefix in _PIXELS else prefix
+        name = f"frequency_{name}" if len(group) > math.prod(shape) else name
+        arrays[name] = numbers[:, start : start + len(group)]
         start += len(group)
     _note_ignored(names, columns, path)
     return CsvFrames(arrays, stated, time_s, named=True)
 
 
-def _groups(names: list[str], shape: tuple[int, int], place: str) -> dict[str, list[int]]:
-    """Return the columns of each numbered group, in the order of their numbers; there must be one a pixel."""
+def _groups(names: list[str], shape: tuple[int, int], place: str, n_frequencies: int) -> dict[str, list[int]]:
+    """Return the columns of each numbered group, in the order of their numbers.
+
+    There must be one a pixel, or one for each frequency of a pixel.
+    """
     found: dict[str, dict[int, int]] = {}
     for column, name in enumerate(names):
         match = _group_of(name)
@@ -166,16 +179,17 @@ def _groups(names: list[str], shape: tuple[int, int], place: str) -> dict[str, l
     pixels = [prefix for prefix in found if prefix in _PIXELS]
     if len(pixels) > 1:
         raise InputFileError(f"{place}: has columns {pixels[0]}_0 … and {pixels[1]}_0 …: leave one of them out")
-    expected = math.prod(shape)
     for prefix, columns in found.items():
+        layers = n_frequencies if max(columns) >= math.prod(shape) and prefix not in ("status", "valid") else 1
+        expected, each = layers * math.prod(shape), f" at each of {layers} frequencies" if layers > 1 else ""
         if sorted(columns) != list(range(expected)):
             missing = next((k for k in range(expected) if k not in columns), None)
             gap = "" if missing is None else f"; '{prefix}_{missing}' is missing"
             raise InputFileError(
                 f"{place}: has {len(columns)} columns '{prefix}_*', must have {expected}, from '{prefix}_0' to"
-                f" '{prefix}_{expected - 1}' ({shape[0]} × {shape[1]} pixels){gap}"
+                f" '{prefix}_{expected - 1}' ({shape[0]} × {shape[1]} pixels{each}){gap}"
             )
-    return {prefix: [columns[k] for k in range(expected)] for prefix, columns in found.items()}
+    return {prefix: [columns[k] for k in range(len(columns))] for prefix, columns in found.items()}
 
 
 def _group_of(name: str) -> re.Match[str] | None:

@@ -23,8 +23,9 @@ from phasemark.data.files.guard import EXPANSION, FREE_BYTES
 from phasemark.data.files.hdf5_reading import open_hdf5
 from phasemark.data.measured.bags import read_rosbag
 from phasemark.data.measured.csv_frames import MILLISECONDS, SECONDS, SECONDS_PER_TIME_UNIT, note_disorder, parse_csv
+from phasemark.data.measured.frequency_layers import LAYERED, layers_of
 from phasemark.inputs import opened
-from phasemark.render import Frames, Sensor
+from phasemark.render import Frames, Sensor, unwrap_frames
 
 Unit = Literal["m", "cm", "mm"]
 RangeOrZ = Literal["range", "z"]
@@ -33,8 +34,9 @@ InvalidMeans = Literal["missing", "no-return"]
 METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 QUANTITIES = ("range", "z")
 
-_FIELDS = ("range", "amplitude", "intensity", "status", "valid")
 _NUMBERS = ("range", "amplitude", "intensity")
+_OF_FREQUENCY = tuple(f"frequency_{name}" for name in _NUMBERS)
+_FIELDS = (*_NUMBERS, "status", "valid", *_OF_FREQUENCY, "frequency", "taps")
 _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
 _BEYOND_MAX_RANGE = 1.25
@@ -91,6 +93,13 @@ def read_frames(
     bag* (its folder): images of 32FC1, metres, or 16UC1, millimetres; 0 is invalid. Arrays are (frames, rows, cols),
     (n, frames, rows, cols), or (rows, cols) for a single frame.
 
+    *Several modulation frequencies*: NPZ and HDF5 have ``frequency_range`` and optionally ``frequency_amplitude`` and
+    ``frequency_intensity`` with an axis of the sensor's m frequencies before the rows, (frames, m, rows, cols) or (n,
+    frames, m, rows, cols), and optionally ``frequency`` (hertz) and ``taps`` (electrons, (…, 4 m, 2, rows, cols)); a
+    line of CSV has m times as many values, all of one frequency before those of the next. These ranges are wrapped, and
+    are unwrapped here (:func:`~phasemark.render.unwrap_frames`). What a file has as ``range`` is unwrapped already, and
+    is used where the others are missing.
+
     A range that is not finite is invalid, and so is a 0, by which most sensors mean that they have no reading. So is
     one that no such camera can measure, and a warning tells how many there are; if it is most of the others, unit or
     sensor are wrong, which is an error. A camera measures no negative range, none beyond c / 2f, and, if it is a direct
@@ -144,7 +153,7 @@ def read_frames(
     if invalid_means not in ("missing", "no-return"):
         raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
     shape = (sensor.cols, sensor.rows) if rotate in (90, 270) else (sensor.rows, sensor.cols)
-    raw = _read(path, shape, untrusted, topic)
+    raw = _read(path, shape, untrusted, topic, len(sensor.frequencies_hz))
     if unit is None and quantity is None and not raw.stated:
         raise UsageError(
             f"{path}: does not say its unit and quantity: give unit={'|'.join(METRES_PER_UNIT)} and"
@@ -154,11 +163,20 @@ def read_frames(
     unit_scale = METRES_PER_UNIT[settled_unit]
     settled_quantity = _settled("quantity", quantity, raw, QUANTITIES, path)
 
-    arrays = {name: _as_frames(values, name, shape, raw.flat, path) for name, values in raw.arrays.items()}
+    layered = layers_of(raw.arrays, sensor, shape, raw.flat, path)
+    plain = {name: values for name, values in raw.arrays.items() if name not in LAYERED}
+    arrays = {name: _as_frames(values, name, shape, raw.flat, path) for name, values in plain.items()}
+    if "frequency_range" in layered:
+        arrays["range"] = layered["frequency_range"][:, :, 0]
     for name, values in arrays.items():
         if values.shape != arrays["range"].shape:
             raise InputFileError(
                 f"{path}: '{name}' must have the shape of 'range', {arrays['range'].shape}, got {values.shape}"
+            )
+    for name, values in layered.items():
+        if values.shape[:2] != arrays["range"].shape[:2]:
+            raise InputFileError(
+                f"{path}: '{name}' must have the frames of 'range', {arrays['range'].shape[:2]}, got {values.shape[:2]}"
             )
     valid = np.ones(arrays["range"].shape, dtype=bool)
     if "valid" in arrays:
@@ -170,24 +188,36 @@ def read_frames(
                 " and VL53L8CX)"
             )
         valid &= np.isin(arrays["status"], list(valid_status))
-    arrays = {name: _upright(values, flip_h, flip_v, rotate) for name, values in arrays.items()}
-    with np.errstate(invalid="ignore", over="ignore"):  # what becomes NaN or infinite is invalid
-        numbers = {name: arrays[name].astype(np.float64) for name in _NUMBERS if name in arrays}
-        range_m = numbers["range"] * unit_scale
-    if settled_quantity == "z":
-        range_m = range_m / sensor.axis_cosine()
-    valid = _upright(valid, flip_h, flip_v, rotate) & np.isfinite(range_m)
-    valid &= ~_impossible(range_m, valid, sensor, settled_unit, path)
-    try:
+    arrays, layered = (
+        {name: _upright(values, flip_h, flip_v, rotate) for name, values in some.items()} for some in (arrays, layered)
+    )
+    valid = _upright(valid, flip_h, flip_v, rotate)
+    time_s = _frame_times_s(raw, valid.shape[:2], path)
+    taps_e = None if "taps" not in layered else layered["taps"].astype(np.float64)
+
+    def frames_of(own: Mapping[str, NDArray[Any]], camera: Sensor, taps: NDArray[np.float64] | None) -> Frames:
+        with np.errstate(invalid="ignore", over="ignore"):  # what becomes NaN or infinite is invalid
+            numbers = {name: own[name].astype(np.float64) for name in _NUMBERS if name in own}
+            range_m = numbers["range"] * unit_scale
+        if settled_quantity == "z":
+            range_m = range_m / sensor.axis_cosine()
+        usable = valid & np.isfinite(range_m)
+        usable &= ~_impossible(range_m, usable, camera, settled_unit, path)
+        amplitude, intensity = numbers.get("amplitude"), numbers.get("intensity")
         return Frames(
-            range_m,
-            numbers.get("amplitude"),
-            numbers.get("intensity"),
-            valid,
-            sensor=sensor,
-            invalid_means=invalid_means,
-            time_s=_frame_times_s(raw, valid.shape[:2], path),
-        )
+            range_m, amplitude, intensity, usable, sensor=camera, taps_e=taps, invalid_means=invalid_means,
+            time_s=time_s,
+        )  # fmt: skip
+
+    try:
+        if "frequency_range" not in layered:
+            return frames_of(arrays, sensor, taps_e)
+        held = [name for name in _NUMBERS if f"frequency_{name}" in layered]
+        parts = [
+            frames_of({name: layered[f"frequency_{name}"][:, :, j] for name in held}, camera, None)
+            for j, camera in enumerate(sensor.by_frequency)
+        ]
+        return unwrap_frames(parts, sensor, taps_e=taps_e)
     except UsageError as error:  # an amplitude or intensity that cannot be
         raise InputFileError(f"{path}: {error}") from None
 
@@ -311,9 +341,17 @@ def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool 
         As :func:`phasemark.data.files.write_atomically`.
     """
     arrays: dict[str, Any] = {"range": frames.range_m, "valid": frames.valid, "flags": frames.flags}
+    if len(frames.by_frequency) > 1:  # each frequency has NaN where it has no range
+        del arrays["valid"]
     for name, values in (("amplitude", frames.amplitude_e), ("intensity", frames.intensity_e)):
         if values is not None:
             arrays[name] = values
+    if len(frames.sensor.frequencies_hz) > 1:
+        arrays["frequency"] = np.array(frames.sensor.frequencies_hz)
+        for key, attribute in zip(_OF_FREQUENCY, ("range_m", "amplitude_e", "intensity_e"), strict=True):
+            own = [getattr(part, attribute) for part in frames.by_frequency]
+            if own and all(values is not None for values in own):
+                arrays[key] = np.stack(own, axis=2)
     if frames.time_s is not None:
         arrays[SECONDS] = frames.time_s
     buffer = io.BytesIO()
@@ -321,7 +359,7 @@ def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool 
     return write_atomically(path, buffer.getvalue(), force=force)
 
 
-def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None) -> _Raw:
+def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None, n_frequencies: int) -> _Raw:
     try:
         if path.is_dir():
             return _Raw(*read_rosbag(path, topic)) if (path / "metadata.yaml").exists() else _read_pngs(path)
@@ -329,7 +367,7 @@ def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None
             start = file.read(8)
             file.seek(0)
             if not start.startswith(b"\x89HDF"):
-                return _read_open(file, start, shape, path)
+                return _read_open(file, start, shape, path, n_frequencies)
         return _read_hdf5(path, untrusted)
     except PhasemarkError:
         raise
@@ -340,7 +378,7 @@ def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None
         raise InputFileError(f"{path}: cannot be read ({reason})") from None
 
 
-def _read_open(file: BinaryIO, start: bytes, shape: tuple[int, int], path: Path) -> _Raw:
+def _read_open(file: BinaryIO, start: bytes, shape: tuple[int, int], path: Path, n_frequencies: int) -> _Raw:
     """Read an open file of any kind but HDF5."""
     if not start:
         raise InputFileError(f"{path}: is empty")
@@ -355,7 +393,7 @@ def _read_open(file: BinaryIO, start: bytes, shape: tuple[int, int], path: Path)
         return _of_images([_read_png(file, path)], path)
     if _size(file) > _MOST_BYTES:
         raise InputFileError(f"{path}: has more than {_MOST_BYTES / 1e6:.3g} MB of text: give it in parts, or as NPZ")
-    found = parse_csv(file.read(), shape, path)
+    found = parse_csv(file.read(), shape, path, n_frequencies)
     return _Raw(found.arrays, found.stated, found.time_s, flat=True, named=found.named)
 
 
@@ -470,7 +508,7 @@ def _read_npz(file: BinaryIO, path: Path) -> _Raw:
         for name in ("unit", "quantity"):
             if name in members and members[name].file_size > _WORD_BYTES + 128:
                 raise InputFileError(f"{path}: '{name}' must be a word, got {members[name].file_size} bytes")
-        if "range" not in archive:
+        if not {"range", "frequency_range"} & set(archive):
             raise InputFileError(f"{path}: must have an array 'range', got {', '.join(archive) or 'nothing'}")
         arrays = {name: np.asarray(archive[name]) for name in _FIELDS if name in archive}
         stated = {name: str(archive[name]) for name in ("unit", "quantity") if name in archive}
@@ -480,14 +518,15 @@ def _read_npz(file: BinaryIO, path: Path) -> _Raw:
 
 def _read_hdf5(path: Path, untrusted: bool) -> _Raw:
     with open_hdf5(path, "file of frames", untrusted=untrusted, foreign=True) as file:
-        if not isinstance(file.get("range"), h5py.Dataset):
+        main = next((name for name in ("frequency_range", "range") if isinstance(file.get(name), h5py.Dataset)), None)
+        if main is None:
             kind = file.attrs.get("format")
             raise InputFileError(
                 f"{path}: must have a dataset 'range', "
                 + (f"but is a {kind}" if kind else f"got {', '.join(file) or 'nothing'}")
             )
         datasets = {name: file[name] for name in _FIELDS if isinstance(file.get(name), h5py.Dataset)}
-        for name in ("amplitude", "intensity"):
+        for name in (*_NUMBERS[1:], *_OF_FREQUENCY[1:]):
             units = datasets[name].attrs.get("units") if name in datasets else None
             if units is not None and units not in _ELECTRONS:
                 raise InputFileError(f"{path}: '{name}' must be in electrons (units 'e-'), got {units!r}")
@@ -499,9 +538,7 @@ def _read_hdf5(path: Path, untrusted: bool) -> _Raw:
             room.take(name, dataset.shape, dataset.dtype)
         attributes = {"unit": "units", "quantity": "quantity"}
         stated = {
-            name: str(datasets["range"].attrs[key])
-            for name, key in attributes.items()
-            if key in datasets["range"].attrs
+            name: str(datasets[main].attrs[key]) for name, key in attributes.items() if key in datasets[main].attrs
         }
         times = {name: np.asarray(dataset[...]) for name, dataset in stamps.items()}
         arrays = {name: np.asarray(dataset[...]) for name, dataset in datasets.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from phasemark.data.files.atomic_write import replacing, write_atomically
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.data.seeds import stream
 from phasemark.render import Background, Flag, Frames, Renderer, Sensor, Views, capture
+from phasemark.render.view import VIEW_FIELDS
 
 STATUS_VALID = 5
 STATUS_NO_TARGET = 255
@@ -90,10 +92,11 @@ def simulate_recording(
     if not 1 <= len(views) <= MOST_FRAMES:
         raise UsageError(f"a simulated recording must have 1 … {MOST_FRAMES} frames, got {len(views)}")
     renderer = Renderer(mesh, sensor, albedo=albedo)
+    renderer.check_in_view(views)
     taken, image, rendered = [], None, None
     for k in range(len(views)):
         view = views[k : k + 1]
-        at = (float(view.distance_m[0]), float(view.delta_rad[0]), float(view.bearing_rad[0]), float(view.height_m[0]))
+        at = tuple(float(getattr(view, name)[0]) for name in VIEW_FIELDS)
         if image is None or at != rendered:
             behind = background
             if background is not None and background.wall_m is not None:
@@ -101,21 +104,30 @@ def simulate_recording(
             image, rendered = renderer.render_views(view, background=behind), at
         taken.append(capture(image, sensor, rng=stream(seed, "simulated recording", 0), first_frame=k))
 
+    stamps = np.round(np.arange(len(views)) / sensor.frame_rate_hz, 3)[None]
+    frames = _one_after_the_other(taken, stamps)
+    return SimulatedRecording(frames, views, class_name)
+
+
+def _one_after_the_other(taken: Sequence[Frames], time_s: NDArray[np.float64] | None = None) -> Frames:
+    """Return frames of one position from single ones."""
+
     def joined(name: str) -> NDArray[Any] | None:
         parts = [getattr(frame, name) for frame in taken]
         return None if parts[0] is None else np.concatenate(parts, axis=1)
 
-    range_m, flags = joined("range_m"), joined("flags")
+    range_m = joined("range_m")
     assert range_m is not None
-    frames = Frames(
+    own = [frame.by_frequency for frame in taken] if len(taken[0].sensor.frequencies_hz) > 1 else []
+    return Frames(
         range_m,
         joined("amplitude_e"),
         joined("intensity_e"),
-        flags=flags,
-        sensor=sensor,
-        time_s=np.round(np.arange(len(views)) / sensor.frame_rate_hz, 3)[None],
+        flags=joined("flags"),
+        sensor=taken[0].sensor,
+        time_s=time_s,
+        by_frequency=[_one_after_the_other(parts) for parts in zip(*own, strict=True)],
     )
-    return SimulatedRecording(frames, views, class_name)
 
 
 def write_recording(
@@ -190,6 +202,11 @@ def _truth(recording: SimulatedRecording) -> dict[str, NDArray[np.float64]]:
         "truth_delta_deg": np.degrees(views.delta_rad),
         "truth_bearing_deg": np.degrees(views.bearing_rad),
         "truth_height_m": views.height_m,
+        **(
+            {"truth_pitch_deg": np.degrees(views.pitch_rad), "truth_roll_deg": np.degrees(views.roll_rad)}
+            if views.are_tilted
+            else {}
+        ),
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 from phasemark.data.plans.frame_plan import FramePlan
@@ -23,6 +24,10 @@ def group_rows(group: GroupName, sensor: Sensor) -> tuple[int, int]:
     return {"lower": sensor.lower_rows, "upper": sensor.upper_rows, "full": (0, sensor.rows)}[group]
 
 
+_OF_FREQUENCY = ("frame", "frequency", "row", "col")
+FREQUENCY_FIELDS = ("frequency_range", "frequency_amplitude", "frequency_intensity", "frequency_flags")
+"""What a frame set of several modulation frequencies holds of each; `range` is then unwrapped, and `amplitude` and
+`intensity` are those at the first."""
 FRAME_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "range": (("frame", "row", "col"), "<f4", "m", "range along the ray, NaN where invalid"),
     "amplitude": (("frame", "row", "col"), "<f4", "e-", "amplitude per phase image"),
@@ -30,6 +35,10 @@ FRAME_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "flags": (("frame", "row", "col"), "|u1", "1", "why a pixel is not valid, 0 where it is"),
     "taps": (("frame", "phase", "tap", "row", "col"), "<f4", "e-", "what each tap reported"),
     "range_shot": (("frame", "row", "col"), "<f4", "m", "range with shot noise alone, NaN where invalid"),
+    "frequency_range": (_OF_FREQUENCY, "<f4", "m", "range at each frequency, wrapped, NaN where invalid"),
+    "frequency_amplitude": (_OF_FREQUENCY, "<f4", "e-", "amplitude per phase image at each frequency"),
+    "frequency_intensity": (_OF_FREQUENCY, "<f4", "e-", "intensity per phase image at each frequency"),
+    "frequency_flags": (_OF_FREQUENCY, "|u1", "1", "why a frequency's range is not valid, 0 where it is"),
 }
 VIEW_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "coverage": (("view", "row", "col"), "<f4", "1", "share of the pixel that sees the landmark"),
@@ -38,9 +47,22 @@ VIEW_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
 }
 
 
+def bank_frequencies_hz(sensor: Sensor, harmonics: Sequence[int]) -> list[float]:
+    """Return at which frequencies a bank holds phasors, rising: the sensor's own, and their harmonics."""
+    return sorted({k * hz for hz in sensor.frequencies_hz for k in (1, *harmonics)})
+
+
+def dimension_sizes(sensor: Sensor) -> dict[str, int]:
+    """Return the lengths of those dimensions of a frame set that its sensor decides."""
+    m = len(sensor.frequencies_hz)
+    return {"row": sensor.rows, "col": sensor.cols, "frequency": m, "phase": sensor.n_phase_images, "tap": 2}
+
+
 def frame_set_fields(plan: FramePlan, sensor: Sensor) -> list[str]:
     """Return the names of the large datasets of a frame set, in their order in the file."""
     per_frame = ["range", "flags"] if sensor.kind == "direct" else ["range", "amplitude", "intensity", "flags"]
+    if len(sensor.frequencies_hz) > 1:
+        per_frame += FREQUENCY_FIELDS
     if plan.keep_taps:
         per_frame.append("taps")
     if "shot" in plan.variants:

@@ -20,26 +20,31 @@ from pydantic import (
     ConfigDict,
     Field,
     PlainSerializer,
+    SerializerFunctionWrapHandler,
     ValidationError,
     ValidationInfo,
     WithJsonSchema,
+    model_serializer,
     model_validator,
 )
 
 from phasemark import PhasemarkError, UsageError
 from phasemark.data.plans.grid_axis import drop_repeated_stop, format_grid, parse_grid
+from phasemark.data.plans.landmark_region import landmark_region, whole_region
 from phasemark.inputs import refuse_truth_values
 from phasemark.inputs.toml_file import read_toml
-from phasemark.landmarks import LandmarkSpec, catalog, mesh_symmetry, read_mesh
+from phasemark.landmarks import LandmarkSpec, build_mesh, catalog, mesh_symmetry, read_mesh
 from phasemark.landmarks.mesh_files import MeshWarning
 from phasemark.landmarks.symmetry import MAX_SYMMETRY
 from phasemark.render import Sensor, preset
+from phasemark.render.sensor.region import MOST_BINNING, Region
 from phasemark.render.view import FARTHEST_M
 
 MOST_LANDMARKS = 256
 """Of a plan: each takes one or two scenes of the intersector, which can hold some hundreds."""
 DEFAULT_DISTANCE_M = "0.7:2.1:0.01"
 DEFAULT_DELTA_STEP_DEG = 1.0
+DEFAULT_MARGIN_DEG = 5.0
 
 _YOUNGER_FIELDS = {
     "histogram",
@@ -61,6 +66,7 @@ _YOUNGER_FIELDS = {
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
 _Albedo = Annotated[float, Field(gt=0, le=1)]
+_Edge = Annotated[int, Field(ge=0, le=4096)]
 
 
 def _to_grid(value: Any, info: ValidationInfo) -> tuple[float, ...]:
@@ -262,6 +268,13 @@ class BankPlan(ScenePlan):
         Replaces the landmarks' own.
     harmonics : sequence of int
         Orders k > 1 to keep beside the fundamental.
+    region : "whole", "landmark" or (first row, stop row, first column, stop column)
+        Which pixels of the camera the images hold. "landmark": those that a landmark of the bank can reach, and a
+        margin. Frames of the whole camera are cut down to the same pixels when they are matched.
+    binning : int
+        n × n pixels become one, whose phasor is their sum. The region holds whole blocks.
+    margin_deg : float
+        Of the region "landmark": how far the landmark may be off its place in the image, to every side.
 
     Raises
     ------
@@ -280,6 +293,18 @@ class BankPlan(ScenePlan):
     layout: Literal["factored", "full"] = "factored"
     albedo: _Albedo | None = None
     harmonics: tuple[Annotated[int, Field(ge=2, le=99)], ...] = ()
+    region: Literal["whole", "landmark"] | tuple[_Edge, _Edge, _Edge, _Edge] = "whole"
+    binning: Annotated[int, Field(ge=1, le=MOST_BINNING)] = 1
+    margin_deg: Annotated[float, Field(ge=0, le=45)] = DEFAULT_MARGIN_DEG
+
+    @model_serializer(mode="wrap")
+    def _without_whole_region(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave the region out where it is the whole image, as files had it before plans had regions."""
+        fields: dict[str, Any] = dump(self)
+        if self.region == "whole" and self.binning == 1:
+            for name in ("region", "binning", "margin_deg"):
+                fields.pop(name, None)
+        return fields
 
     @model_validator(mode="after")
     def _orders_increase(self) -> Self:
@@ -316,7 +341,40 @@ class BankPlan(ScenePlan):
             model=self.model,
             layout=self.layout,
             harmonics=self.harmonics,
+            region=self._resolved_region(specs, meshes),
+            binning=self.binning,
+            margin_deg=self.margin_deg,
         )
+
+    def _resolved_region(
+        self, specs: Sequence[LandmarkSpec], meshes: Sequence[MeshPlan]
+    ) -> Literal["whole"] | tuple[int, int, int, int]:
+        """Return the region as four numbers, or "whole" where every pixel is its own."""
+        if self.region == "whole" and self.binning == 1:
+            return "whole"
+        sensor = self.build_sensor()
+        if self.region == "whole":
+            region = whole_region(sensor, self.binning)
+        elif self.region == "landmark":
+            shapes = [build_mesh(spec) for spec in specs]
+            shapes += [read_mesh(part.path, unit=part.unit, up=part.up, origin=part.origin) for part in meshes]
+            margin_rad = math.radians(self.margin_deg)
+            region = landmark_region(sensor, shapes, self.distance_m, self.binning, margin_rad)
+        else:
+            region = Region(*self.region, self.binning)
+        region.check(sensor)
+        return region[:4]
+
+    def pixel_region(self) -> Region | None:
+        """Return which pixels of the camera the images of a resolved plan hold; None: every one."""
+        if isinstance(self.region, str):
+            return None
+        return Region(*self.region, self.binning)
+
+    def image_sensor(self) -> Sensor:
+        """Return the camera that sees the images of a resolved plan: the sensor, read in its region."""
+        sensor, region = self.build_sensor(), self.pixel_region()
+        return sensor if region is None else region.camera(sensor)
 
     def greatest_distances_m(self) -> dict[str, float]:
         """Return the end of the grid of distances, metres."""
@@ -396,7 +454,7 @@ def factored_refusal(plan: BankPlan) -> str | None:
     Lower and upper images come apart if every landmark is a solid of revolution on one and the same box, and the plane
     between them falls on the image's middle line at every distance: a level camera at the interface's height.
     """
-    sensor = plan.build_sensor()
+    sensor = plan.image_sensor()
     if plan.meshes:
         return f"'{plan.meshes[0].name}' comes from a mesh file"
     bare = next((spec.name for spec in plan.landmarks if spec.upper is None), None)

@@ -8,7 +8,16 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo, WithJsonSchema, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    PlainSerializer,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    WithJsonSchema,
+    model_serializer,
+    model_validator,
+)
 from scipy import special
 
 from phasemark import UsageError
@@ -143,7 +152,9 @@ _Spread = Annotated[Distribution, *_FORM]
 _MaybeSpread = Annotated[Distribution | None, *_FORM]
 _Share = Annotated[float, Field(ge=0, le=1)]
 
-QUANTITIES = ("distance_m", "delta_deg", "bearing_deg", "height_m", "albedo", "wall_m", "floor_m")
+TILT = ("pitch_deg", "roll_deg")
+"""Quantities that a plan of a level camera does not have."""
+QUANTITIES = ("distance_m", "delta_deg", "bearing_deg", "height_m", "albedo", "wall_m", "floor_m", *TILT)
 """What can be spread; the place in this list is part of what the random numbers depend on."""
 
 
@@ -172,6 +183,8 @@ class FramePlan(ScenePlan):
         Root of all random numbers, 0 … 2⁶⁴ − 1.
     distance_m, delta_deg, bearing_deg, height_m : number or Distribution
         The view (PHYSICS section 1).
+    pitch_deg, roll_deg : number or Distribution, optional
+        Tilt of what the camera is mounted on (PHYSICS section 9), within ± 90° and ± 180°; level if left out.
     albedo : number or Distribution, optional
         Replaces the landmarks' own.
     wall_m, floor_m : number or Distribution, optional
@@ -203,6 +216,8 @@ class FramePlan(ScenePlan):
     delta_deg: _Spread = Distribution(uniform=(0.0, 360.0))
     bearing_deg: _Spread = Distribution(fixed=0.0)
     height_m: _Spread = Distribution(fixed=0.0)
+    pitch_deg: _MaybeSpread = None
+    roll_deg: _MaybeSpread = None
     albedo: _MaybeSpread = None
     wall_m: _MaybeSpread = None
     floor_m: _MaybeSpread = None
@@ -227,6 +242,11 @@ class FramePlan(ScenePlan):
                 math.isfinite(end) and abs(end) > FARTHEST_M for end in (spread.lowest, spread.highest)
             ):
                 raise UsageError(f"'{name}' must be at most {FARTHEST_M:g} m throughout, got {_to_plain(spread)}")
+        for name, most in (("pitch_deg", 90.0), ("roll_deg", 180.0)):
+            spread = getattr(self, name)
+            if spread is not None and not -most <= spread.lowest <= spread.highest <= most:
+                hint = "; cut the normal's tails with 'within'" if spread.normal and not spread.within else ""
+                raise UsageError(f"'{name}' must be within ± {most:g}° throughout, got {_to_plain(spread)}{hint}")
         if self.albedo is not None and not 0 < self.albedo.lowest <= self.albedo.highest <= 1:
             raise UsageError(f"'albedo' must be in (0, 1] throughout, got {_to_plain(self.albedo)}")
         if not self.splits or abs(sum(self.splits.values()) - 1) > 1e-9:
@@ -236,6 +256,11 @@ class FramePlan(ScenePlan):
         if len(set(self.variants)) < len(self.variants):
             raise UsageError(f"'variants' must not repeat, got {list(self.variants)}")
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_absent_tilt(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what a level camera does not have: its plans, and the files with them, stay as they are."""
+        return {name: value for name, value in write(self).items() if name not in TILT or value is not None}
 
     def resolve(self) -> Self:
         """Return the plan with every default made explicit; resolving again changes nothing.
@@ -290,7 +315,8 @@ class FramePlan(ScenePlan):
             spread: Distribution | None = getattr(self, name)
             if spread is None:
                 own = np.array([part.albedo for part in landmarks])
-                truth[name] = own[truth["class_index"]] if name == "albedo" else np.full(stop - start, np.nan)
+                absent = np.full(stop - start, 0.0 if name in TILT else np.nan)
+                truth[name] = own[truth["class_index"]] if name == "albedo" else absent
             elif spread.sobol is not None:
                 truth[name] = spread.values(sobol[name])
             elif spread.fixed is not None:

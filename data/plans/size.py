@@ -14,6 +14,8 @@ from phasemark.data.plans.arrays import (
     LAYOUT_GROUPS,
     VIEW_DIMS,
     VIEW_FIELDS,
+    bank_frequencies_hz,
+    dimension_sizes,
     frame_set_fields,
     group_rows,
 )
@@ -59,8 +61,9 @@ def planned_size(plan: BankPlan | FramePlan) -> dict[str, int]:
     {'images': 54, 'bytes': 221184}
     """
     plan = plan.resolve()
-    sensor = plan.build_sensor()
-    return _bank_size(plan, sensor) if isinstance(plan, BankPlan) else _frames_size(plan, sensor)
+    if isinstance(plan, BankPlan):
+        return _bank_size(plan, plan.image_sensor())
+    return _frames_size(plan, plan.build_sensor())
 
 
 def too_many(counts: Mapping[str, int]) -> str | None:
@@ -109,7 +112,9 @@ def _bank_size(plan: BankPlan, sensor: Sensor) -> dict[str, int]:
         "distance": len(plan.distance_m),
         "delta": len(plan.delta_rad),
     }
-    numbers = 2 * (1 + len(plan.harmonics)) + 2  # real and imaginary parts; intensity and coverage
+    numbers = (
+        2 * len(bank_frequencies_hz(sensor, plan.harmonics)) + 2
+    )  # real and imaginary parts; intensity and coverage
     images = size = 0
     for group in LAYOUT_GROUPS[plan.layout]:
         n = math.prod(counts[dim] for dim in VIEW_DIMS[group])
@@ -121,8 +126,7 @@ def _bank_size(plan: BankPlan, sensor: Sensor) -> dict[str, int]:
 
 def _frames_size(plan: FramePlan, sensor: Sensor) -> dict[str, int]:
     counts = {
-        "frame": plan.views * plan.frames_per_view, "view": plan.views, "row": sensor.rows, "col": sensor.cols,
-        "phase": 4, "tap": 2,
+        "frame": plan.views * plan.frames_per_view, "view": plan.views, **dimension_sizes(sensor),
     }  # fmt: skip
     size = _BYTES_OF_A_FRAME * counts["frame"] + _BYTES_OF_A_VIEW * counts["view"]
     for name in frame_set_fields(plan, sensor):

@@ -333,16 +333,4 @@ def frames_of_poses(frames: Sequence[Frames], poses: KnownPoses) -> list[Frames]
     if counts.sum() != total:
         raise UsageError(f"the poses claim {counts.sum()} frames in all, but there are {total}")
     ends = np.cumsum(counts)
-    return [_some_frames(whole, int(end - count), int(end)) for count, end in zip(counts, ends, strict=True)]
-
-
-def _some_frames(frames: Frames, start: int, stop: int) -> Frames:
-    """Return some frames of one position."""
-    part = slice(start, stop)
-    return Frames(
-        frames.range_m[:, part],
-        None if frames.amplitude_e is None else frames.amplitude_e[:, part],
-        None if frames.intensity_e is None else frames.intensity_e[:, part],
-        sensor=frames.sensor,
-        flags=frames.flags[:, part],
-    )
+    return [whole.some_frames(int(end - count), int(end)) for count, end in zip(counts, ends, strict=True)]

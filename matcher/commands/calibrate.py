@@ -270,7 +270,7 @@ def _calibration_target(landmark: str, class_name: str | None, sensor: str | Non
         if class_name is None and len(bank.classes) > 1:
             raise UsageError(f"{landmark} has {', '.join(bank.classes)}: say with --class which one was recorded")
         mesh = bank.mesh(class_name or bank.classes[0])
-        return (mesh, bank.sensor, landmark) if sensor is None else (mesh, read_sensor(sensor), sensor)
+        return (mesh, bank.camera, landmark) if sensor is None else (mesh, read_sensor(sensor), sensor)
 
 
 def _echo_calibration(found: Calibration) -> None:

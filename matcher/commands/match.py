@@ -61,8 +61,8 @@ def match_frames(
     results.check()
     search.check()
     with open_any_bank(bank) as opened:
-        measured = reading.read(frames, opened.sensor)
-        note_too_far(opened.sensor, {"--wall": search.wall})
+        measured = reading.read(frames, opened.camera)
+        note_too_far(opened.camera, {"--wall": search.wall})
         positions = measured.each_a_position() if moving else measured
         plots = results.plots(len(positions))
         refuse_unwritable_files(results.files(plots), results.force)

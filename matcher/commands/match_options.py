@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _DRAWN_ALL = 4
 """Most positions that are drawn unless the user says which; a figure takes two seconds."""
 
-_FREE = {"bearing": "bearing_rad", "height": "height_m"}
+_FREE = {"bearing": "bearing_rad", "height": "height_m", "pitch": "pitch_rad", "roll": "roll_rad"}
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,22 @@ class Search:
         list[str] | None,
         typer.Option(
             "--free",
-            help="With refine, estimate this with nothing known of it: bearing or height; repeatable.",
-            autocompletion=one_of("bearing", "height"),
+            help="With refine, estimate this: bearing, height, pitch or roll; repeatable. Nothing is known of bearing"
+            " and height before; pitch and roll are near 0.",
+            autocompletion=one_of(*_FREE),
         ),
+    ] = None
+    pitch_std: Annotated[
+        float | None,
+        typer.Option("--pitch-std", metavar="DEG", help="With --free pitch, how level the camera is (3)."),
+    ] = None
+    roll_std: Annotated[
+        float | None,
+        typer.Option("--roll-std", metavar="DEG", help="With --free roll, how level the camera is (3)."),
+    ] = None
+    height_std: Annotated[
+        float | None,
+        typer.Option("--height-std", metavar="M", help="With --free height, how well the height is known (not)."),
     ] = None
     fix: Annotated[
         Literal["bearing"] | None,
@@ -100,10 +113,15 @@ class Search:
         return self.method == "refine" and not self.free and not self.fix
 
     @property
+    def _stated_std(self) -> dict[str, float | None]:
+        """How well what is free is known before, where that is stated: metres and degrees."""
+        return {"height": self.height_std, "pitch": self.pitch_std, "roll": self.roll_std}
+
+    @property
     def parameters(self) -> list[str]:
         """What is estimated."""
         free = ["bearing"] if self.near_the_axis else self.free or ()
-        return ["distance_m", "delta_rad", *(_FREE[name] for name in free)]
+        return ["distance_m", "delta_rad", *(_FREE[name] for name in sorted(free, key=list(_FREE).index))]
 
     def filter(self) -> Callable[[Frames], FilteredFrames]:
         """Return what averages the frames of a position."""
@@ -126,7 +144,10 @@ class Search:
             raise UsageError("--free and --fix both name bearing: give one of them")
         for name in self.free or ():
             if name not in _FREE:
-                raise UsageError(f"--free must be {' or '.join(_FREE)}, got '{name}'")
+                raise UsageError(f"--free must be bearing, height, pitch or roll, got '{name}'")
+        for name, std in self._stated_std.items():
+            if std is not None and name not in (self.free or ()):
+                raise UsageError(f"--{name}-std goes with --free {name}: what is not free is 0")
         refined = (
             ("--free", bool(self.free)), ("--on", self.on != "ranges"), ("--pixels", self.pixels != "all"),
             ("--robust", self.robust), ("--auto-background", self.auto_background),
@@ -148,11 +169,19 @@ class Search:
             free=None if self.near_the_axis else self.parameters,
             background="auto" if self.auto_background else "unknown" if self.unknown_background else self.background,
             bearing_std_rad=BEARING_STD_RAD if self.bearing_std is None else math.radians(self.bearing_std),
+            **self._std_options(),
             false_alarm=self.false_alarm,
             on=self.on,
             pixels=self.pixels,
             robust=self.robust,
         )
+
+    def _std_options(self) -> dict[str, float]:
+        """Return the priors that are stated, as a matcher takes them."""
+        units = {"height": ("height_std_m", 1.0), "pitch": ("pitch_std_rad", math.radians(1.0))}
+        units["roll"] = ("roll_std_rad", math.radians(1.0))
+        stated = {name: std for name, std in self._stated_std.items() if std is not None}
+        return {units[name][0]: units[name][1] * std for name, std in stated.items()}
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,9 @@ from phasemark.render.direct.fit_model import undo_pile_up
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.recordings import object_centre, world2cam
-from phasemark.render.direct.scene_samples import SceneMesh, rigid_transforms
+from phasemark.render.direct.scene_samples import SceneMesh
 from phasemark.render.direct.transients import range_axis, zone_transients
+from phasemark.render.rigid import rigid_transforms
 from phasemark.render.sensor.sensor import Sensor
 
 POSE_PARAMETERS = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")

@@ -98,6 +98,8 @@ def _answer(
         delta_rad=candidates[0].delta_rad,
         bearing_rad=candidates[0].bearing_rad,
         height_m=candidates[0].height_m,
+        pitch_rad=candidates[0].pitch_rad,
+        roll_rad=candidates[0].roll_rad,
         free=setup.free,
         covariance=covariance.copy() if np.isfinite(covariance).all() else None,
         chi2=float(fits.tested[best]),
@@ -126,8 +128,8 @@ def _candidates(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.fl
     view[:, 1] = wrap_delta_rad(view[:, 1], [delta_period_rad(shapes.symmetry[c]) for c in classes])
     rows = zip(classes, view.tolist(), fits.cost[kept].tolist(), weight.tolist(), strict=False)
     return tuple(
-        Candidate(shapes.names[c], distance, delta, cost, share, bearing, height)
-        for c, (distance, delta, bearing, height), cost, share in rows
+        Candidate(shapes.names[c], distance, delta, cost, share, bearing, height, pitch, roll)
+        for c, (distance, delta, bearing, height, pitch, roll), cost, share in rows
     )
 
 

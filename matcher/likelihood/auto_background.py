@@ -57,7 +57,7 @@ class AutoBackground:
             Cost of a scene without a landmark.
         """
         setup = self._setup
-        known = not setup.bearing_is_free or bool(setup.prior_std)
+        known = not setup.bearing_is_free or setup.bearing_has_prior
         around = estimate_surroundings(one, bearing_known=known)
         background, seen = around.background, evidence.seen
         if background is not None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
+from phasemark.matcher.information import NATURAL_UNITS
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
@@ -34,7 +35,7 @@ _BACKGROUND_STEPS = 30
 _BACKGROUND_SETTLED = 0.1
 """A step that promises to lower the whitened squared residual by less than this is not taken."""
 _LONGEST_STEP = 3.0
-_VIEW_SCALE = (0.01, math.radians(1), math.radians(1), 0.01)
+_VIEW_SCALE = tuple(NATURAL_UNITS[name] for name in VIEW)
 """Natural units of the view; those of wall and floor are 0.1 m."""
 _USUAL_ALBEDO = 0.5
 
@@ -139,7 +140,7 @@ def fit_background(
     evidence : Evidence
         One frame.
     class_index : int
-    view : (4,) float64
+    view : (6,) float64
     free : sequence of str
         Which parameters of the view move.
     background : Background
@@ -148,7 +149,7 @@ def fit_background(
     Returns
     -------
     background : Background
-    view : (4,) float64
+    view : (6,) float64
     """
     names = [name for name in ("wall_m", "floor_m") if getattr(background, name) is not None]
     columns = [VIEW.index(name) for name in free]

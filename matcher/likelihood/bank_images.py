@@ -41,19 +41,14 @@ class BankModel:
     ----------
     bank : Bank
         Its grid must be regular, with at least four distances and four angles.
-    behind : PhasorImages, optional
-        One image of what stands behind, composed with the landmark's.
-    smooth_only : bool
-        Whether to distrust pixels whose brightness has a kink nearby: those that an edge enters or leaves, or a crease
-        between faces, within two steps of the grid.
     """
 
     slopes_are_free = True
 
-    def __init__(self, bank: Bank, behind: PhasorImages | None = None, *, smooth_only: bool = False) -> None:
+    def __init__(self, bank: Bank) -> None:
         self._sensor = bank.sensor
-        self._smooth_only = smooth_only
-        self._behind = _behind_arrays(behind)
+        self._smooth_only = False
+        self._behind = _behind_arrays(None)
         self._distance, self._delta = bank.distance_m, bank.delta_rad
         self._period = closing_period(bank.delta_rad)
         shape = (len(self._distance), len(self._delta), -1)
@@ -67,9 +62,18 @@ class BankModel:
             self._upper = _stack(bank.upper, (len(bank.classes), len(self._distance), -1))
 
     def before(self, behind: PhasorImages | None) -> BankModel:
-        """Return the same model before another background."""
+        """Return the same model before another background: one image of it is composed with the landmark's."""
         other = copy.copy(self)
         other._behind = _behind_arrays(behind)
+        return other
+
+    def smooth(self, behind: PhasorImages | None) -> BankModel:
+        """Return the same model before a background, which distrusts pixels whose brightness has a kink nearby.
+
+        These are the pixels that an edge enters or leaves, or a crease between faces, within two steps of the grid.
+        """
+        other = self.before(behind)
+        other._smooth_only = True
         return other
 
     @staticmethod

@@ -48,7 +48,7 @@ def fit_starts(
     policy, settings = setup.policy, scene.settings(setup)
     frame, class_index, view = _with_sides(which[starts.frame], starts, sides_rad)
     leading = settings
-    if scene.scout is not None and setup.prior_std:  # a scout knows no bearing
+    if scene.scout is not None and setup.bearing_has_prior:  # a scout knows no bearing
         leading = replace(settings, free=VIEW[:2], prior_std=())
     lead = scene.scout or scene.final
     margin = np.inf if patient else policy.margin_cost
@@ -104,7 +104,7 @@ def _with_sides(
     if not sides_rad:
         return frame, class_index, view
     first = np.flatnonzero(np.diff(starts.frame, prepend=-1))
-    beside = [view[first] + [[0.0, side, 0.0, 0.0]] for side in sides_rad]
+    beside = [view[first] + side * np.eye(len(VIEW))[1] for side in sides_rad]
     return (
         np.concatenate([frame, np.tile(frame[first], len(sides_rad))]),
         np.concatenate([class_index, np.tile(class_index[first], len(sides_rad))]),
@@ -144,7 +144,9 @@ def _close_settings(setup: Setup, scene: Scene, evidence: Evidence) -> Settings:
     side_peaks = evidence.on == "phasors" or scene.behind is not None
     return replace(
         scene.settings(setup),
-        longest_step=policy.step_after_scout if side_peaks and not setup.prior_std else policy.step_after_scout_aside,
+        longest_step=policy.step_after_scout
+        if side_peaks and not setup.bearing_has_prior
+        else policy.step_after_scout_aside,
         look_beside_rad=policy.close_by_rad if side_peaks else (),
     )
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.likelihood.problem import Problem, State
+from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
 from phasemark.matcher.likelihood.uncertainty import capped_std
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, disagrees
 
@@ -19,7 +19,7 @@ def contradicted_pixels(
     seen, settings = problem.evidence.seen, problem.settings
     returned, absent = seen.returned[problem.frame], seen.not_returned[problem.frame]
     # a kink nearby excuses a pixel where it keeps it from being compared
-    among = among & problem.model.trusted(problem.class_index, state.theta[:, :4])
+    among = among & problem.model.trusted(problem.class_index, state.theta[:, :ALBEDO_COLUMN])
 
     def disagree(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
         may, must = high >= MAY_RETURN_COVERAGE, low > MUST_RETURN_COVERAGE
@@ -31,7 +31,7 @@ def contradicted_pixels(
     wrong = disagree(low, high)
     near = near[wrong[near].any(axis=1)]
     if near.size:
-        view = np.ascontiguousarray(state.theta[near, :4])
+        view = np.ascontiguousarray(state.theta[near, :ALBEDO_COLUMN])
         around = problem.model.reach(
             problem.class_index[near], view, problem.settings.free, capped_std(problem, covariance[near])
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.likelihood.problem import Problem, State, picked
+from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State, picked
 
 _FIRST_DAMPING = 1e-3
 _HOPELESS_DAMPING = 1e5
@@ -34,8 +34,8 @@ def descend(problem: Problem, state: State, settled: float) -> State:
             break
         theta = state.theta[active].copy()
         theta[:, problem.columns] += step
-        theta[:, :4] = problem.clipped(theta[:, :4])
-        theta[:, 4] = np.maximum(theta[:, 4], 1e-3)
+        theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN])
+        theta[:, ALBEDO_COLUMN] = np.maximum(theta[:, ALBEDO_COLUMN], 1e-3)
         promises_little = promise < problem.policy.kept_slopes_cost
         goes_on = np.ones(len(active), np.bool_)
         for which, with_slopes in ((np.flatnonzero(~promises_little), True), (np.flatnonzero(promises_little), False)):

@@ -21,7 +21,7 @@ class Fits:
     Parameters
     ----------
     frame, class_index : int64
-    view : (m, 4) float64
+    view : (m, 6) float64
     albedo : float64
         Factor on the landmark's brightness; 1 on ranges.
     cost : float64
@@ -131,18 +131,20 @@ def distinct(fits: Fits, own: NDArray[np.int64], symmetry: Sequence[int], same_m
         Fits nearer to each other are one.
     """
     kept: list[int] = []
-    places: list[tuple[int, float, float]] = []
-    views, classes = fits.view[own, :2].tolist(), fits.class_index[own].tolist()
-    for k, (distance, delta), c in zip(own.tolist(), views, classes, strict=True):
+    places: list[tuple[int, float, float, tuple[float, float, float]]] = []
+    views, classes = fits.view[own].tolist(), fits.class_index[own].tolist()
+    for k, (distance, delta, _, *upright), c in zip(own.tolist(), views, classes, strict=True):
         period = delta_period_rad(symmetry[c])
-        for other, there, angle in places:
-            if other != c or abs(distance - there) >= same_m:
+        for other, there, angle, (height, pitch, roll) in places:
+            if other != c or abs(distance - there) >= same_m or abs(upright[0] - height) >= same_m:
+                continue
+            if max(abs(upright[1] - pitch), abs(upright[2] - roll)) >= same_rad:
                 continue
             if abs(math.remainder(delta - angle, period)) < same_rad:
                 break
         else:
             kept.append(k)
-            places.append((c, distance, delta))
+            places.append((c, distance, delta, (upright[0], upright[1], upright[2])))
     return kept
 
 

@@ -9,7 +9,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-VIEW = ("distance_m", "delta_rad", "bearing_rad", "height_m")
+from phasemark.render.view import VIEW_FIELDS
+
+VIEW = VIEW_FIELDS
+"""What a view is made of; the columns of arrays of views."""
+LEVEL_VIEW = VIEW[:4]
+"""What the view of a level camera is made of."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +47,7 @@ class ImageModel(Protocol):
     slopes_are_free: bool
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
-        """Return the images of views (m, 4), columns :data:`VIEW`, of a class each."""
+        """Return the images of views (m, 6), columns :data:`VIEW`, of a class each."""
 
     def first_images(
         self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]

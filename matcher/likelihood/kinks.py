@@ -12,7 +12,7 @@ from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import whole_cost
 from phasemark.matcher.likelihood.descent import descend
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.problem import Problem, State, picked
+from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Sums
 from phasemark.matcher.likelihood.uncertainty import view_covariance
 
@@ -50,7 +50,7 @@ def look_beside(problem: Problem, state: State) -> State:
     which, at = near[chosen], chosen * len(sides) + best[chosen]
     theta = theta[at]
     theta[:, problem.columns[others]] += step[at] * unit
-    theta[:, :4] = problem.clipped(theta[:, :4])
+    theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN])
     some = problem.some(which)
     found = descend(some, some.state(theta, state.use[which]), problem.policy.settled_cost)
     better = np.flatnonzero(found.sums.cost < state.sums.cost[which])
@@ -74,7 +74,7 @@ def settle(problem: Problem, state: State) -> State:
         source = np.repeat(near, moves.shape[1])
         theta = state.theta[source]
         theta[:, problem.columns] += moves.reshape(len(source), -1)
-        theta[:, :4] = problem.clipped(theta[:, :4])
+        theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN])
         tried = problem.some(source).at(theta)
         total = whole_cost(problem.some(source), tried)[0].reshape(len(near), -1)
         best = total.argmin(axis=1)

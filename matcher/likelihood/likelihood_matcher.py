@@ -30,19 +30,19 @@ from phasemark.matcher.likelihood.shared_errors import with_motion, with_shared_
 from phasemark.matcher.likelihood.systematic import Systematic
 from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
-from phasemark.matcher.nearest.bank_minima import Search
+from phasemark.matcher.nearest.bank_minima import Search, Upward
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts, pixel_mask
 from phasemark.render import Background, PhasorImages, Views, background_image
 from phasemark.render.phasor_images import wrap_difference_m
 
-__all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "LikelihoodMatcher", "Pixels"]
+__all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TILT_STD_RAD", "LikelihoodMatcher", "Pixels"]
 
 Pixels = Literal["all", "lower"]
 ROBUST_FROM = 3.0
 """Residual, in σ, from which Huber's loss is linear: far enough out to cost an honest frame nothing."""
-BEARING_STD_RAD = math.radians(1.5)
-"""Standard deviation of the bearing before a frame is seen, unless the matcher is told."""
+BEARING_STD_RAD, TILT_STD_RAD = math.radians(1.5), math.radians(3.0)
+"""Standard deviations of the bearing, and of pitch and roll, before a frame is seen, unless the matcher is told."""
 
 
 class LikelihoodMatcher:
@@ -59,14 +59,22 @@ class LikelihoodMatcher:
         pixels: Pixels = "all",
         robust: bool = False,
         bearing_std_rad: float = BEARING_STD_RAD,
+        height_std_m: float = math.inf,
+        pitch_std_rad: float = TILT_STD_RAD,
+        roll_std_rad: float = TILT_STD_RAD,
         systematic: Sequence[Systematic] = (),
         tolerance_m: float = TOLERANCE_M,
         tolerance_rad: float = TOLERANCE_RAD,
         workers: int | None = None,
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
-        _check_choices(bank, background, on, pixels)
         near = free is None
+        names = check_free((*VIEW[:2], "bearing_rad") if free is None else free)
+        _check_choices(bank, background, on, pixels, names)
+        known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
+        if near:
+            known["bearing_rad"] = bearing_std_rad
+        prior = tuple(known.get(name, math.inf) for name in names)
         unknown = background == "unknown"
         self._bank = bank
         self._systematic = systematic
@@ -75,8 +83,9 @@ class LikelihoodMatcher:
         self._setup = Setup(
             bank=bank,
             shapes=Shapes.of_bank(bank),
-            free=check_free((*VIEW[:2], "bearing_rad") if free is None else free),
-            prior_std=(math.inf, math.inf, bearing_std_rad) if near else (),
+            free=names,
+            prior_std=prior if near or min(prior) < math.inf else (),
+            bearing_has_prior=near,
             on=on,
             background_is_known=self._stated is not None,
             unknown=unknown,
@@ -154,11 +163,11 @@ class LikelihoodMatcher:
         fixed = setup.free == VIEW[:2]
         is_exact = fixed and setup.on == "ranges" and self._stated is None
         is_exact = is_exact and BankModel.fits(self._bank, *policy.fine_grid)
-        scouts = (fixed or bool(setup.prior_std)) and BankModel.fits(self._bank, *policy.coarse_grid)
-        return (
-            BankModel(self._bank) if is_exact else None,
-            BankModel(self._bank, behind, smooth_only=True) if scouts else None,
-        )
+        scouts = (fixed or setup.bearing_has_prior) and BankModel.fits(self._bank, *policy.coarse_grid)
+        if not (is_exact or scouts):
+            return None, None
+        model = BankModel(self._bank)
+        return model if is_exact else None, model.smooth(behind) if scouts else None
 
     def _check_distances(self) -> None:
         """Check that the bank has distances at which views are rendered."""
@@ -179,7 +188,9 @@ class LikelihoodMatcher:
 
     def _search_stride(self) -> tuple[int, int]:
         """Return every how many distances and angles of the bank are searched."""
-        fine = (1, 1) if self._stated is not None and not self._setup.bearing_is_free else (2, 3)
+        setup = self._setup
+        few = self._stated is not None and not setup.bearing_is_free and setup.is_upright
+        fine = (1, 1) if few else (2, 3)
         along, around = (
             max(1, min(step, (len(grid) - 1) // 4))
             for step, grid in zip(fine, (self._bank.distance_m, self._bank.delta_rad), strict=True)
@@ -189,7 +200,10 @@ class LikelihoodMatcher:
     def _new_search(self, behind: PhasorImages | None, widest_rad: float) -> Search:
         """Return a search before some background, over bearings up to a widest where they are free."""
         widest = widest_rad if self._setup.bearing_is_free else 0.0
-        return Search(self._bank, behind, self._stride, widest, capped=self._setup.unknown)
+        setup = self._setup
+        upward = Upward(setup.std_before("height_m"), setup.std_before("pitch_rad"), setup.policy.prior_sigma)
+        capped = setup.unknown or not setup.is_upright  # edges between rows: no pixel may decide alone where it starts
+        return Search(self._bank, behind, self._stride, widest, upward, capped=capped)
 
     def _scene_before(self, background: Background | None, together: bool) -> Scene:
         """Return the scene of an estimated background; see :class:`AutoBackground`."""
@@ -235,7 +249,7 @@ def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.floa
     return np.asarray(squared.sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
 
 
-def _check_choices(bank: Bank, background: object, on: str, pixels: str) -> None:
+def _check_choices(bank: Bank, background: object, on: str, pixels: str, free: tuple[str, ...]) -> None:
     """Check the choices of a matcher."""
     if on not in ("ranges", "phasors"):
         raise UsageError(f"'on' must be ranges or phasors, got {on!r}")
@@ -245,6 +259,11 @@ def _check_choices(bank: Bank, background: object, on: str, pixels: str) -> None
         raise UsageError(f"the bank's model is '{bank.plan.model}', which knows no mixed pixels: refine needs 'ray'")
     if background == "unknown" and on != "ranges":
         raise UsageError('background="unknown" takes on="ranges": the brightness of unknown things tells nothing')
+    if on == "phasors" and background is not None and set(free) & set(VIEW[4:]):
+        raise UsageError(
+            "on=\"phasors\" before a background takes a level camera: leave pitch_rad and roll_rad out of 'free', or"
+            ' match on="ranges"'
+        )
 
 
 def _usual_workers() -> int:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.likelihood.fits import Fits, best_of_frame, least_of_frame
-from phasemark.matcher.likelihood.images import ImageModel
+from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
@@ -98,7 +98,7 @@ def _most_promising(
     source : (k,) int64
         The fits that they look like.
     class_index : (k,) int64
-    view : (k, 4) float64
+    view : (k, 6) float64
     """
     most = setup.policy.slides_refined
     if not source.size or np.bincount(source).max() <= most:
@@ -180,16 +180,16 @@ def _other_bearings(setup: Setup, scene: Scene, fits: Fits, best: NDArray[np.int
 
 
 def _slides(setup: Setup) -> tuple[float, ...]:
-    return setup.policy.slides_with_prior if setup.prior_std else setup.policy.slides
+    return setup.policy.slides_with_prior if setup.bearing_has_prior else setup.policy.slides
 
 
 def _slid(
     setup: Setup, scene: Scene, which: NDArray[np.int64], view: NDArray[np.float64], sides: tuple[float, ...]
 ) -> _Views:
     """Return views whose bearings move by some half columns, the heading kept."""
-    moves = np.zeros((len(sides), 1, 4))
+    moves = np.zeros((len(sides), 1, len(VIEW)))
     moves[:, 0, 1] = moves[:, 0, 2] = np.array(sides) * scene.search.column_rad / 2
-    return np.tile(which, len(sides)), (view + moves).reshape(-1, 4)
+    return np.tile(which, len(sides)), (view + moves).reshape(-1, len(VIEW))
 
 
 def _at_measured_distance(
@@ -200,7 +200,7 @@ def _at_measured_distance(
     class_index: NDArray[np.int64],
     view: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return views moved along their distance by the median residual of the ranges they explain, (m, 4)."""
+    """Return views moved along their distance by the median residual of the ranges they explain, (m, 6)."""
     view = view.copy()
     for _ in range(setup.policy.registrations):
         view[:, 0] = np.clip(view[:, 0], *model.limits())

@@ -19,8 +19,13 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT, MUST_RETURN_COVERAGE
 
 ALBEDO = "albedo"
 """Name of the factor on the landmark's brightness, profiled out on phasors."""
+ALBEDO_COLUMN = len(VIEW)
+"""Its column in arrays of parameters, behind those of the view."""
 SCALE = {**NATURAL_UNITS, ALBEDO: 0.1}
 """Natural units of the parameters: 1 cm, 1°. Condition numbers and the longest step are stated in them."""
+
+_STEEPEST_RAD = 1.2
+"""Largest pitch and roll that a descent tries: at ± 90° of pitch, roll and bearing are one."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class Settings:
 
 @dataclass(eq=False)
 class State:
-    """Where m candidates are: parameters (view and albedo, (m, 5)), pixels in use, images and sums there."""
+    """Where m candidates are: parameters (view and albedo, (m, 7)), pixels in use, images and sums there."""
 
     theta: NDArray[np.float64]
     use: NDArray[np.bool_]
@@ -116,6 +121,7 @@ class Problem:
         names = (*settings.free, ALBEDO) if self.with_albedo else settings.free
         self.columns = np.array([(*VIEW, ALBEDO).index(name) for name in names])
         self.scale = np.array([SCALE[name] for name in names])
+        self.tilts = bool(set(names) & set(VIEW[4:]))
         known = np.array(settings.prior_std) if settings.prior_std else np.full(len(settings.free), np.inf)
         self.prior_weight = np.concatenate([known**-2.0, np.zeros(len(names) - len(known))])
 
@@ -134,18 +140,18 @@ class Problem:
     def start(self, view: NDArray[np.float64], at_first_sight: bool) -> State:
         """Look at the first views: which pixels count, and how bright the landmark is."""
         theta = np.column_stack([self.clipped(view.copy()), np.ones(len(view))])
-        view, free = np.ascontiguousarray(theta[:, :4]), self.settings.free
+        view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
         if at_first_sight and not self.with_albedo and not self.model.slopes_are_free:
             images = self._images_at_first_sight(theta)
         else:
             images = self.model.first_images(self.class_index, view, free)
         if self.with_albedo:
-            theta[:, 4] = self._brightness(images)
+            theta[:, ALBEDO_COLUMN] = self._brightness(images)
         return self.summed(theta, self.pixels_at(images, theta), self.scaled(images, theta))
 
     def _images_at_first_sight(self, theta: NDArray[np.float64]) -> ModelImages:
         """Return first images; slopes are 0 where no step is likely to lead below the limit."""
-        view, free = np.ascontiguousarray(theta[:, :4]), self.settings.free
+        view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
         images = self.model.images(self.class_index, view, ())
         images = replace(images, slope=np.zeros((len(view), len(free), images.phasor.shape[1]), np.complex128))
         cost = self.summed(theta, self.pixels_at(images, theta), images).sums.cost
@@ -160,13 +166,13 @@ class Problem:
     ) -> State:
         """Render and compare; with known slopes, only the images are new."""
         free = self.settings.free if slope is None else ()
-        images = self.model.images(self.class_index, np.ascontiguousarray(theta[:, :4]), free)
+        images = self.model.images(self.class_index, np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), free)
         images = self.scaled(images, theta)
         return self.summed(theta, use, images if slope is None else replace(images, slope=slope))
 
     def at(self, theta: NDArray[np.float64], *, with_slopes: bool = False) -> State:
         """Return states at some parameters, each with the pixels that count there."""
-        view, free = np.ascontiguousarray(theta[:, :4]), self.settings.free
+        view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
         images = self.model.images(self.class_index, view, free if with_slopes else ())
         if not with_slopes:
             images = replace(images, slope=np.zeros((len(view), len(free), images.phasor.shape[1]), np.complex128))
@@ -177,8 +183,8 @@ class Problem:
         """Return states that differ from `source` in δ alone, with the slopes from there."""
         before = ModelImages(**{name: values[source] for name, values in vars(states.images).items()})
         if self.with_albedo:  # what the model makes is as bright as the bank has it
-            before = replace(before, phasor=before.phasor - (theta[:, 4:] - 1) * before.slope[:, -1])
-        images = self.model.turned(self.class_index, np.ascontiguousarray(theta[:, :4]), before)
+            before = replace(before, phasor=before.phasor - (theta[:, ALBEDO_COLUMN:] - 1) * before.slope[:, -1])
+        images = self.model.turned(self.class_index, np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), before)
         if self.with_albedo:
             images = replace(self.scaled(replace(images, slope=images.slope[:, :-1]), theta), slope=before.slope)
         return self.summed(theta, states.use[source], images)
@@ -211,11 +217,11 @@ class Problem:
 
     def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels count at some views, (m, pixels)."""
-        trusted = self.model.trusted(self.class_index, theta[:, :4])
+        trusted = self.model.trusted(self.class_index, theta[:, :ALBEDO_COLUMN])
         phasor = images.phasor
         if self.with_albedo and images.slope.shape[1] == len(self.columns):
             # a landmark made dim must not make its pixels disappear: the bank's albedo decides
-            phasor = phasor - (theta[:, 4:] - 1) * images.slope[:, -1]
+            phasor = phasor - (theta[:, ALBEDO_COLUMN:] - 1) * images.slope[:, -1]
         return counts(phasor, images.intensity, self.evidence.sensor) & trusted
 
     def near_best(self, state: State, margin: float) -> NDArray[np.intp]:
@@ -235,7 +241,7 @@ class Problem:
         if not self.with_albedo:
             return images
         own = self._landmark_alone(images)
-        factor = theta[:, 4:]
+        factor = theta[:, ALBEDO_COLUMN:]
         slope = np.concatenate([images.slope * factor[:, :, None], own[:, None]], axis=1)
         return replace(images, phasor=images.phasor + (factor - 1) * own, slope=slope)
 
@@ -254,8 +260,10 @@ class Problem:
         return np.asarray(np.clip(factor, 0.01, 100.0))
 
     def clipped(self, view: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Move views, in place, to the distances that the model can show; return them."""
+        """Move views, in place, to distances and tilts that the model can show; return them."""
         view[:, 0] = np.clip(view[:, 0], *self.model.limits())
+        if self.tilts:
+            np.clip(view[:, 4:], -_STEEPEST_RAD, _STEEPEST_RAD, out=view[:, 4:])
         return view
 
 

@@ -17,7 +17,7 @@ from phasemark.matcher.likelihood.descent import descend
 from phasemark.matcher.likelihood.fits import Fits
 from phasemark.matcher.likelihood.images import ImageModel, ModelImages
 from phasemark.matcher.likelihood.kinks import look_beside, settle
-from phasemark.matcher.likelihood.problem import Problem, Settings, State, picked
+from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, Settings, State, picked
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import (
     capped_std,
@@ -49,7 +49,7 @@ def refine(
     evidence : Evidence
     frame, class_index : (m,) int64
         Which frame each candidate explains, and by which class.
-    view : (m, 4) float64
+    view : (m, 6) float64
         Where it starts, columns :data:`~phasemark.matcher.likelihood.images.VIEW`.
     settings : Settings
     give_up_above : (m,) float64, optional
@@ -152,8 +152,8 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     return Fits(
         frame=problem.frame,
         class_index=problem.class_index,
-        view=state.theta[:, :4],
-        albedo=state.theta[:, 4],
+        view=state.theta[:, :ALBEDO_COLUMN],
+        albedo=state.theta[:, ALBEDO_COLUMN],
         cost=sums.cost + further,
         capped=sums.capped + further,
         dof=np.maximum(n_residuals - pixels.unexplained - n_fitted, 0),

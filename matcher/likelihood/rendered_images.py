@@ -99,7 +99,7 @@ class RenderedModel:
                 there = self._render(c, moved).phasor.reshape(len(of), -1)
                 slope[of, k] = (there - phasor[of]) / width[:, None]
         if self._factored and "delta_rad" in free:  # a body of revolution looks the same from every side
-            level, first = view[:, 3] == 0, self.sensor.lower_rows[0] * self.sensor.cols
+            level, first = ~view[:, 3:].any(axis=1), self.sensor.lower_rows[0] * self.sensor.cols
             slope[level, list(free).index("delta_rad"), :first] = 0
         return ModelImages(phasor, slope, intensity, coverage)
 
@@ -161,7 +161,7 @@ class RenderedModel:
 
         A body of revolution looks the same from every side.
         """
-        if self._factored and name == "delta_rad" and not view[:, 3].any():
+        if self._factored and name == "delta_rad" and not view[:, 3:].any():
             return self.sensor.lower_rows, self.sensor.lower_rows[0] * self.sensor.cols
         return None, 0
 

@@ -101,7 +101,7 @@ def _retry_unexplained(
     poor = _unexplained(setup, scene, evidence, bare, fits)
     if not poor.size:
         return fits
-    retry = _retry_with_prior if setup.prior_std else _retry_without_prior
+    retry = _retry_with_prior if setup.bearing_has_prior else _retry_without_prior
     return Fits.joined([fits, *retry(setup, scene, evidence, seen, bare, fits, poor)])
 
 

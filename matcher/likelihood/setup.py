@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -80,6 +81,8 @@ class Setup:
         Parameters of the view.
     prior_std : tuple of float
         Standard deviation of each before the frame is seen, infinite where nothing is known; empty without a prior.
+    bearing_has_prior : bool
+        Whether the bearing is estimated with what is known of it.
     on : {"ranges", "phasors"}
     background_is_known : bool
         Whether a wall or floor was stated.
@@ -101,6 +104,7 @@ class Setup:
     shapes: Shapes
     free: tuple[str, ...]
     prior_std: tuple[float, ...]
+    bearing_has_prior: bool
     on: ResidualKind
     background_is_known: bool
     unknown: bool
@@ -115,6 +119,17 @@ class Setup:
     def bearing_is_free(self) -> bool:
         """Whether the bearing is estimated."""
         return "bearing_rad" in self.free
+
+    @property
+    def is_upright(self) -> bool:
+        """Whether the camera is level and at the height that was stated."""
+        return not set(self.free) & set(VIEW[3:])
+
+    def std_before(self, name: str) -> float:
+        """Return the standard deviation of a parameter before a frame is seen; 0 of one that is not estimated."""
+        if name not in self.free:
+            return 0.0
+        return self.prior_std[self.free.index(name)] if self.prior_std else math.inf
 
     @property
     def fewest_explained(self) -> int:

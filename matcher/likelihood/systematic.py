@@ -60,7 +60,7 @@ def declared_covariance(sensor: Sensor, free: Sequence[str]) -> NDArray[np.float
         "bearing_rad": math.radians(sensor.systematic_bearing_deg),
         "height_m": sensor.systematic_height_m,
     }
-    return np.diag([std[name] ** 2 for name in free])
+    return np.diag([std.get(name, 0.0) ** 2 for name in free])
 
 
 def rates_of_views(

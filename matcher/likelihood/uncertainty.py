@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.information import covariance_of
-from phasemark.matcher.likelihood.problem import Problem, State
+from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
 from phasemark.matcher.likelihood.residuals import Sums, robust_weight
 
 
@@ -34,7 +34,7 @@ def slopes_around(
 
     None where the model is smooth.
     """
-    view = np.ascontiguousarray(state.theta[which, :4])
+    view = np.ascontiguousarray(state.theta[which, :ALBEDO_COLUMN])
     step = np.maximum(0.5 * std, problem.policy.slope_width * problem.scale[: std.shape[1]])
     slope = problem.model.wide_slopes(problem.class_index, view, problem.settings.free, step)
     if slope is None:
@@ -43,7 +43,7 @@ def slopes_around(
         # light that comes and goes within the step has no phase whose slope could tell anything
         phasor = np.abs(state.images.phasor[which])[:, None]
         return np.where(np.abs(slope) * step[:, :, None] > phasor, 0.0, slope)
-    return np.concatenate([slope * state.theta[which, 4:, None], state.images.slope[which, -1:]], axis=1)
+    return np.concatenate([slope * state.theta[which, ALBEDO_COLUMN:, None], state.images.slope[which, -1:]], axis=1)
 
 
 def std_without_one_pixel(

@@ -1,8 +1,8 @@
 """Where to start: the best views of a thinned bank, several modes of the likelihood, any bearing.
 
-A bearing moves the image sideways. The rays of a turned camera meet the landmark at the same ranges, so a frame shifted
-by whole columns is compared with the bank's images straight ahead; what is shifted in is missing, and a return that is
-shifted out is one that no model explains.
+A bearing moves the image sideways, a height or a pitch up and down. The rays of a turned camera meet the landmark at
+the same ranges, so a frame shifted by whole columns and rows is compared with the bank's images ahead; what is
+shifted in is missing, and a return that is shifted out is one that no model explains.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
@@ -23,7 +23,7 @@ from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import PhasorImages
-from phasemark.render.view import wrap_delta_difference_rad
+from phasemark.render.view import VIEW_FIELDS, wrap_delta_difference_rad
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -32,6 +32,10 @@ _UNDECIDED, _SHARE = 300.0, 0.5
 grid's points none of them fits."""
 _GRID_STD_M = 0.01
 """What half a step of the thinned grid changes in a range."""
+_MOST_UP = 4
+"""Number of shifts upwards, and downwards, that are compared."""
+_FRAMES_TIMES_SHIFTS = 1 << 12
+"""Frames are searched in groups of this over the number of shifts: the costs of a group are kept."""
 _MOST_OTHER_SIDES = 2
 _OTHER_SIDE_RAD = math.radians(30.0)
 """Number of further sides that are tried, and the least angle between them."""
@@ -46,7 +50,7 @@ class Starts:
     Parameters
     ----------
     frame, class_index : int64
-    view : (k, 4) float64
+    view : (k, 6) float64
     cost : float64
         Whitened squared distance on the grid.
     """
@@ -55,6 +59,37 @@ class Starts:
     class_index: NDArray[np.int64]
     view: NDArray[np.float64]
     cost: NDArray[np.float64]
+
+
+class Upward(NamedTuple):
+    """What is known before of what moves the landmark up and down in the image.
+
+    Parameters
+    ----------
+    height_std_m, pitch_std_rad : float
+        Standard deviations, 0 of what is known and infinite where nothing is.
+    sigma : float
+        Up to how many of them starts are looked for.
+    """
+
+    height_std_m: float = 0.0
+    pitch_std_rad: float = 0.0
+    sigma: float = 3.0
+
+    def widest_rad(self, distance_m: float) -> float:
+        """Return the largest elevation of the landmark that is looked for."""
+        return self.sigma * math.hypot(self.height_std_m / distance_m, self.pitch_std_rad)
+
+    def split(self, elevation_rad: float, distance_m: float) -> tuple[float, float]:
+        """Return the likeliest height and pitch of a landmark that is seen at an elevation."""
+        by_height, by_pitch = (self.height_std_m / distance_m) ** 2, self.pitch_std_rad**2
+        if math.isinf(by_height) and math.isinf(by_pitch):
+            by_height = by_pitch = 1.0
+        whole = by_height + by_pitch
+        if whole == 0:
+            return 0.0, 0.0
+        share = 1.0 if math.isinf(by_height) else by_height / whole
+        return distance_m * math.tan(share * elevation_rad), (1 - share) * elevation_rad
 
 
 class Search:
@@ -69,6 +104,8 @@ class Search:
         Every how many steps of the bank's grid an image is compared.
     widest_rad : float
         How far the landmark may be off to a side; at most a quarter of the image.
+    upward : Upward
+        How far it may be off upwards or downwards; at most a quarter of the image too.
     capped : bool
         Whether no pixel costs more than a disagreement: other things may stand in view.
     """
@@ -79,6 +116,7 @@ class Search:
         behind: PhasorImages | None,
         stride: tuple[int, int],
         widest_rad: float,
+        upward: Upward = Upward(),  # noqa: B008 - a constant
         *,
         capped: bool = False,
     ) -> None:
@@ -90,7 +128,14 @@ class Search:
         sensor = bank.sensor
         self.column_rad = 2 * math.atan(sensor.tan_half_angles[0]) / sensor.cols
         most = min(sensor.cols // 4, math.ceil(min(widest_rad / self.column_rad, sensor.cols)))
-        self._shifts = range(-most, most + 1)
+        self._upward = upward
+        self._row_rad = 2 * math.atan(sensor.tan_half_angles[1]) / sensor.rows
+        widest_up = upward.widest_rad(float(self._distance[0]))
+        highest = min(sensor.rows // 4, math.ceil(min(widest_up / self._row_rad, sensor.rows)))
+        stride_up = max(math.ceil(highest / _MOST_UP), 1)
+        highest -= highest % stride_up
+        self._n_side = 2 * most + 1
+        self._shifts = [(up, side) for up in range(-highest, highest + 1, stride_up) for side in range(-most, most + 1)]
         thin = slice(None, None, stride[0]), slice(None, None, stride[1])
         self._parts: list[tuple[Templates, tuple[int, int], bool]] = []
         if bank.full is not None:
@@ -128,7 +173,15 @@ class Search:
         """
         n, n_bearing = len(seen.range_m), len(self._shifts)
         if not n:
-            return Starts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4)), np.empty(0))
+            return Starts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, len(VIEW_FIELDS))), np.empty(0))
+        at_once = max(_FRAMES_TIMES_SHIFTS // n_bearing, 1)
+        if n > at_once:
+            groups = [slice(start, start + at_once) for start in range(0, n, at_once)]
+            found_in = [self.starts(seen[group], n_modes, all_classes=all_classes) for group in groups]
+            return Starts(
+                np.concatenate([own.frame + group.start for own, group in zip(found_in, groups, strict=True)]),
+                *(np.concatenate([getattr(own, name) for own in found_in]) for name in ("class_index", "view", "cost")),
+            )
         shape = (len(self._distance), len(self._delta))
         best = np.empty((n, n_bearing, *shape), np.float32)
         by_class = []
@@ -137,7 +190,7 @@ class Search:
             by_class.append(above)
         frame, class_index, views, cost = [], [], [], []
         for f in range(n):
-            found = modes(best[f], n_modes, self._closes)
+            found = modes(best[f], n_modes, self._closes, self._n_side)
             for b, i, j in np.concatenate([found[found[:, 0] >= 0], self._other_sides(best[f], found)]):
                 least = float(best[f, b, i, j])
                 above = by_class[b][f, :, i, min(j, by_class[b].shape[-1] - 1)]
@@ -146,12 +199,13 @@ class Search:
                         break
                     frame.append(f)
                     class_index.append(c)
-                    views.append((self._distance[i], self._delta[j], self._bearing(b), 0.0))
+                    height, pitch = self._upward.split(self._elevation(b), float(self._distance[i]))
+                    views.append((self._distance[i], self._delta[j], self._bearing(b), height, pitch, 0.0))
                     cost.append(least + float(above[c]))
         return Starts(
             np.array(frame, np.int64),
             np.array(class_index, np.int64),
-            np.array(views, np.float64).reshape(-1, 4),
+            np.array(views, np.float64).reshape(-1, len(VIEW_FIELDS)),
             np.array(cost, np.float64),
         )
 
@@ -181,21 +235,25 @@ class Search:
 
     def _bearing(self, index: int) -> float:
         """Return the bearing whose image is shifted by whole columns: left is positive, and a smaller column."""
-        return -self._shifts[index] * self.column_rad
+        return -self._shifts[index][1] * self.column_rad
 
-    def _shifted(self, seen: Observation, shift: int) -> Observation:
-        """Move frames so that what was `shift` columns right of the middle comes to the middle."""
-        if shift == 0:
+    def _elevation(self, index: int) -> float:
+        """Return the elevation whose image is shifted by whole rows."""
+        return self._shifts[index][0] * self._row_rad
+
+    def _shifted(self, seen: Observation, shift: tuple[int, int]) -> Observation:
+        """Move frames so that what was so many rows above and columns right of the middle comes to the middle."""
+        up, side = shift
+        if up == 0 and side == 0:
             return seen
         rows, cols = self._bank.sensor.rows, self._bank.sensor.cols
 
         def move(values: NDArray[_T]) -> NDArray[_T]:
             grid = values.reshape(-1, rows, cols)
             out = np.zeros_like(grid)
-            if shift > 0:
-                out[:, :, :-shift] = grid[:, :, shift:]
-            else:
-                out[:, :, -shift:] = grid[:, :, :shift]
+            to_rows, from_rows = slice(max(up, 0), rows + min(up, 0)), slice(max(-up, 0), rows + min(-up, 0))
+            to_cols, from_cols = slice(max(-side, 0), cols + min(-side, 0)), slice(max(side, 0), cols + min(side, 0))
+            out[:, to_rows, to_cols] = grid[:, from_rows, from_cols]
             return out.reshape(values.shape)
 
         return Observation(move(seen.range_m), move(seen.weight), move(seen.returned), move(seen.not_returned))
@@ -230,9 +288,13 @@ class Search:
 
 
 @njit(cache=True, nogil=True)
-def modes(cost, n_modes, closes):  # type: ignore[no-untyped-def]
-    """Return the lowest local minima of cost (bearing, D, δ), best first; −1 behind the last."""
+def modes(cost, n_modes, closes, n_side):  # type: ignore[no-untyped-def]
+    """Return the lowest local minima of cost (shift, D, δ), best first; −1 behind the last.
+
+    Of the shifts, `n_side` sideways follow one another for each upwards.
+    """
     n_b, n_d, n_a = cost.shape
+    n_up = n_b // n_side
     found = np.full((n_modes, 3), -1, np.int64)
     lowest = np.full(n_modes, np.inf, cost.dtype)
     for b in range(n_b):
@@ -242,13 +304,15 @@ def modes(cost, n_modes, closes):  # type: ignore[no-untyped-def]
                 if not own < lowest[-1]:
                     continue
                 least = True
-                for bb in range(max(b - 1, 0), min(b + 2, n_b)):
-                    for ii in range(max(i - 1, 0), min(i + 2, n_d)):
-                        for jj in range(j - 1, j + 2):
-                            if closes:
-                                jj %= n_a
-                            if 0 <= jj < n_a and cost[bb, ii, jj] < own:
-                                least = False
+                up, side = b // n_side, b % n_side
+                for uu in range(max(up - 1, 0), min(up + 2, n_up)):
+                    for ss in range(max(side - 1, 0), min(side + 2, n_side)):
+                        for ii in range(max(i - 1, 0), min(i + 2, n_d)):
+                            for jj in range(j - 1, j + 2):
+                                if closes:
+                                    jj %= n_a
+                                if 0 <= jj < n_a and cost[uu * n_side + ss, ii, jj] < own:
+                                    least = False
                 if not least:
                     continue
                 k = n_modes - 1

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
+from phasemark.render.view import VIEW_FIELDS
 
-_VIEW = ("distance_m", "delta_rad", "bearing_rad", "height_m")
+_VIEW = VIEW_FIELDS
 
 PRIOR_STD = (1.0, 1.0, 1.0)
 """Standard deviations of x, y (m) and heading (rad) of a prior that comes without a covariance."""
@@ -255,9 +256,9 @@ def _covariance_of_view(match: ViewEstimate) -> NDArray[np.float64] | None:
         raise UsageError(f"'match.free' must name each of {', '.join(_VIEW)} at most once, got {match.free!r}")
     given = _covariance("match.covariance", match.covariance, len(match.free))
     place = [_VIEW.index(name) for name in match.free]
-    of_view = np.zeros((4, 4))
+    of_view = np.zeros((len(_VIEW), len(_VIEW)))
     of_view[np.ix_(place, place)] = given
-    return of_view[:3, :3]  # the height moves nothing in the plane
+    return of_view[:3, :3]  # height and tilt move nothing in the plane
 
 
 def _covariance_of_others(

@@ -26,6 +26,8 @@ _COLUMNS = {
     "delta_rad": ("delta", "_deg", _DEGREES),
     "bearing_rad": ("bearing", "_deg", _DEGREES),
     "height_m": ("height", "_m", 1.0),
+    "pitch_rad": ("pitch", "_deg", _DEGREES),
+    "roll_rad": ("roll", "_deg", _DEGREES),
 }
 """Parameters of a view: name, unit and scale of their columns."""
 
@@ -71,7 +73,7 @@ def match_in_batches(
     MatchedBatch
     """
     for start in range(0, len(frames), at_once):
-        filtered = filter_frames(frames[start : start + at_once])
+        filtered = matcher.read_out(filter_frames(frames[start : start + at_once]))
         yield MatchedBatch(start, filtered, matcher.match(filtered))
 
 

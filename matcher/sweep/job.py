@@ -31,7 +31,7 @@ from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, noise_free, phasor_mean
-from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.images import LEVEL_VIEW
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY
 from phasemark.matcher.match import Match, Matches
@@ -45,7 +45,7 @@ SCHEMA_VERSION = 1
 NONE = -1
 """Stands for "no landmark" where a class's number would be."""
 
-_N = len(VIEW)
+_N = len(LEVEL_VIEW)
 _FIELDS: tuple[tuple[str, tuple[int, ...], str, str], ...] = (
     ("bound", (_N, _N), "<f8", "Cramér–Rao bound at the truth, in the order distance, delta, bearing, height"),
     ("estimate", (_N,), "<f8", "distance_m, delta_rad, bearing_rad, height_m; NaN where there is none"),
@@ -177,7 +177,7 @@ class SweepJob:
         number = self.of.conditions[slab]
         first = self.of.first + start
         views = self.views(number, first, self.of.first + stop)
-        truth = np.stack([getattr(views, name) for name in VIEW], axis=1)
+        truth = np.stack([getattr(views, name) for name in LEVEL_VIEW], axis=1)
         out = {name: np.zeros((len(views), len(self.plan.methods), *shape), kind) for name, shape, kind, _ in _FIELDS}
         image = self.image(number, views)
         frames: dict[tuple[str, str], FilteredFrames] = {}
@@ -267,9 +267,7 @@ class SweepJob:
         rng = stream(self.plan.seed, "sweep.noise", number)
         n_frames = self.all_conditions[number].n_frames
         frames = capture(image, true, rng=rng, n_frames=n_frames, first_view=first)
-        if true == believed:
-            return frames
-        return Frames(frames.range_m, frames.amplitude_e, frames.intensity_e, flags=frames.flags, sensor=believed)
+        return frames if true == believed else frames.taken_by(believed)
 
     def bound(self, number: int, method: Method, image: PhasorImages) -> NDArray[np.float64]:
         """Return the Cramér–Rao bound of the true world at the views of an image of it.
@@ -322,7 +320,9 @@ class SweepJob:
             if wall_m not in self._references:
                 background = Background(wall_m=wall_m) if wall_m else None
                 bank = self._bank(Method(name="reference"))
-                self._references[wall_m] = Matcher(bank, "refine", free=VIEW[:2], background=background, workers=1)
+                self._references[wall_m] = Matcher(
+                    bank, "refine", free=LEVEL_VIEW[:2], background=background, workers=1
+                )
             return self._references[wall_m]
 
     def matcher(self, number: int, m: int) -> Callable[[FilteredFrames], Sequence[Match]]:
@@ -372,7 +372,7 @@ class SweepJob:
             except PhasemarkError as error:
                 raise type(error)(f"{where}: {error}") from None
         for k, one in enumerate(matches):
-            if one.class_name is not None and not np.isfinite([getattr(one, name) for name in VIEW]).all():
+            if one.class_name is not None and not np.isfinite([getattr(one, name) for name in LEVEL_VIEW]).all():
                 raise UsageError(f"{where}: trial {first + k} names '{one.class_name}' with a view that is not finite")
         return matches
 
@@ -384,7 +384,7 @@ class SweepJob:
                 covariance[k] = _spread(one.covariance[None], one.free, 1)[0]
         found = [NONE if one.class_name is None else self._class_number(one.class_name, method) for one in matches]
         return {
-            "estimate": np.stack([getattr(matches, name) for name in VIEW], axis=1),
+            "estimate": np.stack([getattr(matches, name) for name in LEVEL_VIEW], axis=1),
             "covariance": covariance,
             "chi2": matches.chi2,
             "dof": matches.dof,
@@ -463,7 +463,7 @@ def _wrong_field(match: Match) -> str | None:
     """Return what is wrong with the types of a user's match, or None."""
     if not isinstance(match.class_name, str | None):
         return f"'class_name' {match.class_name!r}: it must be a str or None"
-    for name in (*VIEW, "chi2", "p_value"):
+    for name in (*LEVEL_VIEW, "chi2", "p_value"):
         value = getattr(match, name)
         if not isinstance(value, numbers.Real):
             return f"'{name}' of type {type(value).__name__}: it must be a number"
@@ -473,8 +473,8 @@ def _wrong_field(match: Match) -> str | None:
         return f"'class_probability' of type {type(match.class_probability).__name__}: it must be a mapping"
     if match.covariance is not None:
         n = len(match.free)
-        if not set(match.free) <= set(VIEW):
-            return f"'free' {match.free!r}: it must name some of {', '.join(VIEW)}"
+        if not set(match.free) <= set(LEVEL_VIEW):
+            return f"'free' {match.free!r}: it must name some of {', '.join(LEVEL_VIEW)}"
         if np.shape(match.covariance) != (n, n):
             return f"'covariance' of shape {np.shape(match.covariance)}: it must be {(n, n)}, as 'free' has {n} names"
     return None
@@ -500,6 +500,6 @@ def _is_ours_or_import(filename: str) -> bool:
 def _spread(matrix: NDArray[np.float64], free: Sequence[str], n: int) -> NDArray[np.float64]:
     """Put matrices over some parameters into matrices over all, NaN elsewhere."""
     full = np.full((n, _N, _N), np.nan)
-    at = [VIEW.index(name) for name in free]
+    at = [LEVEL_VIEW.index(name) for name in free]
     full[:, np.array(at)[:, None], at] = matrix
     return full

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.data.files.json_text import finite_or_none
 from phasemark.matcher.information import weak_direction
-from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.images import LEVEL_VIEW
 from phasemark.matcher.statistics import (
     Interval,
     binomial_interval,
@@ -109,7 +109,7 @@ class SweepTrials:
         error = self.estimate[rows] - self.truth[rows, None]
         error[true_class < 0] = np.nan
         period = np.array([delta_period_rad(n) for n in self.symmetry])[true_class][:, None]
-        return wrapped_errors(error, VIEW, period)
+        return wrapped_errors(error, LEVEL_VIEW, period)
 
     def rows_of(self, condition: int) -> slice:
         """Return where the trials of a condition lie."""
@@ -125,17 +125,17 @@ class SweepTrials:
             "trial": self.trial[rows].tolist(),
             "method": self.methods * len(number),
             "class": [self.conditions[k].class_name for k in number],
-            **{f"true_{name}": self.truth[rows, i].tolist() for i, name in enumerate(VIEW)},
+            **{f"true_{name}": self.truth[rows, i].tolist() for i, name in enumerate(LEVEL_VIEW)},
         }
         names = (*self.classes, "none")
         own: dict[str, NDArray[Any]] = {
-            **{name: self.estimate[rows, :, i] for i, name in enumerate(VIEW)},
-            **{f"error_{name}": error[:, :, i] for i, name in enumerate(VIEW)},
-            **{f"bound_{name}": _root(self.bound[rows, :, i, i]) for i, name in enumerate(VIEW)},
+            **{name: self.estimate[rows, :, i] for i, name in enumerate(LEVEL_VIEW)},
+            **{f"error_{name}": error[:, :, i] for i, name in enumerate(LEVEL_VIEW)},
+            **{f"bound_{name}": _root(self.bound[rows, :, i, i]) for i, name in enumerate(LEVEL_VIEW)},
             **{
                 f"cov_{_SHORT[i]}_{_SHORT[j]}": self.covariance[rows, :, i, j]
-                for i in range(len(VIEW))
-                for j in range(i, len(VIEW))
+                for i in range(len(LEVEL_VIEW))
+                for j in range(i, len(LEVEL_VIEW))
             },
             **{name: getattr(self, name)[rows] for name in ("chi2", "dof", "p_value", "p_none")},
             "found": np.array(names, object)[self.found[rows]],
@@ -163,7 +163,7 @@ class SweepTrials:
 
     def _cell(self, number: int, m: int, all_errors: NDArray[np.float64]) -> Cell:
         rows, condition = self.rows_of(number), self.conditions[number]
-        at = np.array([VIEW.index(name) for name in self.free[m]])
+        at = np.array([LEVEL_VIEW.index(name) for name in self.free[m]])
         error = all_errors[rows, m][:, at]
         bound = self.bound[rows, m][:, at[:, None], at]
         covariance = self.covariance[rows, m][:, at[:, None], at]
@@ -295,7 +295,7 @@ class Cell:
         out |= {"stranger": int(self.stranger), "confusion_bound": self.confusion_bound}
         for name in ("answered", "accepted", "outliers", "class_right", "nees"):
             out |= _flat(name, getattr(self, name))
-        for name in VIEW:
+        for name in LEVEL_VIEW:
             for kind in ("bias", "rmse", "rmse_with_outliers", "ratio"):
                 out |= _flat(f"{kind}_{name}", getattr(self, kind).get(name, _UNKNOWN))
             out[f"bound_{name}"] = self.bound.get(name, math.nan)

@@ -13,8 +13,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from phasemark import UsageError
-from phasemark.render.integral.arguments import Camera, Motion, Poses, ray_of
+from phasemark.render.integral.arguments import Camera, Motion, Poses
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.light import landmark_hit
 from phasemark.render.integral.mesh_topology import MeshTopology
@@ -24,6 +23,7 @@ from phasemark.render.integral.shells import unite_shells
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.kernel import kernel
 from phasemark.render.renderer import _Buffers
+from phasemark.render.rigid import rigid_transforms
 
 _NO_BACKGROUND = np.zeros(4)
 _SAMPLES = 1 << 15
@@ -100,6 +100,7 @@ class SceneMesh:
             np.ascontiguousarray(grid.level.T @ rotation),
             np.ascontiguousarray(translation @ grid.level),
             np.zeros(len(transforms)),
+            np.repeat(grid.level[None], len(transforms), axis=0),
         )
         found = [self._of_pose(poses._replace(**_only(poses, k)), grid) for k in range(len(transforms))]
         counts = [len(one[1]) for one in found]
@@ -120,10 +121,7 @@ class SceneMesh:
             )  # fmt: skip
             if reached == 1:
                 break
-            if reached == -1:
-                buffers.grow_links()
-            else:
-                buffers.grow_samples()
+            buffers.make_room(reached)
         samples = buffers.samples
 
         def cast(count: int) -> NDArray[np.int32]:
@@ -184,30 +182,6 @@ def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float]
     )
 
 
-def rigid_transforms(transforms: ArrayLike) -> NDArray[np.float64]:
-    """Return (n, 4, 4) float64 transforms that are rigid.
-
-    Raises
-    ------
-    UsageError
-        A matrix is not finite, or not a rotation with a translation.
-    """
-    array = np.asarray(transforms, dtype=np.float64)
-    if array.ndim == 2:
-        array = array[None]
-    if array.shape[1:] != (4, 4):
-        raise UsageError(f"'landmark2cam' must have shape (n, 4, 4), got {array.shape}")
-    if not np.isfinite(array).all():
-        raise UsageError("'landmark2cam' must be finite")
-    square = np.einsum("nij,nkj->nik", array[:, :3, :3], array[:, :3, :3])
-    off = np.abs(square - np.eye(3)).max(axis=(1, 2))
-    bottom = np.abs(array[:, 3] - [0, 0, 0, 1]).max(axis=1)
-    wrong = (off > 1e-4) | (bottom > 1e-9) | (np.linalg.det(array[:, :3, :3]) < 0)
-    if wrong.any():
-        raise UsageError(f"'landmark2cam' must be a rotation and a translation, matrix {int(wrong.argmax())} is not")
-    return array
-
-
 def _only(poses: Poses, k: int) -> dict[str, NDArray[np.float64]]:
     return {name: np.ascontiguousarray(getattr(poses, name)[k : k + 1]) for name in poses._fields}
 
@@ -221,7 +195,7 @@ def _hits(n, samples, mesh, poses, camera, tangents, range_m, amplitude, part): 
         face = samples.face[k]
         if face < 0:
             continue
-        y, z = ray_of(camera, samples.points[k, 0], samples.points[k, 1])
+        y, z = samples.rays[k, 0], samples.rays[k, 1]
         length = math.sqrt(1.0 + y * y + z * z)
         t, cos_theta = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], y, z)
         if not t > 0.0:

@@ -12,6 +12,7 @@ The chain is a row of functions in the order in which the camera does things::
     demodulate            phasor and intensity of the four phase images     taps.py
     validity_flags        why a pixel is not valid                          here
 
+At every modulation frequency of the camera this is done anew; unwrapped_frames.py then makes one range of several.
 :func:`capture` runs it over as many frames as are wanted. Arrays of taps are (..., 4, 2, rows, cols): phase images
 τ = 0, π/2, π, 3π/2, then taps a and b.
 """
@@ -21,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -40,6 +42,7 @@ from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.camera_unit import CameraUnit, camera_unit
 from phasemark.render.sensor.range_noise import phase_image_variance
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.unwrapped_frames import unwrap_frames
 from phasemark.render.view import Views
 
 # float32 files may round |S_1| just above the intensity; anything more is not an image.
@@ -74,7 +77,7 @@ def capture(
     Parameters
     ----------
     image : PhasorImages, or four of them
-        n views; or what a moving camera sees during each phase image, from
+        n views; or what a moving camera sees during each phase image (4 m of m modulation frequencies), from
         :func:`~phasemark.render.exposure.render_moving`.
     sensor : Sensor
         The camera; it may differ from the one the image was rendered for in electrons, noise and validity, not in
@@ -96,7 +99,9 @@ def capture(
     Returns
     -------
     Frames
-        (n, n_frames, rows, cols). An invalid pixel has range NaN, and its flags say why. A direct sensor gives neither
+        (n, n_frames, rows, cols). An invalid pixel has range NaN, and its flags say why. Several modulation frequencies
+        are captured one after the other, each with its own noise, and unwrapped
+        (:func:`~phasemark.render.unwrap_frames`); ``frames.by_frequency`` has each alone. A direct sensor gives neither
         amplitude nor intensity; its own quantity is ``frames.z_m``.
 
     Raises
@@ -106,23 +111,61 @@ def capture(
         not finite, or its phasor is larger than its intensity allows; taps or motion are asked of a direct sensor.
     """
     images = (image,) if isinstance(image, PhasorImages) else tuple(image)
-    _check_numbers(n_frames, first_view, first_frame, workers, images)
+    _check_numbers(n_frames, first_view, first_frame, workers, images, sensor)
     for one in images:
         if difference := sensor.optics_difference(one.sensor):
             raise UsageError(f"the image was rendered for another camera: {difference}")
-        _check_image(one, sensor)
     if sensor.kind == "direct":
         if keep_taps or len(images) > 1:
             what = "'keep_taps'" if keep_taps else "motion during phase images"
             raise UsageError(f"{what} must be left out for a direct sensor: it has neither taps nor phase images")
+        _check_image(images[0], sensor)
         return capture_direct(images[0], sensor, rng, n_frames, first_view, first_frame)
 
+    key = draw_key(rng)
+    parts = []
+    for j, camera in enumerate(sensor.by_frequency):
+        own = images if len(images) == 1 else images[N_PHASES * j : N_PHASES * (j + 1)]
+        seen = tuple(one.by_frequency[j] for one in own)
+        for one in seen:
+            _check_image(one, camera)
+        counters = _Counters(key, first_view, first_frame, N_PHASES * j)
+        parts.append(_capture_frequency(seen, camera, camera_unit(sensor, j), counters, n_frames, keep_taps, workers))
+    if len(parts) == 1:
+        return parts[0]
+    taps_e = None
+    if keep_taps:
+        taps_e = np.concatenate([part.taps_e for part in parts if part.taps_e is not None], axis=2)
+        for part in parts:
+            part.taps_e = None
+    return unwrap_frames(parts, sensor, taps_e=taps_e)
+
+
+class _Counters(NamedTuple):
+    """Where some frames stand in the random streams: key, and numbers of first view, frame and phase image."""
+
+    key: NDArray[np.uint64]
+    first_view: int
+    first_frame: int
+    first_phase: int
+
+
+def _capture_frequency(
+    images: Sequence[PhasorImages],
+    sensor: Sensor,
+    unit: CameraUnit,
+    counters: _Counters,
+    n_frames: int,
+    keep_taps: bool,
+    workers: int,
+) -> Frames:
+    """Take the frames of one modulation frequency; see :func:`capture`."""
     n_views = len(images[0])
     shape = (n_views * n_frames, sensor.rows, sensor.cols)
     range_m, amplitude_e, intensity_e = np.empty(shape), np.empty(shape), np.empty(shape)
     flags = np.empty(shape, dtype=np.uint8)
     kept = np.empty((shape[0], N_PHASES, N_TAPS, *shape[1:])) if keep_taps else None
-    key, unit, read_out = draw_key(rng), camera_unit(sensor), ReadOut.of(sensor)
+    read_out = ReadOut.of(sensor)
     per_block = max(1, _TAPS_PER_BLOCK // (N_PHASES * N_TAPS * sensor.rows * sensor.cols))
 
     def take(run: slice) -> None:
@@ -135,7 +178,8 @@ def capture(
             taps, saturated = room[:n] if kept is None else kept[block], full[:n]
             read_taps(
                 means.reshape(*means.shape[:3], -1)[block.start // n_frames - first :], block.start, block.stop,
-                n_frames, first_view, first_frame, key, read_out, taps.reshape(*taps.shape[:3], -1),
+                n_frames, counters.first_view, counters.first_frame, counters.first_phase, counters.key, read_out,
+                taps.reshape(*taps.shape[:3], -1),
                 saturated.reshape(n, -1),
             )  # fmt: skip
             phasor_e, intensity_e[block] = demodulate(taps)
@@ -176,7 +220,7 @@ def capture_moving(
     keep_taps: bool = False,
     workers: int = 1,
 ) -> Frames:
-    """Take noisy frames while the camera moves: the four phase images see four views, about mid-frame.
+    """Take noisy frames while the camera moves: every phase image sees a view of its own, about mid-frame.
 
     Parameters
     ----------
@@ -310,7 +354,12 @@ def _flag(range_m, amplitude_e, noise_e2, lit, saturated, broken, least, wrap, f
 
 
 def _check_numbers(
-    n_frames: int, first_view: int, first_frame: int, workers: int, images: Sequence[PhasorImages]
+    n_frames: int,
+    first_view: int,
+    first_frame: int,
+    workers: int,
+    images: Sequence[PhasorImages],
+    sensor: Sensor,
 ) -> None:
     for name, value, least in (
         ("n_frames", n_frames, 1),
@@ -320,10 +369,10 @@ def _check_numbers(
     ):
         if not isinstance(value, int | np.integer) or value < least:
             raise UsageError(f"'{name}' must be a whole number of at least {least}, got {value!r}")
-    if len(images) not in (1, N_PHASES) or len({len(one) for one in images}) > 1:
+    if len(images) not in (1, sensor.n_phase_images) or len({len(one) for one in images}) > 1:
         raise UsageError(
-            f"'image' must be one set of images, or {N_PHASES} of equal length, one for each phase image, got "
-            f"{[len(one) for one in images]} views"
+            f"'image' must be one set of images, or {sensor.n_phase_images} of equal length, one for each phase image, "
+            f"got {[len(one) for one in images]} views"
         )
     if max(first_frame + n_frames, first_view + len(images[0])) > _MOST_FRAMES:
         raise UsageError("a run has at most 2^32 views, and 2^32 frames of each")

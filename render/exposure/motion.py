@@ -9,7 +9,6 @@ import numpy as np
 
 from phasemark import UsageError
 from phasemark.render.background import Background
-from phasemark.render.exposure.taps import N_PHASES
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.sensor import Sensor
@@ -71,8 +70,13 @@ class Motion:
 
 
 def phase_image_times_s(sensor: Sensor) -> tuple[float, ...]:
-    """Return when the four phase images are taken, (i − 1.5)·T from mid-frame, seconds."""
-    return tuple((i - 1.5) * sensor.phase_image_interval_s for i in range(N_PHASES))
+    """Return when the phase images are taken, seconds from mid-frame: (i − 1.5)·T, i = 0 … 3 at one frequency.
+
+    Of m frequencies the 4 m phase images follow one another at the same T, four for each frequency in their order, and
+    mid-frame is the middle of them all.
+    """
+    middle = (sensor.n_phase_images - 1) / 2
+    return tuple((i - middle) * sensor.phase_image_interval_s for i in range(sensor.n_phase_images))
 
 
 def render_moving(
@@ -82,8 +86,8 @@ def render_moving(
     *,
     background: Background | None = None,
     workers: int = 1,
-) -> tuple[PhasorImages, PhasorImages, PhasorImages, PhasorImages]:
-    """Render what a moving camera sees during each of the four phase images of a frame.
+) -> tuple[PhasorImages, ...]:
+    """Render what a moving camera sees during each of the phase images of a frame, four for each frequency.
 
     Parameters
     ----------
@@ -99,8 +103,8 @@ def render_moving(
 
     Returns
     -------
-    tuple of four PhasorImages
-        For :func:`~phasemark.render.capture`; n views each.
+    tuple of PhasorImages
+        One for each phase image. For :func:`~phasemark.render.capture`; n views each.
 
     Raises
     ------
@@ -112,8 +116,7 @@ def render_moving(
         moved = motion.views_after(views, time_s)
         behind = None if background is None else _after_motion(background, views, moved, motion, time_s)
         images.append(renderer.render_views(moved, background=behind, workers=workers))
-    first, second, third, fourth = images
-    return first, second, third, fourth
+    return tuple(images)
 
 
 def _after_motion(background: Background, views: Views, moved: Views, motion: Motion, time_s: float) -> Background:

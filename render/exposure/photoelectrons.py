@@ -139,7 +139,7 @@ def decode(taps, gain, black_level):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def read_taps(means, start, stop, n_frames, first_view, first_frame, key, out, taps, saturated):
+def read_taps(means, start, stop, n_frames, first_view, first_frame, first_phase, key, out, taps, saturated):
     """Read frames start … stop of all views' frames, counted view by view.
 
     Parameters
@@ -150,6 +150,8 @@ def read_taps(means, start, stop, n_frames, first_view, first_frame, key, out, t
         Frame i is frame i % n_frames of view i // n_frames.
     first_view, first_frame : int
         Numbers of the first view and of each view's first frame in the counters of the random streams.
+    first_phase : int
+        Number of the first of the four phase images among those of a frame.
     key : (2,) uint64
     out : ReadOut
     taps : (stop − start, 4, 2, pixels) float64
@@ -176,7 +178,7 @@ def read_taps(means, start, stop, n_frames, first_view, first_frame, key, out, t
             row = taps[i - start, phase]
             row[:] = mean[phase]
             if out.shot_noise:
-                samples = phase * n + lit
+                samples = (first_phase + phase) * n + lit
                 fill_uniform(samples, frame, view, _SHOT, key, lit_words, lit_uniform)
                 fill_normal(lit_uniform.reshape(-1), lit_chosen, lit_normal.reshape(-1))
                 draw_arrived(light[phase], lit_uniform, lit_normal, samples, frame, view, key, arrived)
@@ -185,7 +187,7 @@ def read_taps(means, start, stop, n_frames, first_view, first_frame, key, out, t
             if out.full_well_e < math.inf:
                 fill_well(row, out.full_well_e, over)
             if out.read_noise_e > 0.0:
-                fill_uniform(phase * n + every, frame, view, _READ, key, words, uniform)
+                fill_uniform((first_phase + phase) * n + every, frame, view, _READ, key, words, uniform)
                 fill_normal(uniform.reshape(-1), chosen, normal.reshape(-1))
                 add_read_noise(row, out.read_noise_e, normal)
             if out.has_converter:

@@ -10,13 +10,55 @@ from numpy.typing import NDArray
 from phasemark.render.kernel import inlined
 
 
+class Distortion(NamedTuple):
+    """The distortion of a camera's lens, with what is computed of it once.
+
+    Parameters
+    ----------
+    model : int
+        0 for the ideal lens, all else of which is empty, or as :mod:`~phasemark.render.sensor.lens_map` numbers them.
+    coefficients : (8,) float64
+        In OpenCV's order.
+    nodes : (2 rows + 1, 2 cols + 1, 2) float64
+        y and z of the rays of corners, edge middles and centres of all pixels.
+    reach : (rows, cols, 4) float64
+        Of each pixel's rays: lowest and highest y, lowest and highest z.
+    rule : (rows, cols, n, 2) float64
+        Rays of the points at which a background is integrated over a pixel.
+    low_y, high_y, low_z, high_z, radius : float
+        Edges of the mesh are clipped to this rectangle of tangents, which holds the image, and to this circle, within
+        which the lens does not fold.
+    bend : float
+        The image of a straight line of length L, in tangents, leaves its chord by less than bend · L² (pixels).
+    """
+
+    model: int
+    coefficients: NDArray[np.float64]
+    nodes: NDArray[np.float64]
+    reach: NDArray[np.float64]
+    rule: NDArray[np.float64]
+    low_y: float
+    high_y: float
+    low_z: float
+    high_z: float
+    radius: float
+    bend: float
+
+
+IDEAL = Distortion(
+    0, np.zeros(8), np.empty((0, 0, 2)), np.empty((0, 0, 4)), np.empty((0, 0, 0, 2)), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+)
+"""No distortion."""
+
+
 class Camera(NamedTuple):
     """The camera of a batch.
 
     Parameters
     ----------
     scale_u, scale_v, centre_u, centre_v : float
-        A ray (1, y, z) of the tilted camera meets the image in u = centre_u − scale_u · y, v = centre_v − scale_v · z.
+        A ray (1, y, z) of the tilted camera meets the image in u = centre_u − scale_u · y, v = centre_v − scale_v · z;
+        with distortion, y and z are the distorted ones.
     slope_u, slope_v : float
         1 / scale_u, 1 / scale_v.
     rows, cols : int
@@ -25,7 +67,8 @@ class Camera(NamedTuple):
     fill_u, fill_v : float
         Fill factor.
     level : (3, 3) float64
-        Tilted to level camera frame.
+        Camera frame to that of its mount, which is level unless the view is tilted.
+    distortion : Distortion
     """
 
     scale_u: float
@@ -41,6 +84,7 @@ class Camera(NamedTuple):
     fill_u: float
     fill_v: float
     level: NDArray[np.float64]
+    distortion: Distortion = IDEAL
 
 
 class Poses(NamedTuple):
@@ -53,12 +97,15 @@ class Poses(NamedTuple):
     matrix, offset : (n, 3, 3), (n, 3) float64
         p_image = matrix · p' + offset: landmark frame to the tilted camera's frame (x along the axis).
     bearing : (n,) float64
+    level : (n, 3, 3) float64
+        Tilted to level camera frame: mount and view together.
     """
 
     lens: NDArray[np.float64]
     matrix: NDArray[np.float64]
     offset: NDArray[np.float64]
     bearing: NDArray[np.float64]
+    level: NDArray[np.float64]
 
 
 class Light(NamedTuple):
@@ -71,17 +118,22 @@ class Light(NamedTuple):
     albedo : float
         Of the landmark.
     radians_per_metre : float
-        4πf / c.
-    orders : (k,) int64
-        Harmonic orders; the first is 1.
+        4πf / c of the first frequency f.
+    orders : (k,) float64
+        Which multiples of f phasors are wanted at: harmonic orders, other frequencies and their harmonics; the first
+        is 1.
     vignetting : bool
+    fastest : float
+        4πf / c of the highest of several modulation frequencies, for which the background's pixels are cut finely
+        enough; 0 of one frequency, whose pixels are not cut.
     """
 
     background: NDArray[np.float64]
     albedo: float
     radians_per_metre: float
-    orders: NDArray[np.int64]
+    orders: NDArray[np.float64]
     vignetting: bool
+    fastest: float
 
 
 class Edges(NamedTuple):
@@ -90,7 +142,7 @@ class Edges(NamedTuple):
     Parameters
     ----------
     segments : (e, 4) float64
-        u, v of both ends.
+        u, v of both ends. With distortion, an edge is a chain of links.
     limb : (e,) int8
         1 for a silhouette of a smooth surface; then the surface lies on the side where
         du·(v − v_a) − dv·(u − u_a) < 0.
@@ -101,7 +153,11 @@ class Edges(NamedTuple):
     heights : (CLUSTER,) float64
         How far before the faces of one cluster the lens is.
     ends : (e, 2) int32
-        Vertices at both ends; −1: the line where wall and floor meet, or the horizon.
+        Vertices at both ends of the edge; −1: the line where wall and floor meet, or the horizon.
+    extent : (2, 4) float64
+        With distortion: lowest and highest y, lowest and highest z of all edges, and of the limbs among them.
+    line : (4,) float64
+        Scratch: an edge in tangents.
     """
 
     segments: NDArray[np.float64]
@@ -111,6 +167,8 @@ class Edges(NamedTuple):
     owner: NDArray[np.int32]
     heights: NDArray[np.float64]
     ends: NDArray[np.int32]
+    extent: NDArray[np.float64]
+    line: NDArray[np.float64]
 
 
 class Borders(NamedTuple):
@@ -164,7 +222,7 @@ class Motion(NamedTuple):
         1 + p for each view: the view itself, then each parameter moved by its step.
     step : (p,) float64
     segments : (1 + p, 4) float64
-        Scratch: one edge in these poses.
+        Scratch: one edge in these poses; with distortion, in tangents.
     """
 
     poses: Poses
@@ -201,6 +259,8 @@ class Samples(NamedTuple):
     ----------
     points : (m, 2) float64
         u, v.
+    rays : (m, 2) float64
+        y and z of their rays (1, y, z), frame of the tilted camera.
     weights : (m,) float64
         Shares of their pixel's active area.
     regions : (m,) int32
@@ -218,6 +278,7 @@ class Samples(NamedTuple):
     """
 
     points: NDArray[np.float64]
+    rays: NDArray[np.float64]
     weights: NDArray[np.float64]
     regions: NDArray[np.int32]
     pixel: NDArray[np.int64]
@@ -248,12 +309,6 @@ class Sums(NamedTuple):
 
 
 @inlined
-def ray_of(camera, u, v):  # type: ignore[no-untyped-def]
-    """Return y and z of the ray (1, y, z) of an image point, frame of the tilted camera."""
-    return (camera.centre_u - u) * camera.slope_u, (camera.centre_v - v) * camera.slope_v
-
-
-@inlined
 def towards_landmark(matrix, y, z):  # type: ignore[no-untyped-def]
     """Return the ray (1, y, z) in the landmark frame; `matrix` as in :class:`Poses`, of one view."""
     return (
@@ -265,7 +320,7 @@ def towards_landmark(matrix, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def towards_level(level, y, z):  # type: ignore[no-untyped-def]
-    """Return the ray (1, y, z) in the level camera frame."""
+    """Return the ray (1, y, z) in the level camera frame; `level` as in :class:`Poses`, of one view."""
     return (
         level[0, 0] + level[0, 1] * y + level[0, 2] * z,
         level[1, 0] + level[1, 1] * y + level[1, 2] * z,

@@ -1,15 +1,18 @@
 """How fast edges move through the image while a parameter of the view changes.
 
 An edge is one of the mesh, held: at a limb, the fold that makes it does not change. Its speed is that of its place x
-on a line of fixed s, not along its normal.
+on a line of fixed s, not along its normal. Behind a lens with distortion the edge is followed in tangents, where it
+is straight, and the lens's own derivatives tell what that is along the image.
 """
 
 from __future__ import annotations
 
 import math
 
-from phasemark.render.background import background_edge
+from phasemark.render.background import background_edge, background_line
+from phasemark.render.integral.bent_edges import TANGENTS
 from phasemark.render.integral.edge_projection import project
+from phasemark.render.integral.image_rays import rates_of, ray_of
 from phasemark.render.kernel import inlined, kernel
 
 
@@ -27,6 +30,9 @@ def follow_borders(view, first, mesh, motion, background, camera, edges, borders
     edges : Edges
     borders : Borders
     """
+    if camera.distortion.model != 0:
+        _follow_bent_borders(view, first, mesh, motion, background, camera, edges, borders)
+        return
     moved, step, shifted = motion.poses, motion.step, motion.segments
     p = len(step)
     depth_a, depth_b, last = 0.0, 0.0, -1
@@ -39,7 +45,8 @@ def follow_borders(view, first, mesh, motion, background, camera, edges, borders
                 pose = view * (p + 1) + k
                 if start < 0:
                     bearing = moved.bearing[pose]
-                    background_edge(background, math.cos(bearing), math.sin(bearing), camera, shifted[k])
+                    cos_b, sin_b = math.cos(bearing), math.sin(bearing)
+                    background_edge(background, cos_b, sin_b, moved.level[pose], camera, shifted[k])
                 else:
                     project(mesh.vertices, start, end, moved.matrix[pose], moved.offset[pose], camera, shifted[k])
             if start >= 0:
@@ -56,6 +63,62 @@ def follow_borders(view, first, mesh, motion, background, camera, edges, borders
             share = ((borders.points[b, 0] - own[0]) * du + (borders.points[b, 1] - own[1]) * dv) / (du * du + dv * dv)
             share = min(max(share, 0.0), 1.0)
             borders.depth[b] = 1.0 / ((1.0 - share) / depth_a + share / depth_b)
+
+
+@kernel
+def _follow_bent_borders(view, first, mesh, motion, background, camera, edges, borders):  # type: ignore[no-untyped-def]
+    """Do the same behind a lens with distortion.
+
+    With φ the distance of a fixed ray from the edge, in tangents, the edge is where φ = 0, and ẋ = −φ̇ / (∂φ/∂x).
+    """
+    moved, step, shifted = motion.poses, motion.step, motion.segments
+    p = len(step)
+    depth_a, depth_b, start, end = 0.0, 0.0, -2, -2
+    for b in range(first, min(borders.placed[0], len(borders.weights))):
+        e = borders.segment[b]
+        if edges.ends[e, 0] != start or edges.ends[e, 1] != end:
+            start, end = edges.ends[e, 0], edges.ends[e, 1]
+            for k in range(p + 1):
+                pose = view * (p + 1) + k
+                if start < 0:
+                    bearing = moved.bearing[pose]
+                    tx, ty, tz = background_line(background, math.cos(bearing), math.sin(bearing), moved.level[pose])
+                    size = math.sqrt(ty * ty + tz * tz)
+                    shifted[k, 0], shifted[k, 1], shifted[k, 2] = tx / size, ty / size, tz / size
+                else:
+                    project(mesh.vertices, start, end, moved.matrix[pose], moved.offset[pose], TANGENTS, shifted[k])
+            if start >= 0:
+                depth_a, depth_b = _depth(mesh, moved, view * (p + 1), start), _depth(mesh, moved, view * (p + 1), end)
+        y, z = ray_of(camera, borders.points[b, 0], borders.points[b, 1])
+        y_u, z_u, y_v, z_v = rates_of(camera, y, z)
+        y_x, z_x = (y_u, z_u) if borders.along_v[b] == 1 else (y_v, z_v)
+        here, along_x = _distance(shifted[0], start < 0, y, z, y_x, z_x)
+        for k in range(p):
+            away, _ = _distance(shifted[k + 1], start < 0, y, z, y_x, z_x)
+            borders.rates[b, k] = (here - away) / (step[k] * along_x) if along_x != 0.0 else 0.0
+        borders.depth[b] = 0.0
+        if start >= 0 and depth_a > 0.0 and depth_b > 0.0:
+            own = shifted[0]
+            dy, dz = own[2] - own[0], own[3] - own[1]
+            share = ((y - own[0]) * dy + (z - own[1]) * dz) / (dy * dy + dz * dz)
+            share = min(max(share, 0.0), 1.0)
+            borders.depth[b] = 1.0 / ((1.0 - share) / depth_a + share / depth_b)
+
+
+@inlined
+def _distance(line, by_normal, y, z, y_x, z_x):  # type: ignore[no-untyped-def]
+    """Return how far a ray lies from a line, in tangents, and how fast that changes along x.
+
+    The line is given by its ends, or by (d, n_y, n_z) with d + n_y · y + n_z · z = 0.
+    """
+    if by_normal:
+        away, along_x = line[0] + line[1] * y + line[2] * z, line[1] * y_x + line[2] * z_x
+    else:
+        dy, dz = line[2] - line[0], line[3] - line[1]
+        size = 1.0 / math.sqrt(dy * dy + dz * dz)
+        away = (dy * (z - line[1]) - dz * (y - line[0])) * size
+        along_x = (dy * z_x - dz * y_x) * size
+    return away, along_x
 
 
 @inlined

@@ -4,12 +4,16 @@ Inside a pixel the light a surface returns is a smooth function of (u, v) except
 that meet at more than 30°, borders of open meshes) and of silhouettes (an edge between a face seen from its front and
 one seen from its back). :class:`~phasemark.render.integral.mesh_topology.MeshTopology` finds what does not depend on
 the view; :func:`project_edges` selects and projects what a view shows.
+
+A lens with distortion bends the image of an edge: it becomes a chain of links, see
+:mod:`~phasemark.render.integral.bent_edges`.
 """
 
 from __future__ import annotations
 
 import math
 
+from phasemark.render.integral.bent_edges import FULL, TANGENTS, add_bent_edge, start_extents
 from phasemark.render.integral.mesh_topology import CLUSTER
 from phasemark.render.kernel import inlined, kernel
 
@@ -32,17 +36,18 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
         Which of the poses.
     camera : Camera
     edges : Edges
-        ``segments``, ``limb`` and ``ends`` are overwritten.
+        ``segments``, ``limb``, ``ends`` and ``extent`` are overwritten.
 
     Returns
     -------
     int
-        How many segments were written.
+        How many segments were written, or :data:`~phasemark.render.integral.bent_edges.FULL`.
     """
     vertices, planes, creases, concave, folds = mesh.vertices, mesh.planes, mesh.creases, mesh.concave, mesh.folds
     smooth_planes, clusters = mesh.smooth_planes, mesh.clusters
-    lens, matrix, offset, limb = poses.lens[view], poses.matrix[view], poses.offset[view], edges.limb
+    lens, matrix, offset = poses.lens[view], poses.matrix[view], poses.offset[view]
     n = 0
+    start_extents(edges)
     for e in range(len(creases)):
         start, end, face, other = creases[e, 0], creases[e, 1], creases[e, 2], creases[e, 3]
         # a closed mesh hides what turns its back, and a valley from everywhere but between its slopes
@@ -50,10 +55,9 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
             before, before_other = _height(planes, face, lens) > 0.0, _height(planes, other, lens) > 0.0
             if not (before or before_other) or (concave[e] and not (before and before_other)):
                 continue
-        if project(vertices, start, end, matrix, offset, camera, edges.segments[n]):
-            limb[n] = 0
-            edges.ends[n, 0], edges.ends[n, 1] = start, end
-            n += 1
+        n = _add_edge(vertices, start, end, 0, matrix, offset, camera, edges, n)
+        if n < 0:
+            return FULL
     heights = edges.heights
     for c in range(len(clusters)):
         px, py, pz, nx, ny, nz, d, turn, slack, reach, radius = clusters[c]
@@ -73,10 +77,23 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
                 if before == (_smooth_height(smooth_planes, folds[e, 2], lens) > 0.0):
                     continue
                 a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
-                if project(vertices, a, b, matrix, offset, camera, edges.segments[n]):
-                    limb[n] = 1
-                    edges.ends[n, 0], edges.ends[n, 1] = a, b
-                    n += 1
+                n = _add_edge(vertices, a, b, 1, matrix, offset, camera, edges, n)
+                if n < 0:
+                    return FULL
+    return n
+
+
+@kernel
+def _add_edge(vertices, a, b, limb, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
+    """Append the image of the edge between two vertices; return how many segments there are."""
+    if camera.distortion.model != 0:
+        line = edges.line
+        if project(vertices, a, b, matrix, offset, TANGENTS, line):
+            n = add_bent_edge(line[0], line[1], line[2], line[3], a, b, limb, camera, edges, n)
+    elif project(vertices, a, b, matrix, offset, camera, edges.segments[n]):
+        edges.limb[n] = limb
+        edges.ends[n, 0], edges.ends[n, 1] = a, b
+        n += 1
     return n
 
 
@@ -94,7 +111,10 @@ def _smooth_height(planes, i, lens):  # type: ignore[no-untyped-def]
 
 @inlined
 def project(vertices, a, b, matrix, offset, camera, segment):  # type: ignore[no-untyped-def]
-    """Project the edge between two vertices into `segment` (4,); return whether any of it lies before the camera."""
+    """Project the edge between two vertices into `segment` (4,); return whether any of it lies before the camera.
+
+    `camera` is one without distortion, or :data:`~phasemark.render.integral.bent_edges.TANGENTS`.
+    """
     ax = matrix[0, 0] * vertices[a, 0] + matrix[0, 1] * vertices[a, 1] + matrix[0, 2] * vertices[a, 2] + offset[0]
     bx = matrix[0, 0] * vertices[b, 0] + matrix[0, 1] * vertices[b, 1] + matrix[0, 2] * vertices[b, 2] + offset[0]
     if ax < _NEAR_M and bx < _NEAR_M:

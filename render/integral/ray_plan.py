@@ -6,10 +6,12 @@ import math
 
 import numpy as np
 
-from phasemark.render.background import background_edge
+from phasemark.render.background import background_edge, background_line
+from phasemark.render.integral.bent_edges import add_bent_edge
 from phasemark.render.integral.edge_motion import follow_borders
 from phasemark.render.integral.edge_projection import project_edges
 from phasemark.render.integral.edges_in_pixels import bin_segments
+from phasemark.render.integral.image_rays import trace
 from phasemark.render.integral.pixel_splitting import sample_pixel
 from phasemark.render.kernel import kernel
 
@@ -19,6 +21,10 @@ SPLIT = 1
 """Pixel state: sampled, split exactly."""
 UNTRUSTED = 2
 """Pixel state: sampled, but too many edges for an exact split."""
+SHORT_LINKS = -1
+"""Next view that says that ``edges.link`` is too short."""
+SHORT_SEGMENTS = -2
+"""Next view that says that ``edges.segments`` is too short."""
 
 
 @kernel
@@ -37,7 +43,7 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
     edges : Edges
     scratch : Scratch
     samples : Samples
-        ``points``, ``weights``, ``regions`` and ``pixel`` are overwritten.
+        ``points``, ``rays``, ``weights``, ``regions`` and ``pixel`` are overwritten.
     state : (n, rows, cols) uint8, overwritten
         Per pixel :data:`SKIPPED`, :data:`SPLIT` or :data:`UNTRUSTED`.
     motion : Motion
@@ -47,33 +53,38 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
     Returns
     -------
     next_view, n_samples : int, int
-        `next_view` equals `first` when not even one view fits; −1 in place of it: ``edges.link`` is too short.
+        `next_view` equals `first` when not even one view fits; :data:`SHORT_LINKS` or :data:`SHORT_SEGMENTS` in
+        place of it: the edges have no room.
     """
-    segments, limb, head = edges.segments, edges.limb, edges.head
+    head, reach, bent_lens = edges.head, camera.distortion.reach, camera.distortion.model != 0
     rows, cols = camera.stop_row - camera.first_row, camera.cols
     n, region, n_borders, room = 0, 0, 0, len(borders.weights)
     borders.placed[0] = 0
     for view in range(first, len(poses.lens)):
         n_edges = project_edges(mesh, poses, view, camera, edges)
-        u_low, u_high, v_low, v_high = _extent(edges, n_edges, False)
-        bent_low_u, bent_high_u, bent_low_v, bent_high_v = _extent(edges, n_edges, True)
+        if n_edges < 0:
+            return SHORT_SEGMENTS, n
+        u_low, u_high, v_low, v_high = _extent(edges, n_edges, False, bent_lens)
+        bent_low_u, bent_high_u, bent_low_v, bent_high_v = _extent(edges, n_edges, True, bent_lens)
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
-        if background_edge(background, cos_b, sin_b, camera, segments[n_edges]):
-            limb[n_edges] = 0
-            edges.ends[n_edges, 0] = -1
-            n_edges += 1
+        n_edges = _add_background(background, cos_b, sin_b, poses.level[view], camera, edges, n_edges)
+        if n_edges < 0:
+            return SHORT_SEGMENTS, n
         if bin_segments(n_edges, camera, edges) < 0:
-            return -1, n
+            return SHORT_LINKS, n
         start, first_border = n, n_borders
         for row in range(rows):
             r = camera.first_row + row
             for c in range(cols):
-                outside = c >= u_high or c + 1 <= u_low or r >= v_high or r + 1 <= v_low
+                left, right, top, bottom = float(c), c + 1.0, float(r), r + 1.0
+                if bent_lens:
+                    left, right, top, bottom = reach[r, c, 0], reach[r, c, 1], reach[r, c, 2], reach[r, c, 3]
+                outside = left >= u_high or right <= u_low or top >= v_high or bottom <= v_low
                 if outside and head[r + 1, c + 1] < 0:
                     state[view, row, c] = SKIPPED
                     continue
                 before = n
-                bent = c < bent_high_u and c + 1 > bent_low_u and r < bent_high_v and r + 1 > bent_low_v
+                bent = left < bent_high_u and right > bent_low_u and top < bent_high_v and bottom > bent_low_v
                 n, region, trusted = sample_pixel(
                     r, c, bent, splits, camera, edges, scratch, samples, borders, n, region
                 )
@@ -84,6 +95,7 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
                 index = (view * rows + row) * cols + c
                 for k in range(before, n):
                     samples.pixel[k] = index
+                trace(before, n, samples, camera)
                 for b in range(n_borders, borders.placed[0]):
                     borders.pixel[b] = index
                 n_borders = borders.placed[0]
@@ -93,10 +105,39 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
 
 
 @kernel
-def _extent(edges, n_edges, of_limbs):  # type: ignore[no-untyped-def]
-    """Return the extent of the edges, or of the limbs among them: lower and upper u, lower and upper v."""
+def _add_background(background, cos_b, sin_b, level, camera, edges, n):  # type: ignore[no-untyped-def]
+    """Append the line where wall and floor meet, or the horizon; return the number of segments, −1 without room."""
+    lens = camera.distortion
+    if lens.model == 0:
+        if background_edge(background, cos_b, sin_b, level, camera, edges.segments[n]):
+            edges.limb[n], edges.ends[n, 0] = 0, -1
+            n += 1
+        return n
+    if background[1] == 0.0:
+        return n
+    tx, ty, tz = background_line(background, cos_b, sin_b, level)
+    if abs(tz) >= abs(ty) and tz != 0.0:
+        ya, yb = lens.low_y, lens.high_y
+        za, zb = -(tx + ty * ya) / tz, -(tx + ty * yb) / tz
+    elif ty != 0.0:
+        za, zb = lens.low_z, lens.high_z
+        ya, yb = -(tx + tz * za) / ty, -(tx + tz * zb) / ty
+    else:
+        return n
+    return add_bent_edge(ya, za, yb, zb, -1, -1, 0, camera, edges, n)
+
+
+@kernel
+def _extent(edges, n_edges, of_limbs, bent_lens):  # type: ignore[no-untyped-def]
+    """Return the extent of the edges, or of the limbs among them: lower and upper u, lower and upper v.
+
+    Behind a lens with distortion it is that of all edges before they are clipped: lower and upper y and z.
+    """
     segments = edges.segments
     u_low, u_high, v_low, v_high = np.inf, -np.inf, np.inf, -np.inf
+    if bent_lens:
+        own = edges.extent[1 if of_limbs else 0]
+        return own[0], own[1], own[2], own[3]
     for i in range(n_edges):
         if of_limbs and not edges.limb[i]:
             continue

@@ -25,8 +25,10 @@ class SlopeSums:
 
     Parameters
     ----------
-    slope : (pixels, p) complex128
-        The result, added to.
+    slope : (m, pixels, p) complex128
+        The result, added to, at each of m frequencies.
+    columns : (m,) int64
+        Where each frequency stands among the orders of the light.
     motion : Motion
     own : Sums
         The sums of the images themselves; read when the batch is complete.
@@ -34,21 +36,28 @@ class SlopeSums:
         Which parameters turn what stands behind the landmark.
     """
 
-    def __init__(self, slope: NDArray[np.complex128], motion: Motion, own: Sums, turns: NDArray[np.bool_]) -> None:
-        self._slope, self._own, self._turns = slope, own, turns
+    def __init__(
+        self,
+        slope: NDArray[np.complex128],
+        columns: NDArray[np.int64],
+        motion: Motion,
+        own: Sums,
+        turns: NDArray[np.bool_],
+    ) -> None:
+        self._slope, self._columns, self._own, self._turns = slope, columns, own, turns
         p = len(motion.step)
         self._poses = [
             Poses(*(np.ascontiguousarray(part[k :: 1 + p]) for part in motion.poses)) for k in range(1, 1 + p)
         ]
         pixels = len(own.intensity)
         self._sums = Sums(
-            phasor=np.empty((pixels, 1), np.complex128),
+            phasor=np.empty((pixels, len(columns)), np.complex128),
             intensity=np.empty(pixels),
             coverage=np.empty(pixels),
             upper=np.empty(pixels),
             state=own.state,
         )
-        self._moved = np.zeros((p, pixels), np.complex128)
+        self._moved = np.zeros((p, pixels, len(columns)), np.complex128)
 
     def add(
         self,
@@ -62,17 +71,19 @@ class SlopeSums:
         light: Light,
     ) -> None:
         """Add n samples and the points on edges of some of the views, (first, one past the last)."""
-        first_order = light._replace(orders=light.orders[:1])
+        frequencies = light._replace(orders=light.orders[self._columns])
         per_view = self._own.state[0].size
         pixels = slice(views[0] * per_view, views[1] * per_view)
         for k, moved in enumerate(self._poses):
             for values in self._sums[:4]:
                 values[pixels] = 0
-            sum_samples(n, samples, mesh, moved, camera, first_order, self._sums)
+            sum_samples(n, samples, mesh, moved, camera, frequencies, self._sums)
             if self._turns[k]:
-                add_background(views[0], views[1], moved, camera, first_order, self._sums)
-            self._moved[k, pixels] = self._sums.phasor[pixels, 0]
-        sum_borders(n, samples, samples.chosen, mesh, poses, camera, first_order, borders, self._slope)
+                add_background(views[0], views[1], moved, camera, frequencies, self._sums)
+            self._moved[k, pixels] = self._sums.phasor[pixels]
+        for multiple, slope in zip(frequencies.orders, self._slope, strict=True):
+            one = light._replace(radians_per_metre=light.radians_per_metre * multiple, orders=light.orders[:1])
+            sum_borders(n, samples, samples.chosen, mesh, poses, camera, one, borders, slope)
 
     def conclude(self) -> None:
         """Add what the light changes at fixed points of the image, once all samples of the batch are in.
@@ -80,9 +91,10 @@ class SlopeSums:
         Pixels whose edges are not all known become NaN.
         """
         skipped = (self._own.state == SKIPPED).reshape(-1)
-        self._slope[(self._own.state == UNTRUSTED).reshape(-1)] = np.nan
+        self._slope[:, (self._own.state == UNTRUSTED).reshape(-1)] = np.nan
         for k, moved in enumerate(self._moved):
-            change = (moved - self._own.phasor[:, 0]) / STEP
-            if not self._turns[k]:
-                change[skipped] = 0
-            self._slope[:, k] += change
+            for j, column in enumerate(self._columns):
+                change = (moved[:, j] - self._own.phasor[:, column]) / STEP
+                if not self._turns[k]:
+                    change[skipped] = 0
+                self._slope[j, :, k] += change

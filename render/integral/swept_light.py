@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
-from phasemark.render.background import background_hit
-from phasemark.render.integral.arguments import ray_of, towards_landmark, towards_level
+from phasemark.render.background import hit_of_plane, nearer_plane
+from phasemark.render.integral.arguments import towards_landmark, towards_level
 from phasemark.render.integral.face_search import find_face
+from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.light import landmark_hit, phasor_of
 from phasemark.render.kernel import inlined, kernel
 
@@ -77,9 +78,13 @@ def _light_beside(b, which, y, z, view, samples, first_of, mesh, poses, camera, 
             face = g if g >= 0 else face
         t, cos_theta = landmark_hit(mesh, face, lens, matrix, y, z)
         return t, phasor_of(t * length, light.albedo * cos_theta, length, light)
-    dx, dy, dz = towards_level(camera.level, y, z)
-    bearing = poses.bearing[view]
-    t, rho, cos_theta = background_hit(light.background, math.cos(bearing), math.sin(bearing), dx, dy, dz)
+    # where wall and floor meet, the point itself is on both: which of them this side sees, its sample tells
+    cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
+    own_y, own_z = ray_of(camera, points[nearest, 0], points[nearest, 1])
+    dx, dy, dz = towards_level(poses.level[view], own_y, own_z)
+    plane = nearer_plane(light.background, cos_b, sin_b, dx, dy, dz)
+    dx, dy, dz = towards_level(poses.level[view], y, z)
+    t, rho, cos_theta = hit_of_plane(light.background, plane, cos_b, sin_b, dx, dy, dz)
     if t == 0.0:
         return math.inf, 0j
     return t, phasor_of(t * length, rho * cos_theta, length, light)

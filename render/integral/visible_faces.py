@@ -7,7 +7,7 @@ has an apex, the face is looked for; elsewhere, and where it is not found, the r
 
 from __future__ import annotations
 
-from phasemark.render.integral.arguments import ray_of, towards_landmark
+from phasemark.render.integral.arguments import towards_landmark
 from phasemark.render.integral.face_search import find_face, look_about, plane_hit, turns_smoothly
 from phasemark.render.integral.ray_plan import SPLIT
 from phasemark.render.kernel import kernel
@@ -73,24 +73,24 @@ def _search(start, stop, scout, count, mesh, samples, poses, camera):  # type: i
 
     All samples take one step, then all the next: none waits for another, so that the processor works at several.
     """
-    points, face, search, grid = samples.points, samples.face, mesh.search, mesh.grid
+    rays, face, search, grid = samples.rays, samples.face, mesh.search, mesh.grid
     view = samples.pixel[scout] // ((camera.stop_row - camera.first_row) * camera.cols)
     ox, oy, oz = poses.lens[view, 0], poses.lens[view, 1], poses.lens[view, 2]
     matrix, found = poses.matrix[view], face[scout]
     for look in range(_LOOKS):
         for i in range(start, stop):
-            y, z = ray_of(camera, points[i, 0], points[i, 1])
+            y, z = rays[i, 0], rays[i, 1]
             dx, dy, dz = towards_landmark(matrix, y, z)
             face[i] = look_about(search, grid, face[i] if look else found, ox, oy, oz, dx, dy, dz)
     face[scout] = found
-    y, z = ray_of(camera, points[scout, 0], points[scout, 1])
+    y, z = rays[scout, 0], rays[scout, 1]
     dx, dy, dz = towards_landmark(matrix, y, z)
     t = plane_hit(search, found, ox, oy, oz, dx, dy, dz)
     hit_x, hit_y, hit_z = t * dx, t * dy, t * dz
     for i in range(start, stop):
         if i == scout:
             continue
-        y, z = ray_of(camera, points[i, 0], points[i, 1])
+        y, z = rays[i, 0], rays[i, 1]
         dx, dy, dz = towards_landmark(matrix, y, z)
         g, t = find_face(search, grid, face[i], ox, oy, oz, dx, dy, dz)
         if g >= 0 and turns_smoothly(search, found, g, t * dx - hit_x, t * dy - hit_y, t * dz - hit_z):
@@ -104,12 +104,12 @@ def _search(start, stop, scout, count, mesh, samples, poses, camera):  # type: i
 @kernel
 def aim(n, samples, poses, camera):  # type: ignore[no-untyped-def]
     """Write the float32 rays of the first n samples that were chosen, landmark frame."""
-    points, origins, directions = samples.points, samples.origins, samples.directions
+    rays, origins, directions = samples.rays, samples.origins, samples.directions
     pixels_per_view = (camera.stop_row - camera.first_row) * camera.cols
     for i in range(n):
         k = samples.chosen[i]
         view = samples.pixel[k] // pixels_per_view
-        y, z = ray_of(camera, points[k, 0], points[k, 1])
+        y, z = rays[k, 0], rays[k, 1]
         for a in range(3):
             origins[i, a] = poses.lens[view, a]
         directions[i, 0], directions[i, 1], directions[i, 2] = towards_landmark(poses.matrix[view], y, z)

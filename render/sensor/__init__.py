@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from phasemark.render.sensor.camera_unit import CameraUnit
     from phasemark.render.sensor.correlation import Harmonic, pulse_harmonics, square_harmonics
     from phasemark.render.sensor.histogram_fields import Histogram
+    from phasemark.render.sensor.lens_fields import Lens
     from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
     from phasemark.render.sensor.sensor import Sensor
     from phasemark.render.sensor.shipped_sensors import preset, preset_names
@@ -18,6 +19,7 @@ __all__ = [
     "CameraUnit",
     "Harmonic",
     "Histogram",
+    "Lens",
     "Sensor",
     "measured_range_std",
     "predicted_range_std",

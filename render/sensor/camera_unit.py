@@ -41,11 +41,18 @@ class CameraUnit:
 
 
 @lru_cache(maxsize=8)
-def camera_unit(sensor: Sensor) -> CameraUnit:
+def camera_unit(sensor: Sensor, frequency: int = 0) -> CameraUnit:
     """Draw the camera that `sensor.unit_seed` names.
 
     Each pattern has a Philox stream of its own, keyed by seed and name, and is drawn in units of its standard
-    deviation: another strength, or another pattern switched off, leaves its shape as it is.
+    deviation: another strength, or another pattern switched off, leaves its shape as it is. Sensitivity, dark signal
+    and defects are the same at every modulation frequency; phase offsets are drawn for each.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    frequency : int
+        Which of the sensor's modulation frequencies `delay_rad` is for, counted from 0.
 
     Returns
     -------
@@ -57,10 +64,11 @@ def camera_unit(sensor: Sensor) -> CameraUnit:
     hot = _defects(sensor, "hot", sensor.hot_share, sensor.hot_pixels) & ~dead
     response = 1 + sensor.prnu * _pattern(sensor, "prnu", (2, *shape))
     dark_e = sensor.dark_e / 2 + sensor.dsnu_e * _pattern(sensor, "dsnu", (2, *shape)) + hot * sensor.hot_e / 2
+    which = f" of frequency {frequency}" if frequency else ""
     delay_rad = (
-        sensor.range_offset_m / sensor.metres_per_radian
-        + sensor.phase_offset_std_rad * _pattern(sensor, "phase offset", shape)
-        + sensor.tap_phase_offset_std_rad * _pattern(sensor, "tap phase offset", (2, *shape))
+        sensor.range_offset_m / sensor.by_frequency[frequency].metres_per_radian
+        + sensor.phase_offset_std_rad * _pattern(sensor, f"phase offset{which}", shape)
+        + sensor.tap_phase_offset_std_rad * _pattern(sensor, f"tap phase offset{which}", (2, *shape))
     )
     unit = CameraUnit(response * ~dead, np.maximum(dark_e, 0) * ~dead, delay_rad, dead, hot)
     for array in (unit.response, unit.dark_e, unit.delay_rad, unit.dead, unit.hot):

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import model_validator
 
 from phasemark import UsageError
 from phasemark.inputs.toml_file import read_toml
+from phasemark.render.sensor.lens_fields import DERIVED, Lens
 from phasemark.render.sensor.sensor_checks import check_fields
 from phasemark.render.sensor.sensor_fields import CALIBRATION, OPTICS
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
@@ -37,8 +41,14 @@ class Sensor(SensorQuantities):
         pixel is the light-weighted mean over its footprint.
     rows, cols : int
         Size of the image, pixels.
+    lens : Lens, optional
+        Intrinsics and distortion as OpenCV or ROS state them, a table `[lens]` in a file; see
+        :class:`~phasemark.render.sensor.Lens`. Half angles and principal point follow from it and are left out. None:
+        an ideal lens.
     half_angle_h_deg, half_angle_v_deg : float
-        Half angle from the optical axis to the left/right and top/bottom *edge* of the image, degrees.
+        Half angle from the optical axis to the left/right and top/bottom *edge* of the image, degrees. With a lens:
+        the angle whose tangent is half the image's width or height in tangents, along the row or column of the
+        principal point.
     principal_point_px : (u0, v0), optional
         Where the optical axis meets the image, pixels from the top left corner. None: the centre.
     pitch_deg, roll_deg : float
@@ -51,12 +61,14 @@ class Sensor(SensorQuantities):
         Light-sensitive share of the pixel's pitch, a centred rectangle.
     vignetting : bool
         Whether brightness falls as cos⁴ of the angle off the axis.
-    modulation_hz : float
-        Modulation frequency f; the range wraps at c / 2f.
+    modulation_hz : float or tuple of float
+        Modulation frequency f; the range wraps at c / 2f. Several of them, in whole hertz and in the order in which a
+        frame has their phase images: the range wraps at c / (2 · gcd) (PHYSICS section 10). A list of one is that
+        number.
     frame_rate_hz : float
-        Frames a second, four phase images each.
+        Frames a second, four phase images at each of the m modulation frequencies. All phase images take the same time.
     phase_interval_s : float, optional
-        Time T from one phase image to the next; None: 1 / (4 · frame rate), the most there can be.
+        Time T from one phase image to the next; None: 1 / (4 m · frame rate), the most there can be.
     contrast : float
         Demodulation contrast K, in (0, 1].
     modulation : {"sine", "square", "harmonics", "pulse"}
@@ -69,7 +81,7 @@ class Sensor(SensorQuantities):
     emitted_pulse, reference_pulse : tuple of float
         One period of light and reference for "pulse", evenly sampled, of one length, at least 8 samples, any unit.
     signal_e : float
-        Electrons N₀ per phase image, both taps, that intensity 1 produces.
+        Electrons N₀ per phase image, both taps, that intensity 1 produces, at every frequency.
     ambient_e, dark_e : float
         Unmodulated electrons per phase image, both taps: ambient light and dark current.
     shot_noise : bool
@@ -90,7 +102,7 @@ class Sensor(SensorQuantities):
     black_level : float
         Code of no electrons; needs `adc_bits`.
     phase_offset_std_rad : float
-        Phase offset of each pixel, a pattern.
+        Phase offset of each pixel, a pattern; every frequency has its own.
     tap_phase_offset_std_rad : float
         Phase offset of each tap beside its pixel's, a pattern.
     range_offset_m : float
@@ -154,8 +166,20 @@ class Sensor(SensorQuantities):
         return self
 
     def with_(self, **changes: Any) -> Sensor:
-        """Return a copy with some fields changed, validated again."""
-        return Sensor(**{**self.model_dump(), **changes})
+        """Return a copy with some fields changed, validated again; what follows from a lens follows it."""
+        fields = self.model_dump()
+        if {**fields, **changes}.get("lens") is not None:
+            fields = {name: value for name, value in fields.items() if name not in DERIVED}
+        return Sensor(**{**fields, **changes})
+
+    @property
+    def by_frequency(self) -> tuple[Sensor, ...]:
+        """The camera during the phase images of each frequency: cameras of one frequency, in the order of the frame.
+
+        They differ in `modulation_hz` alone, and take their phase images as fast as this camera; a `wrap_guard_m`
+        belongs to the unwrapped range and not to them. A camera of one frequency is its own only one.
+        """
+        return (self,) if len(self.frequencies_hz) == 1 else _cameras_of_one_frequency(self)
 
     def without_errors(self, *, shot_noise: bool = False) -> Sensor:
         """Return the camera without its errors: optics, modulation frequency, contrast and signal alone.
@@ -213,6 +237,57 @@ class Sensor(SensorQuantities):
         )
 
     @classmethod
+    def from_opencv(
+        cls,
+        camera_matrix: ArrayLike,
+        distortion: ArrayLike = (),
+        *,
+        size: tuple[int, int],
+        model: Literal["opencv", "fisheye"] = "opencv",
+        **fields: Any,
+    ) -> Sensor:
+        """Build a sensor from what OpenCV's calibration returns.
+
+        Parameters
+        ----------
+        camera_matrix : (3, 3) array_like
+            [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, counted from the centre of the first pixel, as OpenCV does.
+        distortion : array_like
+            Coefficients in OpenCV's order, any shape: 4, 5 or 8 for "opencv", 4 for "fisheye", none for no distortion.
+        size : (cols, rows)
+            Of the image, in OpenCV's order.
+        model : {"opencv", "fisheye"}
+        **fields
+            Any other field of the sensor.
+
+        Raises
+        ------
+        UsageError
+            The matrix is no camera matrix, or the lens does not belong to an image of this size.
+
+        Examples
+        --------
+        >>> sensor = Sensor.from_opencv([[200, 0, 111.5], [0, 200, 85], [0, 0, 1]], [-0.2, 0.05, 0, 0], size=(224, 171))
+        >>> sensor.centre_px
+        (112.0, 85.5)
+        """
+        matrix = _numbers("camera_matrix", camera_matrix)
+        pattern = np.array([[True, False, True], [False, True, True], [False, False, True]])
+        if matrix.shape != (3, 3) or matrix[~pattern].any() or matrix[2, 2] != 1:
+            shown = " ".join(str(camera_matrix).split())
+            raise UsageError(f"'camera_matrix' must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {shown}")
+        cols, rows = size
+        lens = Lens(
+            model=model,
+            fx=float(matrix[0, 0]),
+            fy=float(matrix[1, 1]),
+            cx=float(matrix[0, 2]),
+            cy=float(matrix[1, 2]),
+            distortion=tuple(float(one) for one in _numbers("distortion", distortion).ravel()),
+        )
+        return cls(rows=rows, cols=cols, lens=lens, **fields)
+
+    @classmethod
     def from_toml(cls, path: str | Path) -> Sensor:
         """Read a sensor file.
 
@@ -266,3 +341,20 @@ class Sensor(SensorQuantities):
             title = titles.get(name, title)
             groups[title] = (*groups.get(title, ()), name)
         return groups
+
+
+@lru_cache(maxsize=32)
+def _cameras_of_one_frequency(sensor: Sensor) -> tuple[Sensor, ...]:
+    # the guard is about the wrap of the unwrapped range, which no frequency has alone
+    same = {"phase_interval_s": sensor.phase_image_interval_s, "wrap_guard_m": 0.0}
+    return tuple(sensor.with_(modulation_hz=hz, **same) for hz in sensor.frequencies_hz)
+
+
+def _numbers(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    try:
+        numbers = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise UsageError(f"'{name}' must be numbers, got {value!r}") from None
+    if not np.isfinite(numbers).all():
+        raise UsageError(f"'{name}' must be finite, got {' '.join(str(value).split())}")
+    return numbers

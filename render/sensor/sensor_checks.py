@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 
+from phasemark.inputs.numbers import in_words
 from phasemark.render.sensor.correlation import SQUARE_PEAK, correlation_peak, pulse_harmonics
+from phasemark.render.sensor.frequencies import check_frequencies
 from phasemark.render.sensor.sensor_fields import CALIBRATION, DIRECT_ONLY, PHASE_ONLY, SensorFields
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
 
@@ -37,6 +39,10 @@ def check_principal_point(sensor: SensorQuantities) -> None:
 
 def check_kind(sensor: SensorQuantities) -> None:
     """Refuse fields of the other kind of camera."""
+    if sensor.histogram is not None and sensor.lens is not None:
+        raise ValueError(
+            "'lens' must be left out beside 'histogram': the zones of a direct sensor are rectangles of tangents"
+        )
     foreign = PHASE_ONLY if sensor.kind == "direct" else DIRECT_ONLY
     for name in foreign:
         value = getattr(sensor, name)
@@ -48,10 +54,15 @@ def check_kind(sensor: SensorQuantities) -> None:
             )
             shown = "a table" if name == "histogram" else value
             raise ValueError(f"'{name}' must be left out for 'kind' = '{sensor.kind}', got {shown}: {why}")
-    if sensor.kind == "direct" and sensor.modulation_hz > DIRECT_MODULATION_HZ:
+    if sensor.kind == "direct" and len(sensor.frequencies_hz) > 1:
+        raise ValueError(
+            f"'modulation_hz' must be one number for 'kind' = 'direct', which has no phase images, got"
+            f" {in_words(sensor.frequencies_hz)}"
+        )
+    if sensor.kind == "direct" and sensor.frequencies_hz[0] > DIRECT_MODULATION_HZ:
         raise ValueError(
             f"'modulation_hz' must be at most {DIRECT_MODULATION_HZ:g} for 'kind' = 'direct', which mixes no "
-            f"phasors, got {sensor.modulation_hz:g}"
+            f"phasors, got {sensor.frequencies_hz[0]:g}"
         )
 
 
@@ -87,10 +98,10 @@ def check_correlation(sensor: SensorQuantities) -> None:
 
 def check_times_and_shares(sensor: SensorQuantities) -> None:
     """Refuse times, shares and pixels that contradict each other."""
-    longest = 1 / (4 * sensor.frame_rate_hz)
+    longest = 1 / (sensor.n_phase_images * sensor.frame_rate_hz)
     if sensor.phase_interval_s is not None and sensor.phase_interval_s > longest * (1 + _ROUNDING):
         raise ValueError(
-            f"'phase_interval_s' must be at most 1 / (4 · frame_rate_hz) = {longest:.6g}, got "
+            f"'phase_interval_s' must be at most 1 / ({sensor.n_phase_images} · frame_rate_hz) = {longest:.6g}, got "
             f"{sensor.phase_interval_s:g}"
         )
     if sensor.blur_share + sensor.veil_share >= 1:
@@ -110,8 +121,9 @@ def check_times_and_shares(sensor: SensorQuantities) -> None:
     if both := sorted(set(sensor.dead_pixels) & set(sensor.hot_pixels)):
         raise ValueError(f"'dead_pixels' and 'hot_pixels' must not share a pixel, got {both[0]} in both")
     if not sensor.wrap_guard_m < sensor.unambiguous_range_m / 2:
+        limit = "c / 4f" if len(sensor.frequencies_hz) == 1 else "c / (4 gcd f)"
         raise ValueError(
-            f"'wrap_guard_m' must be below c / 4f = {sensor.unambiguous_range_m / 2:.4g}, got {sensor.wrap_guard_m:g}"
+            f"'wrap_guard_m' must be below {limit} = {sensor.unambiguous_range_m / 2:.4g}, got {sensor.wrap_guard_m:g}"
         )
 
 
@@ -200,6 +212,7 @@ def check_fields(sensor: SensorQuantities) -> None:
     """Make all checks, in the order in which their findings are told."""
     check_principal_point(sensor)
     check_kind(sensor)
+    check_frequencies(sensor.frequencies_hz)
     check_correlation(sensor)
     check_times_and_shares(sensor)
     check_read_out(sensor)

@@ -7,9 +7,12 @@ from typing import Annotated, Any, Literal
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
     SerializerFunctionWrapHandler,
+    Tag,
     ValidationError,
     model_serializer,
 )
@@ -17,6 +20,7 @@ from pydantic import (
 from phasemark import UsageError
 from phasemark.inputs import refuse_truth_values
 from phasemark.render.sensor.histogram_fields import Histogram
+from phasemark.render.sensor.lens_fields import Lens, with_geometry_of_lens
 
 _LARGEST = 1e12
 """Of any number of a sensor: the square of none overflows, and the reciprocal of none is infinite."""
@@ -43,10 +47,27 @@ _Pixel = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 _Row = tuple[_Finite, ...]
 _PulseShape = tuple[_NonNegative, ...]
 
+_ONE, _SEVERAL = "one frequency", "several frequencies"
+_MOST_FREQUENCIES = 16
+
+
+def _without_list_of_one(value: Any) -> Any:
+    """Return the one number of a list of one, which means the same."""
+    return value[0] if isinstance(value, list | tuple) and len(value) == 1 else value
+
+
+_Frequencies = Annotated[
+    Annotated[_Positive, Tag(_ONE)]
+    | Annotated[tuple[_Positive, ...], Field(min_length=1, max_length=_MOST_FREQUENCIES), Tag(_SEVERAL)],
+    Discriminator(lambda value: _SEVERAL if isinstance(value, list | tuple) else _ONE),
+    BeforeValidator(_without_list_of_one),
+]
+
 # What an image's rays and phases depend on: cameras that agree in these see the same noise-free image.
 OPTICS = (
     "rows",
     "cols",
+    "lens",
     "half_angle_h_deg",
     "half_angle_v_deg",
     "centre_px",
@@ -58,6 +79,9 @@ OPTICS = (
     "vignetting",
     "modulation_hz",
 )
+
+# What is a table of its own in a sensor file, and left out where there is none.
+TABLES = ("lens", "histogram")
 
 # What only a camera with taps has, and what only a direct one has.
 PHASE_ONLY = (
@@ -123,6 +147,7 @@ class SensorFields(BaseModel):
     # geometry
     rows: _PixelCount
     cols: _PixelCount
+    lens: Lens | None = None
     half_angle_h_deg: _HalfAngleDeg
     half_angle_v_deg: _HalfAngleDeg
     principal_point_px: tuple[float, float] | None = None
@@ -133,7 +158,7 @@ class SensorFields(BaseModel):
     fill_factor: tuple[_Fraction, _Fraction] = (1.0, 1.0)
     vignetting: bool = False
     # modulation and timing
-    modulation_hz: _Positive = 10e6
+    modulation_hz: _Frequencies = 10e6
     frame_rate_hz: _Positive = 3.0
     phase_interval_s: _Positive | None = None
     delay_s: Annotated[float, Field(ge=-10, le=10)] = 0.0
@@ -195,18 +220,21 @@ class SensorFields(BaseModel):
 
     def __init__(self, **data: Any) -> None:
         refuse_truth_values(data, type(self).model_fields)
+        data = with_geometry_of_lens(data)
         try:
             super().__init__(**data)
         except ValidationError as error:
             first = error.errors()[0]
             if not first["loc"]:  # a finding about several fields names them itself
                 raise UsageError(first["msg"].removeprefix("Value error, ")) from None
-            raise UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"]) from None
+            location = tuple(part for part in first["loc"] if part not in (_ONE, _SEVERAL))
+            raise UsageError.of_field(location, first["type"], first["msg"], first["input"]) from None
 
     @model_serializer(mode="wrap")
-    def _without_absent_histogram(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave `histogram` out where there is none, as files had it before sensors had histograms."""
+    def _without_absent_tables(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave `histogram` and `lens` out where there is none, as files had it before sensors had these tables."""
         fields: dict[str, Any] = dump(self)
-        if fields.get("histogram", ...) is None:
-            del fields["histogram"]
+        for name in TABLES:
+            if fields.get(name, ...) is None:
+                del fields[name]
         return fields

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.render.sensor.correlation import Harmonic, pulse_harmonics, square_harmonics
+from phasemark.render.sensor.frequencies import common_divisor_hz
 from phasemark.render.sensor.sensor_fields import SensorFields
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
@@ -19,7 +20,7 @@ class SensorQuantities(SensorFields):
 
     @property
     def tan_half_angles(self) -> tuple[float, float]:
-        """Tangents of the horizontal and vertical half angle."""
+        """Tangents of the horizontal and vertical half angle; with a lens, half the width and height as tangents."""
         return math.tan(math.radians(self.half_angle_h_deg)), math.tan(math.radians(self.half_angle_v_deg))
 
     @property
@@ -80,8 +81,18 @@ class SensorQuantities(SensorFields):
 
     @property
     def phase_image_interval_s(self) -> float:
-        """Time from one phase image to the next: `phase_interval_s`, or 1 / (4 · frame rate)."""
-        return self.phase_interval_s or 1 / (4 * self.frame_rate_hz)
+        """Time from one phase image to the next: `phase_interval_s`, or 1 / (4 m · frame rate) with m frequencies."""
+        return self.phase_interval_s or 1 / (self.n_phase_images * self.frame_rate_hz)
+
+    @property
+    def frequencies_hz(self) -> tuple[float, ...]:
+        """The modulation frequencies in the order of the frame's phase images; one or more."""
+        return self.modulation_hz if isinstance(self.modulation_hz, tuple) else (self.modulation_hz,)
+
+    @property
+    def n_phase_images(self) -> int:
+        """Phase images of a frame, four for each modulation frequency."""
+        return 4 * len(self.frequencies_hz)
 
     @property
     def code_e(self) -> float:
@@ -102,13 +113,18 @@ class SensorQuantities(SensorFields):
 
     @property
     def metres_per_radian(self) -> float:
-        """Range per radian of phase, c / 4πf."""
-        return SPEED_OF_LIGHT_M_S / (4 * math.pi * self.modulation_hz)
+        """Range per radian of phase, c / 4πf, at the first frequency."""
+        return SPEED_OF_LIGHT_M_S / (4 * math.pi * self.frequencies_hz[0])
+
+    @property
+    def period_m(self) -> float:
+        """Range at which the phase of the first frequency wraps, c / 2f."""
+        return SPEED_OF_LIGHT_M_S / (2 * self.frequencies_hz[0])
 
     @property
     def unambiguous_range_m(self) -> float:
-        """Range at which the phase wraps, c / 2f."""
-        return SPEED_OF_LIGHT_M_S / (2 * self.modulation_hz)
+        """Range at which all phases repeat: c / 2f, of several frequencies c / (2 · gcd) (PHYSICS section 10)."""
+        return SPEED_OF_LIGHT_M_S / (2 * common_divisor_hz(self.frequencies_hz))
 
     def describe_beyond_range(self, name: str, distance_m: float) -> str | None:
         """Return a sentence on what the sensor shows of something too far away, or None if it is near enough.
@@ -141,7 +157,42 @@ class SensorQuantities(SensorFields):
         if distance_m < period_m:
             return None
         shown = f"it shows at about {distance_m % period_m:.3g} m"
-        return f"{name} at {distance_m:g} m is beyond c / 2f = {period_m:.4g} m, where ranges wrap: {shown}"
+        limit = "c / 2f" if len(self.frequencies_hz) == 1 else "c / (2 gcd f)"
+        return f"{name} at {distance_m:g} m is beyond {limit} = {period_m:.4g} m, where ranges wrap: {shown}"
+
+    def tangents(
+        self, u: NDArray[np.float64] | float, v: NDArray[np.float64] | float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return y and z of the rays (1, y, z) of image points, frame of the tilted camera.
+
+        Parameters
+        ----------
+        u, v : float or ndarray
+            Image coordinates, pixels; they broadcast against each other. With a lens they lie in the image.
+        """
+        if self.lens is not None:
+            return self.lens.before(self.rows, self.cols).rays(np.asarray(u, float), np.asarray(v, float))
+        tan_h, tan_v = self.tan_half_angles
+        u0, v0 = self.centre_px
+        y = 2 * tan_h * (u0 - np.asarray(u, float)) / self.cols
+        z = 2 * tan_v * (v0 - np.asarray(v, float)) / self.rows
+        return y, z
+
+    def image_points(
+        self, y: NDArray[np.float64] | float, z: NDArray[np.float64] | float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return where rays (1, y, z), frame of the tilted camera, meet the image: u and v, pixels.
+
+        Parameters
+        ----------
+        y, z : float or ndarray
+            Tangents to the left and upwards. With a lens they belong to image points; farther out it may fold.
+        """
+        if self.lens is not None:
+            return self.lens.before(self.rows, self.cols).project(np.asarray(y, float), np.asarray(z, float))
+        tan_h, tan_v = self.tan_half_angles
+        u0, v0 = self.centre_px
+        return u0 - np.asarray(y, float) * self.cols / (2 * tan_h), v0 - np.asarray(z, float) * self.rows / (2 * tan_v)
 
     def ray_directions(self, u: NDArray[np.float64] | float, v: NDArray[np.float64] | float) -> NDArray[np.float64]:
         """Return unit ray directions of image points, level camera frame (PHYSICS section 2).
@@ -155,10 +206,7 @@ class SensorQuantities(SensorFields):
         -------
         ndarray, shape (..., 3)
         """
-        tan_h, tan_v = self.tan_half_angles
-        u0, v0 = self.centre_px
-        y = 2 * tan_h * (u0 - np.asarray(u, float)) / self.cols
-        z = 2 * tan_v * (v0 - np.asarray(v, float)) / self.rows
+        y, z = self.tangents(u, v)
         d = np.stack(np.broadcast_arrays(1.0, y, z), axis=-1) @ self.cam2level.T
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 

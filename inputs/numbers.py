@@ -1,0 +1,25 @@
+"""How numbers are written in messages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def in_words(numbers: Sequence[float]) -> str:
+    """Return numbers as a sentence lists them.
+
+    Parameters
+    ----------
+    numbers : sequence of float
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> in_words([20e6]), in_words([20e6, 60e6])
+    ('20000000', '20000000 and 60000000')
+    """
+    shown = [f"{number:.12g}" for number in numbers]
+    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"

@@ -1,0 +1,96 @@
+"""What the kernels need of a lens with distortion: rays of every pixel, and how far out edges matter."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.render.integral.arguments import IDEAL, Distortion
+from phasemark.render.integral.quadrature_rules import gauss_legendre
+from phasemark.render.sensor.lens_fields import Lens
+from phasemark.render.sensor.lens_map import distort
+from phasemark.render.sensor.sensor import Sensor
+
+_MARGIN_PX = 4.0
+"""How far beyond the image edges are followed; limbs are felt up to a pixel and a half beyond it."""
+_SLACK = 0.05
+"""Share of a pixel's rays by which its corners, edge middles and centre may miss the rays between them."""
+_STEP = 1e-4
+"""Width of a difference of the lens's derivatives (tangent)."""
+
+
+def distortion_of(sensor: Sensor, rule: int) -> Distortion:
+    """Return the distortion of a sensor as the kernels take it.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    rule : int
+        Gauss points a side at which a background is integrated over a pixel; 0: there is no background.
+    """
+    if sensor.lens is None:
+        return IDEAL
+    return _tables(sensor.lens, sensor.rows, sensor.cols, sensor.fill_factor if rule else (1.0, 1.0), rule)
+
+
+@lru_cache(maxsize=16)
+def _tables(lens: Lens, rows: int, cols: int, fill_factor: tuple[float, float], rule: int) -> Distortion:
+    mapped = lens.before(rows, cols)
+    u, v = np.arange(2 * cols + 1) / 2, np.arange(2 * rows + 1) / 2
+    nodes = np.stack(mapped.rays(*np.meshgrid(u, v)), axis=-1)
+    border = np.concatenate([nodes[0], nodes[-1], nodes[:, 0], nodes[:, -1]])
+    low, high = border.min(axis=0), border.max(axis=0)
+    pixel = np.abs(np.concatenate([np.diff(nodes, axis=0).reshape(-1, 2), np.diff(nodes, axis=1).reshape(-1, 2)]))
+    margin = 2 * _MARGIN_PX * pixel.max(axis=0)
+    low, high = low - margin, high + margin
+    radius = max(mapped.largest_tangent, float(np.hypot(*border.T).max()))
+    at = [gauss_legendre(rule)[0] - 0.5 if rule else np.empty(0)] * 2
+    inside_u, inside_v = np.meshgrid(fill_factor[0] * at[0], fill_factor[1] * at[1])
+    points_u = np.arange(cols)[None, :, None] + 0.5 + inside_u.ravel()
+    points_v = np.arange(rows)[:, None, None] + 0.5 + inside_v.ravel()
+    return Distortion(
+        model=mapped.model,
+        coefficients=mapped.k,
+        nodes=nodes,
+        reach=_reach(nodes),
+        rule=np.stack(mapped.rays(points_u, points_v), axis=-1),
+        low_y=float(low[0]),
+        high_y=float(high[0]),
+        low_z=float(low[1]),
+        high_z=float(high[1]),
+        radius=radius,
+        bend=_bend(mapped.model, mapped.k, low, high, radius, float(mapped.focal_px.max())),
+    )
+
+
+def _reach(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return lowest and highest y, lowest and highest z of each pixel's rays, (rows, cols, 4)."""
+    rows, cols = nodes.shape[0] // 2, nodes.shape[1] // 2
+    parts = np.stack([nodes[i : i + 2 * rows : 2, j : j + 2 * cols : 2] for i in range(3) for j in range(3)])
+    low, high = parts.min(axis=0), parts.max(axis=0)
+    slack = _SLACK * (high - low)
+    low, high = low - slack, high + slack
+    return np.ascontiguousarray(np.stack([low[..., 0], high[..., 0], low[..., 1], high[..., 1]], axis=-1))
+
+
+def _bend(
+    model: int, k: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], radius: float, focal: float
+) -> float:
+    """Return a bound of the sagitta of a line of length 1: an eighth of the largest second derivative along any."""
+    y, z = np.meshgrid(np.linspace(low[0], high[0], 65), np.linspace(low[1], high[1], 65))
+    x, y = -y.ravel(), -z.ravel()
+    within = np.hypot(x, y) <= radius
+    x, y = x[within], y[within]
+    largest = 0.0
+    for turn in np.linspace(0.0, np.pi, 8, endpoint=False):
+        dx, dy = np.cos(turn), np.sin(turn)
+        moved = []
+        with np.errstate(all="ignore"):
+            for side in (-1, 1):
+                _, _, xx, xy, yy = distort(model, k, x + side * _STEP * dx, y + side * _STEP * dy)
+                moved.append((xx * dx + xy * dy, xy * dx + yy * dy))
+            second = np.hypot(moved[1][0] - moved[0][0], moved[1][1] - moved[0][1]) / (2 * _STEP)
+        largest = max(largest, float(np.nanmax(second, initial=0.0)))
+    return 1.2 * focal * largest / 8

@@ -1,0 +1,49 @@
+"""Rotations and rigid transforms of a camera that is tilted (PHYSICS section 9)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from phasemark import UsageError
+
+
+def tilt2level(pitch_rad: NDArray[np.float64], roll_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotations Ry(pitch) · Rx(roll) from a tilted to the level frame, (n, 3, 3).
+
+    Parameters
+    ----------
+    pitch_rad, roll_rad : (n,) float64
+        A positive pitch looks down.
+    """
+    sin_p, cos_p = np.sin(pitch_rad), np.cos(pitch_rad)
+    sin_r, cos_r = np.sin(roll_rad), np.cos(roll_rad)
+    out = np.zeros((len(pitch_rad), 3, 3))
+    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = cos_p, sin_p * sin_r, sin_p * cos_r
+    out[:, 1, 1], out[:, 1, 2] = cos_r, -sin_r
+    out[:, 2, 0], out[:, 2, 1], out[:, 2, 2] = -sin_p, cos_p * sin_r, cos_p * cos_r
+    return out
+
+
+def rigid_transforms(transforms: ArrayLike) -> NDArray[np.float64]:
+    """Return (n, 4, 4) float64 transforms that are rigid.
+
+    Raises
+    ------
+    UsageError
+        A matrix is not finite, or not a rotation with a translation.
+    """
+    array = np.asarray(transforms, dtype=np.float64)
+    if array.ndim == 2:
+        array = array[None]
+    if array.shape[1:] != (4, 4):
+        raise UsageError(f"'landmark2cam' must have shape (n, 4, 4), got {array.shape}")
+    if not np.isfinite(array).all():
+        raise UsageError("'landmark2cam' must be finite")
+    square = np.einsum("nij,nkj->nik", array[:, :3, :3], array[:, :3, :3])
+    off = np.abs(square - np.eye(3)).max(axis=(1, 2))
+    bottom = np.abs(array[:, 3] - [0, 0, 0, 1]).max(axis=1)
+    wrong = (off > 1e-4) | (bottom > 1e-9) | (np.linalg.det(array[:, :3, :3]) < 0)
+    if wrong.any():
+        raise UsageError(f"'landmark2cam' must be a rotation and a translation, matrix {int(wrong.argmax())} is not")
+    return array

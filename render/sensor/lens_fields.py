@@ -1,0 +1,155 @@
+"""The lens of a camera as OpenCV and ROS state it (PHYSICS section 9)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from phasemark import UsageError
+from phasemark.inputs import refuse_truth_values
+from phasemark.render.sensor.lens_map import LensMap, lens_map
+
+_Focal = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
+_Centre = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
+_Coefficient = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+
+_COUNTS = {"opencv": (0, 4, 5, 8), "fisheye": (0, 4)}
+_ORDERS = {"opencv": "k1 k2 p1 p2, then k3, then k4 k5 k6", "fisheye": "k1 k2 k3 k4"}
+
+_MOST_PIXELS = 4096  # along a side of an image
+_OFF_CENTRE = 0.75  # of the image's size, how far from its centre the principal point may lie
+_SAME = 1e-5  # relative difference up to which a stated field agrees with the lens
+
+DERIVED = ("half_angle_h_deg", "half_angle_v_deg", "principal_point_px")
+"""Fields of a sensor that follow from its lens."""
+
+
+class Lens(BaseModel):
+    """A lens with distortion, as OpenCV and ROS state it: the table ``[lens]`` of a sensor file.
+
+    OpenCV counts pixels from the *centre* of the first one, this program from the corner of the image: OpenCV's point
+    (0, 0) is u = v = ½ here. Stated as OpenCV has it, nothing needs to be added.
+
+    Parameters
+    ----------
+    model : {"opencv", "fisheye"}
+        Polynomial or rational distortion with tangential terms, or OpenCV's fisheye model (Kannala and Brandt).
+    fx, fy : float
+        Focal lengths, pixels.
+    cx, cy : float
+        Principal point, pixels from the centre of the first pixel.
+    distortion : tuple of float
+        Coefficients in OpenCV's order. "opencv": k1 k2 p1 p2, 5 of them with k3, 8 with k4 k5 k6. "fisheye": k1 k2 k3
+        k4. Empty: none.
+
+    Raises
+    ------
+    UsageError
+        A value is out of range, or the number of coefficients does not belong to the model.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+    model: Literal["opencv", "fisheye"] = "opencv"
+    fx: _Focal
+    fy: _Focal
+    cx: _Centre
+    cy: _Centre
+    distortion: tuple[_Coefficient, ...] = ()
+
+    def __init__(self, **data: Any) -> None:
+        refuse_truth_values(data, type(self).model_fields)
+        try:
+            super().__init__(**data)
+        except ValidationError as error:
+            first = error.errors()[0]
+            if not first["loc"]:  # a finding about several fields names them itself
+                raise UsageError(first["msg"].removeprefix("Value error, ")) from None
+            if first["type"] == "extra_forbidden":
+                raise UsageError(
+                    f"'{first['loc'][0]}' is no key of [lens]: it has {', '.join(Lens.model_fields)}"
+                ) from None
+            loc = ("lens", *first["loc"])
+            raise UsageError.of_field(loc, first["type"], first["msg"], first["input"]) from None
+
+    @model_validator(mode="after")
+    def _coefficients_belong_to_the_model(self) -> Self:
+        if len(self.distortion) not in _COUNTS[self.model]:
+            wanted = " or ".join(str(n) for n in _COUNTS[self.model] if n)
+            raise ValueError(
+                f"'lens.distortion' must have {wanted} coefficients for the model '{self.model}'"
+                f" ({_ORDERS[self.model]}), got {len(self.distortion)}"
+            )
+        return self
+
+    def before(self, rows: int, cols: int) -> LensMap:
+        """Return the lens before an image of rows × cols pixels.
+
+        Raises
+        ------
+        ValueError
+            The lens folds inside the image; with one line.
+        """
+        return lens_map(self.model, self.fx, self.fy, self.cx, self.cy, self.distortion, rows, cols)
+
+
+def with_geometry_of_lens(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a sensor with those that follow from its lens, if it has one.
+
+    Parameters
+    ----------
+    data : mapping of str to object
+        Fields as stated.
+
+    Raises
+    ------
+    UsageError
+        A stated field contradicts the lens, or the lens does not belong to an image of this size.
+    """
+    fields = dict(data)
+    lens = fields.get("lens")
+    if isinstance(lens, Mapping):
+        fields["lens"] = lens = Lens(**lens)
+    rows, cols = (_pixels(fields.get(name)) for name in ("rows", "cols"))
+    if not isinstance(lens, Lens) or rows is None or cols is None:
+        return fields  # what is wrong about them is found where fields are checked
+    centre = (lens.cx + 0.5, lens.cy + 0.5)
+    for name, at, size, side in (("cx", centre[0], cols, "cols"), ("cy", centre[1], rows, "rows")):
+        if abs(at - size / 2) > _OFF_CENTRE * size:
+            raise UsageError(
+                f"'lens.{name}' must lie in or near an image of {size} {side}, got {getattr(lens, name):g}: do the"
+                " intrinsics belong to another image size?"
+            )
+    try:
+        tan_h, tan_v = lens.before(rows, cols).tan_half_angles
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    derived = {
+        "half_angle_h_deg": math.degrees(math.atan(tan_h)),
+        "half_angle_v_deg": math.degrees(math.atan(tan_v)),
+        "principal_point_px": None if centre == (cols / 2, rows / 2) else centre,
+    }
+    for name in DERIVED:
+        stated = fields.get(name)
+        if stated is not None and not _agrees(stated, centre if name == "principal_point_px" else derived[name]):
+            shown = f"({centre[0]:.7g}, {centre[1]:.7g})" if name == "principal_point_px" else f"{derived[name]:.7g}"
+            raise UsageError(f"'{name}' must be left out beside 'lens', from which it follows as {shown}, got {stated}")
+    return {**fields, **derived}
+
+
+def _pixels(value: Any) -> int | None:
+    """Return a side of an image as a whole number, None where it is none."""
+    if not isinstance(value, int | float | np.integer) or not 1 <= value <= _MOST_PIXELS or value != int(value):
+        return None
+    return int(value)
+
+
+def _agrees(stated: Any, derived: Any) -> bool:
+    try:
+        return bool(np.allclose(np.asarray(stated, float), derived, rtol=_SAME, atol=1e-9))
+    except (TypeError, ValueError):
+        return False
