@@ -76,7 +76,7 @@ def test_a_class_is_as_likely_as_its_twin(renderers):
 
 
 def test_class_distances_are_the_least_of_a_fine_grid(renderers):
-    """Against a search of its own: residuals of ranges on a grid of 1 mm and 1° about the truth, where the least lies."""
+    """Against a search of its own: residuals of ranges on a grid of 1 mm and 1° about the truth."""
     true, other = renderers["cylinder"], renderers["cone"]
     view = Views.broadcast(2.0, 0.4)
     image = true.render_views(view)

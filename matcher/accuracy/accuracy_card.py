@@ -69,7 +69,7 @@ class AccuracyCard:
         return np.sqrt(self._position_variance(self.covariance))
 
     def shares(self) -> dict[str, float]:
-        """Return the share of each source in the variance of the position, the mean over the views that are observed."""
+        """Return the share of each source in the variance of the position: the mean over the observed views."""
         total = self._position_variance(self.covariance)
         known = np.isfinite(total)
         if not known.any():
@@ -176,8 +176,8 @@ def accuracy_card(
 ) -> AccuracyCard:
     """Return what a measurement can tell at best at some views, and what limits it.
 
-    Standard deviations are the Cramér–Rao bound on ranges (PHYSICS section 7), what the calibration of the sensor leaves,
-    and what the sensor declares. With P the covariance of the noise and I_e the information of the edge pixels, P I_e P
+    Standard deviations are the Cramér–Rao bound on ranges (PHYSICS section 7), what the calibration of the sensor
+    leaves, and what the sensor declares. With P the covariance of the noise and I_e the information of the edge pixels, P I_e P
     is what the noise of edge pixels contributes.
 
     Parameters

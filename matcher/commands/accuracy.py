@@ -41,8 +41,8 @@ def accuracy_line(
 ) -> None:
     """Say in one line how accurate a measurement can be, from the Cramér–Rao bound.
 
-    1 σ of distance, angle and position with the bearing free, what limits it, and how often another class of the catalogue
-    explains a frame better.
+    1 σ of distance, angle and position with the bearing free, what limits it, and how often another class of the
+    catalogue explains a frame better.
     """
     from phasemark.landmarks import catalog
     from phasemark.matcher.accuracy.accuracy_card import accuracy_card, sides_of
