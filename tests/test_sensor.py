@@ -28,7 +28,9 @@ from phasemark.render import (
     preset_names,
 )
 from phasemark.render.exposure import ablate
-from phasemark.render.sensor.sensor_file import sensor_toml
+from phasemark.render.sensor.sensor_file import read_sources, sensor_toml
+from phasemark.render.sensor.shipped_sensors import preset_sources
+from phasemark.render.sensor.sources import kind_of_source
 
 PMD = preset("pmd-16x16")
 DIRECT = preset("vl53l5cx-8x8")
@@ -115,12 +117,54 @@ def test_every_term_is_neutral_by_default():
 @pytest.mark.parametrize("name", [name for name in preset_names() if name != "ideal"])
 def test_every_number_of_a_preset_says_where_it_comes_from(name):
     text = resources.files("phasemark.render.sensor").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")
-    lines = [line for line in text.splitlines() if line and not line.startswith(("#", "["))]
     fields = tomllib.loads(text)
-    assert len(lines) == len(fields | fields.pop("histogram", {}))
-    for line in lines:
-        source = line.split("#")[1].strip()
-        assert source.split()[0].rstrip(":,;") in {"published", "measured", "assumed", "follows", "one", "none"}, line
+    sources = fields.pop("source")
+    assert sources == preset_sources(name)
+    of_table = {f"histogram.{key}" for key in fields.pop("histogram", {})}
+    assert set(sources) == set(fields) | of_table
+    assert all(kind_of_source(source) for source in sources.values())
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ('colour = "assumed"', "'source.colour' is of no field"),
+        ('"rows.bins" = "assumed"', "'source.rows.bins' is of no field"),
+        (
+            'rows = "guessed"',
+            "'source.rows' must be a text that begins with measured, published, assumed, got",
+        ),
+        ("rows = 3", "'source.rows' must be a text"),
+    ],
+)
+def test_a_source_that_says_nothing_is_refused(tmp_path, source, words):
+    path = tmp_path / "camera.toml"
+    path.write_text(f"rows = 4\ncols = 4\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\n[source]\n{source}\n")
+    for read in (Sensor.from_toml, read_sources):
+        with pytest.raises(UsageError, match=re.escape(f"{path}: {words}")):
+            read(path)
+
+
+def test_sources_change_nothing_of_the_sensor(tmp_path):
+    path = tmp_path / "camera.toml"
+    bare = "rows = 4\ncols = 4\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\n"
+    path.write_text(bare)
+    without = Sensor.from_toml(path)
+    assert read_sources(path) == {}
+    path.write_text(bare + '[source]\nrows = "published: data sheet"\n')
+    assert Sensor.from_toml(path) == without
+    assert read_sources(path) == {"rows": "published: data sheet"}
+
+
+def test_a_written_sensor_file_keeps_its_sources(tmp_path):
+    path = tmp_path / "camera.toml"
+    comments = {"signal_e": "measured, ± 3 (standard error): four boards", "contrast": "calibrated"}
+    path.write_text(sensor_toml(PMD, comments, header=[], otherwise="assumed: as in pmd-16x16"))
+    sources = read_sources(path)
+    assert sources["signal_e"] == comments["signal_e"]
+    assert sources["contrast"] == "measured: calibrated"
+    assert sources["rows"] == "assumed: as in pmd-16x16"
+    assert Sensor.from_toml(path) == PMD
 
 
 def test_the_noise_law_counts_quantisation_once():

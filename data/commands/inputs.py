@@ -140,6 +140,15 @@ class PlanWithDistances(Protocol):
         """Return the greatest distance of each key that has one."""
 
 
+def read_sensor_sources(name_or_file: str) -> dict[str, str]:
+    """Return where the numbers of a preset or of a sensor file come from, by field."""
+    from phasemark.render import preset_names
+    from phasemark.render.sensor.sensor_file import read_sources
+    from phasemark.render.sensor.shipped_sensors import preset_sources
+
+    return preset_sources(name_or_file) if name_or_file in preset_names() else read_sources(name_or_file)
+
+
 def read_sensor(name_or_file: str) -> Sensor:
     """Return a preset, or the sensor of a file; a preset's name wins over a file of that name."""
     from phasemark.render import Sensor, preset, preset_names

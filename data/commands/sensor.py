@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import json
+import textwrap
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,7 +15,7 @@ import typer
 from phasemark import UsageError
 from phasemark.data.commands.command import Without
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
-from phasemark.data.commands.inputs import note_too_far, read_sensor
+from phasemark.data.commands.inputs import note_too_far, read_sensor, read_sensor_sources
 from phasemark.data.commands.options import (
     Force,
     FrameReading,
@@ -23,8 +25,11 @@ from phasemark.data.commands.options import (
     a_preset,
 )
 from phasemark.data.commands.outputs import output_folder, refuse_existing
+from phasemark.inputs.toml_file import toml_value
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from phasemark.render import Sensor
     from phasemark.render.bench.fit.fitted_sensor import FittedField
 
@@ -64,10 +69,15 @@ def sensor_show(
     ],
     as_json: Json = False,
 ) -> None:
-    """Print every field of a sensor; the text is a sensor file again."""
-    sensor = read_sensor(name_or_file)
+    """Print a sensor in groups, and of each number whether it is measured, published or assumed.
+
+    The text is a sensor file again. Fields at their defaults stand in a line of comment; --json prints every field.
+    """
+    from phasemark.render.sensor.sensor_file import source_lines
+
+    sensor, sources = read_sensor(name_or_file), read_sensor_sources(name_or_file)
     if as_json:
-        echo_json({"name": name_or_file, **sensor.as_dict()})
+        echo_json({"name": name_or_file, **sensor.as_dict(), "sources": sources})
         return
     if sensor.kind == "direct":
         axis = "z, along the optical axis" if sensor.quantity == "z" else "the range along the ray"
@@ -75,22 +85,48 @@ def sensor_show(
     else:
         scales = ", ".join(f"{camera.metres_per_radian:.6f}" for camera in sensor.by_frequency)
         typer.echo(f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {scales} m per radian")
+    typer.echo(f"# {_sources_counted(sources)}")
     fields = sensor.model_dump(mode="json")
     table = fields.pop("histogram", None)  # a table stands behind all fields
     for title, names in sensor.field_groups().items():
-        typer.echo(f"\n# {title}")
-        for name in names:
-            if name in fields:
-                _echo_field(name, fields[name])
+        _echo_group(f"# {title}", {name: fields[name] for name in names if name in fields}, type(sensor), sources)
     if table is not None:
-        typer.echo("\n[histogram]")
-        for name, value in table.items():
-            _echo_field(name, value)
+        from phasemark.render.sensor.histogram_fields import Histogram
+
+        own = {name.removeprefix("histogram."): text for name, text in sources.items() if "." in name}
+        _echo_group("[histogram]", table, Histogram, own)
+    for line in source_lines(sources):
+        typer.echo(line)
 
 
-def _echo_field(name: str, value: object) -> None:
-    """Print a field as a line of a sensor file."""
-    typer.echo(f"# {name} is not set" if value is None else f"{name} = {json.dumps(value)}")
+def _sources_counted(sources: Mapping[str, str]) -> str:
+    """Say how many numbers are measured, published and assumed."""
+    from phasemark.render.sensor.sources import SOURCE_KINDS, kind_of_source
+
+    if not sources:
+        return "where its numbers come from is not stated: a table [source] would say it"
+    kinds = [kind_of_source(text) for text in sources.values()]
+    return ", ".join(f"{kinds.count(kind)} {kind}" for kind in SOURCE_KINDS)
+
+
+def _echo_group(title: str, fields: Mapping[str, object], model: type[BaseModel], sources: Mapping[str, str]) -> None:
+    """Print fields as lines of a sensor file, each with its source; those at their defaults in one comment."""
+    shown, rest = [], []
+    for name, value in fields.items():
+        known = model.model_fields[name]
+        default = list(known.default) if isinstance(known.default, tuple) else known.default
+        if value is None or (name not in sources and not known.is_required() and value == default):
+            rest.append(f"{name} {'not set' if value is None else json.dumps(value)}")
+        else:
+            shown.append(f"{name} = {toml_value(value)}" + (f"  # {sources[name]}" if name in sources else ""))
+    if not shown and not title.startswith("["):
+        typer.echo(f"\n{title}: all at their defaults")
+    else:
+        typer.echo(f"\n{title}")
+    for line in shown:
+        typer.echo(line)
+    for line in textwrap.wrap(f"at their defaults: {', '.join(rest)}", 118) if rest else ():
+        typer.echo(f"# {line}")
 
 
 def sensor_characterise(

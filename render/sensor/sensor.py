@@ -17,6 +17,7 @@ from phasemark.render.sensor.lens_fields import DERIVED, Lens
 from phasemark.render.sensor.sensor_checks import check_fields
 from phasemark.render.sensor.sensor_fields import CALIBRATION, OPTICS
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
+from phasemark.render.sensor.sources import without_sources
 
 # What is no error of a camera with taps, beside its optics.
 _WITHOUT_ERRORS = ("frame_rate_hz", "phase_interval_s", "contrast", "signal_e")
@@ -301,7 +302,7 @@ class Sensor(SensorQuantities):
         path = Path(path)
         table = read_toml(path)
         try:
-            return cls(**table)
+            return cls(**without_sources(table)[0])
         except UsageError as error:
             raise UsageError(f"{path}: {error}") from None
 
