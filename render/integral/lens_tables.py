@@ -30,7 +30,7 @@ def distortion_of(sensor: Sensor, rule: int) -> Distortion:
     rule : int
         Gauss points a side at which a background is integrated over a pixel; 0: there is no background.
     """
-    if sensor.lens is None:
+    if sensor.lens is None or not sensor.bends_rays:
         return IDEAL
     return _tables(sensor.lens, sensor.rows, sensor.cols, sensor.fill_factor if rule else (1.0, 1.0), rule)
 

@@ -89,6 +89,11 @@ class Lens(BaseModel):
             )
         return self
 
+    @property
+    def is_ideal(self) -> bool:
+        """Whether the lens bends no ray: a pinhole."""
+        return self.model == "opencv" and not any(self.distortion)
+
     def before(self, rows: int, cols: int) -> LensMap:
         """Return the lens before an image of rows × cols pixels.
 

@@ -121,6 +121,8 @@ class LensMap:
     @property
     def tan_half_angles(self) -> tuple[float, float]:
         """Half the width and height of the image, as tangents, along the row and column of the principal point."""
+        if self.model == OPENCV and not self.k.any():
+            return self.cols / (2 * float(self.focal_px[0])), self.rows / (2 * float(self.focal_px[1]))
         u0, v0 = np.clip(self.centre_px, 0.0, [self.cols, self.rows])
         across = self.rays(np.array([0.0, self.cols]), np.full(2, v0))[0]
         along = self.rays(np.full(2, u0), np.array([0.0, self.rows]))[1]
