@@ -1,7 +1,6 @@
 """Lenses with distortion: rays against OpenCV's own code, images against an oracle, files and what is refused."""
 
 import json
-import math
 import time
 from pathlib import Path
 
@@ -157,7 +156,7 @@ def test_slopes_behind_a_lens_are_those_of_differences(name):
             largest = np.abs(expected[:, k]).max()
             error = np.abs(slope[:, k] - expected[:, k]) / largest
             # single pixels differ: beside a limb, as without a lens, and where a bent edge runs along a row
-            assert np.quantile(error, 0.95) <= 1e-5, parameter
+            assert np.quantile(error, 0.95) <= 5e-5, parameter
             assert error.max() <= 0.15, parameter
 
 
@@ -343,9 +342,11 @@ def test_an_imported_sensor_says_of_every_field_where_it_is_from(tmp_path, capsy
     assert Sensor.from_toml(tmp_path / "again.toml") == sensor
 
 
-@pytest.mark.parametrize("name", ["sr4000-176x144", "picoflexx-224x171", "qvga-320x240"])
-def test_presets_of_cameras_that_people_have_see_the_published_field_of_view(name):
-    published = {"sr4000-176x144": (43.6, 34.6), "picoflexx-224x171": (62.0, 45.0), "qvga-320x240": (60.0, 45.0)}[name]
+@pytest.mark.parametrize(
+    ("name", "published"),
+    [("sr4000-176x144", (43.6, 34.6)), ("picoflexx-224x171", (62.0, 45.0)), ("opt8241-320x240", (74.4, 59.3))],
+)
+def test_presets_of_cameras_that_people_have_see_the_published_field_of_view(name, published):
     sensor = preset(name)
-    assert (2 * sensor.half_angle_h_deg, 2 * sensor.half_angle_v_deg) == pytest.approx(published, abs=0.05)
-    assert math.isfinite(sensor.unambiguous_range_m)
+    assert f"{sensor.cols}x{sensor.rows}" == name.partition("-")[2]
+    assert (2 * sensor.half_angle_h_deg, 2 * sensor.half_angle_v_deg) == pytest.approx(published)

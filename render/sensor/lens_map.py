@@ -24,7 +24,7 @@ _RADII = 4096  # of the table that Newton's method starts from
 _STEPS = 40  # of Newton's method at most
 _ROUNDING = 1e-14  # last step of Newton's method
 _CHECKED = 64  # points along each side of an image at which its lens is checked
-_DIRECTIONS = 256  # in which a fold is looked for
+_DIRECTIONS = 64  # in which a fold is looked for
 
 
 def distort(model: int, k: Any, x: Any, y: Any) -> tuple[Any, Any, Any, Any, Any]:
