@@ -315,9 +315,10 @@ class Renderer:
         middle = float(seen.height_m[0]) + 0.5 * float(self.topology.low[2] + self.topology.high[2])
         elevation = math.degrees(math.atan2(middle, float(seen.distance_m[0])))
         pitch, roll = (math.degrees(float(values[k])) for values in (views.pitch_rad, views.roll_rad))
+        right = round(-elevation - self.sensor.pitch_deg, 1) + 0.0
         raise UsageError(
-            f"in view {k} a pitch of {pitch:.4g}° and a roll of {roll:.4g}° turn the landmark out of the image: at roll"
-            f" 0 a pitch of about {-elevation - self.sensor.pitch_deg:.3g}° has it in the middle"
+            f"a pitch of {pitch:.4g}° and a roll of {roll:.4g}° turn the landmark out of the image in view {k}: at roll"
+            f" 0 a pitch of about {right:g}° has it in the middle"
         )
 
     def jacobian(

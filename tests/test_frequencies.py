@@ -130,17 +130,18 @@ def test_a_wall_has_the_phasor_of_the_closed_form_at_every_frequency(hz):
 @pytest.mark.parametrize("hz", FOUR.frequencies_hz)
 def test_a_floor_has_the_phasor_of_dense_quadrature_at_every_frequency(hz):
     floor_m, albedo = 0.3, 0.5
-    image = Renderer(None, FOUR).render(1.0, background=Background(floor_m=floor_m, floor_albedo=albedo))
-    single = PMD.with_(modulation_hz=hz)
+    image = Renderer(None, FOUR.with_(cols=2)).render(1.0, background=Background(floor_m=floor_m, floor_albedo=albedo))
+    single = PMD.with_(modulation_hz=hz, cols=2)
 
     def light(d):
         down = np.maximum(-d[..., 2], 1e-12)
         range_m = floor_m / down
         return np.where(d[..., 2] < 0, albedo * down / range_m**2, 0.0), range_m
 
-    exact, _ = integrate_pixels(single, light, n=80)
-    error = np.abs(image.at_frequency(hz)[0] - exact[1]).max() / np.abs(exact[1]).max()
-    assert error < 1e-4  # 8e-4 at 100 MHz with as many points a pixel as 10 MHz takes
+    exact, _ = integrate_pixels(single, light, n=300)
+    error = np.abs(image.at_frequency(hz)[0] - exact[1]).max(axis=1) / np.abs(exact[1]).max()
+    assert np.delete(error, 8).max() < 1e-6  # with as many points a pixel as 10 MHz takes, 8e-4 at 100 MHz
+    assert error[8] < 1e-3  # the horizon, where phases turn without end
 
 
 def test_a_frequency_that_was_not_rendered_is_refused_with_those_that_were():

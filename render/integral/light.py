@@ -18,7 +18,7 @@ from phasemark.render.kernel import inlined, kernel
 
 _RADIANS_PER_BOX = 2.0
 """How far the fastest phase turns along a box of 4 × 4 Gauss points: the error is some 1e-6 of its light."""
-_MOST_BOXES = 16
+_MOST_BOXES = 64
 
 
 @kernel
@@ -190,7 +190,7 @@ def _boxes(c, r, width, height, cos_b, sin_b, level, camera, light):  # type: ig
         return 1
     if near == 0.0 or far == 0.0:
         return _MOST_BOXES
-    return int(min(math.ceil(abs(far - near) * light.fastest / _RADIANS_PER_BOX), _MOST_BOXES - 1)) + 1
+    return int(min(max(math.ceil(abs(far - near) * light.fastest / _RADIANS_PER_BOX), 1.0), _MOST_BOXES))
 
 
 @kernel
