@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -143,7 +143,7 @@ def sensor_import(
     found = read_camera_info(camera_info)
     base = read_sensor(like)
     per_pixel = [name for name in ("dead_pixels", "hot_pixels", "zone_offset_m") if getattr(base, name)]
-    changes: dict[str, object] = dict.fromkeys(per_pixel, ()) | {name: None for name in DERIVED[2:]}
+    changes: dict[str, Any] = dict.fromkeys(per_pixel, ())
     if modulation is not None:
         changes["modulation_hz"] = modulation
     fields = {name: value for name, value in base.model_dump().items() if name not in (*DERIVED, *TABLES)}

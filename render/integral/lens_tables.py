@@ -79,8 +79,8 @@ def _bend(
     model: int, k: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], radius: float, focal: float
 ) -> float:
     """Return a bound of the sagitta of a line of length 1: an eighth of the largest second derivative along any."""
-    y, z = np.meshgrid(np.linspace(low[0], high[0], 65), np.linspace(low[1], high[1], 65))
-    x, y = -y.ravel(), -z.ravel()
+    left, up = np.meshgrid(np.linspace(low[0], high[0], 65), np.linspace(low[1], high[1], 65))
+    x, y = -left.ravel(), -up.ravel()
     within = np.hypot(x, y) <= radius
     x, y = x[within], y[within]
     largest = 0.0

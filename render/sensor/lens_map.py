@@ -107,7 +107,9 @@ class LensMap:
         """Radius, as a tangent, within which the lens is one to one along every direction."""
         self._check_image()
 
-    def project(self, y: NDArray[np.float64], z: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    def project(
+        self, y: NDArray[np.float64], z: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the image points u, v of rays (1, y, z)."""
         with np.errstate(all="ignore"):
             x_d, y_d = distort(self.model, self.k, -y, -z)[:2]
