@@ -27,8 +27,11 @@ from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.pixel_agreement import pixel_mask
-from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, unwrap_ranges
 from phasemark.render.sensor.frequencies import common_divisor_hz
+
+_UNMIXED_RAD = 0.01
+"""How far the phases of the frequencies may disagree, as a standard deviation, for a pixel to count as unmixed."""
 
 Way = Literal["stacked", "combined"]
 
@@ -150,7 +153,7 @@ class OneFrequency:
             return self.stack(slope)
         s = seen.phasors[:, None]
         power = np.abs(s) ** 2
-        known = power.min(axis=2) > 0
+        known = (power.min(axis=2) > 0) & self._is_unmixed(seen)[:, None]
         scale = self._metres[:, None, None]
         safe = np.where(power > 0, power, 1.0)
         weight = power / scale**2
@@ -160,6 +163,14 @@ class OneFrequency:
         brighter = (s.conj() * slope).real[:, :, 0] / safe[:, :, 0]
         turned = self._combined_phasor(seen)[:, None] * (brighter + 1j * by_range / self.sensor.metres_per_radian)
         return np.asarray(np.where(known, turned, 0.0))
+
+    def _is_unmixed(self, seen: PhasorImages) -> NDArray[np.bool_]:
+        """Return which pixels see one range at all frequencies, (n, rows, cols).
+
+        The unwrapped range of another may run away with the smallest move, and tells nothing of the view.
+        """
+        ranges = np.stack([part.range_m for part in seen.by_frequency])
+        return unwrap_ranges(ranges, _UNMIXED_RAD * self._metres[:, None, None, None], self.camera).consistent
 
     def _combined_phasor(self, seen: PhasorImages) -> NDArray[np.complex128]:
         range_m = seen.range_m
