@@ -198,12 +198,12 @@ def test_a_landmark_beyond_the_range_of_one_frequency_is_found_right_or_refused(
         matches = Matcher(far, method, **options).match(seen)
         assert matches.accepted.any()
         assert np.abs(matches.distance_m - views.distance_m)[matches.accepted].max() < 0.03
-        # nothing of the bank is where these are taken to be by 60 MHz alone: they are refused
+        # these are half a turn of 60 MHz nearer than the bank begins: found where they are, or refused
         near = Renderer(far.mesh("cylinder"), sensor).render_views(
             Views.broadcast(views.distance_m[:4] - 1.249, views.delta_rad[:4])
         )
-        wrong = Matcher(far, method, **options).match(kalman_filter(take(near, sensor, 50)))
-        assert not wrong.accepted.any()
+        found = Matcher(far, method, **options).match(kalman_filter(take(near, sensor, 50)))
+        assert (np.abs(found.distance_m - near.views.distance_m) < 0.03)[found.accepted].all()
 
 
 def test_information_is_the_sum_of_that_of_the_frequencies():
@@ -211,7 +211,7 @@ def test_information_is_the_sum_of_that_of_the_frequencies():
     together = cramer_rao(Renderer(CYLINDER, TWO), views, pixels="lower")
     alone = [cramer_rao(Renderer(CYLINDER, camera), views, pixels="lower") for camera in TWO.by_frequency]
     np.testing.assert_allclose(together.information, sum(one.information for one in alone), rtol=1e-6)
-    assert together.use.shape == (2, 16, 16)
+    assert together.pixels.shape == (2, 16, 16)
 
 
 def test_what_is_not_understood_of_several_frequencies_is_refused_in_one_line(bank):
