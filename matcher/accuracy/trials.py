@@ -13,6 +13,7 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
+from phasemark.matcher.accuracy.pose_report import PoseReport, pose_report, views_as_poses
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.residuals import ResidualKind
@@ -175,6 +176,23 @@ class Trials:
             class_errors=binomial_interval(int((self.found != self.class_name).sum()), len(self)),
             accepted=binomial_interval(int(self.accepted.sum()), len(self)),
         )
+
+    def pose_report(self, symmetry: int = 1) -> PoseReport:
+        """Return the errors of the poses in the terms of ASTM E2919; what is not free counts as known.
+
+        Parameters
+        ----------
+        symmetry : int
+            Of the landmark.
+        """
+        estimates = {name: np.array(getattr(self.views, name)) for name in VIEW}
+        for k, name in enumerate(self.free):
+            estimates[name] += self.error[:, k]
+        measured = np.full((len(self), 4, 4), np.nan)
+        found = np.flatnonzero(np.isfinite(self.error).all(axis=1) & self.accepted)
+        if found.size:
+            measured[found] = views_as_poses(Views(**{name: values[found] for name, values in estimates.items()}))
+        return pose_report(measured, self.views, symmetry=symmetry)
 
     def bias_in_cell(self, step: tuple[float, float], bins: int = 10) -> NDArray[np.float64]:
         """Return the mean scaled error by position in a cell of a bank's grid, in standard errors of that mean.
