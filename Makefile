@@ -4,15 +4,20 @@
 #   make lint types    style, import direction, types (of the tests too)
 #   make bench soak    speed; the long statistical and fault tables
 #   make figures       the pictures of the documentation
+#   make docs          the site in out/site, and its check: links, names, nothing from elsewhere, widths of pages
+#   make pages         the pages of docs/ that are made from the program
 #   make wheel-check   what a release would ship, built from a clean clone
+#   make dist          wheel and sdist, built twice and compared bit for bit
+#   make oldest        the fast tests against the oldest versions of dependencies that are allowed
 
 VENV ?= .venv
 BENCH_VENV ?= $(VENV)-bench
+OLDEST_VENV ?= $(VENV)-oldest
 ARGS ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test soak bench figures lint types wheel-check clean
+.PHONY: demo test soak bench figures lint types docs pages wheel-check dist oldest clean
 
 demo: $(VENV)/.installed
 	$(BIN)/phasemark demo --out out/demo --force
@@ -40,8 +45,22 @@ types: $(VENV)/.installed-test
 	$(BIN)/mypy
 	$(BIN)/mypy --config-file tests/mypy.ini
 
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+	$(BIN)/python docs/site/check.py out/site
+
+pages: $(VENV)/.installed-test
+	$(BIN)/python docs/commands.py
+	$(BIN)/python docs/site/generated_pages.py
+
 wheel-check: $(VENV)/.installed-test
 	$(BIN)/python .ci/wheel_check.py
+
+dist: $(VENV)/.installed-test
+	$(BIN)/python .ci/distributions.py dist
+
+oldest: $(BIN)/python
+	$(BIN)/python .ci/oldest.py $(OLDEST_VENV) $(ARGS)
 
 clean:
 	rm -rf build dist out .typing .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis *.egg-info
@@ -69,6 +88,10 @@ $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
 	rm -rf build
 	$(PIP) install --editable '.[test]'
 	touch $(VENV)/.installed $@
+
+$(VENV)/.installed-docs: pyproject.toml $(VENV)/.installed-test
+	$(PIP) install --editable '.[test,docs]'
+	touch $@
 
 # Open3D brings half a hundred packages, a pytest plugin among them, so the benchmark has an environment of its own.
 $(BENCH_VENV)/.installed-bench: pyproject.toml

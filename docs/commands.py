@@ -16,8 +16,8 @@ INTRODUCTION = """\
 # Every command
 
 Generated from the program by `python docs/commands.py`; do not edit. `phasemark COMMAND --help` prints the same for one
-command, and [the tour by task](../README.md) shows them at work. Results go to standard output, messages and progress
-to standard error; [exit codes](../README.md#when-something-is-wrong) say what went wrong.
+command, and [the tour by task](tour.md) shows them at work. Results go to standard output, messages and progress
+to standard error; [exit codes](errors.md) say what went wrong.
 
 `phasemark` alone says what to do first, `phasemark --version` prints the version, and `phasemark --install-completion`
 teaches commands and options to bash, zsh, fish or PowerShell (`--show-completion` prints what it would install).

@@ -2,11 +2,17 @@
 
 Some show what a run of a minute or more has left in out/. Without ``--runs``, where that is not there they stay as they
 are, and the command is named.
+
+docs/images/drawn.json records from which sources each figure was drawn, so that a test notices a figure that is older
+than its plan or the code that draws it. ``--accept`` records all figures as they are, after somebody has looked at
+them.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
+import hashlib
 import io
 import json
 import shlex
@@ -29,7 +35,8 @@ from phasemark.render import Background, Renderer, capture, preset
 from phasemark.render.figures import draw_range
 
 IMAGES = Path(__file__).parent / "images"
-OUT = Path(__file__).parent.parent / "out"
+ROOT = Path(__file__).resolve().parent.parent
+OUT = ROOT / "out"
 PHASEMARK = (sys.executable, "-c", "import sys; from phasemark.cli import main; sys.exit(main())")
 LEFT_BY = {
     "phasemark sweep run paper --out out/paper": {
@@ -53,6 +60,67 @@ LEFT_BY = {
     },
 }
 """Pictures that are those of a run, by its command."""
+SOURCES = {
+    "accuracy-bearing.png": ("matcher/sweep/plans/robustness.toml", "matcher/sweep/figures"),
+    "accuracy-distance.png": ("matcher/sweep/plans/paper.toml", "matcher/sweep/figures"),
+    "accuracy-frames.png": ("matcher/sweep/plans/distance-angle-noise.toml", "matcher/sweep/figures"),
+    "accuracy-map.png": ("matcher/sweep/plans/distance-angle-noise.toml", "matcher/sweep/figures"),
+    "accuracy-models.png": ("matcher/sweep/plans/robustness.toml", "matcher/sweep/figures"),
+    "accuracy-noise.png": ("matcher/sweep/plans/distance-angle-noise.toml", "matcher/sweep/figures"),
+    "accuracy-position.png": ("matcher/sweep/plans/paper.toml", "matcher/sweep/figures"),
+    "accuracy-risk.png": ("matcher/sweep/plans/distance-angle-noise.toml", "matcher/sweep/figures"),
+    "cost.png": ("docs/figures.py",),
+    "demo.png": ("docs/figures.py", "landmarks/catalog.py", "landmarks/figures.py", "render/figures.py"),
+    "design-bound.png": ("matcher/design/plan.toml", "matcher/design/figures.py"),
+    "design-mark-2.svg": ("matcher/design/plan.toml", "matcher/design/drawing.py"),
+    "design-pareto.png": ("matcher/design/plan.toml", "matcher/design/figures.py"),
+    "direct_error.png": ("examples/direct_sensor.py",),
+    "direct_histograms.png": ("examples/direct_sensor.py",),
+    "drive.png": ("matcher/drive/plan.toml", "matcher/drive/figures.py"),
+}
+"""What decides how a figure looks, beside the physics: plans, and the code that draws."""
+RECORD = IMAGES / "drawn.json"
+
+
+def _content(path: Path) -> bytes:
+    """Return what counts of a source: of Python the code, without comments and docstrings."""
+    if path.suffix != ".py":
+        return path.read_bytes()
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            node.body = [  # type: ignore[attr-defined]
+                each for each in body if not (isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant))
+            ]
+    return ast.unparse(tree).encode()
+
+
+def drawn_from(name: str) -> str:
+    """Return the digest of a figure's sources.
+
+    Parameters
+    ----------
+    name : str
+        A file of docs/images.
+
+    Returns
+    -------
+    str
+    """
+    digest = hashlib.sha256()
+    for source in SOURCES[name]:
+        path = ROOT / source
+        for file in sorted(path.glob("*.py")) if path.is_dir() else (path,):
+            digest.update(_content(file))
+    return digest.hexdigest()
+
+
+def record(names: Sequence[str]) -> None:
+    """Record that figures were drawn from their sources as they are now."""
+    known = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
+    known |= {name: drawn_from(name) for name in names}
+    write_atomically(RECORD, json.dumps(known, indent=2, sort_keys=True).encode() + b"\n", force=True)
 
 
 def demo_figure() -> Figure:
@@ -118,19 +186,26 @@ def write(figure: Figure, name: str) -> None:
     figure.savefig(buffer, format="png", dpi=90)
     IMAGES.mkdir(exist_ok=True)
     write_atomically(IMAGES / name, buffer.getvalue(), force=True)
+    record([name])
 
 
 def main() -> None:
     """Write every figure."""
     parser = argparse.ArgumentParser(description="Draw the figures of the documentation into docs/images.")
     parser.add_argument("--runs", action="store_true", help="make the runs that are missing in out/, ten minutes")
-    runs = parser.parse_args().runs
+    parser.add_argument("--accept", action="store_true", help="record all figures as they are, and draw none")
+    arguments = parser.parse_args()
+    if arguments.accept:
+        record(list(SOURCES))
+        return
+    runs = arguments.runs
     write(demo_figure(), "demo.png")
     write(drive_figure(run_drive(default_drive())), "drive.png")
     for command, figures in LEFT_BY.items():
         made = made_by(f"{command} --force", [OUT / source for source in figures.values()], runs, *PHASEMARK)
         for name, source in figures.items() if made else ():
             write_atomically(IMAGES / name, (OUT / source).read_bytes(), force=True)
+            record([name])
     bench = OUT / "bench.json"
     if runs and bench.exists() and "peer" not in json.loads(bench.read_text(encoding="utf-8")):
         bench.unlink()  # it has other sections alone, and would be replaced

@@ -16,8 +16,11 @@ from phasemark.landmarks.spec import Box, LandmarkSpec
 
 Part = Literal["both", "lower", "upper"]
 
-LOWER, UPPER = 0, 1
-"""Labels in ``mesh.face_attributes["part"]``."""
+LOWER = 0
+"""Label of the lower part's faces in ``mesh.face_attributes["part"]``."""
+
+UPPER = 1
+"""Label of the upper part's faces in ``mesh.face_attributes["part"]``."""
 
 DEFAULT_TOLERANCE_M = 1.2e-6
 """Permitted mean displacement of a silhouette along a pixel.

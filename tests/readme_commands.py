@@ -11,6 +11,8 @@ HTML comments directly above a block change how it is run:
     append options to that command: a later option overrides an earlier one, so a grid becomes small.
 ``<!-- test: as in PAGE -->``
     do not run the block, whose commands a block that is run on that page of the same folder or above prints too.
+``<!-- test: prints -->``
+    what stands below the commands of a console block is what they print.
 ``<!-- test: skip REASON -->``
     do not run the block.
 """
@@ -87,7 +89,8 @@ def read_blocks(markdown: str) -> list[Block]:
         elif fence:
             body, opened, language = [], number, fence[1]
         elif directive:
-            known = directive[1].startswith(("given ", "skip ", "as in ")) or " += " in directive[1]
+            begun = directive[1].startswith(("given ", "skip ", "as in "))
+            known = begun or directive[1] == "prints" or " += " in directive[1]
             if not known:
                 raise ValueError(f"line {number}: unknown directive '{directive[1]}'")
             directives.append(directive[1])
@@ -137,6 +140,21 @@ def run_page(page: Path, folder: Path) -> Iterator[str]:
                     yield command
                 elif program not in SET_UP:
                     raise AssertionError(f"{page.name}:{block.line}: no rule for '{command}'")
+
+
+def printed_and_expected(page: Path, folder: Path) -> Iterator[tuple[str, str, str]]:
+    """Run the commands of blocks marked ``prints``; yield each, what it printed, and what the page says it prints."""
+    for block in read_blocks(page.read_text(encoding="utf-8")):
+        if "prints" not in block.directives:
+            continue
+        for part in re.split(r"^\$ ", block.text, flags=re.MULTILINE)[1:]:
+            command, _, expected = part.partition("\n")
+            printed = io.StringIO()
+            words = shlex.split(command)
+            assert words[0] == "phasemark", command
+            with contextlib.chdir(folder), contextlib.redirect_stdout(printed):
+                assert main(words[1:]) == 0, command
+            yield command, printed.getvalue().rstrip(), expected.rstrip()
 
 
 def _check_twin(block: Block, page: Path) -> None:

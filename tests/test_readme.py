@@ -8,7 +8,8 @@ import pytest
 from readme_commands import RUN, Block, read_blocks, run_page, shell_commands
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("**/*.md")])
+NOTEBOOKS = ROOT / "docs" / "notebooks"  # their cells share names: tests/test_site.py runs them
+PAGES = sorted({*ROOT.glob("*.md"), *(ROOT / "docs").glob("**/*.md")} - {*NOTEBOOKS.glob("*.md")})
 
 
 @pytest.mark.usefixtures("one_example_of_each_method")

@@ -1,0 +1,242 @@
+"""Pages of the site that are made from the program: public names, plans, messages and examples."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from public_names import public_names
+
+from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
+from phasemark.matcher.plan_kinds import KINDS, plan_example, plan_schema
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+SOURCES = ("inputs", "landmarks", "render", "data", "matcher")
+RAISED = (UsageError, InputFileError, OutputExistsError, StorageError)
+
+
+def reference_path(module: str) -> str:
+    """Return the page of a module's public names."""
+    return f"reference/{module}.md"
+
+
+def first_line(thing: object) -> str:
+    """Return the first sentence of what a docstring says."""
+    text = inspect.cleandoc(getattr(thing, "__doc__", None) or "").split("\n\n")[0]
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def reference_page(*, linked: bool) -> str:
+    """Return the page that lists all public names.
+
+    Parameters
+    ----------
+    linked : bool
+        Whether names lead to their own descriptions, which the site alone has.
+
+    Returns
+    -------
+    str
+    """
+    lines = [
+        "# Public names",
+        "",
+        "Generated from the package by `make pages`; do not edit. What may be imported from where. "
+        "Anything else is internal and may change. The site has a page for each of these modules, with parameters, "
+        "results and errors of every name.",
+        "",
+    ]
+    for module, names in public_names().items():
+        thing = importlib.import_module(module)
+        heading = f"[{module}]({reference_path(module)})" if linked else module
+        lines += [f"## {heading}", "", first_line(thing), "", "| name | what it is |", "|---|---|"]
+        for name in names:
+            label = f"[`{name}`]({reference_path(module)}#{module}.{name})" if linked else f"`{name}`"
+            lines.append(f"| {label} | {_described(getattr(thing, name))} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _described(value: object) -> str:
+    return first_line(value) if callable(value) else "A constant."
+
+
+def reference_pages() -> dict[str, str]:
+    """Return a page for each module with public names."""
+    pages = {}
+    for module, names in public_names().items():
+        thing = importlib.import_module(module)
+        rows = [f"| [`{name}`](#{module}.{name}) | {_described(getattr(thing, name))} |" for name in names]
+        body = [line for name in names for line in (f"::: {module}.{name}", "")]
+        head = [f"# {module}", "", first_line(thing), "", "| name | what it is |", "|---|---|", *rows, ""]
+        pages[reference_path(module)] = "\n".join([*head, *body])
+    return pages
+
+
+def _type(schema: dict[str, Any], key: dict[str, Any]) -> str:
+    """Return in words what a key of a plan takes."""
+    if "$ref" in key:
+        return f"[{key['$ref'].rpartition('/')[2]}](#{key['$ref'].rpartition('/')[2].lower()})"
+    for several in ("anyOf", "oneOf"):
+        if several in key:
+            return " or ".join(dict.fromkeys(_type(schema, each) for each in key[several]))
+    if "enum" in key or "const" in key:
+        return ", ".join(f"`{word}`" for word in key.get("enum", [key.get("const")]))
+    if key.get("type") == "array":
+        return f"list of {_type(schema, key['items'])}" if isinstance(key.get("items"), dict) else "list"
+    if key.get("type") == "object":
+        inner = key.get("additionalProperties")
+        return f"table of {_type(schema, inner)}" if isinstance(inner, dict) else "table"
+    words = {
+        "number": "number",
+        "integer": "whole number",
+        "string": "text",
+        "boolean": "true or false",
+        "null": "none",
+    }
+    limits = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+    stated = [f"{sign} {key[name]:g}" for name, sign in limits.items() if isinstance(key.get(name), int | float)]
+    return " ".join([words.get(key.get("type", ""), "any"), ", ".join(stated)]).strip()
+
+
+def _explained(docstring: str) -> dict[str, str]:
+    """Return what the Parameters section of a numpydoc docstring says of each parameter."""
+    section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w[\w ]*\n-+\n|\Z)", docstring, flags=re.MULTILINE | re.DOTALL)
+    found: dict[str, str] = {}
+    names: list[str] = []
+    for line in section[1].splitlines() if section else ():
+        if line[:1].strip():
+            names = [name.strip() for name in line.partition(" : ")[0].split(",")]
+        for name in names if not line[:1].strip() else ():
+            found[name] = f"{found.get(name, '')} {line.strip()}".strip()
+    return found
+
+
+def _default(value: object) -> str:
+    """Return a default as a plan would state it."""
+    if isinstance(value, dict):
+        stated = {key: each for key, each in value.items() if each is not None}
+        if list(stated) == ["fixed"]:
+            return f"`{stated['fixed']}`"
+        value = "{ " + ", ".join(f"{key} = {each}" for key, each in stated.items()) + " }"
+    return "none" if value is None else f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def _rows(schema: dict[str, Any], model: dict[str, Any]) -> Iterator[str]:
+    required = model.get("required", [])
+    explained = _explained(model.get("description", ""))
+    for name, key in model.get("properties", {}).items():
+        default = "required" if name in required else _default(key["default"]) if "default" in key else ""
+        text = " ".join((key.get("description") or explained.get(name, "")).split()).replace("|", "\\|")
+        yield f"| `{name}` | {_type(schema, key)} | {default} | {text} |"
+
+
+def plans_page() -> str:
+    """Return the page of plans: every key of every kind, with an example."""
+    lines = [
+        "# Plans",
+        "",
+        "Generated from the program by `make pages`; do not edit. A plan is a TOML file: what is built or run. "
+        "`phasemark plan example KIND` prints one, `phasemark plan check FILE` says what is wrong with one, and "
+        "`phasemark plan schema KIND` prints the JSON Schema from which this page is made.",
+        "",
+    ]
+    tables: dict[str, dict[str, Any]] = {}
+    for kind in KINDS:
+        schema = plan_schema(kind)
+        lines += [f"## A plan of kind `{kind}`", "", "| key | takes | default | meaning |", "|---|---|---|---|"]
+        lines += [*_rows(schema, schema), "", f"The example of kind `{kind}`:", "", "```toml"]
+        lines += [plan_example(kind).rstrip(), "```", ""]
+        tables.update(schema.get("$defs", {}))
+    lines += ["## Tables within plans", ""]
+    for name, model in sorted(tables.items()):
+        if model.get("properties"):
+            lines += [f"### {name}", "", "| key | takes | default | meaning |", "|---|---|---|---|"]
+            lines += [*_rows({}, model), ""]
+        else:
+            lines += [f"### {name}", "", _type({}, model), ""]
+    return "\n".join(lines)
+
+
+def _template(node: ast.expr) -> str | None:
+    """Return the text of a message, with its values as ``…``."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.JoinedStr):
+        return "".join(part.value if isinstance(part, ast.Constant) else "…" for part in node.values)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        left, right = _template(node.left), _template(node.right)
+        return None if left is None or right is None else left + right
+    return None
+
+
+def messages() -> dict[str, set[str]]:
+    """Return the messages that each class of error is raised with, values as ``…``."""
+    found: dict[str, set[str]] = {error.__name__: set() for error in RAISED}
+    for room in SOURCES:
+        for path in sorted((ROOT / room).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in found):
+                    continue
+                text = _template(node.args[0]) if node.args else None
+                if text and re.search(r"[a-z]{3}", text):
+                    found[node.func.id].add(" ".join(text.split()))
+    return found
+
+
+def messages_page() -> str:
+    """Return the page of exit codes and messages."""
+    lines = [
+        "# Messages",
+        "",
+        "A mistake that you can mend is one line on standard error and an [exit code](../errors.md). These are the "
+        "lines, taken from the program; `…` stands for the file, key or value at hand. In Python the same line is the "
+        "text of the exception; there it names parameters where the command line names flags.",
+        "",
+    ]
+    for error in RAISED:
+        texts = sorted(messages()[error.__name__], key=lambda text: text.lstrip("…: '\"").lower())
+        lines += [f"## {error.__name__}: exit code {error.exit_code}", "", first_line(error), ""]
+        lines += [f"- `{text.replace('`', chr(39))}`" for text in texts]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def examples_page() -> str:
+    """Return the page of the scripts in examples/, whole."""
+    lines = ["# Example scripts", "", "The scripts of the folder `examples`. Each explains itself with `--help`.", ""]
+    for path in sorted((ROOT / "examples").iterdir()):
+        if path.suffix in (".py", ".toml"):
+            language = {".py": "python", ".toml": "toml"}[path.suffix]
+            lines += [f"## {path.name}", "", f"```{language}", path.read_text(encoding="utf-8").rstrip(), "```", ""]
+    return "\n".join(lines)
+
+
+def site_pages() -> dict[str, str]:
+    """Return the pages that the site alone has, or has with more links, by their paths."""
+    return {
+        **reference_pages(),
+        "reference.md": reference_page(linked=True),
+        "reference/messages.md": messages_page(),
+        "reference/examples.md": examples_page(),
+    }
+
+
+WRITTEN = {"reference.md": partial(reference_page, linked=False), "plans.md": plans_page}
+"""Pages of docs/ that are made from the program; docs/commands.py makes one more."""
+
+
+def main() -> None:
+    """Write the pages that the repository holds."""
+    for name, page in WRITTEN.items():
+        (ROOT / "docs" / name).write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""Hooks of MkDocs: the pages that are made from the program, and those of the repository's root."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from generated_pages import ROOT, SOURCES, site_pages
+from markdown_dialect import ROOT_PAGES, for_site, with_site_links
+from mkdocs.structure.files import File, Files
+from notebooks import notebook_page
+
+_ROOT_FILES = ("__init__.py", "__main__.py", "cli.py")
+PACKAGE = ROOT / "out" / "package" / "phasemark"
+"""Where mkdocs.yml has the reader of docstrings look: the package, which lies at the repository's root, by its name."""
+
+
+def on_startup(**_: Any) -> None:
+    """Lay links to the package's files."""
+    PACKAGE.mkdir(parents=True, exist_ok=True)
+    for name in (*_ROOT_FILES, *SOURCES):
+        (PACKAGE / name).unlink(missing_ok=True)
+        (PACKAGE / name).symlink_to(ROOT / name)
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add pages that are no files of docs/."""
+    for name, page in ROOT_PAGES.items():
+        if page and page != "index.md":
+            text = (ROOT / name).read_text(encoding="utf-8")
+            files.append(File.generated(config, page, content=with_site_links(text, root=True)))
+    made: dict[str, str | bytes] = dict(site_pages())
+    for path in sorted((ROOT / "docs" / "notebooks").glob("*.md")):
+        made |= notebook_page(path)
+    for page, content in made.items():
+        known = files.get_file_from_path(page)
+        if known:
+            files.remove(known)
+        files.append(File.generated(config, page, content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Bring a page of docs/ into the builder's dialect."""
+    return for_site(with_site_links(markdown, root=False))
+
+
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Drop the marks of Sphinx from docstrings."""
+    return re.sub(r":(?:mod|class|func|meth|data|attr):(?=<code>)", "", html)
+
+
+def on_post_page(output: str, page: Any, **_: Any) -> str:
+    """Take our own stand-in for workers, where the theme would load one from elsewhere."""
+    root = "../" * page.url.count("/")
+    return re.sub(r'src="https?://[^"]*/iframe-worker/shim"', f'src="{root}assets/search_worker.js"', output)
+
+
+def on_post_build(config: Any, **_: Any) -> None:
+    """Drop the page for unknown addresses: its links start at the root of a server, and the site may lie anywhere."""
+    (Path(config.site_dir) / "404.html").unlink(missing_ok=True)
