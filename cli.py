@@ -19,7 +19,7 @@ from phasemark import PhasemarkError, StorageError, UsageError, __version__
 from phasemark.data.commands import bank, frames, landmark, render, sensor, sensor_direct
 from phasemark.data.commands.command import Commands
 from phasemark.data.commands.console import report_error, tell, warnings_as_notes
-from phasemark.matcher.commands import calibrate, demo, design, drive, match, plan, sweep, verify
+from phasemark.matcher.commands import calibrate, demo, design, drive, match, plan, pose, sweep, verify
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -151,6 +151,7 @@ _add_group(
         "compare": sweep.sweep_compare,
     },
 )
+_add_group("pose", "Measured poses against true ones.", {"report": pose.pose_report_command})
 _add_group(
     "frames",
     "Sets of noisy frames with their truth.",

@@ -48,8 +48,6 @@ _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
 _TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
 """Parameters that turn what stands behind the landmark."""
-_RADIANS_PER_SPLIT = 1.1
-"""Radians per metre, those of 26 MHz, for which a pixel that sees a floor beside something else is cut once more."""
 _LARGE = 1 << 13
 """Faces above which a mesh is more than the processor's cache holds."""
 
@@ -317,9 +315,10 @@ class Renderer:
         middle = float(seen.height_m[0]) + 0.5 * float(self.topology.low[2] + self.topology.high[2])
         elevation = math.degrees(math.atan2(middle, float(seen.distance_m[0])))
         pitch, roll = (math.degrees(float(values[k])) for values in (views.pitch_rad, views.roll_rad))
+        right = round(-elevation - self.sensor.pitch_deg, 1) + 0.0
         raise UsageError(
-            f"in view {k} a pitch of {pitch:.4g}° and a roll of {roll:.4g}° turn the landmark out of the image: at roll"
-            f" 0 a pitch of about {-elevation - self.sensor.pitch_deg:.3g}° has it in the middle"
+            f"a pitch of {pitch:.4g}° and a roll of {roll:.4g}° turn the landmark out of the image in view {k}: at roll"
+            f" 0 a pitch of about {right:g}° has it in the middle"
         )
 
     def jacobian(
@@ -525,7 +524,7 @@ class Renderer:
         parameters: Sequence[str] = (),
     ) -> None:
         """Render slices of the views into `sums`, in one thread; with `slope`, (m, pixels, p), how they change too."""
-        mesh, splits = self.topology, self._splits_before(light)
+        mesh = self.topology
         turns = np.array([name in _TURNING for name in parameters], np.bool_) & light.background[:2].any()
         buffers = _Buffers(
             len(mesh.creases) + len(mesh.folds),
@@ -544,8 +543,8 @@ class Renderer:
             view = 0
             while view < len(poses.lens):
                 reached, n = plan_rays(
-                    view, mesh, poses, camera, splits, light.background, buffers.edges, buffers.scratch,
-                    buffers.samples, own.state, motion, buffers.borders,
+                    view, mesh, poses, camera, self.splits, light.background, light.fastest, buffers.edges,
+                    buffers.scratch, buffers.samples, own.state, motion, buffers.borders,
                 )  # fmt: skip
                 if reached <= view:
                     buffers.make_room(reached)
@@ -559,12 +558,6 @@ class Renderer:
                 view = reached
             if slopes is not None:
                 slopes.conclude()
-
-    def _splits_before(self, light: Light) -> int:
-        """Return into how many boxes a side pixels are cut: more where fast phases turn along a floor."""
-        if light.fastest == 0.0 or not light.background[1] > 0.0:
-            return self.splits
-        return max(self.splits, min(math.ceil(light.fastest / _RADIANS_PER_SPLIT), _MAX_SPLITS))
 
     def _cast_centres(self, tasks: Iterable[slice], views: Views, camera: Camera, light: Light, sums: Sums) -> None:
         """Render slices of the views with one ray a pixel into `sums`, in one thread."""
@@ -610,8 +603,8 @@ class Renderer:
 
 
 def _fastest(sensor: Sensor) -> float:
-    """Return the radians per metre of the highest of several modulation frequencies, 0 of one."""
-    if len(sensor.frequencies_hz) == 1:
+    """Return the radians per metre of the highest modulation frequency, 0 of a single one behind an ideal lens."""
+    if len(sensor.frequencies_hz) == 1 and sensor.lens is None:
         return 0.0
     return max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
 

@@ -8,6 +8,7 @@ import trimesh
 from scipy.integrate import solve_ivp
 
 from phasemark import UsageError
+from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, Views, capture, preset
 from phasemark.render.exposure import Motion, capture_moving, render_moving
 from phasemark.render.exposure.motion import phase_image_times_s
@@ -106,3 +107,16 @@ def test_a_velocity_must_be_finite_and_the_timing_the_same():
         )  # fmt: skip
     with pytest.raises(UsageError, match="must be one set of images, or 4 of equal length"):
         capture([Renderer(None, IDEAL).render(1.0)] * 3, IDEAL, rng=np.random.default_rng(0))
+
+
+def test_a_camera_that_pitches_and_rolls_is_rendered_at_the_tilt_of_each_phase_image():
+    motion = Motion(forward_m_s=0.2, pitch_rate_rad_s=0.3, roll_rate_rad_s=-0.4)
+    views = Views.broadcast(1.2, 0.4, 0.02, 0.01, 0.05, 0.1)
+    renderer = Renderer(build_mesh(catalog()["cone"]), IDEAL)
+    for time_s, image in zip(phase_image_times_s(IDEAL), render_moving(renderer, views, motion), strict=True):
+        level = Motion(forward_m_s=0.2).views_after(Views.broadcast(1.2, 0.4, 0.02, 0.01), time_s)
+        alone = renderer.render(
+            level.distance_m, level.delta_rad, level.bearing_rad, level.height_m, 0.05 + 0.3 * time_s,
+            0.1 - 0.4 * time_s,
+        )  # fmt: skip
+        np.testing.assert_allclose(image.phasor, alone.phasor, rtol=0, atol=1e-12)

@@ -1,6 +1,8 @@
 """Views of a tilted camera: conversions, images and slopes against the mount's own tilt and closed forms."""
 
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from test_derivative import PMD, TAN, WAVE, W, X, by_complex_step
 
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.render import Background, Renderer, Views
+from phasemark.render import Background, Renderer, Sensor, Views
 
 RNG = np.random.default_rng(11)
 TILTS = [(0.05, 0.0), (0.0, -0.2), (-0.07, 0.11), (0.13, 0.7)]
@@ -259,6 +261,24 @@ def test_slopes_of_tilted_views_are_those_of_differences_of_images(name, backgro
     # differences jump where an edge passes a corner of a pixel within their width; limbs as in tests/test_slopes.py
     assert np.quantile(error, 0.99) < 0.01
     assert error.max() < 0.08
+
+
+@pytest.mark.parametrize("frame", range(9))
+def test_tilted_cameras_with_lenses_see_what_an_integration_of_the_true_solids_does(frame):
+    with np.load(Path(__file__).parent / "golden" / "lenses.npz") as file:
+        case, lenses = json.loads(str(file["cases"]))[frame], json.loads(str(file["lenses"]))
+        phasor, coverage, hz = file[f"phasor_{frame}"][0], file[f"coverage_{frame}"], float(file["frequencies_hz"][0])
+    lens = lenses[case.pop("lens_name")]
+    matrix = [[lens["fx"], 0, lens["cx"]], [0, lens["fy"], lens["cy"]], [0, 0, 1]]
+    sensor = Sensor.from_opencv(
+        matrix, lens["distortion"], size=(lens["cols"], lens["rows"]), model=lens["model"], modulation_hz=hz
+    )
+    planes = {name: case.pop(name, None) for name in ("wall_m", "floor_m")}
+    background = Background(**planes) if any(planes.values()) else None
+    image = Renderer(build_mesh(catalog()[case.pop("cls")]), sensor).render(**case, background=background)
+    # a cylinder of 128 sections costs 3e-4 of the brightest pixel, and 1e-3 in coverage (PHYSICS section 3)
+    np.testing.assert_allclose(image.phasor[0], phasor, rtol=0, atol=3e-4 * np.abs(phasor).max())
+    np.testing.assert_allclose(image.coverage[0], coverage, rtol=0, atol=2e-3)
 
 
 def test_four_slopes_are_given_unless_others_are_asked_for():

@@ -13,6 +13,7 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
+from phasemark.matcher.accuracy.pose_report import PoseReport, pose_report, views_as_poses
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, phasor_mean
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.residuals import ResidualKind
@@ -46,6 +47,8 @@ class TrialSetup:
         the brighter ones of a weak pixel count.
     free : tuple of str
         What the matcher estimates, for the bound.
+    height_m, pitch_rad, roll_rad : float
+        True heights and tilts, uniform within ± these.
     nuisances : tuple of str, optional
         See :func:`~phasemark.matcher.accuracy.cramer_rao.cramer_rao`.
     """
@@ -57,6 +60,9 @@ class TrialSetup:
     on: ResidualKind = "ranges"
     free: tuple[str, ...] = VIEW[:2]
     nuisances: tuple[str, ...] | None = None
+    height_m: float = 0.0
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
 
     def views(self, n: int, rng: np.random.Generator, delta_period_rad: float) -> Views:
         """Draw true views, uniform, off the grid."""
@@ -64,8 +70,13 @@ class TrialSetup:
             rng.uniform(*self.distance_m, n),
             rng.uniform(0, delta_period_rad, n),
             rng.uniform(-1, 1, n) * self.bearing_rad,
-            0.0,
+            # a level camera's draws are not followed by others
+            *(rng.uniform(-1, 1, n) * width if width else 0.0 for width in self._upright),
         )
+
+    @property
+    def _upright(self) -> tuple[float, float, float]:
+        return self.height_m, self.pitch_rad, self.roll_rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +176,23 @@ class Trials:
             class_errors=binomial_interval(int((self.found != self.class_name).sum()), len(self)),
             accepted=binomial_interval(int(self.accepted.sum()), len(self)),
         )
+
+    def pose_report(self, symmetry: int = 1) -> PoseReport:
+        """Return the errors of the poses in the terms of ASTM E2919; what is not free counts as known.
+
+        Parameters
+        ----------
+        symmetry : int
+            Of the landmark.
+        """
+        estimates = {name: np.array(getattr(self.views, name)) for name in VIEW}
+        for k, name in enumerate(self.free):
+            estimates[name] += self.error[:, k]
+        measured = np.full((len(self), 4, 4), np.nan)
+        found = np.flatnonzero(np.isfinite(self.error).all(axis=1) & self.accepted)
+        if found.size:
+            measured[found] = views_as_poses(Views(**{name: values[found] for name, values in estimates.items()}))
+        return pose_report(measured, self.views, symmetry=symmetry)
 
     def bias_in_cell(self, step: tuple[float, float], bins: int = 10) -> NDArray[np.float64]:
         """Return the mean scaled error by position in a cell of a bank's grid, in standard errors of that mean.

@@ -124,6 +124,16 @@ class BankModel:
     ) -> None:
         """Return None: what is interpolated is smooth."""
 
+    def differences(
+        self, class_index: NDArray[np.int64], view: NDArray[np.float64], moves: NDArray[np.float64]
+    ) -> NDArray[np.complex128]:
+        """Interpolate both ends."""
+        ends = [
+            [self.images(class_index, view + side * moves[:, k], ()).phasor for side in (1.0, -1.0)]
+            for k in range(moves.shape[1])
+        ]
+        return np.stack([(one - other) / 2 for one, other in ends], axis=1)
+
     def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
         """Interpolate anew."""
         return replace(self.images(class_index, view, ()), slope=before.slope)

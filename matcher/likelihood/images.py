@@ -75,6 +75,11 @@ class ImageModel(Protocol):
     ) -> NDArray[np.complex128] | None:
         """Return slopes from differences over `step` (m, p) to either side; None if they differ little from others."""
 
+    def differences(
+        self, class_index: NDArray[np.int64], view: NDArray[np.float64], moves: NDArray[np.float64]
+    ) -> NDArray[np.complex128]:
+        """Return half the differences of images at both ends of moves (m, k, 6) of views; (m, k, pixels)."""
+
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels of its images may be relied on, (m, pixels)."""
 

@@ -21,6 +21,7 @@ from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, Setting
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import (
     capped_std,
+    slopes_along_axes,
     slopes_around,
     std_without_one_pixel,
     view_covariance,
@@ -181,14 +182,18 @@ def _uncertainty(
     without_one = np.full((len(state.theta), len(problem.settings.free)), np.inf)
     if near.size:
         there = problem.some(near)
-        wide = slopes_around(there, state, near, capped_std(problem, covariance[near]))
-        slope = state.images.slope[near] if wide is None else wide
-        images = ModelImages(
-            **{name: values[near] for name, values in vars(state.images).items() if name != "slope"}, slope=slope
-        )
-        sums = there.summed(state.theta[near], state.use[near], images).sums
-        if wide is not None:
-            covariance[near] = view_covariance(problem, sums)
+        for _ in range(problem.policy.axis_rounds if problem.lifts else 1):
+            if problem.lifts:
+                wide: NDArray[np.complex128] | None = slopes_along_axes(there, state, near, covariance[near])
+            else:
+                wide = slopes_around(there, state, near, capped_std(problem, covariance[near]))
+            slope = state.images.slope[near] if wide is None else wide
+            images = ModelImages(
+                **{name: values[near] for name, values in vars(state.images).items() if name != "slope"}, slope=slope
+            )
+            sums = there.summed(state.theta[near], state.use[near], images).sums
+            if wide is not None:
+                covariance[near] = view_covariance(problem, sums)
         without_one[near] = std_without_one_pixel(there, state, near, slope, sums.information, covariance[near])
     return covariance, without_one
 

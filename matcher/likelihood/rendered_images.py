@@ -156,6 +156,20 @@ class RenderedModel:
                 slope[of, k, first:] = (ends[0][1] - ends[1][1]) / width[:, None]
         return slope
 
+    def differences(
+        self, class_index: NDArray[np.int64], view: NDArray[np.float64], moves: NDArray[np.float64]
+    ) -> NDArray[np.complex128]:
+        """Render both ends."""
+        m, k = moves.shape[:2]
+        ends = np.concatenate([view[:, None] + moves, view[:, None] - moves], axis=1)
+        ends[..., 0] = np.clip(ends[..., 0], *self._limits)
+        phasor = np.empty((m, 2 * k, self.sensor.rows * self.sensor.cols), np.complex128)
+        for c in np.unique(class_index):
+            of = np.flatnonzero(class_index == c)
+            image = self._render(c, ends[of].reshape(-1, len(VIEW)))
+            phasor[of] = image.phasor.reshape(len(of), 2 * k, -1)
+        return np.asarray((phasor[:, :k] - phasor[:, k:]) / 2)
+
     def _changing_rows(self, name: str, view: NDArray[np.float64]) -> tuple[tuple[int, int] | None, int]:
         """Return the rows that a parameter changes, None for all, and their first pixel.
 

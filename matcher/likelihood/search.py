@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy import special
 
 from phasemark.matcher.likelihood.candidates import fit_modes, fit_other_classes, fit_starts, fit_surroundings
 from phasemark.matcher.likelihood.fits import Fits, best_of_frame
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.look_alikes import fit_look_alikes
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
@@ -36,10 +38,10 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     """
     which = _worth_a_search(setup, evidence, bare)
     policy = setup.policy
-    n_modes = policy.modes if scene.background is None else policy.modes_before_background
+    n_modes = setup.modes_before(scene.background)
     sides = () if scene.background is None else policy.beside_rad
     # 1  minima of the bank
-    starts = scene.search.starts(seen[which], n_modes, all_classes=evidence.on == "phasors")
+    starts = scene.search.starts(seen[which], n_modes, all_classes=_all_classes(setup, evidence))
     # 2 to 4  refined on interpolated and on rendered images; other classes
     fits = fit_starts(setup, scene, evidence, which, starts, sides)
     # 5  doubt: from elsewhere, without what fits worst, and from what looks alike
@@ -102,7 +104,46 @@ def _retry_unexplained(
     if not poor.size:
         return fits
     retry = _retry_with_prior if setup.bearing_has_prior else _retry_without_prior
-    return Fits.joined([fits, *retry(setup, scene, evidence, seen, bare, fits, poor)])
+    fits = Fits.joined([fits, *retry(setup, scene, evidence, seen, bare, fits, poor)])
+    if setup.is_upright:
+        return fits
+    poor = _unexplained(setup, scene, evidence, bare, fits, p=setup.policy.refused_p, even_beyond_bare=True)
+    return Fits.joined([fits, _fit_swayed(setup, scene, evidence, poor, fits)]) if poor.size else fits
+
+
+def _all_classes(setup: Setup, evidence: Evidence) -> bool:
+    """Return whether classes that are hardly worse than the best of a minimum start there too.
+
+    They do where the images of a bank are not those of the frames: of another albedo, or of a camera upright.
+    """
+    return evidence.on == "phasors" or not setup.is_upright
+
+
+def _fit_swayed(setup: Setup, scene: Scene, evidence: Evidence, which: NDArray[np.int64], fits: Fits) -> Fits:
+    """Fit some frames from around their best views, with every class: turned, rolled, and raised as they pitch."""
+    policy, free = setup.policy, setup.free
+    best = best_of_frame(fits)
+    best = best[np.isin(fits.frame[best], which)]
+    view = fits.view[best]
+    moved = [view]
+    for size in policy.sways_rad:
+        for name in ("delta_rad", "roll_rad"):
+            if name in free:
+                moved.append(view + size * (np.array(VIEW) == name))
+        if {"height_m", "pitch_rad"} & set(free):
+            raised = view.copy()
+            raised[:, 3] += view[:, 0] * math.tan(size) * ("height_m" in free)
+            raised[:, 4] -= size * ("pitch_rad" in free)
+            moved.append(raised)
+    n_class = len(setup.shapes.names)
+    views = np.concatenate(moved * n_class)
+    frame = np.tile(fits.frame[best], len(moved) * n_class)
+    class_index = np.repeat(np.arange(n_class), len(moved) * len(best))
+    order = np.argsort(frame, kind="stable")
+    settings = scene.settings(setup)
+    return fit_modes(
+        setup, scene.final, evidence, frame[order], class_index[order], views[order], settings, policy.margin_cost
+    )
 
 
 def _retry_with_prior(
@@ -122,8 +163,8 @@ def _retry_with_prior(
     found = [_fit_turned(setup, direct, evidence, poor, fits)]
     poor = _unexplained(setup, scene, evidence, bare, Fits.joined([fits, *found]))
     if poor.size:
-        n_modes = policy.modes if scene.background is None else policy.modes_before_background
-        starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=evidence.on == "phasors")
+        n_modes = setup.modes_before(scene.background)
+        starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=_all_classes(setup, evidence))
         found.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
         poor = _unexplained(
             setup,
@@ -152,7 +193,7 @@ def _retry_without_prior(
     poor: NDArray[np.int64],
 ) -> list[Fits]:
     """Search poor frames from more minima and angles; what would still be refused, around its best fits and anew."""
-    policy, all_classes = setup.policy, evidence.on == "phasors"
+    policy, all_classes = setup.policy, _all_classes(setup, evidence)
 
     def refused(found: list[Fits]) -> NDArray[np.int64]:
         return _unexplained(setup, scene, evidence, bare, Fits.joined([fits, *found]), p=policy.refused_p, among=poor)
@@ -167,7 +208,7 @@ def _retry_without_prior(
         return found
     if scene.scout is not None:
         # too little may be smooth for the scout to see the way
-        n_modes = policy.modes if scene.background is None else policy.modes_before_background
+        n_modes = setup.modes_before(scene.background)
         starts = scene.wide_search.starts(seen[again], n_modes, all_classes=all_classes)
     elif scene.background is not None:
         # edges between columns before a bright wall: no pixel may decide alone where the search starts
@@ -202,14 +243,14 @@ def _retry_trimmed(
 ) -> Fits:
     """Search again without the returns that fit worst, as a robust matcher does where nothing fits."""
     policy = setup.policy
-    n_modes = policy.modes if scene.background is None else policy.modes_before_background
+    n_modes = setup.modes_before(scene.background)
     sides = () if scene.background is None else policy.beside_rad
     for _ in range(policy.trimmings):
         poor = _unexplained(setup, scene, evidence, bare, fits, even_beyond_bare=True)
         if not poor.size:
             break
         kept = _trimmed(setup, scene, evidence, fits, poor, seen)
-        starts = scene.search.starts(kept, n_modes, all_classes=evidence.on == "phasors")
+        starts = scene.search.starts(kept, n_modes, all_classes=_all_classes(setup, evidence))
         fits = Fits.joined([fits, fit_starts(setup, scene, evidence, poor, starts, sides)])
     return fits
 

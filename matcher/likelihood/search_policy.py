@@ -52,6 +52,8 @@ class SearchPolicy:
         about so far away (PHYSICS section 7).
     beside_again_rad : tuple of float
         The same where nothing fits.
+    sways_rad : tuple of float
+        Where height, pitch or roll is free and nothing fits: turns by which the best view is moved to start again.
 
     max_iterations : int
         Steps of one descent.
@@ -78,6 +80,9 @@ class SearchPolicy:
     slope_width : float
         Least half width, in natural units, over which final slopes are differenced, so that a kink narrower than this
         does not make the covariance.
+    axis_rounds : int
+        Where height, pitch or roll is free, slopes are differenced along the axes of the covariance, which they make
+        in turn: how often.
     close_cost : float
         A fit whose cost is above its frame's best by more will not become the best: its surroundings are not looked at.
     recount_cost : float
@@ -160,6 +165,7 @@ class SearchPolicy:
     prior_sigma: float = 3.0
     beside_rad: tuple[float, ...] = _degrees(-1.0, 1.0)
     beside_again_rad: tuple[float, ...] = _degrees(-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0)
+    sways_rad: tuple[float, ...] = _degrees(-12.0, -6.0, 6.0, 12.0)
 
     max_iterations: int = 30
     longest_step: float = 3.0
@@ -175,6 +181,7 @@ class SearchPolicy:
     parabola_share: float = 0.5
     promising_cost: float = 20.0
     slope_width: float = 0.05
+    axis_rounds: int = 3
     close_cost: float = 50.0
     recount_cost: float = 25.0
     settling_rounds: int = 3

@@ -125,6 +125,13 @@ class Setup:
         """Whether the camera is level and at the height that was stated."""
         return not set(self.free) & set(VIEW[3:])
 
+    def modes_before(self, background: Background | None) -> int:
+        """Return how many minima of the bank each frame is first refined from before a background."""
+        policy = self.policy
+        if background is None:
+            return policy.modes
+        return policy.modes_before_background if self.is_upright else policy.modes_again
+
     def std_before(self, name: str) -> float:
         """Return the standard deviation of a parameter before a frame is seen; 0 of one that is not estimated."""
         if name not in self.free:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.information import covariance_of
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
 from phasemark.matcher.likelihood.residuals import Sums, robust_weight
 
@@ -43,6 +44,33 @@ def slopes_around(
         # light that comes and goes within the step has no phase whose slope could tell anything
         phasor = np.abs(state.images.phasor[which])[:, None]
         return np.where(np.abs(slope) * step[:, :, None] > phasor, 0.0, slope)
+    return np.concatenate([slope * state.theta[which, ALBEDO_COLUMN:, None], state.images.slope[which, -1:]], axis=1)
+
+
+def slopes_along_axes(
+    problem: Problem, state: State, which: NDArray[np.integer], covariance: NDArray[np.float64]
+) -> NDArray[np.complex128]:
+    """Return slopes over half a standard deviation to either side along the axes of covariances, (m, p, pixels).
+
+    A height and a pitch nearly cancel. Differences along each of them alone would average over different kinks, and
+    leave of their sum more than there is: information about what hardly changes the image.
+    """
+    p = covariance.shape[1]
+    scale = problem.scale[:p]
+    scaled = covariance / np.outer(scale, scale)
+    known = np.asarray(np.isfinite(scaled).all(axis=(1, 2)))
+    values, vectors = np.linalg.eigh(np.where(known[:, None, None], scaled, np.eye(p)))
+    length = np.clip(0.5 * np.sqrt(np.maximum(values, 0.0)), problem.policy.slope_width, 1.0)
+    moves = np.zeros((len(which), p, len(VIEW)))
+    moves[:, :, problem.columns[:p]] = (vectors * length[:, None]).transpose(0, 2, 1) * scale
+    view = np.ascontiguousarray(state.theta[which, :ALBEDO_COLUMN])
+    change = problem.model.differences(problem.class_index, view, moves)
+    if not problem.with_albedo:
+        change = np.where(np.abs(change) > np.abs(state.images.phasor[which])[:, None], 0.0, change)
+    # along the axes: slope · axis = change
+    slope = np.asarray(np.einsum("mik,mkq->miq", vectors / length[:, None], change) / scale[:, None])
+    if not problem.with_albedo:
+        return slope
     return np.concatenate([slope * state.theta[which, ALBEDO_COLUMN:, None], state.images.slope[which, -1:]], axis=1)
 
 

@@ -34,6 +34,8 @@ _GRID_STD_M = 0.01
 """What half a step of the thinned grid changes in a range."""
 _MOST_UP = 4
 """Number of shifts upwards, and downwards, that are compared."""
+_OFF_KINK_M = 0.002
+"""Heights start at this in place of 0, where the box's top appears and slopes of one side would hold them."""
 _FRAMES_TIMES_SHIFTS = 1 << 12
 """Frames are searched in groups of this over the number of shifts: the costs of a group are kept."""
 _MOST_OTHER_SIDES = 2
@@ -89,7 +91,8 @@ class Upward(NamedTuple):
         if whole == 0:
             return 0.0, 0.0
         share = 1.0 if math.isinf(by_height) else by_height / whole
-        return distance_m * math.tan(share * elevation_rad), (1 - share) * elevation_rad
+        height_m = distance_m * math.tan(share * elevation_rad)
+        return height_m or (_OFF_KINK_M if by_height else 0.0), (1 - share) * elevation_rad
 
 
 class Search:

@@ -116,8 +116,8 @@ class SceneMesh:
         still = Motion(pose, np.empty(0), np.empty((1, 4)))  # no slopes are asked for
         while True:
             reached, n = plan_rays(
-                0, mesh, pose, grid, 1, _NO_BACKGROUND, buffers.edges, buffers.scratch, buffers.samples, state, still,
-                buffers.borders,
+                0, mesh, pose, grid, 1, _NO_BACKGROUND, 0.0, buffers.edges, buffers.scratch, buffers.samples, state,
+                still, buffers.borders,
             )  # fmt: skip
             if reached == 1:
                 break

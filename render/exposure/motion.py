@@ -19,7 +19,7 @@ _SAME_LINE_RAD = 1e-9  # rounding of an angle, or of metres
 
 @dataclass(frozen=True)
 class Motion:
-    """Constant velocities of a camera that drives on the level, in its own frame.
+    """Constant velocities of a camera that drives on the level, in its own level frame, and rates of its tilt.
 
     Parameters
     ----------
@@ -29,6 +29,8 @@ class Motion:
         To the left.
     yaw_rate_rad_s : float
         Counter-clockwise.
+    pitch_rate_rad_s, roll_rate_rad_s : float
+        How fast the pitch and the roll of the view grow.
 
     Raises
     ------
@@ -39,10 +41,11 @@ class Motion:
     forward_m_s: float = 0.0
     sideways_m_s: float = 0.0
     yaw_rate_rad_s: float = 0.0
+    pitch_rate_rad_s: float = 0.0
+    roll_rate_rad_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("forward_m_s", "sideways_m_s", "yaw_rate_rad_s"):
-            value = getattr(self, name)
+        for name, value in vars(self).items():
             if not math.isfinite(value):
                 raise UsageError(f"'{name}' must be finite, got {value!r}")
 
@@ -65,7 +68,12 @@ class Motion:
         y = views.distance_m * np.sin(views.bearing_rad) - (self.forward_m_s * across + self.sideways_m_s * along)
         bearing = np.arctan2(y, x) - turn
         return Views.broadcast(
-            np.hypot(x, y), views.delta_rad - views.bearing_rad + bearing + turn, bearing, views.height_m
+            np.hypot(x, y),
+            views.delta_rad - views.bearing_rad + bearing + turn,
+            bearing,
+            views.height_m,
+            views.pitch_rad + self.pitch_rate_rad_s * time_s,
+            views.roll_rad + self.roll_rate_rad_s * time_s,
         )
 
 

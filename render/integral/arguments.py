@@ -124,8 +124,8 @@ class Light(NamedTuple):
         is 1.
     vignetting : bool
     fastest : float
-        4πf / c of the highest of several modulation frequencies, for which the background's pixels are cut finely
-        enough; 0 of one frequency, whose pixels are not cut.
+        4πf / c of the highest modulation frequency, for which the background's pixels are cut finely enough; 0 of a
+        single frequency behind an ideal lens, whose pixels are not cut.
     """
 
     background: NDArray[np.float64]

@@ -1,9 +1,9 @@
 """Edges seen through a lens with distortion: each becomes a chain of straight links along its curved image.
 
 In tangents (y, z) of rays (1, y, z) the image of an edge is straight. It is clipped there to what can matter, for far
-outside the image the polynomials of a lens fold back into it. Every other vertex of a chain lies outside the curve, by
-a sixth of the second difference of three vertices: by Simpson's rule, the area beside the chain is then that beside
-the curve to the fourth order in the links' length.
+outside the image the polynomials of a lens fold back into it. The vertices of a chain lie outside the curve, two
+thirds of a link's sagitta away from it, so that the area beside each link is that beside the curve. A chain begins and
+ends on the curve, where it meets other edges; its first and last link are shorter by √2, which makes up for that.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ from phasemark.render.kernel import inlined, kernel
 
 FULL = -1
 """Number of segments that says that there is no room for more."""
-_FLAT_PX = 2e-5
+_FLAT_PX = 1.5e-5
 """Largest distance of a curve from its chord at which the chord alone is taken: its area is not corrected."""
-_SAGITTA_PX = 3e-4
+_SAGITTA_PX = 1.5e-4
 """Largest distance of a curve from the chord of one link."""
 _MOST_LINKS = 4096
+_SHORT = math.sqrt(0.5)
+"""First and last link of a chain, in lengths of the others."""
 
 
 class Plane(NamedTuple):
@@ -95,19 +97,26 @@ def add_bent_edge(ya, za, yb, zb, start, end, limb, camera, edges, n):  # type: 
     if links == 1:
         segments[n, 0], segments[n, 1], segments[n, 2], segments[n, 3] = ua, va, ub, vb
         return n + 1
-    step = 1.0 / links
-    for i in range(n, n + links, 2):
-        at = (i - n + 1) * step
-        um, vm = image_of(camera, ya + at * dy, za + at * dz)
-        uc, vc = ub, vb
-        if i + 2 < n + links:
-            at += step
-            uc, vc = image_of(camera, ya + at * dy, za + at * dz)
-        um -= (ua - 2.0 * um + uc) / 6.0
-        vm -= (va - 2.0 * vm + vc) / 6.0
-        segments[i, 0], segments[i, 1], segments[i, 2], segments[i, 3] = ua, va, um, vm
-        segments[i + 1, 0], segments[i + 1, 1], segments[i + 1, 2], segments[i + 1, 3] = um, vm, uc, vc
-        ua, va = uc, vc
+    step = 1.0 / (links - 2 + 2.0 * _SHORT)
+    u0, v0, u1, v1 = ua, va, ua, va  # on the curve: the vertex before, and the one at hand
+    from_u, from_v, before = ua, va, 0.0  # the chain's last vertex, and the length of the link on the curve before
+    for i in range(links):
+        u2, v2, after = ub, vb, _SHORT
+        if i < links - 1:
+            at = (_SHORT + i) * step
+            u2, v2 = image_of(camera, ya + at * dy, za + at * dz)
+            after = 1.0 if i > 0 else _SHORT
+        if i > 0:
+            # the curvature by divided differences over both links; a sagitta is an eighth of it, the length being 1
+            share = 2.0 / (before + after) / 12.0
+            to_u = u1 - share * ((u2 - u1) / after - (u1 - u0) / before)
+            to_v = v1 - share * ((v2 - v1) / after - (v1 - v0) / before)
+            segments[n + i - 1, 0], segments[n + i - 1, 1] = from_u, from_v
+            segments[n + i - 1, 2], segments[n + i - 1, 3] = to_u, to_v
+            from_u, from_v = to_u, to_v
+        u0, v0, u1, v1, before = u1, v1, u2, v2, after
+    last = n + links - 1
+    segments[last, 0], segments[last, 1], segments[last, 2], segments[last, 3] = from_u, from_v, ub, vb
     return n + links
 
 
@@ -126,7 +135,7 @@ def _clip_to_lens(ya, za, yb, zb, lens):  # type: ignore[no-untyped-def]
 
 @kernel
 def _count_links(ya, za, dy, dz, ua, va, ub, vb, camera):  # type: ignore[no-untyped-def]
-    """Return how many links the image of a line needs, from its second differences across its chord: 1 or even."""
+    """Return how many links the image of a line needs, from its second differences across its chord."""
     du, dv = ub - ua, vb - va
     chord = math.sqrt(du * du + dv * dv)
     if chord == 0.0:
@@ -144,5 +153,5 @@ def _count_links(ya, za, dy, dz, ua, va, ub, vb, camera):  # type: ignore[no-unt
     # the second difference over a quarter is eight times a quarter's sagitta; sagittas go with the square of lengths
     if 2.0 * widest <= _FLAT_PX:
         return 1
-    links = 2 * math.ceil(2.0 * math.sqrt(widest / (8.0 * _SAGITTA_PX)))
+    links = math.ceil(4.0 * math.sqrt(widest / (8.0 * _SAGITTA_PX)) + 2.0 * (1.0 - _SHORT))
     return min(max(links, 2), _MOST_LINKS)

@@ -173,19 +173,19 @@ def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _range_of_background(u, v, cos_b, sin_b, camera, light):  # type: ignore[no-untyped-def]
+def _range_of_background(u, v, cos_b, sin_b, level, camera, light):  # type: ignore[no-untyped-def]
     """Return the range of what stands behind an image point, 0 for nothing."""
     y, z = ray_of(camera, u, v)
-    dx, dy, dz = towards_level(camera.level, y, z)
+    dx, dy, dz = towards_level(level, y, z)
     t, _, _ = background_hit(light.background, cos_b, sin_b, dx, dy, dz)
     return t * math.sqrt(1.0 + y * y + z * z)
 
 
 @kernel
-def _boxes(c, r, width, height, cos_b, sin_b, camera, light):  # type: ignore[no-untyped-def]
+def _boxes(c, r, width, height, cos_b, sin_b, level, camera, light):  # type: ignore[no-untyped-def]
     """Return into how many boxes a pixel is cut along its width or height, for its fastest phase to turn little."""
-    near = _range_of_background(c + 0.5 - 0.5 * width, r + 0.5 - 0.5 * height, cos_b, sin_b, camera, light)
-    far = _range_of_background(c + 0.5 + 0.5 * width, r + 0.5 + 0.5 * height, cos_b, sin_b, camera, light)
+    near = _range_of_background(c + 0.5 - 0.5 * width, r + 0.5 - 0.5 * height, cos_b, sin_b, level, camera, light)
+    far = _range_of_background(c + 0.5 + 0.5 * width, r + 0.5 + 0.5 * height, cos_b, sin_b, level, camera, light)
     if near == 0.0 and far == 0.0:
         return 1
     if near == 0.0 or far == 0.0:
@@ -194,7 +194,7 @@ def _boxes(c, r, width, height, cos_b, sin_b, camera, light):  # type: ignore[no
 
 
 @kernel
-def _add_boxes(index, c, r, n_u, n_v, cos_b, sin_b, camera, light, sums):  # type: ignore[no-untyped-def]
+def _add_boxes(index, c, r, n_u, n_v, cos_b, sin_b, level, camera, light, sums):  # type: ignore[no-untyped-def]
     """Integrate the background over one pixel, cut into boxes."""
     for i in range(4 * n_v):
         v = r + 0.5 + camera.fill_v * ((i // 4 + G4X[i % 4]) / n_v - 0.5)
@@ -202,7 +202,7 @@ def _add_boxes(index, c, r, n_u, n_v, cos_b, sin_b, camera, light, sums):  # typ
             u = c + 0.5 + camera.fill_u * ((j // 4 + G4X[j % 4]) / n_u - 0.5)
             y, z = ray_of(camera, u, v)
             length = math.sqrt(1.0 + y * y + z * z)
-            dx, dy, dz = towards_level(camera.level, y, z)
+            dx, dy, dz = towards_level(level, y, z)
             t, rho, cos_theta = background_hit(light.background, cos_b, sin_b, dx, dy, dz)
             if t != 0.0:
                 weight = G4W[i % 4] * G4W[j % 4] / (n_u * n_v)
@@ -228,16 +228,17 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
     rule, bent_lens = camera.distortion.rule, camera.distortion.model != 0
     for view in range(start, stop):
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
+        level = poses.level[view]
         for r in range(rows):
             for c in range(cols):
                 if sums.state[view, r, c] != SKIPPED:
                     continue
                 index = (view * rows + r) * cols + c
                 if light.fastest > 0.0:
-                    n_v = _boxes(c, r + camera.first_row, 0.0, camera.fill_v, cos_b, sin_b, camera, light)
-                    n_u = _boxes(c, r + camera.first_row, camera.fill_u, 0.0, cos_b, sin_b, camera, light)
+                    n_v = _boxes(c, r + camera.first_row, 0.0, camera.fill_v, cos_b, sin_b, level, camera, light)
+                    n_u = _boxes(c, r + camera.first_row, camera.fill_u, 0.0, cos_b, sin_b, level, camera, light)
                     if n_u * n_v > 1:
-                        _add_boxes(index, c, r + camera.first_row, n_u, n_v, cos_b, sin_b, camera, light, sums)
+                        _add_boxes(index, c, r + camera.first_row, n_u, n_v, cos_b, sin_b, level, camera, light, sums)
                         continue
                 for i in range(order):
                     at = G4X[i] if order == 4 else G3X[i]
@@ -246,11 +247,12 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
                         at = G4X[j] if order == 4 else G3X[j]
                         u = c + 0.5 + camera.fill_u * (at - 0.5)
                         if bent_lens:
-                            y, z = rule[r + camera.first_row, c, i * order + j]
+                            ray = rule[r + camera.first_row, c, i * order + j]
+                            y, z = ray[0], ray[1]
                         else:
                             y, z = ray_of(camera, u, v)
                         length = math.sqrt(1.0 + y * y + z * z)
-                        dx, dy, dz = towards_level(poses.level[view], y, z)
+                        dx, dy, dz = towards_level(level, y, z)
                         t, rho, cos_theta = background_hit(light.background, cos_b, sin_b, dx, dy, dz)
                         if t == 0.0:
                             continue

@@ -11,7 +11,9 @@ from phasemark.render.integral.bent_edges import add_bent_edge
 from phasemark.render.integral.edge_motion import follow_borders
 from phasemark.render.integral.edge_projection import project_edges
 from phasemark.render.integral.edges_in_pixels import bin_segments
+from phasemark.render.integral.floor_phase import parts_of_pixel
 from phasemark.render.integral.image_rays import trace
+from phasemark.render.integral.limbs import lists_limb
 from phasemark.render.integral.pixel_splitting import sample_pixel
 from phasemark.render.kernel import kernel
 
@@ -28,7 +30,9 @@ SHORT_SEGMENTS = -2
 
 
 @kernel
-def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, samples, state, motion, borders):  # type: ignore[no-untyped-def]
+def plan_rays(  # type: ignore[no-untyped-def]
+    first, mesh, poses, camera, splits, background, fastest, edges, scratch, samples, state, motion, borders
+):
     """Place the samples of as many views as fit into the buffers, from view `first` on.
 
     Parameters
@@ -38,8 +42,10 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
     poses : Poses
     camera : Camera
     splits : int
-        Boxes a side that every pixel is cut into.
+        Boxes a side that every pixel is cut into, at least.
     background : (4,) float64
+    fastest : float
+        As :class:`~phasemark.render.integral.arguments.Light` has it.
     edges : Edges
     scratch : Scratch
     samples : Samples
@@ -85,8 +91,10 @@ def plan_rays(first, mesh, poses, camera, splits, background, edges, scratch, sa
                     continue
                 before = n
                 bent = left < bent_high_u and right > bent_low_u and top < bent_high_v and bottom > bent_low_v
+                parts = parts_of_pixel(r, c, background, fastest, cos_b, sin_b, poses.level[view], camera)
+                parts = max(splits, parts if parts > 1 and not _near_limb(r + 1, c + 1, edges) else 1)
                 n, region, trusted = sample_pixel(
-                    r, c, bent, splits, camera, edges, scratch, samples, borders, n, region
+                    r, c, bent, parts, camera, edges, scratch, samples, borders, n, region
                 )
                 if n < 0 or borders.placed[0] > room:
                     borders.placed[0] = first_border
@@ -125,6 +133,16 @@ def _add_background(background, cos_b, sin_b, level, camera, edges, n):  # type:
     else:
         return n
     return add_bent_edge(ya, za, yb, zb, -1, -1, 0, camera, edges, n)
+
+
+@kernel
+def _near_limb(i, j, edges):  # type: ignore[no-untyped-def]
+    """Return whether a limb runs through a pixel or one beside it; the rules beside a limb belong to whole pixels."""
+    head = edges.head
+    for entry in (head[i, j], head[i, j - 1], head[i, j + 1], head[i - 1, j], head[i + 1, j]):
+        if lists_limb(entry, edges):
+            return True
+    return False
 
 
 @kernel

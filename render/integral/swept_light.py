@@ -80,7 +80,7 @@ def _light_beside(b, which, y, z, view, samples, first_of, mesh, poses, camera, 
         return t, phasor_of(t * length, light.albedo * cos_theta, length, light)
     # where wall and floor meet, the point itself is on both: which of them this side sees, its sample tells
     cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
-    own_y, own_z = ray_of(camera, points[nearest, 0], points[nearest, 1])
+    own_y, own_z = samples.rays[nearest, 0], samples.rays[nearest, 1]
     dx, dy, dz = towards_level(poses.level[view], own_y, own_z)
     plane = nearer_plane(light.background, cos_b, sin_b, dx, dy, dz)
     dx, dy, dz = towards_level(poses.level[view], y, z)

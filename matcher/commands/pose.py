@@ -1,0 +1,102 @@
+"""The command ``phasemark pose report``: measured poses against true ones."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from phasemark import UsageError
+from phasemark.data.commands.console import Table, echo_json
+from phasemark.data.commands.options import Json
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from phasemark.matcher.recordings.pose_table import PoseTable
+    from phasemark.render import Views
+
+
+def pose_report_command(
+    estimates: Annotated[Path, typer.Argument(metavar="ESTIMATES", help="What match --estimates wrote, CSV.")],
+    truth: Annotated[
+        Path,
+        typer.Argument(
+            metavar="TRUTH", help="True poses by position or by time, or a recording with truth_ columns, CSV."
+        ),
+    ],
+    symmetry: Annotated[
+        int, typer.Option("--symmetry", min=1, help="Turns about its axis that leave the landmark as it is.")
+    ] = 1,
+    delay_s: Annotated[
+        float, typer.Option("--delay", help="Seconds added to the stamps of the estimates, for poses by time.")
+    ] = 0.0,
+    refused: Annotated[bool, typer.Option("--refused", help="Count answers that were not accepted, too.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Report the errors of measured poses in the terms of ASTM E2919.
+
+    Absolute errors of position and orientation, and those of the motion from one pose to the next: mean, r.m.s.,
+    percentiles and maximum, each with its 95 % interval.
+    """
+    import numpy as np
+
+    from phasemark.matcher.accuracy.pose_report import pose_report, views_as_poses
+    from phasemark.matcher.recordings.pose_table import read_pose_table
+
+    found, true = read_pose_table(estimates), read_pose_table(truth)
+    rows, views = _truth_of(found, true, estimates, truth, delay_s)
+    counted = found.known[rows] & (found.accepted[rows] | refused)
+    measured = np.full((len(rows), 4, 4), np.nan)
+    if counted.any():
+        from phasemark.render import Views
+
+        measured[counted] = views_as_poses(Views.broadcast(*found.view[rows[counted]].T))
+    report = pose_report(measured, views, symmetry=symmetry)
+    if as_json:
+        echo_json({"estimates": str(estimates), "truth": str(truth), **report.as_dict()})
+        return
+    lines = report.rows()
+    table = Table(list(lines[0]))
+    table.echo([list(line.values()) for line in lines])
+    typer.echo(f"{report.n_measured} of {report.n_poses} poses measured")
+
+
+def _truth_of(
+    found: PoseTable, true: PoseTable, estimates: Path, truth: Path, delay_s: float
+) -> tuple[NDArray[np.int64], Views]:
+    """Return which estimates have a truth, and the true views of these."""
+    import numpy as np
+
+    from phasemark.render import Views
+
+    if not true.known.all():
+        raise UsageError(f"{truth}: pose {int(np.argmin(true.known))} has an empty cell: every true pose must be whole")
+    by_position = true.time_s is None or found.time_s is None or len(true) == len(found)
+    if by_position:
+        index = np.arange(len(found)) if found.index is None else found.index
+        if index.min() < 0 or index.max() >= len(true):
+            raise UsageError(
+                f"{truth}: has {len(true)} poses, and {estimates} has an estimate of position {int(index.max())}:"
+                " give one true pose for each position, or stamps (t_s) in both files"
+            )
+        return np.arange(len(found)), true.views()[index]
+    from phasemark.matcher.calibration.known_poses import KnownPoses
+    from phasemark.matcher.calibration.pose_track import PoseTrack
+
+    assert found.time_s is not None
+    if true.view[:, 4:].any():
+        raise UsageError(f"{truth}: pitch and roll by time are not interpolated: give one true pose for each position")
+    distance, delta, bearing, height = np.ascontiguousarray(true.view[:, :4].T)
+    track = PoseTrack.of(KnownPoses(distance, delta, bearing, height, time_s=true.time_s))
+    at = found.time_s + delay_s
+    rows = np.flatnonzero(np.isfinite(at) & track.known(at, at))
+    if not rows.size:
+        raise UsageError(
+            f"{truth}: no estimate of {estimates} was taken between two of its poses: do the clocks agree?"
+        )
+    return rows, Views.broadcast(*track.at(at[rows])[0].T)
