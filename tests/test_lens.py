@@ -10,6 +10,7 @@ import pytest
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
+from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, Sensor, Views, preset
 from phasemark.render.derivative import VIEW_PARAMETERS
@@ -255,6 +256,19 @@ def test_what_knows_no_lens_refuses_it():
     direct = preset("vl53l5cx-8x8")
     with pytest.raises(UsageError, match="'lens' must be left out beside 'histogram'"):
         direct.with_(lens=Lens(fx=10, fy=10, cx=3.5, cy=3.5))
+
+
+@pytest.mark.parametrize("with_lens", [True, False])
+def test_a_bank_holds_its_sensor_whole_and_needs_its_file_no_more(tmp_path, with_lens):
+    sensor = barrel(rows=8, cols=8, focal=20.0, distortion=BARREL[:4])
+    sensor = sensor if with_lens else sensor.with_(lens=None)
+    (tmp_path / "own.toml").write_text(sensor_toml(sensor, {}, header=(), otherwise="assumed"), encoding="utf-8")
+    plan = BankPlan(classes=["cone"], sensor=str(tmp_path / "own.toml"), distance_m="0.9:1.1:0.1", delta_deg="0:180:45")
+    build_bank(plan, tmp_path / "own.h5")
+    (tmp_path / "own.toml").unlink()
+    bank = open_bank(tmp_path / "own.h5")
+    assert bank.sensor == sensor
+    assert bank.plan.build_sensor() == sensor
 
 
 # --- camera_info ---

@@ -47,6 +47,7 @@ DEFAULT_DELTA_STEP_DEG = 1.0
 DEFAULT_MARGIN_DEG = 5.0
 
 _YOUNGER_FIELDS = {
+    "lens",
     "histogram",
     "bearing_offset_deg",
     "height_offset_m",
