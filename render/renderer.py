@@ -293,7 +293,7 @@ class Renderer:
                 slope = ahead[axis] / ahead[0]
                 beyond |= (corners[..., axis] > slope.max() * corners[..., 0]).all(axis=1)
                 beyond |= (corners[..., axis] < slope.min() * corners[..., 0]).all(axis=1)
-        return tilted[beyond]
+        return np.asarray(tilted[beyond], np.intp)
 
     def check_in_view(self, views: Views) -> None:
         """Refuse views that are tilted so far that the landmark is out of the image.

@@ -23,6 +23,7 @@ from phasemark.data.commands.options import (
     a_preset,
 )
 from phasemark.data.commands.outputs import output_folder, refuse_existing
+from phasemark.inputs.numbers import in_words
 
 if TYPE_CHECKING:
     from phasemark.render import Sensor
@@ -52,6 +53,23 @@ def sensor_list(as_json: Json = False) -> None:
             for name, sensor in sensors.items()
         ),
     )
+
+
+Frequency = Annotated[
+    float | None,
+    typer.Option("--frequency", metavar="HZ", help="Which of the sensor's modulation frequencies, if it has several."),
+]
+
+
+def _which_frequency(sensor: Sensor, hz: float | None) -> int:
+    """Return the number of the frequency that an option names; one that has no other needs no name."""
+    known = sensor.frequencies_hz
+    if hz is None and len(known) == 1:
+        return 0
+    if hz not in known:
+        got = "nothing" if hz is None else f"{hz:.12g}"
+        raise UsageError(f"--frequency must be one of the sensor's {in_words(known)} Hz, got {got}")
+    return known.index(hz)
 
 
 def _in_mhz(sensor: Sensor) -> str:
@@ -184,6 +202,7 @@ def sensor_characterise(
         int | None, typer.Option("--frames", min=2, help="Frames at each point; by default 51200 readings a point.")
     ] = None,
     seed: Seed = 2005,
+    frequency: Frequency = None,
     as_json: Json = False,
     force: Force = False,
 ) -> None:
@@ -193,6 +212,7 @@ def sensor_characterise(
     from phasemark.render import characterise
 
     sensor = read_sensor(name_or_file)
+    sensor = sensor.by_frequency[_which_frequency(sensor, frequency)]
     with output_folder(out, "sensor characterise", NAMES, force), LongWork("measuring"):
         found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
         report = write_characterisation(found, readable(name_or_file), out, seed=seed, force=force)[0]
@@ -233,6 +253,7 @@ def sensor_fit(
         typer.Option("--amplitude-unit", help="Unit of amplitude and intensity: electrons or arbitrary."),
     ] = "electrons",
     reading: Annotated[FrameReading, Without("invalid_means")],
+    frequency: Frequency = None,
     as_json: Json = False,
     force: Force = False,
 ) -> None:
@@ -248,8 +269,13 @@ def sensor_fit(
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")
     refuse_existing([out], force)
     base = read_sensor(sensor)
+    which = _which_frequency(base, frequency)
     measured = [reading.read(path, base) for path in frames]
     note_too_far(base, {"--distance": max(distance)})
+    for path, one in zip(frames, measured, strict=True):
+        if not one.by_frequency:
+            raise UsageError(f"{path}: holds unwrapped ranges alone, and a fit takes what each frequency measured")
+    measured, base = [one.by_frequency[which] for one in measured], base.by_frequency[which]
     fit = fit_sensor(
         [one[k : k + 1] for one in measured for k in range(len(one))],  # every position of a file has its distance
         distance,

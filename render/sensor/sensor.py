@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import model_validator
 
 from phasemark import UsageError
+from phasemark.inputs.numbers import in_words
 from phasemark.inputs.toml_file import read_toml
 from phasemark.render.sensor.lens_fields import DERIVED, Lens, changed_lens, check_image_size
 from phasemark.render.sensor.sensor_checks import check_fields
@@ -192,6 +193,24 @@ class Sensor(SensorQuantities):
         belongs to the unwrapped range and not to them. A camera of one frequency is its own only one.
         """
         return (self,) if len(self.frequencies_hz) == 1 else _cameras_of_one_frequency(self)
+
+    def refuse_several_frequencies(self, what: str) -> None:
+        """Refuse several modulation frequencies where only one is understood.
+
+        Parameters
+        ----------
+        what : str
+            What takes only one, for the message.
+
+        Raises
+        ------
+        UsageError
+        """
+        if len(self.frequencies_hz) > 1:
+            raise UsageError(
+                f"{what} takes a sensor of one modulation frequency, got 'modulation_hz' ="
+                f" {in_words(self.frequencies_hz)}: give sensor and frames of one of them"
+            )
 
     def without_errors(self, *, shot_noise: bool = False) -> Sensor:
         """Return the camera without its errors: optics, modulation frequency, contrast and signal alone.

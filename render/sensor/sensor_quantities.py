@@ -122,6 +122,13 @@ class SensorQuantities(SensorFields):
         return SPEED_OF_LIGHT_M_S / (4 * math.pi * self.frequencies_hz[0])
 
     @property
+    def range_per_phase_noise_m(self) -> float:
+        """Standard deviation of a range per radian of phase noise: c / 4πf, of several frequencies c / 4π√Σf²."""
+        if not isinstance(self.modulation_hz, tuple):
+            return self.metres_per_radian
+        return SPEED_OF_LIGHT_M_S / (4 * math.pi * math.hypot(*self.modulation_hz))
+
+    @property
     def period_m(self) -> float:
         """Range at which the phase of the first frequency wraps, c / 2f."""
         return SPEED_OF_LIGHT_M_S / (2 * self.frequencies_hz[0])
