@@ -24,12 +24,12 @@ from phasemark.render import (
     capture,
     predicted_range_std,
     preset,
-    unwrap_frames,
     unwrap_ranges,
     unwrapping_error_probability,
 )
 from phasemark.render.exposure import Motion, capture_moving, render_moving
 from phasemark.render.exposure.motion import phase_image_times_s
+from phasemark.render.unwrapped_frames import unwrap_frames
 
 PMD = preset("pmd-16x16")
 TWO = PMD.with_(modulation_hz=[20e6, 60e6])
