@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,8 +10,11 @@ from pydantic import BaseModel
 
 from phasemark.inputs.toml_file import toml_value
 from phasemark.render.sensor.histogram_fields import Histogram
+from phasemark.render.sensor.lens_fields import DERIVED, Lens
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor_fields import TABLES
 
+_MODELS: dict[str, type[BaseModel]] = {"lens": Lens, "histogram": Histogram}
 _DIGITS = 7  # of a number in a sensor file
 
 
@@ -28,7 +32,8 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
         What stands behind the other fields.
     """
     fields = sensor.model_dump(mode="json")
-    table = fields.pop("histogram", None)
+    tables = {name: fields.pop(name) for name in TABLES if name in fields}
+    derived = DERIVED if sensor.lens is not None else ()
     lines = [f"# {line}" for line in header]
     for title, names in Sensor.field_groups().items():
         own = [
@@ -38,14 +43,15 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
             or (fields.get(name) is not None and fields[name] != _plain_default(name))
             or Sensor.model_fields[name].is_required()
         ]
+        own = [name for name in own if name not in TABLES and (name in comments or name not in derived)]
         if own:
             lines += ["", f"# {title}"]
         lines += [f"{name} = {toml_value(fields[name])}  # {comments.get(name, otherwise)}" for name in own]
-    if table is not None:
-        lines += ["", "[histogram]"]
+    for title, table in tables.items():
+        lines += ["", f"[{title}]"]
         for name, value in table.items():
-            comment = comments.get(f"histogram.{name}")
-            if comment is not None or (value is not None and value != _default_of(Histogram, name)):
+            comment = comments.get(f"{title}.{name}")
+            if comment is not None or (value is not None and value != _default_of(_MODELS[title], name)):
                 lines.append(f"{name} = {toml_value(value)}  # {comment or otherwise}")
     return "\n".join(lines) + "\n"
 
@@ -64,3 +70,23 @@ def _plain_default(name: str) -> object:
 def _default_of(model: type[BaseModel], name: str) -> object:
     default = model.model_fields[name].default
     return list(default) if isinstance(default, tuple) else default
+
+
+def comments_of(text: str) -> dict[str, str]:
+    """Return the comments behind the keys of a sensor file, by key; those of a table as ``table.key``.
+
+    Examples
+    --------
+    >>> comments_of("rows = 8  # published")
+    {'rows': 'published'}
+    """
+    found: dict[str, str] = {}
+    table = ""
+    for line in text.splitlines():
+        heading = re.fullmatch(r"\s*\[(\w+)\]\s*(#.*)?", line)
+        if heading:
+            table = f"{heading[1]}."
+        stated = re.fullmatch(r"\s*(\w+)\s*=[^#]*#\s*(.*\S)\s*", line)
+        if stated:
+            found[table + stated[1]] = stated[2]
+    return found
