@@ -144,6 +144,13 @@ def test_a_floor_has_the_phasor_of_dense_quadrature_at_every_frequency(hz):
     assert error[8] < 1e-3  # the horizon, where phases turn without end
 
 
+def test_a_floor_is_the_same_whether_the_view_or_the_mounting_tilts():
+    background = Background(floor_m=0.3)
+    of_view = Renderer(None, TWO).render(1.0, pitch_rad=0.1, background=background)
+    of_mount = Renderer(None, TWO.with_(pitch_deg=math.degrees(0.1))).render(1.0, background=background)
+    np.testing.assert_allclose(of_view.phasors, of_mount.phasors, rtol=0, atol=1e-12)  # the product of two rotations
+
+
 def test_a_frequency_that_was_not_rendered_is_refused_with_those_that_were():
     image = Renderer(None, TWO).render(1.0, background=Background(wall_m=2.0))
     with pytest.raises(UsageError, match="no phasor at 30000000 Hz, only at 20000000 and 60000000 Hz"):
