@@ -127,6 +127,7 @@ _add_group(
     {
         "list": sensor.sensor_list,
         "show": sensor.sensor_show,
+        "import": sensor.sensor_import,
         "characterise": sensor.sensor_characterise,
         "fit": sensor.sensor_fit,
         "fit-direct": sensor_direct.sensor_fit_direct,

@@ -44,7 +44,7 @@ def renderers():
 
 def test_interpolated_images_are_rendered_ones_within_a_fraction_of_the_noise(bank, renderers):
     rng = np.random.default_rng(4)
-    view = np.column_stack([rng.uniform(0.8, 1.6, 60), rng.uniform(0, np.pi, 60), np.zeros((60, 2))])
+    view = np.column_stack([rng.uniform(0.8, 1.6, 60), rng.uniform(0, np.pi, 60), np.zeros((60, 4))])
     c = bank.classes.index("cone")
     made = BankModel(bank).images(np.full(60, c), view, VIEW[:2])
     image = renderers["cone"].render_views(Views(*np.ascontiguousarray(view.T)))
@@ -187,7 +187,7 @@ def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, render
         RenderedModel(bank), evidence, np.zeros(1, np.int64), np.array([bank.classes.index("cone")]),
         Settings(free, used, huber), np.full(1, np.inf),
     )  # fmt: skip
-    state = problem.start(np.array([[1.02, 0.5, 0.0, 0.0]]), False)
+    state = problem.start(np.array([[1.02, 0.5, 0.0, 0.0, 0.0, 0.0]]), False)
     p = len(problem.columns)
     covariance = view_covariance(problem, state.sums)
     found = std_without_one_pixel(problem, state, np.array([0]), state.images.slope, state.sums.information, covariance)
@@ -320,11 +320,11 @@ def test_rendering_only_the_rows_that_turn_gives_the_whole_image(bank, on):
     settings = Settings(VIEW[:2], np.ones(256, bool), background=behind)
     cone, evidence = np.full(2, bank.classes.index("cone")), Evidence.from_frames(frames, on)
     problem = Problem(RenderedModel(bank, WALL), evidence, np.arange(2), cone, settings, np.full(2, np.inf))
-    state = problem.start(np.array([[1.0, 0.6, 0, 0], [1.0, 1.1, 0, 0]]), False)
+    state = problem.start(np.array([[1.0, 0.6, 0, 0, 0, 0], [1.0, 1.1, 0, 0, 0, 0]]), False)
     theta = state.theta.copy()
     theta[:, 1] += 0.01
     if on == "phasors":
-        assert (np.abs(theta[:, 4] - 0.5 / 0.8) < 0.02).all()  # the factor on the bank's albedo was found
+        assert (np.abs(theta[:, 6] - 0.5 / 0.8) < 0.02).all()  # the factor on the bank's albedo was found
     turned, anew = problem.turned(state, np.arange(2), theta), problem.state(theta, state.use)
     # the facets of a solid of revolution turn too: within the renderer's budget of 1e-4
     for name in ("phasor", "intensity", "coverage"):

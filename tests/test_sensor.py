@@ -1,5 +1,6 @@
 """The fields of a sensor: ranges, contradictions, presets."""
 
+import json
 import math
 import re
 import tomllib
@@ -12,6 +13,7 @@ from oracles.noise_law import FALSE_ALARM
 from scipy import stats
 
 from phasemark import UsageError
+from phasemark.cli import main
 from phasemark.inputs.toml_file import toml_value
 from phasemark.matcher import kalman_filter
 from phasemark.matcher.filters.filtered_frames import assumed_std_m
@@ -143,6 +145,34 @@ def test_a_source_that_says_nothing_is_refused(tmp_path, source, words):
     for read in (Sensor.from_toml, read_sources):
         with pytest.raises(UsageError, match=re.escape(f"{path}: {words}")):
             read(path)
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_what_is_shown_of_a_sensor_is_its_file_again_with_its_sources(name, tmp_path, capsys):
+    assert main(["sensor", "show", name]) == 0
+    path = tmp_path / "again.toml"
+    path.write_text(capsys.readouterr().out, encoding="utf-8")
+    assert Sensor.from_toml(path) == preset(name)
+    assert read_sources(path) == preset_sources(name)
+
+
+def test_what_is_shown_counts_sources_and_leaves_out_the_other_kind(capsys):
+    assert main(["sensor", "show", "pmd-16x16"]) == 0
+    text = capsys.readouterr().out
+    assert "# 0 measured, 6 published, 7 assumed" in text
+    assert "frame_rate_hz = 3.0  # published\n" in text
+    assert "# read-out, at their defaults: full_well_e not set" in text
+    assert "zone_offset_m" not in text
+    assert main(["sensor", "show", "ideal"]) == 0
+    assert "where its numbers come from is not stated" in capsys.readouterr().out
+    assert main(["sensor", "show", "pmd-16x16", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sources"]["rows"] == "published"
+
+
+def test_a_file_without_the_table_may_state_sources_in_comments(tmp_path):
+    path = tmp_path / "camera.toml"
+    path.write_text("rows = 4  # published\ncols = 4  # four of them\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\n")
+    assert read_sources(path) == {"rows": "published"}
 
 
 def test_sources_change_nothing_of_the_sensor(tmp_path):

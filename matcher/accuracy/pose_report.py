@@ -141,7 +141,7 @@ class PoseReport:
         ]
 
 
-def pose_report(measured: ArrayLike, true: ArrayLike, *, symmetry: int = 1) -> PoseReport:
+def pose_report(measured: ArrayLike | Views, true: ArrayLike | Views, *, symmetry: int = 1) -> PoseReport:
     """Compare measured poses of a landmark with true ones.
 
     Parameters
@@ -178,7 +178,7 @@ def pose_report(measured: ArrayLike, true: ArrayLike, *, symmetry: int = 1) -> P
     own, truth_there = _nearest_turn(rigid_transforms(found[there]), truth[there], symmetry), truth[there]
     shift, angle = _differences(own, truth_there)
     follows = np.flatnonzero(np.diff(there) == 1)
-    moved, moved_truth = (np.linalg.solve(poses[follows], poses[follows + 1]) for poses in (own, truth_there))
+    moved, moved_truth = _motions(own, follows), _motions(truth_there, follows)
     relative_shift, relative_angle = _differences(moved, moved_truth)
     x, y, z = (mean_interval(axis) for axis in shift.T)
     return PoseReport(
@@ -241,6 +241,11 @@ def _matrices(poses: ArrayLike | Views) -> NDArray[np.float64]:
     if array.ndim != 3 or array.shape[1:] != (4, 4):
         raise UsageError(f"poses must have shape (n, 4, 4), got {array.shape}")
     return array
+
+
+def _motions(poses: NDArray[np.float64], which: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Return the transforms from some poses to those that follow them, (k, 4, 4)."""
+    return np.asarray(np.linalg.solve(poses[which], poses[which + 1]), np.float64)
 
 
 def _nearest_turn(found: NDArray[np.float64], truth: NDArray[np.float64], symmetry: int) -> NDArray[np.float64]:

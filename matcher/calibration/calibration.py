@@ -253,6 +253,7 @@ def calibrate(
     lit = quantity == "phasors" or background is not None or poses.wall_m is not None
     if free is None and not lit:
         names = tuple(name for name in names if name != "albedo")
+    sensor.refuse_several_frequencies("a calibration")
     kept = check_names(fixed, "'fixed'")
     names = tuple(name for name in names if name not in kept)
     assumed = start or Mounting.of_sensor(sensor, albedo)

@@ -30,7 +30,7 @@ def distortion_of(sensor: Sensor, rule: int) -> Distortion:
     rule : int
         Gauss points a side at which a background is integrated over a pixel; 0: there is no background.
     """
-    if sensor.lens is None:
+    if sensor.lens is None or not sensor.bends_rays:
         return IDEAL
     return _tables(sensor.lens, sensor.rows, sensor.cols, sensor.fill_factor if rule else (1.0, 1.0), rule)
 
@@ -66,12 +66,14 @@ def _tables(lens: Lens, rows: int, cols: int, fill_factor: tuple[float, float], 
 
 
 def _reach(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return lowest and highest y, lowest and highest z of each pixel's rays, (rows, cols, 4)."""
+    """Return lowest and highest y, lowest and highest z of each pixel's rays and of each row's, (rows, cols + 1, 4)."""
     rows, cols = nodes.shape[0] // 2, nodes.shape[1] // 2
     parts = np.stack([nodes[i : i + 2 * rows : 2, j : j + 2 * cols : 2] for i in range(3) for j in range(3)])
     low, high = parts.min(axis=0), parts.max(axis=0)
     slack = _SLACK * (high - low)
     low, high = low - slack, high + slack
+    low = np.concatenate([low, low.min(axis=1, keepdims=True)], axis=1)
+    high = np.concatenate([high, high.max(axis=1, keepdims=True)], axis=1)
     return np.ascontiguousarray(np.stack([low[..., 0], high[..., 0], low[..., 1], high[..., 1]], axis=-1))
 
 
@@ -79,8 +81,8 @@ def _bend(
     model: int, k: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], radius: float, focal: float
 ) -> float:
     """Return a bound of the sagitta of a line of length 1: an eighth of the largest second derivative along any."""
-    y, z = np.meshgrid(np.linspace(low[0], high[0], 65), np.linspace(low[1], high[1], 65))
-    x, y = -y.ravel(), -z.ravel()
+    left, up = np.meshgrid(np.linspace(low[0], high[0], 65), np.linspace(low[1], high[1], 65))
+    x, y = -left.ravel(), -up.ravel()
     within = np.hypot(x, y) <= radius
     x, y = x[within], y[within]
     largest = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,16 @@ from typing import Any
 from pydantic import BaseModel
 
 from phasemark import UsageError
+from phasemark.inputs.reading import MOST_TOML_BYTES, read_text
 from phasemark.inputs.toml_file import read_toml, toml_value
 from phasemark.render.sensor.histogram_fields import Histogram
+from phasemark.render.sensor.lens_fields import DERIVED, Lens
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor_fields import TABLES
 from phasemark.render.sensor.sources import SOURCE_TABLE, kind_of_source, without_sources
 
+TABLE_MODELS: dict[str, type[BaseModel]] = {"lens": Lens, "histogram": Histogram}
+"""What a table of its own in a sensor file holds."""
 _DIGITS = 7  # of a number in a sensor file
 
 
@@ -31,7 +37,8 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
         What stands behind the other fields.
     """
     fields = sensor.model_dump(mode="json")
-    table = fields.pop("histogram", None)
+    tables = {name: fields.pop(name) for name in TABLES if name in fields}
+    derived = DERIVED if sensor.lens is not None else ()
     lines = [f"# {line}" for line in header]
     sources: dict[str, str] = {}
     for title, names in Sensor.field_groups().items():
@@ -42,17 +49,18 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
             or (fields.get(name) is not None and fields[name] != _plain_default(name))
             or Sensor.model_fields[name].is_required()
         ]
+        own = [name for name in own if name not in TABLES and (name in comments or name not in derived)]
         if own:
             lines += ["", f"# {title}"]
         lines += [f"{name} = {toml_value(fields[name])}  # {comments.get(name, otherwise)}" for name in own]
         sources |= {name: comments.get(name, otherwise) for name in own}
-    if table is not None:
-        lines += ["", "[histogram]"]
+    for title, table in tables.items():
+        lines += ["", f"[{title}]"]
         for name, value in table.items():
-            comment = comments.get(f"histogram.{name}")
-            if comment is not None or (value is not None and value != _default_of(Histogram, name)):
+            comment = comments.get(f"{title}.{name}")
+            if comment is not None or (value is not None and value != _default_of(TABLE_MODELS[title], name)):
                 lines.append(f"{name} = {toml_value(value)}  # {comment or otherwise}")
-                sources[f"histogram.{name}"] = comment or otherwise
+                sources[f"{title}.{name}"] = comment or otherwise
     lines += source_lines({name: _as_source(text) for name, text in sources.items()})
     return "\n".join(lines) + "\n"
 
@@ -68,6 +76,8 @@ def source_lines(sources: Mapping[str, str]) -> list[str]:
 def read_sources(path: str | Path) -> dict[str, str]:
     """Return where the numbers of a sensor file come from, by field; empty if it does not say.
 
+    A file without the table ``[source]`` may say it in comments behind its numbers.
+
     Raises
     ------
     InputFileError
@@ -75,8 +85,13 @@ def read_sources(path: str | Path) -> dict[str, str]:
     UsageError
         A source is of no field, or does not begin with measured, published or assumed.
     """
+    path = Path(path)
+    table = read_toml(path)
+    if SOURCE_TABLE not in table:
+        stated = comments_of(read_text(path, most_bytes=MOST_TOML_BYTES))
+        return {name: text for name, text in stated.items() if kind_of_source(text) is not None}
     try:
-        return without_sources(read_toml(path))[1]
+        return without_sources(table)[1]
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from None
 
@@ -102,3 +117,23 @@ def _plain_default(name: str) -> object:
 def _default_of(model: type[BaseModel], name: str) -> object:
     default = model.model_fields[name].default
     return list(default) if isinstance(default, tuple) else default
+
+
+def comments_of(text: str) -> dict[str, str]:
+    """Return the comments behind the keys of a sensor file, by key; those of a table as ``table.key``.
+
+    Examples
+    --------
+    >>> comments_of("rows = 8  # published")
+    {'rows': 'published'}
+    """
+    found: dict[str, str] = {}
+    table = ""
+    for line in text.splitlines():
+        heading = re.fullmatch(r"\s*\[(\w+)\]\s*(#.*)?", line)
+        if heading:
+            table = f"{heading[1]}."
+        stated = re.fullmatch(r"\s*(\w+)\s*=[^#]*#\s*(.*\S)\s*", line)
+        if stated:
+            found[table + stated[1]] = stated[2]
+    return found
