@@ -109,9 +109,8 @@ class Matcher:
 
     def __repr__(self) -> str:
         """Say in one line how frames are matched, and against what."""
-        stated = [
-            f"{name}={value!r}" for name, value in self.options.items() if value not in (None, False, "all", "ranges")
-        ]
+        usual = (None, False, "all", "ranges")
+        stated = [f"{name}={value!r}" for name, value in self.options.items() if value not in usual]
         return f"Matcher({', '.join([self.method, *stated])}, {self.bank!r})"
 
     def __init__(

@@ -111,7 +111,7 @@ def test_the_page_is_whole_and_loads_nothing(mesh):
 
 
 def test_axes_and_the_line_of_sight_at_delta_0_start_where_the_landmark_has_its_origin():
-    """The page scales the mesh into a ball about the middle of its bounding box; its origin goes where (0, 0, 0) goes."""
+    """The page scales the mesh into a ball about the middle of its bounding box; (0, 0, 0) goes with it."""
     moved = BOX.copy()
     moved.apply_translation((0.3, -0.1, 0.15))
     page = mesh_html(moved, "part")

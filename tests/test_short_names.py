@@ -56,6 +56,8 @@ def test_a_bank_and_its_matcher_say_classes_grid_and_options(bank):
     assert repr(matcher).startswith("Matcher(refine, background=Background(wall_m=3.0")
     assert repr(matcher).endswith(held + ")")
     assert repr(Matcher(bank)) == f"Matcher(nearest, {bank!r})"
+    some = Matcher(bank, "refine", free=("distance_m", "delta_rad"), pixels="lower")
+    assert repr(some) == f"Matcher(refine, free=('distance_m', 'delta_rad'), pixels='lower', {bank!r})"
     bank.close()
     assert repr(bank).endswith(held)  # a closed bank has a name too
 

@@ -21,6 +21,7 @@ from phasemark.data import build_bank, read_frames
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
 from phasemark.landmarks.spec import Box, Cylinder
 from phasemark.matcher.filters.filtered_frames import kalman_filter
+from phasemark.matcher.sweep.answer import answer, answer_cells
 from phasemark.matcher.sweep.compare import compare_cells
 from phasemark.matcher.sweep.examples import sweep_frames
 from phasemark.matcher.sweep.figures.errors import maps
@@ -124,6 +125,24 @@ def test_the_page_answers_first_and_ends_with_its_command(folder):
     ]  # fmt: skip
     assert "distance_m" not in text
     assert "class_name" not in text
+
+
+def test_the_answer_is_of_the_method_nearest_to_the_bound(folder):
+    cells = [cell for cell in read_sweep(folder)[1].cells() if not cell.stranger]
+    own = answer_cells(cells)
+    assert {cell.condition.distance_m for cell in own} == {1.05}
+    assert len(own) == 4  # two classes, two angles
+    assert len({cell.method for cell in own}) == 1
+    far = [cell for cell in cells if cell.condition.distance_m == 1.05]
+    pooled = {
+        method: max(
+            math.sqrt(np.mean([cell.ratio[name].value ** 2 for cell in far if cell.method == method]))
+            for name in ("distance_m", "delta_rad")
+        )
+        for method in ("nearest", "planar")
+    }
+    assert own[0].method not in pooled or pooled[own[0].method] == min(pooled.values())
+    assert answer([]) == "No method found distance and angle in the middle of the design."
 
 
 def test_the_command_at_the_end_makes_the_same_trials(folder, tmp_path, capsys):

@@ -69,7 +69,9 @@ def _series(axes: Axes) -> Iterator[tuple[str, float, float, float, float, float
                 yield _named(str(line.get_label())), x, y, nothing, nothing, nothing
     for one in axes.collections:
         if isinstance(one, Quiver):
-            for (x, y), u, v in zip(np.asarray(one.get_offsets()), one.U, one.V, strict=True):
+            along = np.stack([np.asarray(one.U, np.float64), np.asarray(one.V, np.float64)], axis=1)
+            ends = np.concatenate([np.asarray(one.get_offsets(), np.float64), along], axis=1)
+            for x, y, u, v in ends:
                 yield "arrow, to the right", x, y, nothing, nothing, float(u)
                 yield "arrow, upwards", x, y, nothing, nothing, float(v)
         elif isinstance(one, LineCollection) and one not in drawn:

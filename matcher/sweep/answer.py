@@ -29,7 +29,8 @@ def answer_cells(cells: Sequence[Cell]) -> list[Cell]:
     """Return the cells that a page answers with: one method's, of all classes and angles, at one distance.
 
     The distance is the middle one of the design, the other axes are at their first values, and the method is the one
-    with the smallest error of position there.
+    whose errors are nearest to the bound there. The error itself would favour a method that answers with grid points,
+    which may be nearer to the truth than what the frames tell.
 
     Parameters
     ----------
@@ -50,9 +51,9 @@ def answer_cells(cells: Sequence[Cell]) -> list[Cell]:
     middle = distances[len(distances) // 2]
     by_method: dict[str, list[Cell]] = {}
     for one in plain:
-        if one.condition.distance_m == middle and math.isfinite(_position(one)):
+        if one.condition.distance_m == middle and _found(one):
             by_method.setdefault(one.method, []).append(one)
-    return min(by_method.values(), key=lambda own: _rms([_position(one) for one in own]), default=[])
+    return min(by_method.values(), key=_badness, default=[])
 
 
 def answer(cells: Sequence[Cell]) -> str:
@@ -110,11 +111,15 @@ def card_of(job: SweepJob, cells: Sequence[Cell]) -> AccuracyCard | None:
     )
 
 
-def _position(cell: Cell) -> float:
-    """Return the root mean square error of the position in the plane, metres."""
-    if not {"distance_m", "delta_rad"} <= set(cell.rmse):
-        return math.nan
-    return math.hypot(cell.rmse["distance_m"].value, cell.condition.distance_m * cell.rmse["delta_rad"].value)
+def _found(cell: Cell) -> bool:
+    """Return whether a method has an error of distance and of angle."""
+    return all(name in cell.rmse and math.isfinite(cell.rmse[name].value) for name in ("distance_m", "delta_rad"))
+
+
+def _badness(cells: Sequence[Cell]) -> float:
+    """Return the larger of the ratios of distance and angle to the bound, pooled; infinite where there is no bound."""
+    ratios = [_rms([one.ratio[name].value for one in cells]) for name in ("distance_m", "delta_rad")]
+    return max(ratios) if all(map(math.isfinite, ratios)) else math.inf
 
 
 def _rms(values: Sequence[float]) -> float:
