@@ -212,7 +212,7 @@ def _commands(plan: SweepPlan, folder: Path) -> list[str]:
 def _examples(plan: SweepPlan, trials: SweepTrials, ours: OwnedFiles) -> list[dict[str, Any]]:
     where = shlex.quote(str(ours.folder))
     of_each = max(1, _MOST_EXAMPLES // len(plan.methods))
-    shown = []
+    shown: list[dict[str, Any]] = []
     for example in worst_examples(plan, trials, of_each):
         name = f"figures/worst-{len(shown) + 1}.csv"
         ours.claim(name)

@@ -110,7 +110,8 @@ def maps(cells: Sequence[Cell], quantity: str) -> Figure:
             for i, j in np.ndindex(table.shape):
                 if math.isfinite(table[i, j]):
                     if quantity == "ratio":
-                        colour = "white" if abs(math.log(max(table[i, j], 1e-9))) > math.log(RATIO_DARK) else "black"
+                        ratio = max(float(table[i, j]), 1e-9)
+                        colour = "white" if max(ratio, 1 / ratio) > RATIO_DARK else "black"
                     else:
                         colour = "white" if table[i, j] < middle else "black"
                     panel.text(j, i, f"{table[i, j]:.3g}", ha="center", va="center", color=colour, fontsize=7)
