@@ -45,6 +45,7 @@ ODD = (
 VALUES = 2
 """Odd values that each option is tried with, some 460 runs: all of them on every option would take an hour."""
 SMALL = {
+    "accuracy": ("--class", "cylinder", "--distance", "1"),
     "bank build": ("--class", "cone", "--distance", "1", "--delta", "0", "-o", "out.h5"),
     "bank info": ("bank.h5",),
     "bank merge": ("bank1.h5", "bank2.h5", "-o", "out.h5"),
