@@ -9,7 +9,10 @@ from pydantic import BaseModel
 
 from phasemark.inputs.toml_file import toml_value
 from phasemark.render.sensor.histogram_fields import Histogram
+from phasemark.render.sensor.lens_fields import DERIVED, Lens
 from phasemark.render.sensor.sensor import Sensor
+
+_TABLES: dict[str, type[BaseModel]] = {"lens": Lens, "histogram": Histogram}
 
 _DIGITS = 7  # of a number in a sensor file
 
@@ -28,24 +31,31 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
         What stands behind the other fields.
     """
     fields = sensor.model_dump(mode="json")
-    table = fields.pop("histogram", None)
+    tables = {name: fields.pop(name, None) for name in _TABLES}
+    follows = DERIVED if sensor.lens is not None else ()
     lines = [f"# {line}" for line in header]
     for title, names in Sensor.field_groups().items():
         own = [
             name
             for name in names
-            if name in comments
-            or (fields.get(name) is not None and fields[name] != _plain_default(name))
-            or Sensor.model_fields[name].is_required()
+            if name not in follows
+            and (
+                name in comments
+                or (fields.get(name) is not None and fields[name] != _plain_default(name))
+                or Sensor.model_fields[name].is_required()
+            )
         ]
         if own:
             lines += ["", f"# {title}"]
         lines += [f"{name} = {toml_value(fields[name])}  # {comments.get(name, otherwise)}" for name in own]
-    if table is not None:
-        lines += ["", "[histogram]"]
-        for name, value in table.items():
-            comment = comments.get(f"histogram.{name}")
-            if comment is not None or (value is not None and value != _default_of(Histogram, name)):
+    for table, model in _TABLES.items():
+        values = tables[table]
+        if values is None:
+            continue
+        lines += ["", f"[{table}]"]
+        for name, value in values.items():
+            comment = comments.get(f"{table}.{name}")
+            if comment is not None or (value is not None and value != _default_of(model, name)):
                 lines.append(f"{name} = {toml_value(value)}  # {comment or otherwise}")
     return "\n".join(lines) + "\n"
 
