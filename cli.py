@@ -19,7 +19,7 @@ from phasemark import PhasemarkError, StorageError, UsageError, __version__
 from phasemark.data.commands import bank, frames, landmark, render, sensor, sensor_direct
 from phasemark.data.commands.command import Commands
 from phasemark.data.commands.console import report_error, tell, warnings_as_notes
-from phasemark.matcher.commands import calibrate, demo, design, drive, match, plan, pose, sweep, verify
+from phasemark.matcher.commands import accuracy, calibrate, demo, design, drive, match, plan, pose, sweep, verify
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -45,7 +45,7 @@ Then, by task:
   try it without camera  phasemark frames simulate --class cylinder --distance 1.0 -o recording.csv
   know the mounting      phasemark calibrate cylinder frames.npz --poses poses.csv -o mounted.toml
   make labelled frames   phasemark plan example frames > frames.toml; phasemark frames build frames.toml -o frames.h5
-  know the accuracy      phasemark sweep run paper -o out/paper
+  know the accuracy      phasemark accuracy --class cylinder --distance 1.5     in full: phasemark sweep run paper
   drive a robot          phasemark drive
 
 phasemark --help lists all commands, COMMAND --help explains one, --install-completion teaches them to your shell.
@@ -105,6 +105,7 @@ _add(
         "render": render.render_frame,
         "match": match.match_frames,
         "calibrate": calibrate.calibrate_camera,
+        "accuracy": accuracy.accuracy_line,
         "demo": demo.demo_report,
         "drive": drive.drive_robot,
     },
@@ -126,6 +127,7 @@ _add_group(
     {
         "list": sensor.sensor_list,
         "show": sensor.sensor_show,
+        "import": sensor.sensor_import,
         "characterise": sensor.sensor_characterise,
         "fit": sensor.sensor_fit,
         "fit-direct": sensor_direct.sensor_fit_direct,

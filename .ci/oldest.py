@@ -6,6 +6,7 @@ The environment is made anew. What no version is found of, or no wheel for this 
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import shutil
 import subprocess
@@ -50,11 +51,12 @@ def main() -> int:
     subprocess.run([*pip, "install", "--no-deps", "--editable", ROOT], check=True)
     shown = subprocess.run([python, "-m", "pip", "--disable-pip-version-check", "list"], capture_output=True, text=True)
     print(shown.stdout)
-    subprocess.run([python, "-c", IMPORT_ALL], check=True)
+    # compiled code of another numba would be thrown away, and compiled again by whoever runs next
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(arguments.venv.absolute() / "numba")}
+    subprocess.run([python, "-c", IMPORT_ALL], check=True, env=environment)
     # what is deprecated in an old version is not ours to mend: only errors count here
-    return subprocess.run(
-        [python, "-m", "pytest", "-q", "-W", "default", *(arguments.tests or FAST)], cwd=ROOT
-    ).returncode
+    command = [python, "-m", "pytest", "-q", "-W", "default", *(arguments.tests or FAST)]
+    return subprocess.run(command, cwd=ROOT, env=environment).returncode
 
 
 if __name__ == "__main__":

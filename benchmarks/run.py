@@ -167,6 +167,35 @@ def rendering_of(name: str, views: Views) -> dict[str, Any]:
     }
 
 
+def lenses() -> Table:
+    """Time views behind a lens with distortion beside those of the same pixels behind an ideal one, in turn."""
+    rows = []
+    for size, focal, n in (((16, 16), 41.0, 64), ((224, 171), 200.0, 4)):
+        matrix = [[focal, 0, size[0] / 2 - 0.5], [0, focal, size[1] / 2 - 0.5], [0, 0, 1]]
+        lens = Sensor.from_opencv(matrix, (-0.31, 0.12, 0.0012, -0.0008, -0.02), size=size)
+        views = random_views(n)
+        for name in catalog():
+            for background in (None, Background(wall_m=4.0, floor_m=0.5)):
+                pair = [Renderer(build_mesh(catalog()[name]), one) for one in (lens, lens.with_(lens=None))]
+                times: list[list[float]] = [[], []]
+                for run in range(8):
+                    for spent, renderer in zip(times, pair, strict=True):
+                        seconds = processor_seconds(partial(renderer.render_views, views, background=background), 1)
+                        spent += [seconds] if run else []  # the first one fills the tables
+                with_lens, without = (statistics.median(spent) / n for spent in times)
+                rows.append(
+                    {
+                        "pixels": f"{size[0]} × {size[1]}",
+                        "class": name,
+                        "background": "none" if background is None else "wall and floor",
+                        "a view, ideal lens (ms)": round(1e3 * without, 2),
+                        "a view, distortion (ms)": round(1e3 * with_lens, 2),
+                        "frames/s with over without": round(without / with_lens, 2),
+                    }
+                )
+    return {"rows": rows, "least ratio": min(row["frames/s with over without"] for row in rows)}
+
+
 def banks() -> Table:
     """Time the default banks; memory is the peak of a process that does nothing else."""
     code = (
@@ -494,6 +523,7 @@ def supersampled(scene: Any, case: dict[str, Any], density: int, rng: np.random.
 SECTIONS: dict[str, tuple[str, Callable[[], Table]]] = {
     "accuracy": ("Error against frames integrated from the true solids", accuracy),
     "rendering": ("Rendering", rendering),
+    "lenses": ("Lenses with distortion", lenses),
     "peer": ("Against supersampling", peer),
     "banks": ("Banks", banks),
     "million": ("A frame set of a million frames", million),

@@ -11,6 +11,7 @@ from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.region import read_region
+from phasemark.matcher.frequencies import OneFrequency, OneFrequencyBank
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import (
     BEARING_STD_RAD,
@@ -59,7 +60,9 @@ class Matcher:
         Share of good frames that the test of the fit may refuse.
     on : {"ranges", "phasors"}
         What "refine" explains: ranges, or amplitude · exp(iφ) with the landmark's albedo estimated too. Phasors need
-        frames with amplitudes, best from :func:`~phasemark.matcher.phasor_mean`.
+        frames with amplitudes, best from :func:`~phasemark.matcher.phasor_mean`. Of several modulation frequencies
+        ranges are the unwrapped ones with their combined variance; phasors, and the phases that "nearest" compares, are
+        those of every frequency, each wrapped by itself: nothing is unwrapped, and mixed pixels count.
     pixels : {"all", "lower"}
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool
@@ -148,6 +151,11 @@ class Matcher:
         self.options: Mapping[str, Any] = MappingProxyType(
             {"free": free, "background": background, "on": on, "pixels": pixels, "robust": robust}
         )
+        self._one: OneFrequency | None = None
+        self._systematic = check_systematic(systematic)
+        if len(bank.sensor.frequencies_hz) > 1:
+            bank = OneFrequencyBank(bank, "combined" if method == "refine" and on == "ranges" else "stacked")
+            self._one = bank.one
         self._method: MatchMethod
         if method == "refine":
             self._method = LikelihoodMatcher(
@@ -162,7 +170,7 @@ class Matcher:
                 height_std_m=height_std_m,
                 pitch_std_rad=pitch_std_rad,
                 roll_std_rad=roll_std_rad,
-                systematic=check_systematic(systematic),
+                systematic=self._systematic,
                 tolerance_m=tolerance_m,
                 tolerance_rad=tolerance_rad,
                 workers=workers,
@@ -200,8 +208,18 @@ class Matcher:
         UsageError
             The frames come from another camera than the bank.
         """
-        frames = self.read_out(frames)
-        return Matches(self._method.match(frames.without_offset().with_pooled_noise()))
+        frames = self.read_out(frames).without_offset().with_pooled_noise()
+        return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
+
+    def _of_one_frequency(self, frames: FilteredFrames, one: OneFrequency) -> FilteredFrames:
+        """Return what a camera of one frequency would have measured in place of the camera of several."""
+        if one.stacked and self.method == "refine" and "calibration" in self._systematic:
+            if names := frames.sensor.calibration_fields:
+                raise UsageError(
+                    f"what the calibration leaves of '{names[0]}' is carried over on ranges alone with several"
+                    ' modulation frequencies: match on="ranges", or leave "calibration" out of \'systematic\''
+                )
+        return one.frames(frames)
 
     def read_out(self, frames: FilteredFrames) -> FilteredFrames:
         """Return frames as the bank has its images: those of the whole camera cut down to the bank's region.

@@ -6,7 +6,7 @@ Figures are built without pyplot, so that nothing here needs a display or touche
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from phasemark.render.frames import Frames
     from phasemark.render.phasor_images import PhasorImages
+    from phasemark.render.sensor.sensor import Sensor
 
 PAPER_CMAP = LinearSegmentedColormap.from_list("paper", ["#ffffff", "#2f6fe4", "#000000"])
 """The colours of the paper's figure 4, as :data:`RANGE_COLOURS` explains them."""
@@ -47,6 +48,43 @@ _FLAG_COLOURS = {
     "saturated": "#d62728",
     "dead": "#202020",
 }
+
+_GRID_LINES = 32
+"""Borders of pixels that are drawn along each side of an image, about."""
+_GRID_STYLE: dict[str, Any] = {"color": "#2f6fe4", "linewidth": 0.7}
+
+
+def pixel_grid_figure(sensor: Sensor) -> Figure:
+    """Draw the borders of a sensor's pixels on what it sees, in tangents.
+
+    Parameters
+    ----------
+    sensor : Sensor
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        With many pixels only every so many borders are drawn; the title says how many pixels lie between them.
+    """
+    step = max(1, math.ceil(max(sensor.rows, sensor.cols) / _GRID_LINES))
+    figure = Figure(figsize=(7.0, 7.0 * min(1.4, max(0.6, sensor.rows / sensor.cols))), layout="constrained")
+    axes = figure.add_subplot()
+    along_u, along_v = np.linspace(0.0, sensor.cols, 201), np.linspace(0.0, sensor.rows, 201)
+    for v in [*range(0, sensor.rows, step), sensor.rows]:
+        y, z = sensor.tangents(along_u, float(v))
+        axes.plot(-np.broadcast_to(y, 201), np.broadcast_to(z, 201), **_GRID_STYLE)
+    for u in [*range(0, sensor.cols, step), sensor.cols]:
+        y, z = sensor.tangents(float(u), along_v)
+        axes.plot(-np.broadcast_to(y, 201), np.broadcast_to(z, 201), **_GRID_STYLE)
+    axes.plot(0.0, 0.0, "+", color="#d62728", markersize=12, label="optical axis")
+    figure.legend(loc="outside lower center")
+    axes.set_aspect("equal")
+    axes.set_xlabel("tangent to the right")
+    axes.set_ylabel("tangent upwards")
+    between = "each pixel" if step == 1 else f"every {step}th pixel border"
+    lens = "ideal lens" if sensor.lens is None else f"lens: {sensor.lens.model}"
+    axes.set_title(f"{sensor.rows} × {sensor.cols} pixels, {between}, {lens}")
+    return figure
 
 
 def range_figure(

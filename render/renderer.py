@@ -293,7 +293,7 @@ class Renderer:
                 slope = ahead[axis] / ahead[0]
                 beyond |= (corners[..., axis] > slope.max() * corners[..., 0]).all(axis=1)
                 beyond |= (corners[..., axis] < slope.min() * corners[..., 0]).all(axis=1)
-        return tilted[beyond]
+        return np.asarray(tilted[beyond], np.intp)
 
     def check_in_view(self, views: Views) -> None:
         """Refuse views that are tilted so far that the landmark is out of the image.
@@ -604,7 +604,7 @@ class Renderer:
 
 def _fastest(sensor: Sensor) -> float:
     """Return the radians per metre of the highest modulation frequency, 0 of a single one behind an ideal lens."""
-    if len(sensor.frequencies_hz) == 1 and sensor.lens is None:
+    if len(sensor.frequencies_hz) == 1 and not sensor.bends_rays:
         return 0.0
     return max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
 
@@ -661,7 +661,7 @@ def _camera(sensor: Sensor, rows: tuple[int, int], rule: int) -> Camera:
     tan_h, tan_v = sensor.tan_half_angles
     scale = sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v)
     slope = 2 * tan_h / sensor.cols, 2 * tan_v / sensor.rows
-    if sensor.lens is not None:
+    if sensor.lens is not None and sensor.bends_rays:
         scale, slope = (sensor.lens.fx, sensor.lens.fy), (1 / sensor.lens.fx, 1 / sensor.lens.fy)
     return Camera(
         scale_u=scale[0],

@@ -296,10 +296,21 @@ def _copy_example(path: Path) -> None:
     path.write_bytes((Path(__file__).parent.parent / "examples" / path.name).read_bytes())
 
 
+def _write_camera_info(path: Path) -> None:
+    """Write what ROS's calibration writes of a camera."""
+    path.write_text(
+        "image_width: 224\nimage_height: 171\ncamera_name: own\n"
+        "camera_matrix: {rows: 3, cols: 3, data: [211.5, 0, 111.2, 0, 211.8, 86.1, 0, 0, 1]}\n"
+        "distortion_model: plumb_bob\n"
+        "distortion_coefficients: {rows: 1, cols: 5, data: [-0.28, 0.11, 0.001, -0.0005, 0]}\n"
+    )
+
+
 GIVEN: dict[str, Callable[[Path], None]] = {
     "board_1m.npz": _write_board,
     "board_2m.npz": _write_board,
     "board_3m.npz": _write_board,
+    "camera_info.yaml": _write_camera_info,
     "large.toml": _write_large_sensor,
     "measured.csv": _write_measured,
     "my_part.stl": _write_part,

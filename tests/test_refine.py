@@ -44,7 +44,7 @@ def renderers():
 
 def test_interpolated_images_are_rendered_ones_within_a_fraction_of_the_noise(bank, renderers):
     rng = np.random.default_rng(4)
-    view = np.column_stack([rng.uniform(0.8, 1.6, 60), rng.uniform(0, np.pi, 60), np.zeros((60, 2))])
+    view = np.column_stack([rng.uniform(0.8, 1.6, 60), rng.uniform(0, np.pi, 60), np.zeros((60, 4))])
     c = bank.classes.index("cone")
     made = BankModel(bank).images(np.full(60, c), view, VIEW[:2])
     image = renderers["cone"].render_views(Views(*np.ascontiguousarray(view.T)))
@@ -187,7 +187,7 @@ def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, render
         RenderedModel(bank), evidence, np.zeros(1, np.int64), np.array([bank.classes.index("cone")]),
         Settings(free, used, huber), np.full(1, np.inf),
     )  # fmt: skip
-    state = problem.start(np.array([[1.02, 0.5, 0.0, 0.0]]), False)
+    state = problem.start(np.array([[1.02, 0.5, 0.0, 0.0, 0.0, 0.0]]), False)
     p = len(problem.columns)
     covariance = view_covariance(problem, state.sums)
     found = std_without_one_pixel(problem, state, np.array([0]), state.images.slope, state.sums.information, covariance)

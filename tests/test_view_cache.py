@@ -49,7 +49,7 @@ def test_a_model_renders_a_view_once_and_keeps_to_its_bytes(bank, monkeypatch):
         return images(self, class_index, view, free)
 
     monkeypatch.setattr(RenderedModel, "images", counted)
-    view = np.zeros((12, 4))
+    view = np.zeros((12, 6))
     view[:, 0] = np.tile(np.linspace(0.95, 1.05, 6), 2)  # every view twice
     c = np.zeros(12, np.int64)
     first = model.first_images(c, view, BEARING)

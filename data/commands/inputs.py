@@ -140,6 +140,17 @@ class PlanWithDistances(Protocol):
         """Return the greatest distance of each key that has one."""
 
 
+def sensor_text(name_or_file: str) -> str:
+    """Return the text of a preset or a sensor file."""
+    from phasemark.inputs.reading import MOST_TOML_BYTES, read_text
+    from phasemark.render import preset_names
+    from phasemark.render.sensor.shipped_sensors import preset_text
+
+    if name_or_file in preset_names():
+        return preset_text(name_or_file)
+    return read_text(Path(name_or_file), most_bytes=MOST_TOML_BYTES)
+
+
 def read_sensor(name_or_file: str) -> Sensor:
     """Return a preset, or the sensor of a file; a preset's name wins over a file of that name."""
     from phasemark.render import Sensor, preset, preset_names

@@ -6,14 +6,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from phasemark import UsageError
 from phasemark.data.commands.command import Without
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
-from phasemark.data.commands.inputs import note_too_far, read_sensor
+from phasemark.data.commands.inputs import note_too_far, read_sensor, sensor_text
 from phasemark.data.commands.options import (
     Force,
     FrameReading,
@@ -23,6 +23,7 @@ from phasemark.data.commands.options import (
     a_preset,
 )
 from phasemark.data.commands.outputs import output_folder, refuse_existing
+from phasemark.inputs.numbers import in_words
 
 if TYPE_CHECKING:
     from phasemark.render import Sensor
@@ -54,6 +55,23 @@ def sensor_list(as_json: Json = False) -> None:
     )
 
 
+Frequency = Annotated[
+    float | None,
+    typer.Option("--frequency", metavar="HZ", help="Which of the sensor's modulation frequencies, if it has several."),
+]
+
+
+def _which_frequency(sensor: Sensor, hz: float | None) -> int:
+    """Return the number of the frequency that an option names; one that has no other needs no name."""
+    known = sensor.frequencies_hz
+    if hz is None and len(known) == 1:
+        return 0
+    if hz not in known:
+        got = "nothing" if hz is None else f"{hz:.12g}"
+        raise UsageError(f"--frequency must be one of the sensor's {in_words(known)} Hz, got {got}")
+    return known.index(hz)
+
+
 def _in_mhz(sensor: Sensor) -> str:
     return " + ".join(f"{hz / 1e6:g}" for hz in sensor.frequencies_hz)
 
@@ -62,10 +80,16 @@ def sensor_show(
     name_or_file: Annotated[
         str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=a_preset)
     ],
+    picture: Annotated[
+        Path | None, typer.Option("--picture", help="Also write a picture of the pixel grid on the view, .png.")
+    ] = None,
     as_json: Json = False,
+    force: Force = False,
 ) -> None:
     """Print every field of a sensor; the text is a sensor file again."""
     sensor = read_sensor(name_or_file)
+    if picture is not None:
+        _write_picture(sensor, picture, force)
     if as_json:
         echo_json({"name": name_or_file, **sensor.as_dict()})
         return
@@ -75,17 +99,93 @@ def sensor_show(
     else:
         scales = ", ".join(f"{camera.metres_per_radian:.6f}" for camera in sensor.by_frequency)
         typer.echo(f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {scales} m per radian")
+    from phasemark.render.sensor.sensor_fields import TABLES
+
     fields = sensor.model_dump(mode="json")
-    table = fields.pop("histogram", None)  # a table stands behind all fields
+    tables = {name: fields.pop(name) for name in TABLES if name in fields}  # they stand behind all fields
     for title, names in sensor.field_groups().items():
         typer.echo(f"\n# {title}")
         for name in names:
             if name in fields:
                 _echo_field(name, fields[name])
-    if table is not None:
-        typer.echo("\n[histogram]")
+    for title, table in tables.items():
+        typer.echo(f"\n[{title}]")
         for name, value in table.items():
             _echo_field(name, value)
+
+
+def _write_picture(sensor: Sensor, picture: Path, force: bool) -> None:
+    """Write the picture of a sensor's pixel grid."""
+    from io import BytesIO
+
+    from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.render.figures import pixel_grid_figure
+
+    if picture.suffix != ".png":
+        raise UsageError(f"--picture must end in .png, got '{picture}'")
+    refuse_existing([picture], force)
+    drawn = BytesIO()
+    pixel_grid_figure(sensor).savefig(drawn, format="png", dpi=120)
+    write_atomically(picture, drawn.getvalue(), force=force)
+
+
+def sensor_import(
+    camera_info: Annotated[Path, typer.Argument(metavar="CAMERA_INFO", help="A camera_info of ROS 1 or ROS 2, .yaml.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
+    like: Annotated[
+        str,
+        typer.Option(
+            "--like",
+            metavar="NAME|FILE",
+            help="The preset or sensor file that all other fields are taken from.",
+            autocompletion=a_preset,
+        ),
+    ] = "pmd-16x16",
+    modulation: Annotated[
+        float | None,
+        typer.Option("--modulation", metavar="HZ", help="Modulation frequency; by default that of --like."),
+    ] = None,
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Make a sensor file from the intrinsics that ROS or OpenCV calibrated."""
+    from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.render.sensor.camera_info import read_camera_info
+    from phasemark.render.sensor.lens_fields import DERIVED
+    from phasemark.render.sensor.sensor_fields import TABLES
+    from phasemark.render.sensor.sensor_file import comments_of, sensor_toml
+
+    if out.suffix != ".toml":
+        raise UsageError(f"--out must end in .toml, got '{out}'")
+    refuse_existing([out], force)
+    found = read_camera_info(camera_info)
+    base = read_sensor(like)
+    per_pixel = [name for name in ("dead_pixels", "hot_pixels", "zone_offset_m") if getattr(base, name)]
+    changes: dict[str, Any] = dict.fromkeys(per_pixel, ())
+    if modulation is not None:
+        changes["modulation_hz"] = modulation
+    fields = {name: value for name, value in base.model_dump().items() if name not in (*DERIVED, *TABLES)}
+    if base.histogram is not None:
+        raise UsageError(f"--like must be a camera without [histogram], got '{like}': zones have no lens of this kind")
+    sensor = type(base)(**{**fields, **changes, "rows": found.rows, "cols": found.cols, "lens": found.lens})
+    origin = readable(str(like))
+    stated = {k: f"{v} ({origin})" for k, v in comments_of(sensor_text(like)).items() if k in type(base).model_fields}
+    measured = f"measured: {camera_info.name}"
+    comments = {name: text for name, text in stated.items() if name not in (*DERIVED, *TABLES, *per_pixel)}
+    comments |= {"rows": measured, "cols": measured}
+    comments |= {f"lens.{name}": measured for name in type(found.lens).model_fields}
+    if modulation is not None:
+        comments["modulation_hz"] = "stated when this file was made"
+    header = [
+        f"Made by phasemark from {camera_info.name} ({found.distortion_model}); all else is as in {origin}.",
+        "Half angles and principal point follow from [lens]. OpenCV counts pixels from the centre of the first one.",
+    ]
+    text = sensor_toml(sensor, comments, header=header, otherwise=f"assumed: as in {origin}")
+    write_atomically(out, text.encode(), force=force)
+    if as_json:
+        echo_json({"file": str(out), **sensor.as_dict()})
+        return
+    typer.echo(out)
 
 
 def _echo_field(name: str, value: object) -> None:
@@ -102,6 +202,7 @@ def sensor_characterise(
         int | None, typer.Option("--frames", min=2, help="Frames at each point; by default 51200 readings a point.")
     ] = None,
     seed: Seed = 2005,
+    frequency: Frequency = None,
     as_json: Json = False,
     force: Force = False,
 ) -> None:
@@ -111,6 +212,7 @@ def sensor_characterise(
     from phasemark.render import characterise
 
     sensor = read_sensor(name_or_file)
+    sensor = sensor.by_frequency[_which_frequency(sensor, frequency)]
     with output_folder(out, "sensor characterise", NAMES, force), LongWork("measuring"):
         found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
         report = write_characterisation(found, readable(name_or_file), out, seed=seed, force=force)[0]
@@ -151,6 +253,7 @@ def sensor_fit(
         typer.Option("--amplitude-unit", help="Unit of amplitude and intensity: electrons or arbitrary."),
     ] = "electrons",
     reading: Annotated[FrameReading, Without("invalid_means")],
+    frequency: Frequency = None,
     as_json: Json = False,
     force: Force = False,
 ) -> None:
@@ -166,8 +269,13 @@ def sensor_fit(
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")
     refuse_existing([out], force)
     base = read_sensor(sensor)
+    which = _which_frequency(base, frequency)
     measured = [reading.read(path, base) for path in frames]
     note_too_far(base, {"--distance": max(distance)})
+    for path, one in zip(frames, measured, strict=True):
+        if not one.by_frequency:
+            raise UsageError(f"{path}: holds unwrapped ranges alone, and a fit takes what each frequency measured")
+    measured, base = [one.by_frequency[which] for one in measured], base.by_frequency[which]
     fit = fit_sensor(
         [one[k : k + 1] for one in measured for k in range(len(one))],  # every position of a file has its distance
         distance,

@@ -36,10 +36,12 @@ def write_bop(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     metres_per_unit = scale_of(frames, quantity)
     fx, fy, cx, cy = pinhole(frames)
     sensor = frames.sensor
-    camera = {
+    camera: dict[str, Any] = {
         "cx": cx, "cy": cy, "depth_scale": metres_per_unit * _MM, "fx": fx, "fy": fy, "height": sensor.rows,
         "width": sensor.cols,
     }  # fmt: skip
+    if sensor.lens is not None:
+        camera |= {"distortion_model": sensor.lens.model, "distortion": list(sensor.lens.distortion)}
     _write_json(folder / "camera.json", camera)
     _write_json(
         folder / "dataset_info.json", {"quantity": "z", "classes": list(frames.classes), "seed": frames.plan.seed}

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import StorageError
-from phasemark.data.export.samples import CAM2OPTICAL, blocks, pinhole, quaternion
+from phasemark.data.export.samples import CAM2OPTICAL, blocks, pinhole, quaternion, ros_distortion
 from phasemark.data.frames.frame_set_file import FrameSet
 from phasemark.data.measured.bags import AMPLITUDE_TOPIC, INFO_TOPIC, RANGE_TOPIC, Z_TOPIC, ros_types
 from phasemark.data.measured.reading import RangeOrZ
@@ -94,10 +94,11 @@ def _image(types: Any, header: Any, values: NDArray[Any]) -> Any:
 
 def _camera_info(types: Any, header: Any, frames: FrameSet) -> Any:
     fx, fy, cx, cy = pinhole(frames)
+    model, coefficients = ros_distortion(frames.sensor)
     region = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return types["sensor_msgs/msg/CameraInfo"](
-        header=header, height=frames.sensor.rows, width=frames.sensor.cols, distortion_model="plumb_bob",
-        d=np.zeros(5), k=np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0]), r=np.eye(3).ravel(),
+        header=header, height=frames.sensor.rows, width=frames.sensor.cols, distortion_model=model,
+        d=np.array(coefficients), k=np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0]), r=np.eye(3).ravel(),
         p=np.array([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1.0, 0]), binning_x=0, binning_y=0, roi=region,
     )  # fmt: skip
 

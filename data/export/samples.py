@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from phasemark.data.frames.frame_set_file import FrameSet, Sample
 from phasemark.data.measured.reading import RangeOrZ
 from phasemark.data.plans.frame_plan import TILT
+from phasemark.render import Sensor
 
 BLOCK = 1024
 """Frames read at a time."""
@@ -59,9 +60,23 @@ def truth_columns(frames: FrameSet, sample: Sample) -> dict[str, NDArray[Any]]:
 def pinhole(frames: FrameSet) -> tuple[float, float, float, float]:
     """Return fx, fy, cx, cy in pixels, counted as OpenCV, ROS and BOP do, from the centre of the first pixel."""
     sensor = frames.sensor
+    if sensor.lens is not None:
+        return sensor.lens.fx, sensor.lens.fy, sensor.lens.cx, sensor.lens.cy
     tan_h, tan_v = sensor.tan_half_angles
     u0, v0 = sensor.centre_px
     return sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v), u0 - 0.5, v0 - 0.5
+
+
+def ros_distortion(sensor: Sensor) -> tuple[str, tuple[float, ...]]:
+    """Return the name that ROS has for a sensor's distortion, and the coefficients in ROS's order."""
+    lens = sensor.lens
+    if lens is None:
+        return "plumb_bob", (0.0,) * 5
+    if lens.model == "fisheye":
+        return "equidistant", lens.distortion or (0.0,) * 4
+    if len(lens.distortion) == 8:
+        return "rational_polynomial", lens.distortion
+    return "plumb_bob", (*lens.distortion, *(0.0,) * (5 - len(lens.distortion)))
 
 
 CAM2OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])

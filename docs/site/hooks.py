@@ -13,6 +13,7 @@ from generated_pages import ROOT, SOURCES, site_pages
 from markdown_dialect import ROOT_PAGES, for_site, with_site_links
 from mkdocs.structure.files import File, Files
 from notebooks import notebook_page
+from pymdownx.slugs import slugify
 
 _ROOT_FILES = ("__init__.py", "__main__.py", "cli.py")
 PACKAGE = ROOT / "out" / "package" / "phasemark"
@@ -49,9 +50,25 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return for_site(with_site_links(markdown, root=False))
 
 
+def _sections_of_physics() -> dict[str, str]:
+    """Return the anchors of physics.md by the numbers of its sections."""
+    headings = re.findall(
+        r"^## (\d+)\. (.+)$", (ROOT / "docs" / "physics.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    return {number: slugify(case="lower")(f"{number}. {title}", "-") for number, title in headings}
+
+
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Drop the marks of Sphinx from docstrings."""
-    return re.sub(r":(?:mod|class|func|meth|data|attr):(?=<code>)", "", html)
+    """Drop the marks of Sphinx from docstrings, and let what cites physics.md lead there."""
+    html = re.sub(r":(?:mod|class|func|meth|data|attr):(?=<code>)", "", html)
+    anchors = _sections_of_physics()
+    root = "../" * page.url.count("/")
+
+    def linked(match: re.Match[str]) -> str:
+        anchor = anchors.get(match[1])
+        return f'<a href="{root}physics.html#{anchor}">{match[0]}</a>' if anchor else match[0]
+
+    return re.sub(r"PHYSICS,? sections? (\d+)", linked, html) if page.url.startswith("reference/phasemark") else html
 
 
 def on_post_page(output: str, page: Any, **_: Any) -> str:

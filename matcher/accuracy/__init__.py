@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
+    from phasemark.matcher.accuracy.accuracy_card import AccuracyCard, accuracy_card, sides_of
     from phasemark.matcher.accuracy.cramer_rao import Bound, confusion_probability
     from phasemark.matcher.accuracy.grid_spacing import GridLoss, SpacingLoss, grid_loss
     from phasemark.matcher.accuracy.trials import Trials, TrialSetup, TrialSummary, run_trials
@@ -12,13 +13,16 @@ else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)
 
 __all__ = [
+    "AccuracyCard",
     "Bound",
     "GridLoss",
     "SpacingLoss",
     "TrialSetup",
     "TrialSummary",
     "Trials",
+    "accuracy_card",
     "confusion_probability",
     "grid_loss",
     "run_trials",
+    "sides_of",
 ]

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from phasemark import UsageError
+from phasemark.matcher.frequencies import OneFrequency, OneFrequencyRenderer
 from phasemark.matcher.information import covariance_of, eliminated
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.residuals import ResidualKind
@@ -83,7 +84,8 @@ def cramer_rao(
 ) -> Bound:
     """Return the Cramér–Rao bound at some views (PHYSICS section 7).
 
-    Pixels count where one frame measures the range to 0.1 rad or better (0.24 m at 10 MHz).
+    Pixels count where one frame measures the range to 0.1 rad or better (0.24 m at 10 MHz). Of several modulation
+    frequencies the information is the sum of that of each.
 
     Parameters
     ----------
@@ -131,6 +133,12 @@ def cramer_rao(
         raise UsageError(f"'free' must name some of {', '.join(VIEW)} once each, got {tuple(free)!r}")
     if (background is None or background.wall_m is None) and set(nuisances) & {"wall_m", "wall_albedo"}:
         raise UsageError("a wall can be a nuisance only where there is one: give 'background' a wall")
+    one = None
+    if len(renderer.sensor.frequencies_hz) > 1:
+        one = OneFrequency(renderer.sensor, "stacked")
+        renderer = OneFrequencyRenderer(renderer, one)
+        if "calibration" in systematic and calibrated_fields(one.camera):
+            raise UsageError('systematic="calibration" takes a sensor of one modulation frequency')
     sensor = renderer.sensor
     image, slope = _image_and_slopes(renderer, views, free, background, workers)
     columns = [slope]
@@ -152,7 +160,12 @@ def cramer_rao(
                     for step in (_WALL_STEP_M, -_WALL_STEP_M)
                 ]
                 columns.append(((sides[0] - sides[1]) / (2 * _WALL_STEP_M))[:, None])
-    use = np.broadcast_to(pixel_mask(pixels, sensor), image.phasor.shape) & (image.phasor != 0)
+    mask = pixel_mask(pixels, sensor if one is None else one.camera)
+    if one is not None:
+        mask = one.same_for_all(mask)
+        if np.ndim(n_frames) > 1:
+            n_frames = one.same_for_all(np.asarray(n_frames, np.float64))
+    use = np.broadcast_to(mask, image.phasor.shape) & (image.phasor != 0)
     if isinstance(pixels, str):
         use = use & counts(image.phasor, image.intensity, sensor)
     frames = np.broadcast_to(np.asarray(n_frames, np.float64), image.phasor.shape)
@@ -171,6 +184,8 @@ def cramer_rao(
             known = np.nan_to_num(covariance_of(everything, weak_share=_WEAK_SHARE))
             p = len(free)
             common += carried_covariance(known, rows, calibrated, calibrated_covariance(sensor))[:, :p, :p]
+    if one is not None:
+        use = one.layers(use).any(axis=-3)
     return Bound(tuple(free), information, use, common)
 
 

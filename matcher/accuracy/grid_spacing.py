@@ -125,6 +125,7 @@ def grid_loss(bank: Bank, n: int, *, seed: int = 0, workers: int | None = None) 
         raise UsageError(f"n=… must be at least 1, got {n}")
     if len(bank.distance_m) < 2 or len(bank.delta_rad) < 2:
         raise UsageError(f"{bank.path}: has one distance or one angle only: there is no spacing to test")
+    bank.sensor.refuse_several_frequencies("the test of a bank's spacing")
     methods = {"nearest": Matcher(bank, "nearest")}
     if bank.plan.model == "ray":
         methods["refined"] = Matcher(bank, "refine", free=VIEW[:2], workers=workers)

@@ -50,7 +50,7 @@ from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.pixel_agreement import MIN_RETURNS
 from phasemark.render import Background, Frames, Sensor
 from phasemark.render.phasor_images import wrap_difference_m, wrap_range_m
-from phasemark.render.sensor.lens_fields import TERMS, Lens
+from phasemark.render.sensor.lens_fields import DERIVED, TERMS, Lens
 from phasemark.render.sensor.sensor_file import rounded
 
 FEWEST_POSES = 3
@@ -322,6 +322,7 @@ def calibrate(
     lit = quantity == "phasors" or background is not None or poses.wall_m is not None
     if free is None and not lit:
         names = tuple(name for name in names if name != "albedo")
+    sensor.refuse_several_frequencies("a calibration")
     kept = check_names(fixed, "'fixed'", lens)
     names = tuple(name for name in names if name not in kept)
     assumed = _assumed(start, sensor, albedo)
@@ -943,7 +944,8 @@ def _calibrated(
 ) -> Sensor:
     """Return a sensor with its mounting and what is common to all its frames: the covariance of what was estimated.
 
-    What an earlier calibration estimated and this one left stays, uncorrelated with the rest.
+    What an earlier calibration estimated and this one left stays, uncorrelated with the rest; not half angles beside
+    terms of a lens, from which they follow.
     """
     there = _mounted(sensor, mounting, free)
     known = [name for name in free if PARAMETERS[name].field is not None]
@@ -951,7 +953,8 @@ def _calibrated(
     unit = np.array([PARAMETERS[name].shown if PARAMETERS[name].unit == "°" else 1.0 for name in known])
     index = [list(free).index(name) for name in known]
     own = covariance[np.ix_(index, index)] * np.outer(unit, unit)
-    older = [k for k, name in enumerate(sensor.calibration_fields) if name not in fields]
+    replaced = {*fields, *(DERIVED if set(free) & set(TERMS) else ())}
+    older = [k for k, name in enumerate(sensor.calibration_fields) if name not in replaced]
     n = len(fields)
     whole = np.zeros((n + len(older), n + len(older)))
     whole[:n, :n] = (own + own.T) / 2

@@ -88,6 +88,10 @@ class AllowedDimensions:
         """Tangents of the narrower half of the field sideways, and of half of it up and down."""
         tan_h, tan_v = self.sensor.tan_half_angles
         u0 = self.sensor.centre_px[0] / self.sensor.cols
+        if self.sensor.lens is not None:
+            row = min(max(self.sensor.centre_px[1], 0.0), float(self.sensor.rows))
+            left, right = (float(self.sensor.tangents(u, row)[0]) for u in (0.0, self.sensor.cols))
+            return min(left, -right), tan_v
         return 2 * tan_h * min(u0, 1 - u0), tan_v
 
     @property

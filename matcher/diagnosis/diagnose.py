@@ -264,7 +264,8 @@ def diagnose(
     Raises
     ------
     UsageError
-        The frame is accepted, there is no such frame, or the frames come from another camera than the bank.
+        The frame is accepted, there is no such frame, or the frames come from another camera than the bank, or from
+        one of several modulation frequencies.
 
     Notes
     -----
@@ -273,6 +274,7 @@ def diagnose(
     """
     if not -len(frames) <= index < len(frames):
         raise UsageError(f"'index' must be in 0 … {len(frames) - 1}, got {index}")
+    frames.sensor.refuse_several_frequencies("the diagnosis of a refused frame")
     index %= len(frames)
     frame = frames[index]
     refused = matcher.match(frame)[0]

@@ -157,7 +157,8 @@ class Search:
         tan_h = sensor.tan_half_angles[0]
         column = np.broadcast_to(np.arange(sensor.cols) + 0.5, near.shape)[near].mean()
         per_column = 2 * math.atan(tan_h) / sensor.cols
-        middle = math.atan(2 * tan_h * (sensor.centre_px[0] - column) / sensor.cols)
+        row = min(max(sensor.centre_px[1], 0.0), float(sensor.rows))
+        middle = math.atan(float(sensor.tangents(column, row)[0]))
         middle -= math.radians(sensor.bearing_offset_deg)
         vertices = self._renderers[c].topology.vertices
         grid = []

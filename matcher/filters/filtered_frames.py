@@ -7,7 +7,7 @@ deviation. Neither removes mixing at edges: averaging converges to the mixed ran
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING, TypeVar
@@ -23,12 +23,15 @@ from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m, wrap
 from phasemark.render.png import figure_png
 from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.unwrapped_frames import unwrapped
 
 if TYPE_CHECKING:
     pass
 
 _Number = TypeVar("_Number", bound=np.generic)
 
+_USUAL_LIMIT_RAD = 0.1
+"""Phase noise where a frame does not know its own and the sensor allows no less."""
 _LEAST_POOLED = 1e-4
 """Least variance over that of the law; frames without any scatter are simulated, or frozen."""
 
@@ -69,6 +72,10 @@ class FilteredFrames:
         than predicted from amplitude and intensity: tests then need F, not χ².
     time_s : (n,) float64, optional
         Mean time stamp of the frames at each position, seconds.
+    by_frequency : tuple of FilteredFrames
+        What each of several modulation frequencies measured alone, its range wrapped at c / 2f; `range_m` is then
+        unwrapped from these, `std_m` is that of the unwrapped range, and amplitude and intensity are those of the first
+        frequency. Empty for one frequency, and where the frequencies were unwrapped before they were filtered.
 
     Raises
     ------
@@ -85,6 +92,7 @@ class FilteredFrames:
     sensor: Sensor
     std_from_scatter: bool = False
     time_s: NDArray[np.float64] | None = None
+    by_frequency: tuple[FilteredFrames, ...] = ()
 
     def __post_init__(self) -> None:
         shape = (len(self.range_m), self.sensor.rows, self.sensor.cols)
@@ -111,6 +119,7 @@ class FilteredFrames:
             self.sensor,
             self.std_from_scatter,
             None if self.time_s is None else self.time_s[rows],
+            tuple(part[index] for part in self.by_frequency),
         )
 
     def __iter__(self) -> Iterator[FilteredFrames]:
@@ -123,7 +132,12 @@ class FilteredFrames:
         if sensor.range_offset_m == 0 and not sensor.zone_offset_m:
             return self
         corrected = wrap_range_m(self.range_m - (sensor.range_offset_m + sensor.zone_offsets), sensor)
-        return replace(self, range_m=corrected, sensor=sensor.with_(range_offset_m=0.0, zone_offset_m=()))
+        return replace(
+            self,
+            range_m=corrected,
+            sensor=sensor.with_(range_offset_m=0.0, zone_offset_m=()),
+            by_frequency=tuple(part.without_offset() for part in self.by_frequency),
+        )
 
     def with_pooled_noise(self) -> FilteredFrames:
         """Return the frames of a direct sensor with the noise of its law, scaled to the scatter of all pixels together.
@@ -153,6 +167,52 @@ class FilteredFrames:
         return figure_png(filtered_figure(self.range_m[0], self.std_m[0])) if len(self) else None
 
 
+def unwrap_filtered(parts: Sequence[FilteredFrames], sensor: Sensor) -> FilteredFrames:
+    """Return filtered frames of several modulation frequencies from those of each (PHYSICS section 10).
+
+    The ranges are unwrapped after they were filtered, with the variances of the filter: what one frame leaves open many
+    may decide. A pixel returns where every frequency does and these agree beyond doubt; it is *no return* where none
+    does, and *missing* elsewhere: a mixed pixel has no one range.
+
+    Parameters
+    ----------
+    parts : sequence of FilteredFrames
+        Of each of ``sensor.by_frequency``, in this order.
+    sensor : Sensor
+
+    Returns
+    -------
+    FilteredFrames
+        `n_effective` is the least of the frequencies'.
+    """
+    unknown = (sensor.max_phase_std_rad or _USUAL_LIMIT_RAD) * np.array(
+        [part.sensor.metres_per_radian for part in parts]
+    )
+    std = [np.where(np.isfinite(part.std_m), part.std_m, limit) for part, limit in zip(parts, unknown, strict=True)]
+    found = unwrapped([part.range_m for part in parts], std, sensor)
+    states = np.stack([part.state for part in parts])
+    returned = (states == PixelState.RETURN).all(axis=0) & found.consistent
+    dark = (states == PixelState.NO_RETURN).all(axis=0)
+    known = returned & np.all([np.isfinite(part.std_m) for part in parts], axis=0)
+    least = np.min([part.n_effective for part in parts], axis=0)
+    return replace(
+        parts[0],
+        range_m=np.where(returned, found.range_m, np.nan),
+        std_m=np.where(known, found.std_m, np.where(returned, np.inf, np.nan)),
+        state=np.where(returned, PixelState.RETURN, np.where(dark, PixelState.NO_RETURN, PixelState.MISSING)).astype(
+            np.uint8
+        ),
+        n_effective=np.where(returned, least, 0.0),
+        sensor=sensor,
+        by_frequency=tuple(parts),
+    )
+
+
+def _filter_each(frames: Frames, filter_one: Callable[[Frames], FilteredFrames]) -> FilteredFrames:
+    """Filter the frames of each modulation frequency, and unwrap what comes of it."""
+    return unwrap_filtered([filter_one(part) for part in frames.by_frequency], frames.sensor)
+
+
 def assumed_std_m(range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
     """Return the one-frame noise of a surface of albedo 0.8 that faces the camera at a range, metres."""
     amplitude = 0.8 / np.maximum(range_m, 1e-3) ** 2
@@ -178,6 +238,8 @@ def noise_free(images: PhasorImages, n_frames: float, returned: NDArray[np.bool_
         `std_m` is the noise law's (PHYSICS section 4) over √n_frames.
     """
     sensor = images.sensor
+    if len(sensor.frequencies_hz) > 1:
+        return unwrap_filtered([noise_free(part, n_frames, returned) for part in images.by_frequency], sensor)
     std = predicted_range_std(images.amplitude, images.intensity, sensor)
     limit = math.inf if sensor.max_phase_std_rad is None else sensor.max_phase_std_rad * sensor.metres_per_radian
     if returned is None:
@@ -358,6 +420,8 @@ def kalman_filter(frames: Frames, process_var_m2: float = 0.0) -> FilteredFrames
         `process_var_m2` is negative or not finite, or there is no frame.
     """
     _check_process_variance(process_var_m2)
+    if len(frames.by_frequency) > 1:
+        return _filter_each(frames, lambda part: kalman_filter(part, process_var_m2))
     tally = _Tally.of(frames)
     measurement_var = tally.law_variance_m2()
     if measurement_var is None:
@@ -399,6 +463,13 @@ def phasor_mean(frames: Frames) -> FilteredFrames:
     UsageError
         There is no frame.
     """
+    if len(frames.by_frequency) > 1:
+        return _filter_each(frames, phasor_mean)
+    if not frames.by_frequency:
+        raise UsageError(
+            "the frames hold unwrapped ranges alone, and a mean of phasors takes what each modulation frequency"
+            " measured: filter them with kalman_filter"
+        )
     tally = _Tally.of(frames)
     n_valid = tally.n_valid
     mean = np.zeros(n_valid.shape, dtype=np.complex128)
@@ -449,6 +520,7 @@ class PixelKalman:
         self._sensor = sensor
         self._process_var_m2 = process_var_m2
         self._tally: _Tally | None = None
+        self._each: tuple[PixelKalman, ...] = ()
         self._scatter: _Scatter
         self._track: _Track
 
@@ -470,6 +542,11 @@ class PixelKalman:
             raise UsageError(f"update() takes one frame at a time, got {frame.n_frames}: kalman_filter takes many")
         if frame.sensor != self._sensor:
             raise UsageError("the frame was taken by another sensor than the filter's")
+        if len(frame.by_frequency) > 1:
+            self._update_each(frame)
+            return
+        if self._each:
+            raise UsageError("the frame holds an unwrapped range alone, the ones before what each frequency measured")
         news = _Tally.of(frame)
         if self._tally is None:
             self._tally = news
@@ -480,6 +557,15 @@ class PixelKalman:
         self._scatter.add(frame.range_m[:, 0], frame.valid[:, 0])
         self._track.follow(frame, self._process_var_m2, self._measurement_var_m2(self._tally))
 
+    def _update_each(self, frame: Frames) -> None:
+        """Take in what each modulation frequency measured."""
+        if self._tally is not None:
+            raise UsageError("the frame holds what each frequency measured, the ones before an unwrapped range alone")
+        if not self._each:
+            self._each = tuple(PixelKalman(camera, self._process_var_m2) for camera in self._sensor.by_frequency)
+        for one, part in zip(self._each, frame.by_frequency, strict=True):
+            one.update(part)
+
     def result(self) -> FilteredFrames:
         """Return the filtered frame as of now.
 
@@ -488,6 +574,8 @@ class PixelKalman:
         UsageError
             There was no frame yet.
         """
+        if self._each:
+            return unwrap_filtered([one.result() for one in self._each], self._sensor)
         if self._tally is None:
             raise UsageError("no frame to filter: call update() first")
         std_m = np.sqrt(self._track.scaled_var * self._measurement_var_m2(self._tally))
@@ -601,9 +689,9 @@ class _Tally:
         return None if self.intensity is None else self.intensity.mean()
 
     def law_variance_m2(self) -> NDArray[np.float64] | None:
-        """Return R of one frame by the noise law; None without amplitude or intensity."""
+        """Return R of one frame by the noise law; None without amplitude or intensity of what the range is made of."""
         amplitude_e, intensity_e = self.mean_amplitude_e(), self.mean_intensity_e()
-        if amplitude_e is None or intensity_e is None:
+        if amplitude_e is None or intensity_e is None or len(self.sensor.frequencies_hz) > 1:
             return None
         return measured_range_std(amplitude_e, intensity_e, self.sensor) ** 2
 
@@ -692,7 +780,7 @@ def _result(
         state=state,
         n_effective=np.where(returned, n_effective, 0.0),
         sensor=tally.sensor,
-        std_from_scatter=tally.amplitude is None or tally.intensity is None,
+        std_from_scatter=tally.amplitude is None or tally.intensity is None or len(tally.sensor.frequencies_hz) > 1,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
+from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState, unwrap_filtered
 from phasemark.render.phasor_images import wrap_range_m
 from phasemark.render.sensor.range_noise import measured_range_std
 from phasemark.render.sensor.region import Region
@@ -42,6 +42,8 @@ def read_region(frames: FilteredFrames, region: Region) -> FilteredFrames:
         The region does not fit the camera, or pixels are to be added up whose amplitudes are unknown.
     """
     sensor = region.camera(frames.sensor)
+    if frames.by_frequency:
+        return unwrap_filtered([read_region(part, region) for part in frames.by_frequency], sensor)
     if region.binning == 1:
         return _cut(frames, region, sensor)
     if frames.amplitude_e is None or frames.intensity_e is None:

@@ -223,10 +223,8 @@ def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _level_rays(sensor: Sensor) -> NDArray[np.float64]:
     """Return the ray of every pixel's centre in the level camera, (3, rows, cols), unit vectors."""
-    tan_h, tan_v = sensor.tan_half_angles
-    u0, v0 = sensor.centre_px
     v, u = np.mgrid[: sensor.rows, : sensor.cols] + 0.5
-    ray = np.stack([np.ones_like(u), tan_h * 2 * (u0 - u) / sensor.cols, tan_v * 2 * (v0 - v) / sensor.rows])
+    ray = np.stack([np.ones_like(u), *sensor.tangents(u, v)])
     ray /= np.linalg.norm(ray, axis=0)
     return np.asarray(np.einsum("jk,krc->jrc", sensor.cam2level, ray))
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.frequencies import OneFrequencyBank, background_of, pixels_of
 from phasemark.matcher.likelihood.acceptance import rank
 from phasemark.matcher.likelihood.auto_background import AutoBackground
 from phasemark.matcher.likelihood.background_estimate import NEAREST_WALL_M
@@ -32,8 +33,8 @@ from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
 from phasemark.matcher.nearest.bank_minima import Search, Upward
 from phasemark.matcher.nearest.templates import Observation
-from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts, pixel_mask
-from phasemark.render import Background, PhasorImages, Views, background_image
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
+from phasemark.render import Background, PhasorImages, Views
 from phasemark.render.phasor_images import wrap_difference_m
 
 __all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TILT_STD_RAD", "LikelihoodMatcher", "Pixels"]
@@ -89,14 +90,14 @@ class LikelihoodMatcher:
             on=on,
             background_is_known=self._stated is not None,
             unknown=unknown,
-            used=pixel_mask(pixels, bank.sensor).ravel(),
+            used=pixels_of(bank, pixels).ravel(),
             huber=ROBUST_FROM if robust or unknown else None,
             false_alarm=false_alarm,
             tolerance={name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW},
             widest_rad=policy.prior_sigma * bearing_std_rad if near else math.inf,
             policy=policy,
         )
-        behind = None if self._stated is None else background_image(self._stated, bank.sensor)
+        behind = None if self._stated is None else background_of(bank, self._stated)
         self._exact, self._scout = self._bank_models(behind)
         self._stride = self._search_stride()
         search = self._new_search(behind, 0.0 if near else self._setup.widest_rad)
@@ -209,7 +210,7 @@ class LikelihoodMatcher:
         """Return the scene of an estimated background; see :class:`AutoBackground`."""
         if background is None:
             return self._scene
-        behind = background_image(background, self._bank.sensor)
+        behind = background_of(self._bank, background)
         scene = replace(
             self._scene,
             background=background,
@@ -232,7 +233,7 @@ class LikelihoodMatcher:
         wall_m = float(np.average(forward[returned], weights=seen.weight[0, returned]))
         if wall_m < NEAREST_WALL_M:
             return np.array([np.inf])
-        return bare_cost(seen, background_image(Background(wall_m=wall_m), self._bank.sensor))
+        return bare_cost(seen, background_of(self._bank, Background(wall_m=wall_m)))
 
 
 def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.float64]:
@@ -259,6 +260,14 @@ def _check_choices(bank: Bank, background: object, on: str, pixels: str, free: t
         raise UsageError(f"the bank's model is '{bank.plan.model}', which knows no mixed pixels: refine needs 'ray'")
     if background == "unknown" and on != "ranges":
         raise UsageError('background="unknown" takes on="ranges": the brightness of unknown things tells nothing')
+    if isinstance(bank, OneFrequencyBank) and bank.one.stacked:
+        if background == "auto":
+            raise UsageError('background="auto" takes on="ranges" with several modulation frequencies')
+        if tilted := [name for name in VIEW[3:] if name in free]:
+            raise UsageError(
+                f"'free' with several modulation frequencies takes {tilted[0]} on=\"ranges\" alone: leave it out on"
+                " phasors"
+            )
     if on == "phasors" and background is not None and set(free) & set(VIEW[4:]):
         raise UsageError(
             "on=\"phasors\" before a background takes a level camera: leave pitch_rad and roll_rad out of 'free', or"

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data import Bank
+from phasemark.matcher.frequencies import renderer_of
 from phasemark.matcher.likelihood.images import VIEW, ModelImages
 from phasemark.matcher.likelihood.view_cache import ViewCache
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
@@ -45,7 +46,7 @@ class RenderedModel:
         self._radius_m = 0.0
         for name in bank.classes:
             mesh = bank.mesh(name)
-            self._renderers.append(Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"])))
+            self._renderers.append(renderer_of(bank, mesh, float(mesh.metadata["albedo"])))
             self._radius_m = max(self._radius_m, float(np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max()))
         self._bank_end_m = float(bank.distance_m[-1])
         self._limits = self._limits_before(background)

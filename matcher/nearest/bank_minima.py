@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
 from phasemark.data.plans.arrays import group_rows
+from phasemark.matcher.frequencies import phases_wrap
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
@@ -152,8 +153,9 @@ class Search:
     def _add(self, group: BankGroup, which: tuple[slice, ...], behind: PhasorImages | None) -> None:
         rows = group_rows(group.name, self._bank.sensor)
         templates = Templates.build(
-            group.phasor[which], group.intensity[which], group.coverage[which], self._bank.sensor, behind, rows
-        )
+            group.phasor[which], group.intensity[which], group.coverage[which], self._bank.sensor, behind, rows,
+            wraps=phases_wrap(self._bank),
+        )  # fmt: skip
         self._parts.append((templates, rows, group.name == "upper"))
 
     def capped(self) -> Search:

@@ -14,11 +14,12 @@ from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
 from phasemark.matcher.chi_squared import p_values_of
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.frequencies import background_of, phases_wrap
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Candidate, Match, Reason
 from phasemark.matcher.nearest.search import lowest, nearest_search
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS
-from phasemark.render import Background, background_image
+from phasemark.render import Background
 from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
 
@@ -67,7 +68,7 @@ class NearestMatcher:
         self._bank = bank
         self._tolerance_m, self._tolerance_rad = tolerance_m, tolerance_rad
         self._false_alarm = false_alarm
-        self._behind = None if background is None else background_image(background, bank.sensor)
+        self._behind = None if background is None else background_of(bank, background)
         self._symmetry = {name: int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes}
         if bank.full is not None:
             self._pose_rows, self._class_rows = (0, bank.sensor.rows), None
@@ -92,7 +93,10 @@ class NearestMatcher:
         return matches
 
     def _templates(self, group: BankGroup, rows: tuple[int, int]) -> Templates:
-        return Templates.build(group.phasor, group.intensity, group.coverage, self._bank.sensor, self._behind, rows)
+        return Templates.build(
+            group.phasor, group.intensity, group.coverage, self._bank.sensor, self._behind, rows,
+            wraps=phases_wrap(self._bank),
+        )  # fmt: skip
 
     def _match_some(self, frames: FilteredFrames) -> list[Match]:
         pose_seen = Observation.from_frames(frames, self._pose_rows)

@@ -18,7 +18,7 @@ comes within its rounding error of the smallest is computed again in float64.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -58,6 +58,7 @@ class Observation:
         Where a frame does not know its own noise (a single frame without amplitudes), the noise law at the measured
         range of an albedo of 0.8 facing the camera stands in.
         """
+        frames.sensor.refuse_several_frequencies("comparing frames with model images")
         picked = slice(*rows)
         shape = (len(frames), -1)
         state = frames.state[:, picked].reshape(shape)
@@ -89,6 +90,8 @@ class Templates:
     mean_m : (pixels,) float64
         Circular mean of the model ranges of each pixel.
     sensor : Sensor
+    wraps : bool
+        Whether model and frame may differ by more than half a period about the mean; then no cost is a matrix product.
     """
 
     range_m: NDArray[np.float32]
@@ -96,6 +99,7 @@ class Templates:
     must_return: NDArray[np.bool_]
     mean_m: NDArray[np.float64]
     sensor: Sensor
+    wraps: bool = False
 
     @classmethod
     def build(
@@ -106,6 +110,8 @@ class Templates:
         sensor: Sensor,
         background: PhasorImages | None,
         rows: tuple[int, int],
+        *,
+        wraps: bool = False,
     ) -> Templates:
         """Turn model images into templates, composed with a background if there is one.
 
@@ -118,6 +124,8 @@ class Templates:
             One image of the background without the landmark; S = S_landmark + (1 − coverage) · S_background.
         rows : (first, stop)
             Rows of the sensor that the images hold.
+        wraps : bool
+            As an attribute.
         """
         pixels = math.prod(phasor.shape[-2:])
         s = phasor.reshape(-1, pixels)
@@ -141,14 +149,19 @@ class Templates:
         mean = phasor_to_range_m(turn.sum(axis=0), sensor)
         mean = np.where(np.isfinite(mean), mean, 0.0)
         about = np.where(may, wrap_difference_m(ranges - mean, sensor), 0.0).astype(np.float32)
-        return cls(about, may, must, mean, sensor)
+        return cls(about, may, must, mean, sensor, wraps)
 
     def __len__(self) -> int:
         return len(self.range_m)
 
     def __getitem__(self, index: NDArray[np.integer]) -> Templates:
         """Return some of the templates, about the same mean."""
-        return Templates(self.range_m[index], self.may_return[index], self.must_return[index], self.mean_m, self.sensor)
+        return replace(
+            self,
+            range_m=self.range_m[index],
+            may_return=self.may_return[index],
+            must_return=self.must_return[index],
+        )
 
     @cached_property
     def matrix(self) -> NDArray[np.float32]:
@@ -160,6 +173,10 @@ class Templates:
     def costs(self, seen: Observation, subset: slice | None = None) -> NDArray[np.float32]:
         """Return the distances of n frames from all templates (or a slice of them), (n, t), to float32's accuracy."""
         about = self.about(seen)
+        if self.wraps:
+            picked = slice(None) if subset is None else subset
+            models = (self.range_m[picked], self.may_return[picked], self.must_return[picked])
+            return self._wrapped_costs(models, about, seen.weight, seen, np.inf)
         query = np.concatenate(
             [
                 seen.weight * about**2 - DISAGREEMENT * seen.returned,
@@ -182,14 +199,24 @@ class Templates:
         grid_std_m : float
             What half a step of the grid changes in a range; added to the noise.
         """
-        out = np.empty((len(seen.range_m), len(self)), np.float32)
         variance = np.divide(1.0, seen.weight, out=np.zeros_like(seen.weight), where=seen.weight > 0)
         weight = np.where(seen.returned, 1 / (variance + grid_std_m**2), 0.0)
-        period = self.sensor.unambiguous_range_m
+        models = (self.range_m, self.may_return, self.must_return)
+        return self._wrapped_costs(models, self.about(seen), weight, seen, DISAGREEMENT)
+
+    def _wrapped_costs(
+        self,
+        models: tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]],
+        about: NDArray[np.float64],
+        weight: NDArray[np.float64],
+        seen: Observation,
+        most: float,
+    ) -> NDArray[np.float32]:
+        """Return the distances of n frames from t templates, (n, t), where no return costs more than `most`."""
+        out = np.empty((len(about), len(models[0])), np.float32)
         _capped_costs(
-            self.range_m, self.may_return, self.must_return, self.about(seen), weight,
-            seen.returned, seen.not_returned, period, out,
-        )  # fmt: skip
+            *models, about, weight, seen.returned, seen.not_returned, self.sensor.unambiguous_range_m, most, out
+        )
         return out
 
     def exact_costs(self, seen: Observation, frame: int, index: NDArray[np.integer]) -> NDArray[np.float64]:
@@ -232,8 +259,8 @@ class Templates:
 
 
 @njit(cache=True, nogil=True)
-def _capped_costs(model, may, must, about, weight, returned, absent, period, out):  # type: ignore[no-untyped-def]
-    """Fill the costs of every frame at every template, no pixel above the disagreement."""
+def _capped_costs(model, may, must, about, weight, returned, absent, period, most, out):  # type: ignore[no-untyped-def]
+    """Fill the costs of every frame at every template, no residual above `most`."""
     for f in range(out.shape[0]):
         for t in range(out.shape[1]):
             total = 0.0
@@ -242,7 +269,7 @@ def _capped_costs(model, may, must, about, weight, returned, absent, period, out
                     if may[t, q]:
                         difference = abs(about[f, q] - model[t, q])
                         difference = min(difference, abs(period - difference))
-                        total += min(weight[f, q] * difference * difference, DISAGREEMENT)
+                        total += min(weight[f, q] * difference * difference, most)
                     else:
                         total += DISAGREEMENT
                 elif absent[f, q] and must[t, q]:

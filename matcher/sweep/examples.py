@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from phasemark import UsageError
-from phasemark.matcher.likelihood.images import LEVEL_VIEW
 from phasemark.matcher.match import Match
 from phasemark.matcher.sweep.job import Round, SweepJob
 from phasemark.matcher.sweep.plan import SweepPlan
@@ -118,7 +117,7 @@ def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, method: str) ->
     match = Match(
         class_name=name,
         accepted=bool(trials.accepted[k, m]),
-        **dict(zip(LEVEL_VIEW, trials.estimate[k, m].tolist(), strict=True)) if name else {},
+        **dict(zip(trials.numbers, trials.estimate[k, m].tolist(), strict=True)) if name else {},
         covariance=covariance if np.isfinite(covariance[:2, :2]).all() else None,
         symmetry=trials.symmetry[found] if found >= 0 else 1,
     )

@@ -31,7 +31,7 @@ from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, noise_free, phasor_mean
-from phasemark.matcher.likelihood.images import LEVEL_VIEW
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY
 from phasemark.matcher.match import Match, Matches
@@ -45,24 +45,34 @@ SCHEMA_VERSION = 1
 NONE = -1
 """Stands for "no landmark" where a class's number would be."""
 
-_N = len(LEVEL_VIEW)
-_FIELDS: tuple[tuple[str, tuple[int, ...], str, str], ...] = (
-    ("bound", (_N, _N), "<f8", "Cramér–Rao bound at the truth, in the order distance, delta, bearing, height"),
-    ("estimate", (_N,), "<f8", "distance_m, delta_rad, bearing_rad, height_m; NaN where there is none"),
-    ("covariance", (_N, _N), "<f8", "the method's own covariance; NaN where it has none"),
-    ("chi2", (), "<f8", "whitened squared residual"),
-    ("dof", (), "<i4", "degrees of freedom"),
-    ("p_value", (), "<f8", "probability of a larger chi2"),
-    ("p_none", (), "<f8", "probability of no landmark"),
-    ("found", (), "<i2", "number of the class found, -1: none"),
-    ("accepted", (), "|u1", "whether the match passed its test"),
-    ("modes", (), "<i2", "explanations kept, the best included"),
-    ("seconds", (), "<f8", "time of the match, an equal share of its batch"),
-)
-_SHARED_FIELDS: tuple[tuple[str, tuple[int, ...], str, str], ...] = (
-    ("truth", (_N,), "<f8", "distance_m, delta_rad, bearing_rad, height_m"),
-    ("confusion", (), "<f8", "bound on the probability of a wrong class; NaN where it was not computed"),
-)
+
+def _own_fields(p: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
+    """Return what is kept of each method's match of a trial; views have p numbers."""
+    names = ", ".join(VIEW[:p])
+    order = ", ".join(name.split("_")[0] for name in VIEW[:p])
+    return (
+        ("bound", (p, p), "<f8", f"Cramér–Rao bound at the truth, in the order {order}"),
+        ("estimate", (p,), "<f8", f"{names}; NaN where there is none"),
+        ("covariance", (p, p), "<f8", "the method's own covariance; NaN where it has none"),
+        ("chi2", (), "<f8", "whitened squared residual"),
+        ("dof", (), "<i4", "degrees of freedom"),
+        ("p_value", (), "<f8", "probability of a larger chi2"),
+        ("p_none", (), "<f8", "probability of no landmark"),
+        ("found", (), "<i2", "number of the class found, -1: none"),
+        ("accepted", (), "|u1", "whether the match passed its test"),
+        ("modes", (), "<i2", "explanations kept, the best included"),
+        ("seconds", (), "<f8", "time of the match, an equal share of its batch"),
+    )
+
+
+def _shared_fields(p: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
+    """Return what is kept of each trial; views have p numbers."""
+    return (
+        ("truth", (p,), "<f8", ", ".join(VIEW[:p])),
+        ("confusion", (), "<f8", "bound on the probability of a wrong class; NaN where it was not computed"),
+    )
+
+
 _CONFUSION_TRIALS = 4
 """Views of a condition, which hardly differ, for which the bound on class confusion is computed."""
 _WIGGLES = (3, 5, 7)
@@ -159,11 +169,11 @@ class SweepJob:
             numbers = np.concatenate([self.of.first + np.arange(count) for count in self.items])
             file.create_dataset("trial", data=numbers.astype("<i8"))
             first = []
-            for name, shape, kind, long_name in _SHARED_FIELDS:
+            for name, shape, kind, long_name in _shared_fields(self.plan.n_numbers):
                 dataset, offset = layout.reserve(file, name, (n, *shape), kind)
                 dataset.attrs["long_name"] = long_name
                 first.append(Place(offset, int(np.prod(shape)) * np.dtype(kind).itemsize))
-            for name, shape, kind, long_name in _FIELDS:
+            for name, shape, kind, long_name in _own_fields(self.plan.n_numbers):
                 dataset, offset = layout.reserve(file, name, (n, methods, *shape), kind)
                 dataset.attrs["long_name"] = long_name
                 first.append(Place(offset, methods * int(np.prod(shape)) * np.dtype(kind).itemsize))
@@ -177,8 +187,10 @@ class SweepJob:
         number = self.of.conditions[slab]
         first = self.of.first + start
         views = self.views(number, first, self.of.first + stop)
-        truth = np.stack([getattr(views, name) for name in LEVEL_VIEW], axis=1)
-        out = {name: np.zeros((len(views), len(self.plan.methods), *shape), kind) for name, shape, kind, _ in _FIELDS}
+        truth = np.stack([getattr(views, name) for name in VIEW[: self.plan.n_numbers]], axis=1)
+        p = self.plan.n_numbers
+        own = _own_fields(p)
+        out = {name: np.zeros((len(views), len(self.plan.methods), *shape), kind) for name, shape, kind, _ in own}
         image = self.image(number, views)
         frames: dict[tuple[str, str], FilteredFrames] = {}
         bounds: dict[tuple[Any, ...], NDArray[np.float64]] = {}
@@ -188,7 +200,7 @@ class SweepJob:
                 frames[kind] = self.frames(number, method, image, first)
             what = (method.on, method.parameters, method.pixels)
             if what not in bounds and self.is_stranger(number):
-                bounds[what] = np.full((len(views), _N, _N), np.nan)
+                bounds[what] = np.full((len(views), p, p), np.nan)
             elif what not in bounds:
                 bounds[what] = self.bound(number, method, image)
             begun = time.perf_counter()
@@ -198,7 +210,7 @@ class SweepJob:
             for name, values in self._table(matches, method).items():
                 out[name][:, m] = narrowed(values, out[name].dtype.str, name)
         confusion = self.confusion(number, views, first)
-        return [truth.astype("<f8"), confusion.astype("<f8"), *(out[name] for name, *_ in _FIELDS)]
+        return [truth.astype("<f8"), confusion.astype("<f8"), *(out[name] for name, *_ in own)]
 
     def views(self, number: int, first: int, stop: int) -> Views:
         """Return the true views of some trials of a condition."""
@@ -209,6 +221,7 @@ class SweepJob:
             np.deg2rad(condition.delta_deg + self.plan.spread[1] * unit[:, 1]),
             np.deg2rad(condition.bearing_deg),
             condition.height_m,
+            *(np.deg2rad([condition.pitch_deg, condition.roll_deg]) if self.plan.is_tilted else ()),
         )
 
     def believed_sensor(self, number: int) -> Sensor:
@@ -219,7 +232,9 @@ class SweepJob:
     def true_sensor(self, number: int) -> Sensor:
         """Return the camera as it is."""
         condition = self.all_conditions[number]
-        changes: dict[str, Any] = {"pitch_deg": self.sensor.pitch_deg + condition.pitch_deg}
+        changes: dict[str, Any] = {}
+        if not self.plan.is_tilted:  # a view of its own otherwise
+            changes["pitch_deg"] = self.sensor.pitch_deg + condition.pitch_deg
         if condition.wiggling:
             changes["modulation"] = "harmonics"
             changes["harmonics"] = tuple((k, condition.wiggling / k**2, 0.0) for k in _WIGGLES)
@@ -272,7 +287,7 @@ class SweepJob:
     def bound(self, number: int, method: Method, image: PhasorImages) -> NDArray[np.float64]:
         """Return the Cramér–Rao bound of the true world at the views of an image of it.
 
-        (n, 4, 4), NaN for what is not estimated.
+        (n, p, p), NaN for what is not estimated.
         """
         free = method.parameters
         found = cramer_rao(
@@ -280,7 +295,7 @@ class SweepJob:
             free=free, n_frames=self.all_conditions[number].n_frames, on=method.on, pixels=method.pixels,
             background=self.background(number),
         )  # fmt: skip
-        return _spread(found.covariance, free, len(image))
+        return _spread(found.covariance, free, len(image), self.plan.n_numbers)
 
     def confusion(self, number: int, views: Views, first: int) -> NDArray[np.float64]:
         """Return a bound on how often another class explains a frame better, (n,); NaN beyond the first few trials.
@@ -320,9 +335,7 @@ class SweepJob:
             if wall_m not in self._references:
                 background = Background(wall_m=wall_m) if wall_m else None
                 bank = self._bank(Method(name="reference"))
-                self._references[wall_m] = Matcher(
-                    bank, "refine", free=LEVEL_VIEW[:2], background=background, workers=1
-                )
+                self._references[wall_m] = Matcher(bank, "refine", free=VIEW[:2], background=background, workers=1)
             return self._references[wall_m]
 
     def matcher(self, number: int, m: int) -> Callable[[FilteredFrames], Sequence[Match]]:
@@ -365,26 +378,26 @@ class SweepJob:
         where = f"method '{method.name}', condition {number}, trials {first} … {first + len(frames) - 1}"
         match = self.matcher(number, m)
         if method.is_program:
-            matches = _matches_of_plugin(match, method.method, frames, where)
+            matches = _matches_of_plugin(match, method.method, frames, where, VIEW[: self.plan.n_numbers])
         else:
             try:
                 matches = Matches(match(frames))
             except PhasemarkError as error:
                 raise type(error)(f"{where}: {error}") from None
         for k, one in enumerate(matches):
-            if one.class_name is not None and not np.isfinite([getattr(one, name) for name in LEVEL_VIEW]).all():
+            if one.class_name is not None and not np.isfinite([getattr(one, name) for name in VIEW]).all():
                 raise UsageError(f"{where}: trial {first + k} names '{one.class_name}' with a view that is not finite")
         return matches
 
     def _table(self, matches: Matches, method: Method) -> dict[str, Any]:
-        n = len(matches)
-        covariance = np.full((n, _N, _N), np.nan)
+        n, p = len(matches), self.plan.n_numbers
+        covariance = np.full((n, p, p), np.nan)
         for k, one in enumerate(matches):
             if one.covariance is not None:
-                covariance[k] = _spread(one.covariance[None], one.free, 1)[0]
+                covariance[k] = _spread(one.covariance[None], one.free, 1, p)[0]
         found = [NONE if one.class_name is None else self._class_number(one.class_name, method) for one in matches]
         return {
-            "estimate": np.stack([getattr(matches, name) for name in LEVEL_VIEW], axis=1),
+            "estimate": np.stack([getattr(matches, name) for name in VIEW[:p]], axis=1),
             "covariance": covariance,
             "chi2": matches.chi2,
             "dof": matches.dof,
@@ -436,7 +449,7 @@ def _imported(text: str) -> Callable[[FilteredFrames], Sequence[Match]]:
 
 
 def _matches_of_plugin(
-    match: Callable[[FilteredFrames], Any], text: str, frames: FilteredFrames, where: str
+    match: Callable[[FilteredFrames], Any], text: str, frames: FilteredFrames, where: str, names: Sequence[str]
 ) -> Matches:
     """Call a user's matcher, and refuse what is not a Match for each frame."""
     due = f"{where}: the matcher '{text}' must return a Match for each of the {len(frames)} frames"
@@ -452,18 +465,18 @@ def _matches_of_plugin(
     for k, one in enumerate(matches):
         if not isinstance(one, Match):
             raise UsageError(f"{due}, got an object of type {type(one).__name__} for frame {k}")
-        if (wrong := _wrong_field(one)) is not None:
+        if (wrong := _wrong_field(one, names)) is not None:
             raise UsageError(f"{due}, but the Match for frame {k} has {wrong}")
     if len(matches) != len(frames):
         raise UsageError(f"{due}, got {len(matches)}")
     return Matches(matches)
 
 
-def _wrong_field(match: Match) -> str | None:
+def _wrong_field(match: Match, names: Sequence[str]) -> str | None:
     """Return what is wrong with the types of a user's match, or None."""
     if not isinstance(match.class_name, str | None):
         return f"'class_name' {match.class_name!r}: it must be a str or None"
-    for name in (*LEVEL_VIEW, "chi2", "p_value"):
+    for name in (*names, "chi2", "p_value"):
         value = getattr(match, name)
         if not isinstance(value, numbers.Real):
             return f"'{name}' of type {type(value).__name__}: it must be a number"
@@ -473,8 +486,8 @@ def _wrong_field(match: Match) -> str | None:
         return f"'class_probability' of type {type(match.class_probability).__name__}: it must be a mapping"
     if match.covariance is not None:
         n = len(match.free)
-        if not set(match.free) <= set(LEVEL_VIEW):
-            return f"'free' {match.free!r}: it must name some of {', '.join(LEVEL_VIEW)}"
+        if not set(match.free) <= set(names):
+            return f"'free' {match.free!r}: it must name some of {', '.join(names)}"
         if np.shape(match.covariance) != (n, n):
             return f"'covariance' of shape {np.shape(match.covariance)}: it must be {(n, n)}, as 'free' has {n} names"
     return None
@@ -497,9 +510,9 @@ def _is_ours_or_import(filename: str) -> bool:
     return filename in (__file__, importlib.__file__) or filename.startswith("<frozen importlib")
 
 
-def _spread(matrix: NDArray[np.float64], free: Sequence[str], n: int) -> NDArray[np.float64]:
-    """Put matrices over some parameters into matrices over all, NaN elsewhere."""
-    full = np.full((n, _N, _N), np.nan)
-    at = [LEVEL_VIEW.index(name) for name in free]
+def _spread(matrix: NDArray[np.float64], free: Sequence[str], n: int, p: int) -> NDArray[np.float64]:
+    """Put matrices over some parameters into matrices over the first p of a view, NaN elsewhere."""
+    full = np.full((n, p, p), np.nan)
+    at = [VIEW.index(name) for name in free]
     full[:, np.array(at)[:, None], at] = matrix
     return full

@@ -20,6 +20,7 @@ from phasemark.data.plans.bank_plan import MeshPlan, PlanModel, ScenePlan, commo
 from phasemark.data.plans.grid_axis import parse_grid
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec
+from phasemark.matcher.likelihood.images import LEVEL_VIEW, VIEW
 
 _MOST_CELLS = 100_000
 SHIPPED_SWEEPS = ("paper", "distance-angle-noise", "robustness")
@@ -39,7 +40,7 @@ class Condition:
         σ of a range, relative to the sensor's: `signal_e` is divided by its square.
     n_frames : int
         Frames that are averaged.
-    bearing_deg, height_m, pitch_deg : float
+    bearing_deg, height_m, pitch_deg, roll_deg : float
         Of the true view and mounting; a method takes 0 unless it estimates them.
     albedo : float
         The landmark's true albedo.
@@ -66,17 +67,18 @@ class Condition:
     wiggling: float = 0.0
     unit: int = 0
     dimension_error: float = 0.0
+    roll_deg: float = 0.0
 
 
 AXES = tuple(field.name for field in fields(Condition))
 """Names of a condition's fields, each of which may be an axis."""
-MODEL_ERRORS = ("bearing_deg", "height_m", "pitch_deg", "wiggling", "unit", "dimension_error")
+MODEL_ERRORS = ("bearing_deg", "height_m", "pitch_deg", "roll_deg", "wiggling", "unit", "dimension_error")
 """Axes on which the world differs from what a method takes it to be, unless they are 0."""
 _WHOLE = ("n_frames", "unit")
 _LIMITS: dict[str, tuple[float, float]] = {
     "distance_m": (1e-3, 1e3), "noise_factor": (1e-3, 1e3), "n_frames": (1, 100_000), "bearing_deg": (-45, 45),
-    "height_m": (-10, 10), "pitch_deg": (-45, 45), "albedo": (1e-3, 1), "wall_m": (0, 1e3), "wiggling": (0, 1),
-    "unit": (0, 2**62), "dimension_error": (-0.5, 0.5), "delta_deg": (-360, 360),
+    "height_m": (-10, 10), "pitch_deg": (-45, 45), "roll_deg": (-45, 45), "albedo": (1e-3, 1), "wall_m": (0, 1e3),
+    "wiggling": (0, 1), "unit": (0, 2**62), "dimension_error": (-0.5, 0.5), "delta_deg": (-360, 360),
 }  # fmt: skip
 
 
@@ -117,7 +119,7 @@ class Method(PlanModel):
     on : {"ranges", "phasors"}
         What ``refine`` explains. On phasors frames are taken without a validity threshold.
     pixels : {"all", "lower"}
-    free : sequence of {"bearing", "height"}
+    free : sequence of {"bearing", "height", "pitch", "roll"}
         What is estimated beside distance and angle.
     knows : {"wall", "auto", "nothing"}
         Whether the background is known, estimated from the frames, or taken to be none.
@@ -133,7 +135,7 @@ class Method(PlanModel):
     filter: Literal["kalman", "phasor-mean"] = "kalman"
     on: Literal["ranges", "phasors"] = "ranges"
     pixels: Literal["all", "lower"] = "all"
-    free: tuple[Literal["bearing", "height"], ...] = ()
+    free: tuple[Literal["bearing", "height", "pitch", "roll"], ...] = ()
     knows: Literal["wall", "auto", "nothing"] = "wall"
     bank_model: Literal["ray", "hard", "planar"] = "ray"
     bank_step: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (0.01, 1.0)
@@ -166,7 +168,8 @@ class Method(PlanModel):
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of what is estimated, as :class:`phasemark.matcher.Matcher` has them."""
-        return ("distance_m", "delta_rad", *({"bearing": "bearing_rad", "height": "height_m"}[k] for k in self.free))
+        names = {name.split("_")[0]: name for name in VIEW}
+        return (*VIEW[:2], *(names[k] for k in self.free))
 
 
 class SweepPlan(ScenePlan):
@@ -322,6 +325,21 @@ class SweepPlan(ScenePlan):
         """Return the far end of the axes of distances, and of the banks, metres."""
         axes = {f"axes.{name}": max(self.axes[name]) for name in ("distance_m", "wall_m") if name in self.axes}
         return {**axes, "bank_distance_m": self.bank_distance_m[1]}
+
+    @property
+    def is_tilted(self) -> bool:
+        """Whether a method estimates pitch or roll, or the camera rolls: the true views then have six numbers.
+
+        Otherwise a pitch is an error of the mounting, and tables have no columns of pitch and roll.
+        """
+        return any({"pitch", "roll"} & set(method.free) for method in self.methods) or any(
+            self.axes.get("roll_deg", ())
+        )
+
+    @property
+    def n_numbers(self) -> int:
+        """How many numbers of a view are told, the first of those that it has."""
+        return len(VIEW) if self.is_tilted else len(LEVEL_VIEW)
 
     @property
     def class_names(self) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.data.files.json_text import finite_or_none
 from phasemark.matcher.information import weak_direction
-from phasemark.matcher.likelihood.images import LEVEL_VIEW
+from phasemark.matcher.likelihood.images import LEVEL_VIEW, VIEW
 from phasemark.matcher.statistics import (
     Interval,
     binomial_interval,
@@ -47,13 +47,13 @@ class SweepTrials:
         Of each class.
     outlier : (metres, degrees)
     condition, trial : (n,) int64
-    truth : (n, 4) float64
-        distance_m, delta_rad, bearing_rad, height_m.
+    truth : (n, p) float64
+        distance_m, delta_rad, bearing_rad, height_m, and with a tilt pitch_rad, roll_rad.
     confusion : (n,) float64
         Bound on the probability of a wrong class; NaN where it was not computed.
-    estimate : (n, m, 4) float64
+    estimate : (n, m, p) float64
         NaN where there is none.
-    bound, covariance : (n, m, 4, 4) float64
+    bound, covariance : (n, m, p, p) float64
         NaN where a parameter is not estimated, and where a method has no covariance.
     chi2, p_value, p_none, seconds : (n, m) float64
     dof, found, modes : (n, m) int64
@@ -87,6 +87,11 @@ class SweepTrials:
         return len(self.truth)
 
     @property
+    def numbers(self) -> tuple[str, ...]:
+        """What views are made of: four names, six where the plan has a tilt."""
+        return VIEW[: self.truth.shape[1]]
+
+    @property
     def true_class(self) -> NDArray[np.int64]:
         """Number of each trial's class, −1 for a stranger, which has none; (n,)."""
         number = {name: k for k, name in enumerate(self.classes)}
@@ -100,7 +105,7 @@ class SweepTrials:
 
     @property
     def error(self) -> NDArray[np.float64]:
-        """Estimate less truth, δ wrapped by the true landmark's symmetry; (n, m, 4), NaN for strangers."""
+        """Estimate less truth, δ wrapped by the true landmark's symmetry; (n, m, p), NaN for strangers."""
         return self.error_of(slice(None))
 
     def error_of(self, rows: slice) -> NDArray[np.float64]:
@@ -109,7 +114,7 @@ class SweepTrials:
         error = self.estimate[rows] - self.truth[rows, None]
         error[true_class < 0] = np.nan
         period = np.array([delta_period_rad(n) for n in self.symmetry])[true_class][:, None]
-        return wrapped_errors(error, LEVEL_VIEW, period)
+        return wrapped_errors(error, self.numbers, period)
 
     def rows_of(self, condition: int) -> slice:
         """Return where the trials of a condition lie."""
@@ -117,7 +122,7 @@ class SweepTrials:
 
     def trial_table(self, rows: slice) -> dict[str, list[Any]]:
         """Return what trials.csv holds of some trials: columns, trial by trial and method by method."""
-        m = len(self.methods)
+        m, names_of_view = len(self.methods), self.numbers
         number = self.condition[rows]
         error = self.error_of(rows)
         shared: dict[str, Sequence[Any]] = {
@@ -125,17 +130,17 @@ class SweepTrials:
             "trial": self.trial[rows].tolist(),
             "method": self.methods * len(number),
             "class": [self.conditions[k].class_name for k in number],
-            **{f"true_{name}": self.truth[rows, i].tolist() for i, name in enumerate(LEVEL_VIEW)},
+            **{f"true_{name}": self.truth[rows, i].tolist() for i, name in enumerate(names_of_view)},
         }
         names = (*self.classes, "none")
         own: dict[str, NDArray[Any]] = {
-            **{name: self.estimate[rows, :, i] for i, name in enumerate(LEVEL_VIEW)},
-            **{f"error_{name}": error[:, :, i] for i, name in enumerate(LEVEL_VIEW)},
-            **{f"bound_{name}": _root(self.bound[rows, :, i, i]) for i, name in enumerate(LEVEL_VIEW)},
+            **{name: self.estimate[rows, :, i] for i, name in enumerate(names_of_view)},
+            **{f"error_{name}": error[:, :, i] for i, name in enumerate(names_of_view)},
+            **{f"bound_{name}": _root(self.bound[rows, :, i, i]) for i, name in enumerate(names_of_view)},
             **{
                 f"cov_{_SHORT[i]}_{_SHORT[j]}": self.covariance[rows, :, i, j]
-                for i in range(len(LEVEL_VIEW))
-                for j in range(i, len(LEVEL_VIEW))
+                for i in range(len(names_of_view))
+                for j in range(i, len(names_of_view))
             },
             **{name: getattr(self, name)[rows] for name in ("chi2", "dof", "p_value", "p_none")},
             "found": np.array(names, object)[self.found[rows]],
@@ -163,7 +168,7 @@ class SweepTrials:
 
     def _cell(self, number: int, m: int, all_errors: NDArray[np.float64]) -> Cell:
         rows, condition = self.rows_of(number), self.conditions[number]
-        at = np.array([LEVEL_VIEW.index(name) for name in self.free[m]])
+        at = np.array([VIEW.index(name) for name in self.free[m]])
         error = all_errors[rows, m][:, at]
         bound = self.bound[rows, m][:, at[:, None], at]
         covariance = self.covariance[rows, m][:, at[:, None], at]
@@ -175,9 +180,7 @@ class SweepTrials:
         confusion = self.confusion[rows]
         confusion = confusion[np.isfinite(confusion)]
         answered = np.isfinite(error).all(axis=1) & (found >= 0)
-        limit = np.array(
-            [self.outlier[0], math.radians(self.outlier[1]), math.radians(self.outlier[1]), self.outlier[0]]
-        )
+        limit = np.array([self.outlier[0] if name.endswith("_m") else math.radians(self.outlier[1]) for name in VIEW])
         std = np.sqrt(np.einsum("npp->np", bound))
         with np.errstate(invalid="ignore"):
             gross = answered & (np.abs(error) > np.fmax(limit[at], _HONEST_SIGMA * std)).any(axis=1)
@@ -216,10 +219,11 @@ class SweepTrials:
             condition_number=condition_number,
             weak_direction=weak,
             seconds=float(np.median(self.seconds[rows, m])) if n else math.nan,
+            numbers=self.numbers,
         )  # fmt: skip
 
 
-_SHORT = ("distance", "delta", "bearing", "height")
+_SHORT = tuple(name.split("_")[0] for name in VIEW)
 
 
 @dataclass(frozen=True)
@@ -264,6 +268,8 @@ class Cell:
         The direction known worst, as the standard deviation along it.
     seconds : float
         Median time of a match; the one number that differs from run to run.
+    numbers : tuple of str
+        What the views of the sweep are made of: without pitch and roll, the table has no columns of them.
     """
 
     number: int
@@ -288,14 +294,18 @@ class Cell:
     condition_number: float
     weak_direction: dict[str, float]
     seconds: float
+    numbers: tuple[str, ...] = LEVEL_VIEW
 
     def row(self) -> dict[str, Any]:
         """Return the cell as one flat row of cells.csv; what a method does not estimate is NaN."""
-        out: dict[str, Any] = {"cell": self.number, **asdict(self.condition), "method": self.method, "n": self.n}
+        condition = asdict(self.condition)
+        if self.numbers == LEVEL_VIEW:
+            del condition["roll_deg"]
+        out: dict[str, Any] = {"cell": self.number, **condition, "method": self.method, "n": self.n}
         out |= {"stranger": int(self.stranger), "confusion_bound": self.confusion_bound}
         for name in ("answered", "accepted", "outliers", "class_right", "nees"):
             out |= _flat(name, getattr(self, name))
-        for name in LEVEL_VIEW:
+        for name in self.numbers:
             for kind in ("bias", "rmse", "rmse_with_outliers", "ratio"):
                 out |= _flat(f"{kind}_{name}", getattr(self, kind).get(name, _UNKNOWN))
             out[f"bound_{name}"] = self.bound.get(name, math.nan)

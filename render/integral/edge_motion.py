@@ -69,7 +69,8 @@ def follow_borders(view, first, mesh, motion, background, camera, edges, borders
 def _follow_bent_borders(view, first, mesh, motion, background, camera, edges, borders):  # type: ignore[no-untyped-def]
     """Do the same behind a lens with distortion.
 
-    With φ the distance of a fixed ray from the edge, in tangents, the edge is where φ = 0, and ẋ = −φ̇ / (∂φ/∂x).
+    With φ the distance of a fixed ray from the edge, in tangents, the edge is where φ = 0. Along the normal m of a link
+    it moves by −φ̇ / (∇φ · m), and the link along x by that over m_x: weights are lengths along the link, not the curve.
     """
     moved, step, shifted = motion.poses, motion.step, motion.segments
     p = len(step)
@@ -91,10 +92,14 @@ def _follow_bent_borders(view, first, mesh, motion, background, camera, edges, b
                 depth_a, depth_b = _depth(mesh, moved, view * (p + 1), start), _depth(mesh, moved, view * (p + 1), end)
         y, z = ray_of(camera, borders.points[b, 0], borders.points[b, 1])
         y_u, z_u, y_v, z_v = rates_of(camera, y, z)
-        y_x, z_x = (y_u, z_u) if borders.along_v[b] == 1 else (y_v, z_v)
-        here, along_x = _distance(shifted[0], start < 0, y, z, y_x, z_x)
+        here, along_u = _distance(shifted[0], start < 0, y, z, y_u, z_u)
+        _, along_v = _distance(shifted[0], start < 0, y, z, y_v, z_v)
+        link = edges.segments[e]
+        du, dv = link[2] - link[0], link[3] - link[1]
+        across = dv if borders.along_v[b] == 1 else -du
+        along_x = (along_u * dv - along_v * du) * across / (du * du + dv * dv)
         for k in range(p):
-            away, _ = _distance(shifted[k + 1], start < 0, y, z, y_x, z_x)
+            away, _ = _distance(shifted[k + 1], start < 0, y, z, y_u, z_u)
             borders.rates[b, k] = (here - away) / (step[k] * along_x) if along_x != 0.0 else 0.0
         borders.depth[b] = 0.0
         if start >= 0 and depth_a > 0.0 and depth_b > 0.0:
@@ -106,19 +111,19 @@ def _follow_bent_borders(view, first, mesh, motion, background, camera, edges, b
 
 
 @inlined
-def _distance(line, by_normal, y, z, y_x, z_x):  # type: ignore[no-untyped-def]
-    """Return how far a ray lies from a line, in tangents, and how fast that changes along x.
+def _distance(line, by_normal, y, z, y_s, z_s):  # type: ignore[no-untyped-def]
+    """Return how far a ray lies from a line, in tangents, and how fast that changes along a way through the image.
 
     The line is given by its ends, or by (d, n_y, n_z) with d + n_y · y + n_z · z = 0.
     """
     if by_normal:
-        away, along_x = line[0] + line[1] * y + line[2] * z, line[1] * y_x + line[2] * z_x
+        away, along = line[0] + line[1] * y + line[2] * z, line[1] * y_s + line[2] * z_s
     else:
         dy, dz = line[2] - line[0], line[3] - line[1]
         size = 1.0 / math.sqrt(dy * dy + dz * dz)
         away = (dy * (z - line[1]) - dz * (y - line[0])) * size
-        along_x = (dy * z_x - dz * y_x) * size
-    return away, along_x
+        along = (dy * z_s - dz * y_s) * size
+    return away, along
 
 
 @inlined

@@ -14,7 +14,7 @@ from phasemark.render.kernel import kernel
 
 _PER_PART_RAD = 1.5
 """Turn of the phase that two Gauss points a side integrate."""
-_MOST_PARTS = 8
+_MOST_PARTS = 8.0
 _DARK = 2e-6
 """Amplitude, 1 being albedo 1 facing at 1 m, below which the phase of a pixel does not matter."""
 
@@ -53,4 +53,5 @@ def parts_of_pixel(r, c, background, fastest, cos_b, sin_b, level, camera):  # t
         return 1
     if misses:  # the horizon crosses the pixel: amplitudes fall with the third power of the distance
         most = 2.0 * least
-    return min(max(math.ceil(fastest * (most - least) / _PER_PART_RAD), 1), _MOST_PARTS)
+    # clamped before the conversion: a ray along the floor meets it at any distance
+    return max(math.ceil(min(fastest * (most - least) / _PER_PART_RAD, _MOST_PARTS)), 1)

@@ -30,7 +30,7 @@ def distortion_of(sensor: Sensor, rule: int) -> Distortion:
     rule : int
         Gauss points a side at which a background is integrated over a pixel; 0: there is no background.
     """
-    if sensor.lens is None:
+    if sensor.lens is None or not sensor.bends_rays:
         return IDEAL
     return _tables(sensor.lens, sensor.rows, sensor.cols, sensor.fill_factor if rule else (1.0, 1.0), rule)
 
@@ -79,8 +79,8 @@ def _bend(
     model: int, k: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], radius: float, focal: float
 ) -> float:
     """Return a bound of the sagitta of a line of length 1: an eighth of the largest second derivative along any."""
-    y, z = np.meshgrid(np.linspace(low[0], high[0], 65), np.linspace(low[1], high[1], 65))
-    x, y = -y.ravel(), -z.ravel()
+    left, up = np.meshgrid(np.linspace(low[0], high[0], 65), np.linspace(low[1], high[1], 65))
+    x, y = -left.ravel(), -up.ravel()
     within = np.hypot(x, y) <= radius
     x, y = x[within], y[within]
     largest = 0.0

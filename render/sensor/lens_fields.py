@@ -30,7 +30,10 @@ LENS_FIELD = "lens."
 """What stands before a term where it is named among the fields of a sensor, as in `calibration_fields`."""
 
 _MOST_PIXELS = 4096  # along a side of an image
-_OFF_CENTRE = 0.75  # of the image's size, how far from its centre the principal point may lie
+_OFF_CENTRE = 0.4  # of the image's size, how far from its centre the principal point of a whole image may lie
+_PARTS_OFF = 1.0  # the same of a camera that reads a part of an image
+_SOLVED = 1e-13  # relative difference of tangents up to which focal lengths are solved for
+_MOST_STEPS = 30
 _SAME = 1e-5  # relative difference up to which a stated field agrees with the lens
 
 DERIVED = ("half_angle_h_deg", "half_angle_v_deg", "principal_point_px")
@@ -120,6 +123,11 @@ class Lens(BaseModel):
         distortion = tuple(terms[name] for name in _NAMES[self.model][: len(self.distortion)])
         return Lens(model=self.model, **{name: terms[name] for name in _INTRINSICS}, distortion=distortion)
 
+    @property
+    def is_ideal(self) -> bool:
+        """Whether the lens bends no ray: a pinhole."""
+        return self.model == "opencv" and not any(self.distortion)
+
     def before(self, rows: int, cols: int) -> LensMap:
         """Return the lens before an image of rows × cols pixels.
 
@@ -152,12 +160,7 @@ def with_geometry_of_lens(data: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(lens, Lens) or rows is None or cols is None:
         return fields  # what is wrong about them is found where fields are checked
     centre = (lens.cx + 0.5, lens.cy + 0.5)
-    for name, at, size, side in (("cx", centre[0], cols, "cols"), ("cy", centre[1], rows, "rows")):
-        if abs(at - size / 2) > _OFF_CENTRE * size:
-            raise UsageError(
-                f"'lens.{name}' must lie in or near an image of {size} {side}, got {getattr(lens, name):g}: do the"
-                " intrinsics belong to another image size?"
-            )
+    check_image_size(lens, rows, cols, _PARTS_OFF)
     try:
         tan_h, tan_v = lens.before(rows, cols).tan_half_angles
     except ValueError as error:
@@ -173,6 +176,47 @@ def with_geometry_of_lens(data: Mapping[str, Any]) -> dict[str, Any]:
             shown = f"({centre[0]:.7g}, {centre[1]:.7g})" if name == "principal_point_px" else f"{derived[name]:.7g}"
             raise UsageError(f"'{name}' must be left out beside 'lens', from which it follows as {shown}, got {stated}")
     return {**fields, **derived}
+
+
+def check_image_size(lens: Lens, rows: int, cols: int, farthest: float = _OFF_CENTRE) -> None:
+    """Refuse a lens whose principal point lies farther from the centre of an image than `farthest` image sizes.
+
+    Raises
+    ------
+    UsageError
+    """
+    for name, at, size, side in (("cx", lens.cx, cols, "columns"), ("cy", lens.cy, rows, "rows")):
+        if abs(at + 0.5 - size / 2) > farthest * size:
+            raise UsageError(
+                f"'lens.{name}' must lie near the middle of an image of {size} {side}, got {at:g}: do the intrinsics"
+                " belong to another image size?"
+            )
+
+
+def changed_lens(lens: Lens, rows: int, cols: int, changes: Mapping[str, Any]) -> Lens:
+    """Return a lens with the focal lengths and the principal point that fields which follow from it ask for.
+
+    Parameters
+    ----------
+    lens : Lens
+    rows, cols : int
+        Of the image.
+    changes : mapping of str to object
+        Half angles and principal point that the lens is to have, among :data:`DERIVED`; others are left alone.
+    """
+    point = changes.get("principal_point_px")
+    if point is not None:
+        lens = Lens(**{**lens.model_dump(), "cx": point[0] - 0.5, "cy": point[1] - 0.5})
+    for name, focal, axis in (("half_angle_h_deg", "fx", 0), ("half_angle_v_deg", "fy", 1)):
+        if name not in changes:
+            continue
+        wanted = math.tan(math.radians(changes[name]))
+        for _ in range(_MOST_STEPS):  # the tangents go nearly with the reciprocal of the focal length
+            ratio = lens.before(rows, cols).tan_half_angles[axis] / wanted
+            if abs(ratio - 1) < _SOLVED:
+                break
+            lens = Lens(**{**lens.model_dump(), focal: getattr(lens, focal) * ratio})
+    return lens
 
 
 def _pixels(value: Any) -> int | None:

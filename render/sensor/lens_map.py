@@ -24,7 +24,7 @@ _RADII = 4096  # of the table that Newton's method starts from
 _STEPS = 40  # of Newton's method at most
 _ROUNDING = 1e-14  # last step of Newton's method
 _CHECKED = 64  # points along each side of an image at which its lens is checked
-_DIRECTIONS = 256  # in which a fold is looked for
+_DIRECTIONS = 64  # in which a fold is looked for
 
 
 def distort(model: int, k: Any, x: Any, y: Any) -> tuple[Any, Any, Any, Any, Any]:
@@ -107,7 +107,9 @@ class LensMap:
         """Radius, as a tangent, within which the lens is one to one along every direction."""
         self._check_image()
 
-    def project(self, y: NDArray[np.float64], z: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    def project(
+        self, y: NDArray[np.float64], z: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the image points u, v of rays (1, y, z)."""
         with np.errstate(all="ignore"):
             x_d, y_d = distort(self.model, self.k, -y, -z)[:2]
@@ -121,6 +123,8 @@ class LensMap:
     @property
     def tan_half_angles(self) -> tuple[float, float]:
         """Half the width and height of the image, as tangents, along the row and column of the principal point."""
+        if self.model == OPENCV and not self.k.any():
+            return self.cols / (2 * float(self.focal_px[0])), self.rows / (2 * float(self.focal_px[1]))
         u0, v0 = np.clip(self.centre_px, 0.0, [self.cols, self.rows])
         across = self.rays(np.array([0.0, self.cols]), np.full(2, v0))[0]
         along = self.rays(np.full(2, u0), np.array([0.0, self.rows]))[1]

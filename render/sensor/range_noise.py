@@ -19,7 +19,9 @@ def predicted_range_std(amplitude: ArrayLike, intensity: ArrayLike, sensor: Sens
 
     σ = (c / 4πf) · √(N₀·intensity + N_amb + N_dark + 2σ_r² + q²/6) / (√2 · K · N₀ · |S_1|), PHYSICS section 4. It is
     the limit of high signal: 0.5 % low at a phase noise of 0.1 rad, 1 % at 0.14 rad. Patterns (PRNU, DSNU) and stray
-    light are not in it. A direct sensor has a law of its own, :func:`direct_range_std`.
+    light are not in it. A direct sensor has a law of its own, :func:`direct_range_std`. Of several modulation
+    frequencies it is the combined (Σ σ_f⁻²)^−½ of an unwrapped range (PHYSICS section 10), with this amplitude at each
+    of them: c / 4π√Σf² in place of c / 4πf. ``sensor.by_frequency`` has the law of each.
 
     Parameters
     ----------
@@ -63,7 +65,7 @@ def measured_range_std(amplitude_e: ArrayLike, intensity_e: ArrayLike, sensor: S
     ndarray
         Metres; infinite where the amplitude is zero, for a direct sensor where amplitude or intensity is.
     """
-    return sensor.metres_per_radian * measured_phase_std(amplitude_e, intensity_e, sensor)
+    return sensor.range_per_phase_noise_m * measured_phase_std(amplitude_e, intensity_e, sensor)
 
 
 def direct_range_std(intensity: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:

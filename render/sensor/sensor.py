@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import model_validator
 
 from phasemark import UsageError
+from phasemark.inputs.numbers import in_words
 from phasemark.inputs.toml_file import read_toml
-from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD, Lens
+from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD, Lens, changed_lens, check_image_size
 from phasemark.render.sensor.sensor_checks import check_fields
 from phasemark.render.sensor.sensor_fields import CALIBRATION, OPTICS
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
@@ -167,11 +168,23 @@ class Sensor(SensorQuantities):
         return self
 
     def with_(self, **changes: Any) -> Sensor:
-        """Return a copy with some fields changed, validated again; what follows from a lens follows it."""
-        fields = self.model_dump()
-        if {**fields, **changes}.get("lens") is not None:
-            fields = {name: value for name, value in fields.items() if name not in DERIVED}
-        return Sensor(**{**fields, **changes})
+        """Return a copy with some fields changed, validated again.
+
+        Half angles and principal point of a camera with a lens follow from it. Changing one of them alone changes the
+        focal length or the principal point of the lens.
+        """
+        fields = {**self.model_dump(), **changes}
+        if fields.get("lens") is not None:
+            asked = {name: changes[name] for name in DERIVED if name in changes}
+            fields = {name: value for name, value in fields.items() if name not in DERIVED or name in asked}
+            differ = {name: value for name, value in asked.items() if value != getattr(self, name)}
+            if self.lens is not None and "lens" not in changes and differ:
+                fields = {name: value for name, value in fields.items() if name not in asked}
+                try:
+                    fields["lens"] = changed_lens(self.lens, fields["rows"], fields["cols"], differ)
+                except (TypeError, ValueError) as error:
+                    raise UsageError(str(error)) from None
+        return Sensor(**fields)
 
     def number(self, field: str) -> float:
         """Return one number of the sensor by the name of its field, ``lens.k1`` for a term of its lens.
@@ -221,6 +234,24 @@ class Sensor(SensorQuantities):
         belongs to the unwrapped range and not to them. A camera of one frequency is its own only one.
         """
         return (self,) if len(self.frequencies_hz) == 1 else _cameras_of_one_frequency(self)
+
+    def refuse_several_frequencies(self, what: str) -> None:
+        """Refuse several modulation frequencies where only one is understood.
+
+        Parameters
+        ----------
+        what : str
+            What takes only one, for the message.
+
+        Raises
+        ------
+        UsageError
+        """
+        if len(self.frequencies_hz) > 1:
+            raise UsageError(
+                f"{what} takes a sensor of one modulation frequency, got 'modulation_hz' ="
+                f" {in_words(self.frequencies_hz)}: give sensor and frames of one of them"
+            )
 
     def without_errors(self, *, shot_noise: bool = False) -> Sensor:
         """Return the camera without its errors: optics, modulation frequency, contrast and signal alone.
@@ -326,7 +357,32 @@ class Sensor(SensorQuantities):
             cy=float(matrix[1, 2]),
             distortion=tuple(float(one) for one in _numbers("distortion", distortion).ravel()),
         )
+        check_image_size(lens, rows, cols)
         return cls(rows=rows, cols=cols, lens=lens, **fields)
+
+    @classmethod
+    def from_camera_info(cls, path: str | Path, **fields: Any) -> Sensor:
+        """Build a sensor from a camera_info file of ROS 1 or ROS 2.
+
+        Parameters
+        ----------
+        path : path-like
+            YAML as ROS's calibration writes it, or as ``rostopic echo`` or ``ros2 topic echo`` prints it, with the
+            distortion model plumb_bob, rational_polynomial, equidistant or fisheye.
+        **fields
+            Any other field of the sensor.
+
+        Raises
+        ------
+        InputFileError
+            The file is not YAML, or describes a camera that cannot be used; with one line.
+        UsageError
+            A field is wrong.
+        """
+        from phasemark.render.sensor.camera_info import read_camera_info
+
+        found = read_camera_info(path)
+        return cls(rows=found.rows, cols=found.cols, lens=found.lens, **fields)
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Sensor:
@@ -342,7 +398,10 @@ class Sensor(SensorQuantities):
         path = Path(path)
         table = read_toml(path)
         try:
-            return cls(**table)
+            sensor = cls(**table)
+            if sensor.lens is not None:
+                check_image_size(sensor.lens, sensor.rows, sensor.cols)
+            return sensor
         except UsageError as error:
             raise UsageError(f"{path}: {error}") from None
 

@@ -9,7 +9,7 @@ import numpy as np
 from phasemark.inputs.numbers import in_words
 from phasemark.render.sensor.correlation import SQUARE_PEAK, correlation_peak, pulse_harmonics
 from phasemark.render.sensor.frequencies import check_frequencies
-from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD
+from phasemark.render.sensor.lens_fields import LENS_FIELD
 from phasemark.render.sensor.sensor_fields import CALIBRATION, DIRECT_ONLY, PHASE_ONLY, SensorFields
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
 
@@ -208,17 +208,13 @@ def check_tables(sensor: SensorQuantities) -> None:
 
 
 def _check_calibrated_field(sensor: SensorQuantities, name: str) -> None:
-    """Refuse the name of what is no number of the sensor, or of what follows from its lens."""
+    """Refuse the name of what is no number of the sensor or of its lens."""
     if name.startswith(LENS_FIELD):
         terms = {} if sensor.lens is None else sensor.lens.terms
         if name.removeprefix(LENS_FIELD) not in terms:
             has = f"has {', '.join(terms)}" if terms else "is not stated"
             raise ValueError(f"'calibration_fields' must name terms of the lens, which {has}, got '{name}'")
         return
-    if sensor.lens is not None and name in DERIVED:
-        raise ValueError(
-            f"'calibration_fields' must name terms as lens.fx for a sensor with a lens, from which '{name}' follows"
-        )
     number = name in SensorFields.model_fields and isinstance(getattr(sensor, name), float)
     if not number or name in CALIBRATION:
         raise ValueError(f"'calibration_fields' must name fields of the sensor that are numbers, got '{name}'")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,9 +12,9 @@ from phasemark.inputs.toml_file import toml_value
 from phasemark.render.sensor.histogram_fields import Histogram
 from phasemark.render.sensor.lens_fields import DERIVED, Lens
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor_fields import TABLES
 
-_TABLES: dict[str, type[BaseModel]] = {"lens": Lens, "histogram": Histogram}
-
+_MODELS: dict[str, type[BaseModel]] = {"lens": Lens, "histogram": Histogram}
 _DIGITS = 7  # of a number in a sensor file
 
 
@@ -31,31 +32,26 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
         What stands behind the other fields.
     """
     fields = sensor.model_dump(mode="json")
-    tables = {name: fields.pop(name, None) for name in _TABLES}
-    follows = DERIVED if sensor.lens is not None else ()
+    tables = {name: fields.pop(name) for name in TABLES if name in fields}
+    derived = DERIVED if sensor.lens is not None else ()
     lines = [f"# {line}" for line in header]
     for title, names in Sensor.field_groups().items():
         own = [
             name
             for name in names
-            if name not in follows
-            and (
-                name in comments
-                or (fields.get(name) is not None and fields[name] != _plain_default(name))
-                or Sensor.model_fields[name].is_required()
-            )
+            if name in comments
+            or (fields.get(name) is not None and fields[name] != _plain_default(name))
+            or Sensor.model_fields[name].is_required()
         ]
+        own = [name for name in own if name not in TABLES and (name in comments or name not in derived)]
         if own:
             lines += ["", f"# {title}"]
         lines += [f"{name} = {toml_value(fields[name])}  # {comments.get(name, otherwise)}" for name in own]
-    for table, model in _TABLES.items():
-        values = tables[table]
-        if values is None:
-            continue
-        lines += ["", f"[{table}]"]
-        for name, value in values.items():
-            comment = comments.get(f"{table}.{name}")
-            if comment is not None or (value is not None and value != _default_of(model, name)):
+    for title, table in tables.items():
+        lines += ["", f"[{title}]"]
+        for name, value in table.items():
+            comment = comments.get(f"{title}.{name}")
+            if comment is not None or (value is not None and value != _default_of(_MODELS[title], name)):
                 lines.append(f"{name} = {toml_value(value)}  # {comment or otherwise}")
     return "\n".join(lines) + "\n"
 
@@ -74,3 +70,23 @@ def _plain_default(name: str) -> object:
 def _default_of(model: type[BaseModel], name: str) -> object:
     default = model.model_fields[name].default
     return list(default) if isinstance(default, tuple) else default
+
+
+def comments_of(text: str) -> dict[str, str]:
+    """Return the comments behind the keys of a sensor file, by key; those of a table as ``table.key``.
+
+    Examples
+    --------
+    >>> comments_of("rows = 8  # published")
+    {'rows': 'published'}
+    """
+    found: dict[str, str] = {}
+    table = ""
+    for line in text.splitlines():
+        heading = re.fullmatch(r"\s*\[(\w+)\]\s*(#.*)?", line)
+        if heading:
+            table = f"{heading[1]}."
+        stated = re.fullmatch(r"\s*(\w+)\s*=[^#]*#\s*(.*\S)\s*", line)
+        if stated:
+            found[table + stated[1]] = stated[2]
+    return found

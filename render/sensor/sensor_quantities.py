@@ -24,6 +24,11 @@ class SensorQuantities(SensorFields):
         return math.tan(math.radians(self.half_angle_h_deg)), math.tan(math.radians(self.half_angle_v_deg))
 
     @property
+    def bends_rays(self) -> bool:
+        """Whether there is a lens with distortion."""
+        return self.lens is not None and not self.lens.is_ideal
+
+    @property
     def centre_px(self) -> tuple[float, float]:
         """Where the optical axis meets the image, (u0, v0) in pixels."""
         return self.principal_point_px or (self.cols / 2, self.rows / 2)
@@ -117,6 +122,13 @@ class SensorQuantities(SensorFields):
         return SPEED_OF_LIGHT_M_S / (4 * math.pi * self.frequencies_hz[0])
 
     @property
+    def range_per_phase_noise_m(self) -> float:
+        """Standard deviation of a range per radian of phase noise: c / 4πf, of several frequencies c / 4π√Σf²."""
+        if not isinstance(self.modulation_hz, tuple):
+            return self.metres_per_radian
+        return SPEED_OF_LIGHT_M_S / (4 * math.pi * math.hypot(*self.modulation_hz))
+
+    @property
     def period_m(self) -> float:
         """Range at which the phase of the first frequency wraps, c / 2f."""
         return SPEED_OF_LIGHT_M_S / (2 * self.frequencies_hz[0])
@@ -170,7 +182,7 @@ class SensorQuantities(SensorFields):
         u, v : float or ndarray
             Image coordinates, pixels; they broadcast against each other. With a lens they lie in the image.
         """
-        if self.lens is not None:
+        if self.lens is not None and self.bends_rays:
             return self.lens.before(self.rows, self.cols).rays(np.asarray(u, float), np.asarray(v, float))
         tan_h, tan_v = self.tan_half_angles
         u0, v0 = self.centre_px
@@ -188,7 +200,7 @@ class SensorQuantities(SensorFields):
         y, z : float or ndarray
             Tangents to the left and upwards. With a lens they belong to image points; farther out it may fold.
         """
-        if self.lens is not None:
+        if self.lens is not None and self.bends_rays:
             return self.lens.before(self.rows, self.cols).project(np.asarray(y, float), np.asarray(z, float))
         tan_h, tan_v = self.tan_half_angles
         u0, v0 = self.centre_px

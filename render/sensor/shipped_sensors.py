@@ -33,7 +33,17 @@ def preset(name: str) -> Sensor:
     >>> preset("pmd-16x16").unambiguous_range_m.__round__(4)
     14.9896
     """
+    return Sensor(**tomllib.loads(preset_text(name)))
+
+
+def preset_text(name: str) -> str:
+    """Return the file of a shipped sensor, with its comments.
+
+    Raises
+    ------
+    UsageError
+        The name is not known.
+    """
     if name not in preset_names():
         raise UsageError(f"unknown sensor '{name}': the presets are {', '.join(preset_names())}")
-    text = resources.files("phasemark.render.sensor").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")
-    return Sensor(**tomllib.loads(text))
+    return resources.files("phasemark.render.sensor").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")

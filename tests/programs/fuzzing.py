@@ -104,7 +104,8 @@ def checksum(path: Path) -> None:
 KINDS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "npy": (".npy", frames), "npz": (".npz", stated_frames), "png": (".png", stated_frames), "csv": (".csv", frames),
     **{f"{kind}-plan": (".toml", plan(kind)) for kind in PLANS},
-    "sensor": (".toml", Sensor.from_toml), "map": (".toml", read_landmark_map),
+    "sensor": (".toml", Sensor.from_toml), "camera-info": (".yaml", Sensor.from_camera_info),
+    "map": (".toml", read_landmark_map),
     "poses": (".csv", read_poses), "manifest": (".manifest", _Manifest.read),
     "checksum": (".sha256", checksum), "stl": (".stl", mesh), "ply": (".ply", mesh), "obj": (".obj", mesh),
     "off": (".off", mesh), "bag": ("", stated_frames), "h5": (".h5", stated_frames), "bank": (".h5", whole_bank),
@@ -173,7 +174,22 @@ def _good_sensor(folder: Path) -> list[bytes]:
     for one in fields:
         histogram = one.pop("histogram", None)
         files.append(lines(one) + (f"[histogram]\n{lines(histogram)}" if histogram else ""))
+    lens = {"fx": 15.0, "fy": 15.0, "cx": 3.5, "cy": 3.5, "distortion": [-0.2, 0.1, 0.001, 0.0]}
+    files.append(f"rows = 8\ncols = 8\n[lens]\n{lines(lens)}")
     return [text.encode() for text in files]
+
+
+def _good_camera_info(folder: Path) -> list[bytes]:
+    calibrated = (
+        b"image_width: 8\nimage_height: 8\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+        b"  data: [15, 0, 3.5, 0, 15, 3.5, 0, 0, 1]\ndistortion_model: plumb_bob\n"
+        b"distortion_coefficients:\n  data: [-0.2, 0.1, 0.001, 0, 0]\n"
+    )
+    echoed = (
+        b"width: 8\nheight: 8\nbinning_x: 0\nroi: {width: 0}\ndistortion_model: equidistant\nd: [0.1, 0, 0, 0]\n"
+        b"k: [15, 0, 3.5, 0, 15, 3.5, 0, 0, 1]\n---\n"
+    )
+    return [calibrated, echoed]
 
 
 def _good_map(folder: Path) -> list[bytes]:
@@ -245,7 +261,7 @@ def _packed(path: Path) -> bytes:
 GOOD: dict[str, Callable[[Path], list[bytes]]] = {
     "npy": _good_npy, "npz": _good_npz, "png": _good_png, "csv": _good_csv,
     **{f"{kind}-plan": _good_plan(kind) for kind in PLANS},
-    "sensor": _good_sensor, "map": _good_map,
+    "sensor": _good_sensor, "camera-info": _good_camera_info, "map": _good_map,
     "poses": _good_poses,
     "manifest": _good_manifest, "checksum": _good_checksum,
     **{kind: _good_mesh(kind) for kind in ("stl", "ply", "obj", "off")},

@@ -24,6 +24,7 @@ SHOWN = {"distance_m": ("distance", "mm", 1e3), "delta_rad": ("angle δ", "°", 
 AXIS_LABEL = {
     "distance_m": "distance D (m)", "delta_deg": "angle δ (°)", "noise_factor": "noise, relative to the sensor's",
     "n_frames": "frames averaged", "bearing_deg": "bearing (°)", "height_m": "height (m)", "pitch_deg": "pitch (°)",
+    "roll_deg": "roll (°)",
     "albedo": "albedo", "wall_m": "wall (m)", "wiggling": "wiggling, relative to square against square",
     "unit": "unit, with its fixed pattern", "dimension_error": "relative error of the dimensions",
 }  # fmt: skip

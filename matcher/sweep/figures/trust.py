@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-from phasemark.matcher.likelihood.images import LEVEL_VIEW
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.statistics import binomial_interval, nees
 from phasemark.matcher.sweep.figures.style import as_written, logarithmic, methods_of, panels, style
 from phasemark.matcher.sweep.result_tables import LEVELS, Cell, SweepTrials
@@ -28,7 +28,7 @@ def nees_quantiles(trials: SweepTrials) -> Figure:
     error = trials.error
     top = 1.0
     for m, method in enumerate(trials.methods):
-        at = np.array([LEVEL_VIEW.index(name) for name in trials.free[m]])
+        at = np.array([VIEW.index(name) for name in trials.free[m]])
         e, covariance = error[:, m][:, at], trials.covariance[:, m][:, at[:, None], at]
         known = np.isfinite(e).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)) & (trials.found[:, m] >= 0)
         if not known.any():

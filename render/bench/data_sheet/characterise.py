@@ -36,6 +36,7 @@ def characterise(sensor: Sensor, *, rng: np.random.Generator, n_frames: int | No
     Parameters
     ----------
     sensor : Sensor
+        Of one modulation frequency; of several, each of ``sensor.by_frequency`` has a data sheet of its own.
     rng : numpy.random.Generator
         Source of all noise.
     n_frames : int, optional
@@ -48,8 +49,9 @@ def characterise(sensor: Sensor, *, rng: np.random.Generator, n_frames: int | No
     Raises
     ------
     UsageError
-        `n_frames` is less than 2, or no pixel works.
+        `n_frames` is less than 2, no pixel works, or the sensor has several modulation frequencies.
     """
+    sensor.refuse_several_frequencies("a data sheet")
     if n_frames is None:
         n_frames = max(_FEWEST_FRAMES, math.ceil(_SAMPLES_PER_POINT / (sensor.rows * sensor.cols)))
     if n_frames < 2:

@@ -64,7 +64,8 @@ def fit_sensor(
     distance_m : sequence of float
         Distance of the board along the optical axis for each.
     base : Sensor
-        The camera as far as it is known: geometry, modulation frequency and all that is not measured.
+        The camera as far as it is known: geometry, modulation frequency and all that is not measured. Of several
+        frequencies each is fitted by itself, ``base.by_frequency[j]`` to ``frames.by_frequency[j]``.
     albedo : sequence of float, optional
         Albedo of each board, or one for all; without it 0.8 is assumed.
     amplitude_unit : {"electrons", "arbitrary"}
@@ -83,6 +84,7 @@ def fit_sensor(
         Numbers of frames, distances, albedos and standard deviations do not fit; there are too few frames; no pixel is
         valid often enough; a standard deviation is negative or more than a tenth of its distance.
     """
+    base.refuse_several_frequencies("a fit")
     if len(frames) != len(distance_m) or not frames:
         raise UsageError(
             f"each set of frames needs its distance: got {len(frames)} of frames and {len(distance_m)} of distances"

@@ -1,0 +1,260 @@
+"""Accuracy at a glance: what a landmark before a camera gives, from the Cramér–Rao bound, and what limits it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data.files.json_text import finite_or_none
+from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
+from phasemark.matcher.accuracy.look_alikes import class_distances_squared
+from phasemark.matcher.information import covariance_of
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.render import Background, Renderer, Views
+
+EDGES, FACES = "noise of edge pixels", "noise of face pixels"
+CALIBRATION, DECLARED = "calibration of the sensor", "systematic errors declared by the sensor"
+SOURCES = (EDGES, FACES, CALIBRATION, DECLARED)
+"""What the variance of a pose comes from. An edge pixel is covered by the landmark in part."""
+_WEAK_SHARE = 1e-13
+_WHOLE = 1e-6  # of a pixel: coverage is exact but for rounding
+_SIDES = 12
+
+
+@dataclass(frozen=True, eq=False)
+class AccuracyCard:
+    """What one measurement can tell at best, at n views.
+
+    Parameters
+    ----------
+    views : Views
+    free : tuple of str
+        Parameters of the view that are estimated, in the order of the matrices.
+    n_frames : int
+        Frames averaged for one measurement.
+    parts : dict of str to (n, p, p) float64
+        Covariance from each of :data:`SOURCES`, metres and radians; NaN where a view is not observed.
+    class_error : (n,) float64
+        Union bound on the probability of a wrong class; NaN if there is no other class.
+    others : tuple of str
+        The classes that it is a bound for.
+    """
+
+    views: Views
+    free: tuple[str, ...]
+    n_frames: int
+    parts: dict[str, NDArray[np.float64]]
+    class_error: NDArray[np.float64]
+    others: tuple[str, ...] = field(default=())
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Sum of the parts, (n, p, p)."""
+        return np.asarray(sum(self.parts.values()))
+
+    def std(self, name: str) -> NDArray[np.float64]:
+        """Return the standard deviation of one free parameter, metres or radians, (n,)."""
+        k = self.free.index(name)
+        return np.sqrt(self.covariance[:, k, k])
+
+    @property
+    def position_std_m(self) -> NDArray[np.float64]:
+        """Of the lens in the plane, √(σ_D² + D² σ_δ²), (n,)."""
+        return np.sqrt(self._position_variance(self.covariance))
+
+    def shares(self) -> dict[str, float]:
+        """Return the share of each source in the variance of the position: the mean over the observed views."""
+        total = self._position_variance(self.covariance)
+        known = np.isfinite(total)
+        if not known.any():
+            return {}
+        return {
+            name: float(np.mean(self._position_variance(part)[known] / total[known]))
+            for name, part in self.parts.items()
+        }
+
+    @property
+    def dominant(self) -> str | None:
+        """The source with the largest share; None if no view is observed."""
+        shares = self.shares()
+        return max(shares, key=lambda name: shares[name]) if shares else None
+
+    def _position_variance(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        along, across = (self.free.index(name) for name in VIEW[:2])
+        return np.asarray(covariance[:, along, along] + self.views.distance_m**2 * covariance[:, across, across])
+
+    def line(self) -> str:
+        """Say it in one line: medians over the views, the worst position, the class error and what dominates."""
+        shares, n = self.shares(), len(self.views)
+        if not shares:
+            return f"{self._where()}: the view is not observed: too few pixels are measured to 0.1 rad"
+        numbers = (
+            f"D {_written(1e3 * _median(self.std('distance_m')))} mm,"
+            f" δ {_written(math.degrees(_median(self.std('delta_rad'))))}°,"
+            f" position {_written(1e3 * _median(self.position_std_m))} mm"
+        )
+        over = "1 σ"
+        if n > 1:
+            worst = float(np.nanmax(self.position_std_m))
+            over += f", median of {n} views; worst position {_written(1e3 * worst)} mm"
+        blind = int(np.isnan(self.position_std_m).sum())
+        unseen = f", {blind} of {n} views not observed" if blind else ""
+        error = _median(self.class_error)
+        classes = "" if math.isnan(error) else f"; class error {_percent(error)}"
+        return (
+            f"{self._where()}: {numbers} ({over}{unseen}){classes};"
+            f" {self.dominant} dominates ({100 * shares[self.dominant or '']:.0f} % of the position's variance)"
+        )
+
+    def _where(self) -> str:
+        distances, sides = np.unique(self.views.distance_m), np.degrees(np.unique(self.views.delta_rad))
+        distance = " … ".join(f"{one:g}" for one in dict.fromkeys((distances[0], distances[-1])))
+        side = " … ".join(f"{one:g}" for one in dict.fromkeys((round(sides[0], 3), round(sides[-1], 3))))
+        return f"at {distance} m, δ {side}°, {self.n_frames} frame{'s' * (self.n_frames > 1)}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return medians over the views, the worst position, and the shares as plain numbers for JSON."""
+        names = {"distance_m": "distance_std_m", "delta_rad": "delta_std_deg", "bearing_rad": "bearing_std_deg"}
+        std = {
+            named: _median(np.degrees(self.std(name)) if name.endswith("rad") else self.std(name))
+            for name, named in names.items()
+            if name in self.free
+        }
+        observed = np.isfinite(self.position_std_m)
+        return finite_or_none(
+            {
+                "distance_m": [float(self.views.distance_m.min()), float(self.views.distance_m.max())],
+                "delta_deg": [
+                    float(np.degrees(end)) for end in (self.views.delta_rad.min(), self.views.delta_rad.max())
+                ],
+                "views": len(self.views),
+                "views_observed": int(observed.sum()),
+                "n_frames": self.n_frames,
+                "free": list(self.free),
+                **std,
+                "position_std_m": _median(self.position_std_m),
+                "worst_position_std_m": float(self.position_std_m[observed].max()) if observed.any() else math.nan,
+                "class_error": _median(self.class_error),
+                "other_classes": list(self.others),
+                "dominant": self.dominant,
+                "shares": self.shares(),
+            }
+        )
+
+
+def sides_of(distance_m: float, period_rad: float, n: int = _SIDES) -> Views:
+    """Return views of one distance from n sides, evenly over one period of δ.
+
+    Parameters
+    ----------
+    distance_m : float
+    period_rad : float
+        After which the landmark looks the same.
+    n : int
+
+    Returns
+    -------
+    Views
+    """
+    return Views.broadcast(distance_m, np.arange(n) * (period_rad / n))
+
+
+def accuracy_card(
+    renderer: Renderer,
+    views: Views,
+    *,
+    others: Mapping[str, Renderer] | None = None,
+    n_frames: int = 50,
+    free: Sequence[str] = VIEW[:3],
+    background: Background | None = None,
+) -> AccuracyCard:
+    """Return what a measurement can tell at best at some views, and what limits it.
+
+    Standard deviations are the Cramér–Rao bound on ranges (PHYSICS section 7), what the calibration of the sensor
+    leaves, and what the sensor declares. With P the covariance of the noise and I_e the information of the edge pixels, P I_e P
+    is what the noise of edge pixels contributes.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        The landmark and the camera.
+    views : Views
+    others : mapping of str to Renderer, optional
+        Other classes before the same camera, for the class error.
+    n_frames : int
+        Frames averaged for one measurement.
+    free : sequence of str
+        Parameters that are estimated, distance_m and delta_rad among them.
+    background : Background, optional
+
+    Returns
+    -------
+    AccuracyCard
+
+    Raises
+    ------
+    UsageError
+        `n_frames` is below 1, or `free` lacks distance_m or delta_rad.
+
+    Examples
+    --------
+    >>> from phasemark.landmarks import build_mesh, catalog
+    >>> from phasemark.render import Renderer, Views, preset
+    >>> renderer = Renderer(build_mesh(catalog()["cylinder"]), preset("pmd-16x16"))
+    >>> accuracy_card(renderer, Views.broadcast(1.5, 0.5)).dominant
+    'noise of face pixels'
+    """
+    if n_frames < 1:
+        raise UsageError(f"'n_frames' must be at least 1, got {n_frames}")
+    if not set(VIEW[:2]) <= set(free):
+        raise UsageError(f"'free' must have {' and '.join(VIEW[:2])} among its names, got {tuple(free)!r}")
+    others = dict(others or {})
+
+    def bound(pixels: Any = "all", systematic: Sequence[str] = ()) -> Any:
+        return cramer_rao(
+            renderer,
+            views,
+            free=free,
+            n_frames=n_frames,
+            pixels=pixels,
+            background=background,
+            systematic=systematic,
+        )
+
+    calibrated, declared = bound(systematic=("calibration",)), bound(systematic=("declared",))
+    noise = covariance_of(declared.information, weak_share=_WEAK_SHARE)
+    coverage = renderer.render_views(views, background=background).coverage
+    edge = (coverage > _WHOLE) & (coverage < 1 - _WHOLE)
+    of_edges = noise @ bound(declared.pixels & edge).information @ noise
+    parts = {
+        EDGES: of_edges,
+        FACES: noise - of_edges,
+        CALIBRATION: calibrated.systematic,
+        DECLARED: declared.systematic,
+    }
+    if others:
+        squares = class_distances_squared(renderer, views, others, n_frames=n_frames, background=background)
+        error = np.minimum(confusion_probability(squares), 1.0)
+    else:
+        error = np.full(len(views), np.nan)
+    return AccuracyCard(views, tuple(free), n_frames, parts, error, tuple(others))
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else math.nan
+
+
+def _written(value: float) -> str:
+    """Write a number with two digits that count."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def _percent(share: float) -> str:
+    return "below 0.01 %" if share < 1e-4 else f"{_written(100 * share)} %"

@@ -1,0 +1,77 @@
+"""The command ``phasemark accuracy``: what a landmark before a camera gives, in one line."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import typer
+
+from phasemark.data.commands.console import echo_json
+from phasemark.data.commands.inputs import (
+    background_of,
+    class_mesh,
+    note_too_far,
+    read_class_or_mesh,
+    read_sensor,
+    refuse_unless_one,
+)
+from phasemark.data.commands.options import Floor, Json, MeshReading, SensorName, Wall, a_class
+
+
+def accuracy_line(
+    distance: Annotated[float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")],
+    *,
+    delta: Annotated[
+        float | None,
+        typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen; all sides unless given."),
+    ] = None,
+    class_name: Annotated[
+        str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=a_class)
+    ] = None,
+    mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
+    mesh_reading: MeshReading,
+    sensor: SensorName = "pmd-16x16",
+    wall: Wall = None,
+    floor: Floor = None,
+    n_frames: Annotated[int, typer.Option("--frames", min=1, help="Frames averaged for one measurement.")] = 50,
+    as_json: Json = False,
+) -> None:
+    """Say in one line how accurate a measurement can be, from the Cramér–Rao bound.
+
+    1 σ of distance, angle and position with the bearing free, what limits it, and how often another class of the
+    catalogue explains a frame better.
+    """
+    from phasemark.landmarks import catalog
+    from phasemark.matcher.accuracy.accuracy_card import accuracy_card, sides_of
+    from phasemark.render import Renderer, Views
+
+    refuse_unless_one(class_name, mesh_file, mesh_reading, "judge")
+    name, mesh = read_class_or_mesh(class_name, mesh_file, mesh_reading)
+    camera = read_sensor(sensor)
+    note_too_far(camera, {"--distance": distance, "--wall": wall})
+    renderer = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8))
+    views = Views.broadcast(distance, math.radians(delta or 0.0))
+    renderer.check_in_view(views)
+    if delta is None:
+        views = sides_of(distance, _period_rad(name if class_name else None))
+    others = {
+        other: Renderer(class_mesh(other), camera, albedo=spec.albedo)
+        for other, spec in catalog().items()
+        if class_name is None or other != name
+    }
+    card = accuracy_card(renderer, views, others=others, n_frames=n_frames, background=background_of(wall, floor))
+    if as_json:
+        echo_json({"landmark": name, "sensor": sensor, "wall_m": wall, "floor_m": floor, **card.as_dict()})
+        return
+    typer.echo(f"{name} {card.line()}")
+
+
+def _period_rad(class_name: str | None) -> float:
+    """Return the period of δ of a class of the catalogue; a mesh is seen from all around."""
+    from phasemark.landmarks import catalog
+    from phasemark.render.view import delta_period_rad
+
+    return delta_period_rad(1 if class_name is None else catalog()[class_name].symmetry)

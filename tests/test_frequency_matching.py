@@ -1,0 +1,262 @@
+"""Filters, bounds and matching of cameras with several modulation frequencies (PHYSICS section 10)."""
+
+import math
+
+import numpy as np
+import pytest
+from builders import wrapped
+from scipy import stats
+
+from phasemark import UsageError
+from phasemark.data import BankPlan, build_bank
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.matcher import Matcher, PixelKalman, kalman_filter, phasor_mean
+from phasemark.matcher.accuracy.cramer_rao import cramer_rao
+from phasemark.matcher.filters.filtered_frames import PixelState, noise_free
+from phasemark.render import (
+    Background,
+    Frames,
+    Renderer,
+    Views,
+    capture,
+    characterise,
+    predicted_range_std,
+    preset,
+)
+from phasemark.render.bench.fit.fit_sensor import fit_sensor
+
+PMD = preset("pmd-16x16")
+TWO = PMD.with_(modulation_hz=[20e6, 60e6])
+CYLINDER = build_mesh(catalog()["cylinder"])
+
+
+def take(image, sensor, n_frames, seed=1):
+    return capture(image, sensor, rng=np.random.default_rng(seed), n_frames=n_frames)
+
+
+# Filters
+
+
+@pytest.fixture(scope="module")
+def wall():
+    return Renderer(None, TWO).render(np.ones(20), background=Background(wall_m=5.8))
+
+
+@pytest.mark.parametrize("filter_frames", [kalman_filter, phasor_mean])
+def test_filtered_ranges_are_unwrapped_with_the_variance_of_the_filter(wall, filter_frames):
+    filtered = filter_frames(take(wall, TWO.with_(max_phase_std_rad=None), 40))
+    assert (filtered.state == PixelState.RETURN).mean() > 0.999
+    law = sum(predicted_range_std(p.amplitude, p.intensity, p.sensor) ** -2.0 for p in wall.by_frequency) * 40
+    error = (filtered.range_m - wall.range_m)[filtered.state == PixelState.RETURN]
+    np.testing.assert_allclose(np.nanmedian(filtered.std_m**2 * law), 1.0, rtol=0.02)
+    whitened = error * np.sqrt(law[filtered.state == PixelState.RETURN])
+    low, high = stats.chi2.interval(0.999, error.size)
+    # σ_φ is 0.05 rad here, and the law is 0.1 % low
+    assert low <= np.sum(whitened**2) / 1.004 <= high
+
+
+def test_the_recursive_filter_gives_what_the_batch_gives(wall):
+    frames = take(wall, TWO, 5)
+    one = PixelKalman(TWO)
+    for k in range(5):
+        one.update(frames.some_frames(k, k + 1))
+    batch = kalman_filter(frames)
+    np.testing.assert_allclose(one.result().range_m, batch.range_m, rtol=1e-12)
+    np.testing.assert_array_equal(one.result().state, batch.state)
+
+
+def test_mixed_pixels_are_missing_and_each_frequency_keeps_them():
+    image = Renderer(CYLINDER, TWO).render(1.0, 0.3, background=Background(wall_m=3.0))
+    filtered = kalman_filter(take(image, TWO, 50))
+    mixed = (image.coverage[0] > 0.1) & (image.coverage[0] < 0.9)
+    assert (filtered.state[0][mixed] == PixelState.MISSING).mean() > 0.9
+    assert all((part.state[0][mixed] == PixelState.RETURN).mean() > 0.9 for part in filtered.by_frequency)
+    assert [part.range_m.shape for part in filtered[:1].by_frequency] == [(1, 16, 16)] * 2
+
+
+def test_unwrapped_ranges_alone_are_filtered_by_their_scatter(wall):
+    frames = take(wall, TWO, 30)
+    alone = Frames(frames.range_m, frames.amplitude_e, frames.intensity_e, flags=frames.flags, sensor=TWO)
+    filtered = kalman_filter(alone)
+    assert filtered.std_from_scatter
+    np.testing.assert_allclose(np.nanmedian(filtered.std_m / kalman_filter(frames).std_m), 1.0, rtol=0.1)
+    with pytest.raises(UsageError, match="unwrapped ranges alone"):
+        phasor_mean(alone)
+
+
+def test_the_offset_is_taken_off_every_frequency(wall):
+    late = TWO.with_(range_offset_m=1.9)
+    filtered = kalman_filter(take(wall, late, 5)).without_offset()
+    for part, image in zip(filtered.by_frequency, wall.by_frequency, strict=True):
+        assert np.nanmax(np.abs(wrapped(part.range_m - image.range_m, part.sensor))) < 6 * np.nanmax(part.std_m)
+    assert np.nanmax(np.abs(filtered.range_m - wall.range_m)) < 6 * np.nanmax(filtered.std_m)
+
+
+def test_frames_without_noise_have_the_exact_range(wall):
+    filtered = noise_free(wall, 50)
+    np.testing.assert_allclose(filtered.range_m, wall.range_m, atol=1e-9)
+
+
+# Matching
+
+
+N = 24
+CLASSES = ("cylinder", "cone", "post")
+
+
+@pytest.fixture(scope="module")
+def bank():
+    plan = BankPlan(
+        classes=list(CLASSES),
+        distance_m="0.8:1.5:0.01",
+        delta_deg="0:178:2",
+        sensor_overrides={"modulation_hz": [20e6, 60e6]},
+    )
+    with build_bank(plan, workers=1) as built:
+        yield built
+
+
+def scene(bank, background, bearing_std_deg=1.0, seed=5):
+    rng = np.random.default_rng(seed)
+    views = Views.broadcast(
+        rng.uniform(0.9, 1.4, N), rng.uniform(0.1, 3.0, N), rng.normal(0, math.radians(bearing_std_deg), N)
+    )
+    renderer = Renderer(bank.mesh("cylinder"), bank.sensor)
+    return renderer, renderer.render_views(views, background=background)
+
+
+def errors_of(matches, views):
+    delta = matches.delta_rad - views.delta_rad
+    delta -= math.pi * np.round(delta / math.pi)
+    return np.stack([matches.distance_m - views.distance_m, delta, matches.bearing_rad - views.bearing_rad], axis=1)
+
+
+@pytest.mark.parametrize("background", [None, Background(wall_m=3.0)])
+def test_matching_on_phasors_reaches_the_bound_and_its_covariance_is_honest(bank, background):
+    renderer, image = scene(bank, background)
+    frames = take(image, TWO.with_(max_phase_std_rad=None), 50)
+    matches = Matcher(bank, "refine", on="phasors", background=background).match(phasor_mean(frames))
+    accepted = matches.accepted
+    assert accepted.mean() > 0.8
+    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted))
+    error = errors_of(matches, image.views)
+    bound = cramer_rao(
+        renderer, image.views, free=("distance_m", "delta_rad", "bearing_rad"), on="phasors", background=background
+    )
+    for k, name in enumerate(bound.free):
+        ratio = error[accepted, k] / bound.std(name)[accepted]
+        low, high = stats.chi2.interval(1 - 0.001 / 8, accepted.sum())  # 99.9 %, eight cells
+        assert low < np.sum(ratio**2) < 1.3 * high  # the bound is local: slopes jump where edges cross pixel borders
+    nees = [error[k] @ np.linalg.solve(matches[k].covariance, error[k]) for k in np.flatnonzero(accepted)]
+    low, high = stats.chi2.interval(1 - 0.001 / 8, 3 * accepted.sum())
+    assert low < np.sum(nees) < high
+
+
+def test_matching_on_unwrapped_ranges_reaches_the_bound(bank):
+    renderer, image = scene(bank, None)
+    matches = Matcher(bank, "refine").match(kalman_filter(take(image, TWO, 50)))
+    accepted = matches.accepted
+    assert accepted.mean() > 0.6  # the start is a grid of 2°, and these ranges are good to half a millimetre
+    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted))
+    error = errors_of(matches, image.views)
+    bound = cramer_rao(renderer, image.views, free=("distance_m", "delta_rad", "bearing_rad"))
+    ratio = np.sum((error[accepted, 0] / bound.std("distance_m")[accepted]) ** 2)
+    low, high = stats.chi2.interval(1 - 0.001 / 8, accepted.sum())
+    assert low < ratio < 1.3 * high
+    nees = [error[k] @ np.linalg.solve(matches[k].covariance, error[k]) for k in np.flatnonzero(accepted)]
+    low, high = stats.chi2.interval(1 - 0.001 / 8, 3 * accepted.sum())
+    assert low < np.sum(nees) < high
+
+
+@pytest.mark.parametrize("background", [None, Background(wall_m=3.0)])
+def test_the_nearest_image_is_found_by_phases_of_every_frequency(bank, background):
+    _, image = scene(bank, background, bearing_std_deg=0.0)
+    matches = Matcher(bank, background=background).match(kalman_filter(take(image, TWO, 5)))
+    accepted = matches.accepted
+    assert accepted.mean() > 0.5
+    error = errors_of(matches, image.views)
+    assert np.abs(error[accepted, 0]).max() < 0.03
+    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted))
+
+
+@pytest.mark.parametrize(("method", "on"), [("nearest", "ranges"), ("refine", "ranges"), ("refine", "phasors")])
+def test_a_landmark_beyond_the_range_of_one_frequency_is_found_right_or_refused(method, on):
+    sensor = TWO.with_(signal_e=4e5, half_angle_h_deg=5, half_angle_v_deg=5)
+    plan = BankPlan(
+        classes=["cylinder"], distance_m="2.3:3.0:0.02", delta_deg="0:176:4",
+        sensor_overrides={
+            "modulation_hz": [20e6, 60e6], "signal_e": 4e5, "half_angle_h_deg": 5.0, "half_angle_v_deg": 5.0,
+        },
+    )  # fmt: skip
+    rng = np.random.default_rng(8)
+    with build_bank(plan, workers=1) as far:
+        # 60 MHz wraps at 2.498 m: some are before it, some beyond
+        views = Views.broadcast(rng.uniform(2.4, 2.9, 12), rng.uniform(0.2, 2.9, 12))
+        image = Renderer(far.mesh("cylinder"), sensor).render_views(views)
+        seen = kalman_filter(take(image, sensor, 50))
+        options = {"on": on, "free": ("distance_m", "delta_rad")} if method == "refine" else {}
+        matches = Matcher(far, method, **options).match(seen)
+        assert matches.accepted.any()
+        assert np.abs(matches.distance_m - views.distance_m)[matches.accepted].max() < 0.03
+        # these are half a turn of 60 MHz nearer than the bank begins: found where they are, or refused
+        near = Renderer(far.mesh("cylinder"), sensor).render_views(
+            Views.broadcast(views.distance_m[:4] - 1.249, views.delta_rad[:4])
+        )
+        found = Matcher(far, method, **options).match(kalman_filter(take(near, sensor, 50)))
+        assert (np.abs(found.distance_m - near.views.distance_m) < 0.03)[found.accepted].all()
+
+
+def test_information_is_the_sum_of_that_of_the_frequencies():
+    views = Views.broadcast([1.0, 1.3], [0.3, 1.2])
+    together = cramer_rao(Renderer(CYLINDER, TWO), views, pixels="lower")
+    alone = [cramer_rao(Renderer(CYLINDER, camera), views, pixels="lower") for camera in TWO.by_frequency]
+    np.testing.assert_allclose(together.information, sum(one.information for one in alone), rtol=1e-6)
+    assert together.pixels.shape == (2, 16, 16)
+
+
+def test_what_is_not_understood_of_several_frequencies_is_refused_in_one_line(bank):
+    _, image = scene(bank, None)
+    frames = take(image, TWO, 2)
+    alone = Frames(frames.range_m, flags=frames.flags, sensor=TWO)
+    with pytest.raises(UsageError, match="unwrapped ranges alone, and phases are compared at every modulation"):
+        Matcher(bank).match(kalman_filter(alone))
+    with pytest.raises(UsageError, match='background="auto" takes on="ranges"'):
+        Matcher(bank, "refine", on="phasors", background="auto")
+    with pytest.raises(UsageError, match="with several modulation frequencies takes height_m on"):
+        Matcher(bank, "refine", on="phasors", free=("distance_m", "delta_rad", "height_m"))
+    with pytest.raises(UsageError, match="a data sheet takes a sensor of one modulation frequency, got"):
+        characterise(TWO, rng=np.random.default_rng(1))
+    with pytest.raises(UsageError, match="a fit takes a sensor of one modulation frequency"):
+        fit_sensor([frames[:1]], [1.0], base=TWO)
+    with pytest.raises(UsageError, match="another sensor than the bank's: 'modulation_hz' is"):
+        Matcher(bank).match(kalman_filter(take(Renderer(CYLINDER, PMD).render(1.0), PMD, 2)))
+
+
+# Each frequency by itself
+
+
+def test_the_noise_law_of_several_frequencies_is_the_combined_one():
+    each = [predicted_range_std(0.5, 0.6, camera) for camera in TWO.by_frequency]
+    assert predicted_range_std(0.5, 0.6, TWO) == pytest.approx(sum(std**-2.0 for std in each) ** -0.5, rel=1e-12)
+
+
+def test_a_camera_is_characterised_and_fitted_at_each_frequency():
+    camera = TWO.with_(range_offset_m=0.05, phase_offset_std_rad=0.01)
+    distances = [0.8, 1.0, 1.3, 1.7]
+    boards = [
+        capture(
+            Renderer(None, camera).render(1.0, background=Background(wall_m=d, wall_albedo=0.8)),
+            camera, rng=np.random.default_rng(k), n_frames=40,
+        )
+        for k, d in enumerate(distances)
+    ]  # fmt: skip
+    for j, single in enumerate(TWO.by_frequency):
+        fit = fit_sensor([one.by_frequency[j] for one in boards], distances, base=single, albedo=[0.8])
+        found = fit.estimates["range_offset_m"]
+        # the mean of 256 fixed offsets of 0.01 rad moves it too
+        tolerance = 4 * math.hypot(found.std_error, 0.01 * single.metres_per_radian / 16)
+        assert abs(fit.sensor.range_offset_m - 0.05) < tolerance
+        assert fit.sensor.phase_offset_std_rad == pytest.approx(0.01, rel=0.15)
+        assert fit.sensor.signal_e * fit.sensor.contrast == pytest.approx(TWO.signal_e * 0.5, rel=0.02)
+    sheet = characterise(TWO.by_frequency[1], rng=np.random.default_rng(1), n_frames=20)
+    assert sheet.sensor.modulation_hz == 60e6
