@@ -134,7 +134,7 @@ def _check_lens_name(name: str, what: str, lens: Lens | None) -> None:
         if name == "lens" or name in TERMS:
             raise UsageError(
                 f"{what}: {name!r} belongs to a sensor with a lens, and this one has none: give it a table [lens] in"
-                " its sensor file"
+                " its sensor file ('phasemark sensor import CAMERA_INFO' writes one)"
             )
     elif name == "fov" or name in HALF_ANGLES:
         raise UsageError(

@@ -15,10 +15,15 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.render import Sensor
 from phasemark.render.sensor.lens_fields import TERMS, Lens
+from phasemark.render.sensor.lens_map import distort
 from phasemark.render.sensor.lens_rates import lens_rates
 
 _UNIT = math.tan(math.radians(1.0))
 """By how much, as a tangent, a natural unit moves the image where it moves it most."""
+_POINTS = 9
+"""Along each side of the image."""
+_LEAST_STRETCH = 0.01
+"""A lens that leaves a smaller share of its area to a part of the image is about to fold there: no step leads to it."""
 _HALVINGS = 12
 """How often a step that leads to no lens is halved before it is not taken."""
 
@@ -60,8 +65,10 @@ def natural_units(sensor: Sensor) -> NDArray[np.float64]:
     return np.array([_UNIT / rates[name] if name in rates else 1.0 for name in TERMS])
 
 
-def is_lens(sensor: Sensor, numbers: NDArray[np.float64]) -> bool:
-    """Return True if numbers make a lens that maps the whole image of a sensor one to one.
+def stretch_of(sensor: Sensor, numbers: NDArray[np.float64]) -> float:
+    """Return the least share of its area at the axis that a lens leaves to any part of an image; 0 if it is no lens.
+
+    A lens that folds inside the image, or is out of range, is none. Where the share is 0 it is about to fold.
 
     Parameters
     ----------
@@ -72,10 +79,15 @@ def is_lens(sensor: Sensor, numbers: NDArray[np.float64]) -> bool:
     """
     assert sensor.lens is not None
     try:
-        sensor.with_(lens=lens_of(sensor.lens, numbers))
+        lens = lens_of(sensor.lens, numbers)
+        sensor.with_(lens=lens)
     except UsageError:
-        return False
-    return True
+        return 0.0
+    before = lens.before(sensor.rows, sensor.cols)
+    u, v = np.meshgrid(np.linspace(0, sensor.cols, _POINTS), np.linspace(0, sensor.rows, _POINTS))
+    y, z = before.rays(u, v)
+    _, _, xx, xy, yy = distort(before.model, before.k, -y, -z)
+    return float(np.nan_to_num(xx * yy - xy * xy).min())
 
 
 def farthest_lens(sensor: Sensor, before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -89,8 +101,9 @@ def farthest_lens(sensor: Sensor, before: NDArray[np.float64], after: NDArray[np
     """
     if sensor.lens is None or (before == after).all():
         return after
+    least = min(_LEAST_STRETCH, stretch_of(sensor, before))
     for halvings in range(_HALVINGS):
         there = before + 0.5**halvings * (after - before) if halvings else after
-        if is_lens(sensor, there):
+        if stretch_of(sensor, there) > least:
             return there
     return before
