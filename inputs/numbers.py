@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 
-def in_words(numbers: Sequence[float]) -> str:
+def in_words(numbers: Iterable[float]) -> str:
     """Return numbers as a sentence lists them.
 
     Parameters
     ----------
-    numbers : sequence of float
+    numbers : iterable of float
 
     Returns
     -------

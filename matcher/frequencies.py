@@ -344,6 +344,13 @@ class OneFrequencyBank(Bank):
         )
 
 
+def phases_of(renderer: Renderer) -> Renderer:
+    """Return what renders the phases of every frequency as one image, stacked; of one frequency the renderer itself."""
+    if len(renderer.sensor.frequencies_hz) == 1:
+        return renderer
+    return OneFrequencyRenderer(renderer, OneFrequency(renderer.sensor, "stacked"))
+
+
 def renderer_of(bank: Bank, mesh: trimesh.Trimesh | None, albedo: float = 0.8) -> Renderer:
     """Return what renders a landmark as a bank has it.
 

@@ -14,8 +14,7 @@ from phasemark.render.sensor.camera_unit import camera_unit
 from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.shipped_sensors import preset, preset_names
-from phasemark.render.unwrapped_frames import unwrap_frames
-from phasemark.render.unwrapping import Unwrapped, unwrap_ranges, unwrapping_error_probability
+from phasemark.render.unwrapping import unwrap_ranges, unwrapping_error_probability
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:
@@ -29,7 +28,6 @@ __all__ = [
     "PhasorImages",
     "Renderer",
     "Sensor",
-    "Unwrapped",
     "Views",
     "background_image",
     "camera_unit",
@@ -40,7 +38,6 @@ __all__ = [
     "predicted_range_std",
     "preset",
     "preset_names",
-    "unwrap_frames",
     "unwrap_ranges",
     "unwrapping_error_probability",
 ]

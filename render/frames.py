@@ -66,7 +66,7 @@ class Frames:
         shape. Real stamps may repeat or run backwards.
     by_frequency : sequence of Frames, optional
         What each of several modulation frequencies measured alone: frames of ``sensor.by_frequency``, with the range
-        wrapped at c / 2f of each. :func:`~phasemark.render.unwrap_frames` makes frames from these.
+        wrapped at c / 2f of each. :func:`~phasemark.render.unwrapped_frames.unwrap_frames` makes frames from these.
 
     Raises
     ------

@@ -24,12 +24,12 @@ from phasemark.render import (
     capture,
     predicted_range_std,
     preset,
-    unwrap_frames,
     unwrap_ranges,
     unwrapping_error_probability,
 )
 from phasemark.render.exposure import Motion, capture_moving, render_moving
 from phasemark.render.exposure.motion import phase_image_times_s
+from phasemark.render.unwrapped_frames import unwrap_frames
 
 PMD = preset("pmd-16x16")
 TWO = PMD.with_(modulation_hz=[20e6, 60e6])
@@ -142,6 +142,13 @@ def test_a_floor_has_the_phasor_of_dense_quadrature_at_every_frequency(hz):
     error = np.abs(image.at_frequency(hz)[0] - exact[1]).max(axis=1) / np.abs(exact[1]).max()
     assert np.delete(error, 8).max() < 1e-6  # with as many points a pixel as 10 MHz takes, 8e-4 at 100 MHz
     assert error[8] < 1e-3  # the horizon, where phases turn without end
+
+
+def test_a_floor_is_the_same_whether_the_view_or_the_mounting_tilts():
+    background = Background(floor_m=0.3)
+    of_view = Renderer(None, TWO).render(1.0, pitch_rad=0.1, background=background)
+    of_mount = Renderer(None, TWO.with_(pitch_deg=math.degrees(0.1))).render(1.0, background=background)
+    np.testing.assert_allclose(of_view.phasors, of_mount.phasors, rtol=0, atol=1e-12)  # the product of two rotations
 
 
 def test_a_frequency_that_was_not_rendered_is_refused_with_those_that_were():

@@ -19,7 +19,7 @@ from phasemark.data.plans import planned_size
 from phasemark.data.seeds import stream
 from phasemark.data.verify import verify_bank, verify_frames
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.render import Background, Flag, Renderer, capture, preset
+from phasemark.render import Background, Flag, Renderer, Sensor, capture, preset
 
 TWO = preset("pmd-16x16").with_(modulation_hz=[20e6, 60e6])
 FRAMES = FramePlan(
@@ -275,3 +275,33 @@ def test_a_distance_beyond_what_the_frequencies_tell_is_refused_with_the_divisor
 
 def test_flags_of_frames_and_files_are_the_same():
     assert [flag.value for flag in Flag] == [1, 2, 4, 8, 16, 32, 64]
+
+
+@pytest.mark.parametrize("options", [[], ["--frequency", "30e6"]])
+def test_a_data_sheet_asks_which_frequency(tmp_path, capsys, options):
+    sensor = tmp_path / "two.toml"
+    sensor.write_text(
+        "rows = 2\ncols = 2\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\nmodulation_hz = [20e6, 60e6]\n",
+        encoding="utf-8",
+    )
+    assert main(["sensor", "characterise", str(sensor), "-o", str(tmp_path / "sheet"), *options]) == 2
+    (line,) = error_lines(capsys.readouterr().err)
+    assert "--frequency must be one of the sensor's 20000000 and 60000000 Hz, got" in line
+    assert not (tmp_path / "sheet").exists()
+
+
+def test_a_fit_takes_the_frequency_that_is_named(tmp_path, capsys):
+    fields = "rows = 16\ncols = 16\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\nmodulation_hz = [20e6, 60e6]\n"
+    sensor, out = tmp_path / "two.toml", tmp_path / "fitted.toml"
+    sensor.write_text(fields, encoding="utf-8")
+    files = []
+    for distance in (1.0, 1.6):
+        image = Renderer(None, TWO).render(1.0, background=Background(wall_m=distance, wall_albedo=0.8))
+        frames = capture(image, TWO, rng=np.random.default_rng(3), n_frames=12)
+        files.append(write_measured(frames, tmp_path / f"board_{distance}.npz"))
+    arguments = ["sensor", "fit", *map(str, files), "--distance", "1.0", "--distance", "1.6", "--albedo", "0.8"]
+    assert main([*arguments, "--sensor", str(sensor), "--frequency", "60e6", "-o", str(out)]) == 0
+    capsys.readouterr()
+    fitted = Sensor.from_toml(out)
+    assert fitted.modulation_hz == 60e6
+    assert fitted.signal_e == pytest.approx(TWO.signal_e, rel=0.05)

@@ -12,6 +12,7 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, PixelKalman, kalman_filter, phasor_mean
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
+from phasemark.matcher.accuracy.look_alikes import class_distances_squared
 from phasemark.matcher.filters.filtered_frames import PixelState, noise_free
 from phasemark.render import (
     Background,
@@ -212,6 +213,19 @@ def test_information_is_the_sum_of_that_of_the_frequencies():
     alone = [cramer_rao(Renderer(CYLINDER, camera), views, pixels="lower") for camera in TWO.by_frequency]
     np.testing.assert_allclose(together.information, sum(one.information for one in alone), rtol=1e-6)
     assert together.pixels.shape == (2, 16, 16)
+
+
+def test_another_class_is_farther_away_in_two_frequencies_than_in_one():
+    views = Views.broadcast([1.2], [0.5])
+
+    def distance_squared(sensor):
+        return class_distances_squared(
+            Renderer(CYLINDER, sensor), views, {"cone": Renderer(build_mesh(catalog()["cone"]), sensor)}
+        )[0, 0]
+
+    alone = [distance_squared(camera) for camera in TWO.by_frequency]
+    # at one view distances add up; each frequency alone may choose its own
+    assert distance_squared(TWO) > 0.95 * sum(alone)
 
 
 def test_what_is_not_understood_of_several_frequencies_is_refused_in_one_line(bank):

@@ -10,6 +10,8 @@ import pytest
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
+from phasemark.data import BankPlan, build_bank, open_bank
+from phasemark.data.plans.bank_plan import factored_refusal
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, Sensor, Views, preset
 from phasemark.render.derivative import VIEW_PARAMETERS
@@ -255,6 +257,33 @@ def test_what_knows_no_lens_refuses_it():
     direct = preset("vl53l5cx-8x8")
     with pytest.raises(UsageError, match="'lens' must be left out beside 'histogram'"):
         direct.with_(lens=Lens(fx=10, fy=10, cx=3.5, cy=3.5))
+
+
+@pytest.mark.parametrize("with_lens", [True, False])
+def test_a_bank_holds_its_sensor_whole_and_needs_its_file_no_more(tmp_path, with_lens):
+    sensor = barrel(rows=8, cols=8, focal=20.0, distortion=BARREL[:4])
+    sensor = sensor if with_lens else sensor.with_(lens=None)
+    (tmp_path / "own.toml").write_text(sensor_toml(sensor, {}, header=(), otherwise="assumed"), encoding="utf-8")
+    grid = {"distance_m": "0.9:1.1:0.1", "delta_deg": "0:180:45", "layout": "full"}
+    plan = BankPlan(classes=["cone"], sensor=str(tmp_path / "own.toml"), **grid)
+    build_bank(plan, tmp_path / "own.h5")
+    (tmp_path / "own.toml").unlink()
+    bank = open_bank(tmp_path / "own.h5")
+    assert bank.sensor == sensor
+    assert bank.plan.build_sensor() == sensor
+
+
+def test_a_factored_bank_needs_a_middle_line_that_is_straight():
+    lens = {"fx": 41.0, "fy": 41.0, "cx": 7.5, "cy": 7.5, "distortion": (-0.3, 0.1, 0.0, 1e-3)}
+    straight = preset("pmd-16x16").with_(lens=lens)
+    overrides = straight.model_dump(mode="json")
+    plan = BankPlan(classes=["cone"], sensor_overrides=overrides, distance_m="0.9:1.1:0.1", delta_deg="0:180:45")
+    assert factored_refusal(plan.resolve()) is None
+    overrides["lens"]["distortion"] = (-0.3, 0.1, 1e-3, 0.0)
+    for name in ("half_angle_h_deg", "half_angle_v_deg"):
+        overrides.pop(name)
+    bent = BankPlan(classes=["cone"], sensor_overrides=overrides, distance_m="0.9:1.1:0.1", delta_deg="0:180:45")
+    assert "bends the image's middle line" in factored_refusal(bent.resolve())
 
 
 # --- camera_info ---

@@ -320,11 +320,11 @@ def test_rendering_only_the_rows_that_turn_gives_the_whole_image(bank, on):
     settings = Settings(VIEW[:2], np.ones(256, bool), background=behind)
     cone, evidence = np.full(2, bank.classes.index("cone")), Evidence.from_frames(frames, on)
     problem = Problem(RenderedModel(bank, WALL), evidence, np.arange(2), cone, settings, np.full(2, np.inf))
-    state = problem.start(np.array([[1.0, 0.6, 0, 0], [1.0, 1.1, 0, 0]]), False)
+    state = problem.start(np.array([[1.0, 0.6, 0, 0, 0, 0], [1.0, 1.1, 0, 0, 0, 0]]), False)
     theta = state.theta.copy()
     theta[:, 1] += 0.01
     if on == "phasors":
-        assert (np.abs(theta[:, 4] - 0.5 / 0.8) < 0.02).all()  # the factor on the bank's albedo was found
+        assert (np.abs(theta[:, 6] - 0.5 / 0.8) < 0.02).all()  # the factor on the bank's albedo was found
     turned, anew = problem.turned(state, np.arange(2), theta), problem.state(theta, state.use)
     # the facets of a solid of revolution turn too: within the renderer's budget of 1e-4
     for name in ("phasor", "intensity", "coverage"):

@@ -25,7 +25,8 @@ from phasemark.data.measured.bags import read_rosbag
 from phasemark.data.measured.csv_frames import MILLISECONDS, SECONDS, SECONDS_PER_TIME_UNIT, note_disorder, parse_csv
 from phasemark.data.measured.frequency_layers import LAYERED, layers_of
 from phasemark.inputs import opened
-from phasemark.render import Frames, Sensor, unwrap_frames
+from phasemark.render import Frames, Sensor
+from phasemark.render.unwrapped_frames import unwrap_frames
 
 Unit = Literal["m", "cm", "mm"]
 RangeOrZ = Literal["range", "z"]
@@ -97,7 +98,7 @@ def read_frames(
     ``frequency_intensity`` with an axis of the sensor's m frequencies before the rows, (frames, m, rows, cols) or (n,
     frames, m, rows, cols), and optionally ``frequency`` (hertz) and ``taps`` (electrons, (…, 4 m, 2, rows, cols)); a
     line of CSV has m times as many values, all of one frequency before those of the next. These ranges are wrapped, and
-    are unwrapped here (:func:`~phasemark.render.unwrap_frames`). What a file has as ``range`` is unwrapped already, and
+    are unwrapped here (`unwrap_frames`). What a file has as ``range`` is unwrapped already, and
     is used where the others are missing.
 
     A range that is not finite is invalid, and so is a 0, by which most sensors mean that they have no reading. So is

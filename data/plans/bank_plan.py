@@ -47,6 +47,7 @@ DEFAULT_DELTA_STEP_DEG = 1.0
 DEFAULT_MARGIN_DEG = 5.0
 
 _YOUNGER_FIELDS = {
+    "lens",
     "histogram",
     "bearing_offset_deg",
     "height_offset_m",
@@ -471,6 +472,8 @@ def factored_refusal(plan: BankPlan) -> str | None:
         return f"the sensor has an odd number of rows ({sensor.rows})"
     if sensor.centre_px[1] != sensor.rows / 2:
         return f"the optical axis meets the image at row {sensor.centre_px[1]:g}, not in the middle"
+    if sensor.lens is not None and sensor.lens.bends_middle_row:
+        return "the lens bends the image's middle line (its coefficient p1 is not 0)"
     return None
 
 

@@ -177,8 +177,8 @@ def accuracy_card(
     """Return what a measurement can tell at best at some views, and what limits it.
 
     Standard deviations are the Cramér–Rao bound on ranges (PHYSICS section 7), what the calibration of the sensor
-    leaves, and what the sensor declares. With P the covariance of the noise and I_e the information of the edge pixels, P I_e P
-    is what the noise of edge pixels contributes.
+    leaves, and what the sensor declares. With P the covariance of the noise and I_e the information of the edge pixels,
+    P I_e P is what the noise of edge pixels contributes.
 
     Parameters
     ----------

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.accuracy.appearance import Appearance
+from phasemark.matcher.frequencies import phases_of
 from phasemark.render import Background, Renderer, Views
 
 _SHIFT_M = np.arange(-0.04, 0.041, 0.02)
@@ -49,6 +50,7 @@ def class_distances_squared(
     (n, k) float64
         One column for each class of `others`, in their order.
     """
+    renderer, others = phases_of(renderer), {name: phases_of(other) for name, other in others.items()}
     truth = Appearance.of(renderer, views, (), None, n_frames, background=background)
     own = np.array([truth.one(k).imitated_by(truth.one(k))[0][0] for k in range(len(views))])
     columns = [_least_cost(truth, views, other, n_frames, background) for other in others.values()]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def pose_report_command(
-    estimates: Annotated[Path, typer.Argument(metavar="ESTIMATES", help="What match --estimates wrote, CSV.")],
+    measured: Annotated[Path, typer.Argument(metavar="ESTIMATES", help="What match --estimates wrote, CSV.")],
     truth: Annotated[
         Path,
         typer.Argument(
@@ -48,17 +48,17 @@ def pose_report_command(
     from phasemark.matcher.accuracy.pose_report import pose_report, views_as_poses
     from phasemark.matcher.recordings.pose_table import read_pose_table
 
-    found, true = read_pose_table(estimates), read_pose_table(truth)
-    rows, views = _truth_of(found, true, estimates, truth, delay_s)
+    found, true = read_pose_table(measured), read_pose_table(truth)
+    rows, views = _truth_of(found, true, measured, truth, delay_s)
     counted = found.known[rows] & (found.accepted[rows] | refused)
-    measured = np.full((len(rows), 4, 4), np.nan)
+    poses = np.full((len(rows), 4, 4), np.nan)
     if counted.any():
         from phasemark.render import Views
 
-        measured[counted] = views_as_poses(Views.broadcast(*found.view[rows[counted]].T))
-    report = pose_report(measured, views, symmetry=symmetry)
+        poses[counted] = views_as_poses(Views.broadcast(*found.view[rows[counted]].T))
+    report = pose_report(poses, views, symmetry=symmetry)
     if as_json:
-        echo_json({"estimates": str(estimates), "truth": str(truth), **report.as_dict()})
+        echo_json({"estimates": str(measured), "truth": str(truth), **report.as_dict()})
         return
     lines = report.rows()
     table = Table(list(lines[0]))

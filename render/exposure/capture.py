@@ -101,7 +101,7 @@ def capture(
     Frames
         (n, n_frames, rows, cols). An invalid pixel has range NaN, and its flags say why. Several modulation frequencies
         are captured one after the other, each with its own noise, and unwrapped
-        (:func:`~phasemark.render.unwrap_frames`); ``frames.by_frequency`` has each alone. A direct sensor gives neither
+        (`unwrap_frames`); ``frames.by_frequency`` has each alone. A direct sensor gives neither
         amplitude nor intensity; its own quantity is ``frames.z_m``.
 
     Raises

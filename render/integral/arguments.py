@@ -21,8 +21,8 @@ class Distortion(NamedTuple):
         In OpenCV's order.
     nodes : (2 rows + 1, 2 cols + 1, 2) float64
         y and z of the rays of corners, edge middles and centres of all pixels.
-    reach : (rows, cols, 4) float64
-        Of each pixel's rays: lowest and highest y, lowest and highest z.
+    reach : (rows, cols + 1, 4) float64
+        Of each pixel's rays: lowest and highest y, lowest and highest z; in the last column of all rays of the row.
     rule : (rows, cols, n, 2) float64
         Rays of the points at which a background is integrated over a pixel.
     low_y, high_y, low_z, high_z, radius : float

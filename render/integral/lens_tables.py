@@ -66,12 +66,14 @@ def _tables(lens: Lens, rows: int, cols: int, fill_factor: tuple[float, float], 
 
 
 def _reach(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return lowest and highest y, lowest and highest z of each pixel's rays, (rows, cols, 4)."""
+    """Return lowest and highest y, lowest and highest z of each pixel's rays and of each row's, (rows, cols + 1, 4)."""
     rows, cols = nodes.shape[0] // 2, nodes.shape[1] // 2
     parts = np.stack([nodes[i : i + 2 * rows : 2, j : j + 2 * cols : 2] for i in range(3) for j in range(3)])
     low, high = parts.min(axis=0), parts.max(axis=0)
     slack = _SLACK * (high - low)
     low, high = low - slack, high + slack
+    low = np.concatenate([low, low.min(axis=1, keepdims=True)], axis=1)
+    high = np.concatenate([high, high.max(axis=1, keepdims=True)], axis=1)
     return np.ascontiguousarray(np.stack([low[..., 0], high[..., 0], low[..., 1], high[..., 1]], axis=-1))
 
 

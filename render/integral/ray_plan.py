@@ -81,7 +81,14 @@ def plan_rays(  # type: ignore[no-untyped-def]
         start, first_border = n, n_borders
         for row in range(rows):
             r = camera.first_row + row
+            row_outside = False
+            if bent_lens:
+                whole = reach[r, cols]
+                row_outside = whole[0] >= u_high or whole[1] <= u_low or whole[2] >= v_high or whole[3] <= v_low
             for c in range(cols):
+                if row_outside and head[r + 1, c + 1] < 0:
+                    state[view, row, c] = SKIPPED
+                    continue
                 left, right, top, bottom = float(c), c + 1.0, float(r), r + 1.0
                 if bent_lens:
                     left, right, top, bottom = reach[r, c, 0], reach[r, c, 1], reach[r, c, 2], reach[r, c, 3]

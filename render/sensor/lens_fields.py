@@ -128,6 +128,11 @@ class Lens(BaseModel):
         """Whether the lens bends no ray: a pinhole."""
         return self.model == "opencv" and not any(self.distortion)
 
+    @property
+    def bends_middle_row(self) -> bool:
+        """Whether the row of the principal point is bent: y_d = p1 · x² there, for rays that are level."""
+        return self.model == "opencv" and len(self.distortion) > 2 and self.distortion[2] != 0
+
     def before(self, rows: int, cols: int) -> LensMap:
         """Return the lens before an image of rows × cols pixels.
 
