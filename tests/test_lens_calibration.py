@@ -418,3 +418,21 @@ def test_the_command_refuses_what_the_camera_has_not(folder, tmp_path, capsys, m
     assert part in error
     assert len(error.strip().splitlines()) == 1
     assert not (tmp_path / "camera.toml").exists()
+
+
+def test_a_camera_that_gets_a_new_lens_forgets_the_covariance_of_its_old_one(tmp_path, capsys):
+    old = with_covariance(WIDE, np.diag([1e-4, 4e-6, 9e-4]), ("lens.k3", "range_offset_m", "pitch_deg"))
+    (tmp_path / "old.toml").write_text(sensor_toml(old, {}, header=(), otherwise="stated"), encoding="utf-8")
+    (tmp_path / "info.yaml").write_text(
+        "image_width: 16\nimage_height: 16\ndistortion_model: plumb_bob\n"
+        "camera_matrix: {rows: 3, cols: 3, data: [17, 0, 7.5, 0, 17, 7.5, 0, 0, 1]}\n"
+        "distortion_coefficients: {rows: 1, cols: 4, data: [-0.1, 0, 0, 0]}\n"
+    )
+    out = tmp_path / "new.toml"
+    assert (
+        main(["sensor", "import", str(tmp_path / "info.yaml"), "--like", str(tmp_path / "old.toml"), "-o", str(out)])
+        == 0
+    )
+    new = Sensor.from_toml(out)
+    assert new.calibration_fields == ("range_offset_m", "pitch_deg")
+    np.testing.assert_allclose(new.calibration_matrix, np.diag([4e-6, 9e-4]))

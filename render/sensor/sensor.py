@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -225,6 +225,21 @@ class Sensor(SensorQuantities):
                 )
             changes["lens"] = self.lens.with_terms(**terms)
         return self.with_(**changes)
+
+    def calibration_without(self, left_out: Callable[[str], bool]) -> dict[str, Any]:
+        """Return the two fields of the covariance that a calibration leaves, without some of the fields it estimated.
+
+        Parameters
+        ----------
+        left_out : callable
+            Whether the field of a name is left out.
+        """
+        kept = [k for k, name in enumerate(self.calibration_fields) if not left_out(name)]
+        matrix = self.calibration_matrix[np.ix_(kept, kept)]
+        return {
+            "calibration_fields": tuple(self.calibration_fields[k] for k in kept),
+            "calibration_covariance": tuple(tuple(row) for row in matrix.tolist()),
+        }
 
     @property
     def by_frequency(self) -> tuple[Sensor, ...]:
