@@ -55,7 +55,7 @@ def class_distances_squared(
     own = np.array([truth.one(k).imitated_by(truth.one(k))[0][0] for k in range(len(views))])
     columns = [_least_cost(truth, views, other, n_frames, background) for other in others.values()]
     found = np.stack(columns, axis=1) if columns else np.zeros((len(views), 0))
-    return np.maximum(found - own[:, None], 0.0)
+    return np.asarray(np.maximum(found - own[:, None], 0.0))
 
 
 def _least_cost(
@@ -73,7 +73,7 @@ def _least_cost(
         grid = Views.broadcast(distance + shift, side, bearing, height)
         images = Appearance.of(other, grid, (), None, n_frames, background=background)
         for k in members:
-            best = np.argsort(truth.one(k).imitated_by(images)[0])[:_STARTS]
+            best = np.argsort(truth.one(int(k)).imitated_by(images)[0])[:_STARTS]
             place[k] = np.stack([grid.distance_m[best], grid.delta_rad[best]], axis=1)
     whose = np.repeat(np.arange(n), _STARTS)
     at = place.reshape(-1, 2)

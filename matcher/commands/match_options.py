@@ -161,7 +161,7 @@ class Search:
     def matcher(self, bank: Bank) -> Matcher:
         """Return the matcher."""
         from phasemark.matcher import Matcher
-        from phasemark.matcher.likelihood.likelihood_matcher import BEARING_STD_RAD
+        from phasemark.matcher.likelihood.likelihood_matcher import BEARING_STD_RAD, TILT_STD_RAD
 
         return Matcher(
             bank,
@@ -169,19 +169,19 @@ class Search:
             free=None if self.near_the_axis else self.parameters,
             background="auto" if self.auto_background else "unknown" if self.unknown_background else self.background,
             bearing_std_rad=BEARING_STD_RAD if self.bearing_std is None else math.radians(self.bearing_std),
-            **self._std_options(),
+            height_std_m=self._stated_in("height", 1.0, math.inf),
+            pitch_std_rad=self._stated_in("pitch", math.radians(1.0), TILT_STD_RAD),
+            roll_std_rad=self._stated_in("roll", math.radians(1.0), TILT_STD_RAD),
             false_alarm=self.false_alarm,
             on=self.on,
             pixels=self.pixels,
             robust=self.robust,
         )
 
-    def _std_options(self) -> dict[str, float]:
-        """Return the priors that are stated, as a matcher takes them."""
-        units = {"height": ("height_std_m", 1.0), "pitch": ("pitch_std_rad", math.radians(1.0))}
-        units["roll"] = ("roll_std_rad", math.radians(1.0))
-        stated = {name: std for name, std in self._stated_std.items() if std is not None}
-        return {units[name][0]: units[name][1] * std for name, std in stated.items()}
+    def _stated_in(self, name: str, unit: float, otherwise: float) -> float:
+        """Return a prior that is stated, in the unit of the matcher, or what holds where none is."""
+        std = self._stated_std.get(name)
+        return otherwise if std is None else std * unit
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from phasemark.landmarks import LandmarkSpec
 from phasemark.landmarks.spec import Box, Upper
+from phasemark.matcher.accuracy.appearance import Appearance
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.position_bound import RangeBound, box_alone, range_bound
 from phasemark.matcher.design.rules import AllowedDimensions, Check
 from phasemark.matcher.design.separation import (
-    Appearance,
     ClassDistances,
     choose_far_apart,
     turn_distance,
