@@ -2,6 +2,7 @@
 
 import json
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -103,7 +104,7 @@ def test_phase_images_of_all_frequencies_fit_the_frame():
 
 @pytest.mark.parametrize("sensor", [TWO, FOUR, preset("pmd-16x16-wiggle").with_(modulation_hz=[20e6, 50e6])])
 def test_each_frequency_of_an_image_is_that_of_a_camera_of_this_frequency_alone(sensor):
-    view = {"distance_m": [0.9, 1.7], "delta_rad": [0.3, 1.4], "bearing_rad": 0.03, "height_m": 0.02}
+    view: dict[str, Any] = {"distance_m": [0.9, 1.7], "delta_rad": [0.3, 1.4], "bearing_rad": 0.03, "height_m": 0.02}
     background = Background(wall_m=3.0)
     together = Renderer(CYLINDER, sensor).render(**view, background=background)
     np.testing.assert_array_equal(together.phasor, together.at_frequency(sensor.frequencies_hz[0]))

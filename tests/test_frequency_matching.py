@@ -47,7 +47,9 @@ def wall():
 def test_filtered_ranges_are_unwrapped_with_the_variance_of_the_filter(wall, filter_frames):
     filtered = filter_frames(take(wall, TWO.with_(max_phase_std_rad=None), 40))
     assert (filtered.state == PixelState.RETURN).mean() > 0.999
-    law = sum(predicted_range_std(p.amplitude, p.intensity, p.sensor) ** -2.0 for p in wall.by_frequency) * 40
+    law = 40 * np.sum(
+        [predicted_range_std(p.amplitude, p.intensity, p.sensor) ** -2.0 for p in wall.by_frequency], axis=0
+    )
     error = (filtered.range_m - wall.range_m)[filtered.state == PixelState.RETURN]
     np.testing.assert_allclose(np.nanmedian(filtered.std_m**2 * law), 1.0, rtol=0.02)
     whitened = error * np.sqrt(law[filtered.state == PixelState.RETURN])
@@ -139,7 +141,7 @@ def test_matching_on_phasors_reaches_the_bound_and_its_covariance_is_honest(bank
     matches = Matcher(bank, "refine", on="phasors", background=background).match(phasor_mean(frames))
     accepted = matches.accepted
     assert accepted.mean() > 0.8
-    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted))
+    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted).tolist())
     error = errors_of(matches, image.views)
     bound = cramer_rao(
         renderer, image.views, free=("distance_m", "delta_rad", "bearing_rad"), on="phasors", background=background
@@ -148,7 +150,7 @@ def test_matching_on_phasors_reaches_the_bound_and_its_covariance_is_honest(bank
         ratio = error[accepted, k] / bound.std(name)[accepted]
         low, high = stats.chi2.interval(1 - 0.001 / 8, accepted.sum())  # 99.9 %, eight cells
         assert low < np.sum(ratio**2) < 1.3 * high  # the bound is local: slopes jump where edges cross pixel borders
-    nees = [error[k] @ np.linalg.solve(matches[k].covariance, error[k]) for k in np.flatnonzero(accepted)]
+    nees = [error[k] @ np.linalg.solve(matches[k].covariance, error[k]) for k in np.flatnonzero(accepted).tolist()]
     low, high = stats.chi2.interval(1 - 0.001 / 8, 3 * accepted.sum())
     assert low < np.sum(nees) < high
 
@@ -158,13 +160,13 @@ def test_matching_on_unwrapped_ranges_reaches_the_bound(bank):
     matches = Matcher(bank, "refine").match(kalman_filter(take(image, TWO, 50)))
     accepted = matches.accepted
     assert accepted.mean() > 0.6  # the start is a grid of 2°, and these ranges are good to half a millimetre
-    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted))
+    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted).tolist())
     error = errors_of(matches, image.views)
     bound = cramer_rao(renderer, image.views, free=("distance_m", "delta_rad", "bearing_rad"))
     ratio = np.sum((error[accepted, 0] / bound.std("distance_m")[accepted]) ** 2)
     low, high = stats.chi2.interval(1 - 0.001 / 8, accepted.sum())
     assert low < ratio < 1.3 * high
-    nees = [error[k] @ np.linalg.solve(matches[k].covariance, error[k]) for k in np.flatnonzero(accepted)]
+    nees = [error[k] @ np.linalg.solve(matches[k].covariance, error[k]) for k in np.flatnonzero(accepted).tolist()]
     low, high = stats.chi2.interval(1 - 0.001 / 8, 3 * accepted.sum())
     assert low < np.sum(nees) < high
 
@@ -177,7 +179,7 @@ def test_the_nearest_image_is_found_by_phases_of_every_frequency(bank, backgroun
     assert accepted.mean() > 0.5
     error = errors_of(matches, image.views)
     assert np.abs(error[accepted, 0]).max() < 0.03
-    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted))
+    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted).tolist())
 
 
 @pytest.mark.parametrize(("method", "on"), [("nearest", "ranges"), ("refine", "ranges"), ("refine", "phasors")])

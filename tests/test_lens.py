@@ -3,6 +3,7 @@
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -111,12 +112,12 @@ def test_frame_agrees_with_the_true_solid_behind_the_lens(frame, frequency):
 @pytest.mark.parametrize("background", [None, Background(wall_m=4.0), Background(wall_m=4.0, floor_m=0.5)])
 def test_a_lens_without_distortion_is_the_ideal_camera(background):
     ideal = Sensor.from_intrinsics(60.0, 61.0, 16.3, 11.7, rows=24, cols=32, pitch_deg=3, fill_factor=(0.8, 0.9))
-    matrix = [[60.0, 0, 15.8], [0, 61.0, 11.2], [0, 0, 1]]
+    matrix = np.array([[60.0, 0, 15.8], [0, 61.0, 11.2], [0, 0, 1]])
     views = Views.broadcast([0.9, 1.3], [0.3, 2.0], [0.02, -0.05], 0.02)
     expected = Renderer(MESHES["cylinder"], ideal).render_views(views, background=background)
-    for model, zeros in (("opencv", ()), ("opencv", (0.0,) * 8)):
+    for zeros in ((), (0.0,) * 8):
         lens = Sensor.from_opencv(
-            matrix, zeros, size=(32, 24), model=model, pitch_deg=3, fill_factor=(0.8, 0.9), modulation_hz=10e6
+            matrix, zeros, size=(32, 24), model="opencv", pitch_deg=3, fill_factor=(0.8, 0.9), modulation_hz=10e6
         )
         assert lens.tan_half_angles == pytest.approx(ideal.tan_half_angles, rel=1e-14)
         found = Renderer(MESHES["cylinder"], lens).render_views(views, background=background)
@@ -248,7 +249,9 @@ def test_a_lens_that_folds_inside_the_image_is_refused_with_the_radius():
         barrel(focal=20.0, distortion=(-1 / 3, 0, 0, 0))
     assert barrel(focal=40.0, distortion=(-1 / 3, 0, 0, 0)).lens is not None  # it folds outside
     with pytest.raises(UsageError, match="no farther than 85°"):
-        Sensor.from_opencv([[10, 0, 15.5], [0, 10, 11.5], [0, 0, 1]], (0.0,) * 4, size=(32, 24), model="fisheye")
+        Sensor.from_opencv(
+            np.array([[10, 0, 15.5], [0, 10, 11.5], [0, 0, 1]]), (0.0,) * 4, size=(32, 24), model="fisheye"
+        )
 
 
 def test_what_knows_no_lens_refuses_it():
@@ -288,7 +291,12 @@ def test_a_factored_bank_needs_a_middle_line_that_is_straight():
 
 # --- camera_info ---
 
-NUMBERS = {"w": 224, "h": 171, "k": [211.5, 0, 111.2, 0, 211.8, 86.1, 0, 0, 1], "d": [-0.28, 0.11, 1e-3, -5e-4, 0.0]}
+NUMBERS: dict[str, Any] = {
+    "w": 224,
+    "h": 171,
+    "k": [211.5, 0, 111.2, 0, 211.8, 86.1, 0, 0, 1],
+    "d": [-0.28, 0.11, 1e-3, -5e-4, 0.0],
+}
 
 
 def calibrated(model="plumb_bob", d=NUMBERS["d"], w=NUMBERS["w"], k=NUMBERS["k"]):

@@ -2,6 +2,7 @@
 
 import csv
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from phasemark.render import Background, Renderer, Views, capture, preset
 
 PMD = preset("pmd-16x16")
 PLAN = BankPlan(classes=["cylinder", "cone"], distance_m="0.85:1.3:0.02", delta_deg="0:180:2")
-UNKNOWN = {"pitch_std_rad": math.inf, "roll_std_rad": math.inf}
+UNKNOWN: dict[str, Any] = {"pitch_std_rad": math.inf, "roll_std_rad": math.inf}
 ANYWHERE = TrialSetup(
     free=VIEW, distance_m=(0.95, 1.15), bearing_rad=0.04, height_m=0.04, pitch_rad=0.05, roll_rad=0.1, n_frames=2000
 )

@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from phasemark.render import Background, Renderer, Sensor, Views
 
 RNG = np.random.default_rng(11)
 TILTS = [(0.05, 0.0), (0.0, -0.2), (-0.07, 0.11), (0.13, 0.7)]
-SEEN = dict(distance_m=1.1, delta_rad=0.7, bearing_rad=0.03, height_m=-0.02)
+SEEN: dict[str, Any] = dict(distance_m=1.1, delta_rad=0.7, bearing_rad=0.03, height_m=-0.02)
 BACKGROUNDS = [None, Background(wall_m=4.0), Background(floor_m=0.6), Background(wall_m=2.5, floor_m=0.5)]
 
 
