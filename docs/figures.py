@@ -32,7 +32,7 @@ from phasemark.landmarks import build_mesh, catalog, mesh_figure
 from phasemark.matcher import kalman_filter
 from phasemark.matcher.drive import default_drive, drive_figure, run_drive
 from phasemark.render import Background, Renderer, capture, preset
-from phasemark.render.figures import draw_range
+from phasemark.render.figures import draw_range, landmark_limits_m
 
 IMAGES = Path(__file__).parent / "images"
 ROOT = Path(__file__).resolve().parent.parent
@@ -128,6 +128,7 @@ def demo_figure() -> Figure:
     sensor = preset("pmd-16x16")
     figure = Figure(figsize=(12.6, 6.0), layout="constrained")
     above, below = figure.subplots(2, 4, height_ratios=(1.15, 1))
+    shown = []
     for k, (name, spec) in enumerate(catalog().items()):
         mesh = build_mesh(spec)
         above[k].imshow(imread(io.BytesIO(mesh_figure(mesh))))
@@ -137,7 +138,10 @@ def demo_figure() -> Figure:
             1.0, np.radians(30), background=Background(wall_m=3.0)
         )
         frames = capture(image, sensor, rng=stream(2005, "documentation", k), n_frames=50)
-        draw_range(below[k], kalman_filter(frames).range_m[0], near_m=0.8, far_m=3.1, colour_bar=k == 3)
+        shown.append((kalman_filter(frames).range_m[0], landmark_limits_m(image.range_m[0], image.coverage[0])))
+    near, far = (np.array([limits for _, limits in shown])[:, end] for end in (0, 1))
+    for k, (range_m, _) in enumerate(shown):
+        draw_range(below[k], range_m, near_m=near.min(), far_m=far.max(), colour_bar=k == 3)
     return figure
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import json
 import string
 from importlib import resources
 
@@ -77,7 +78,7 @@ def mesh_html(mesh: trimesh.Trimesh, title: str) -> str:
     Returns
     -------
     str
-        HTML with the mesh inside; it loads nothing.
+        HTML with the mesh inside; it loads nothing. Axes x', y', z' and the line of sight at δ = 0 are drawn beside it.
     """
     vertices = np.asarray(mesh.vertices)
     centre = mesh.bounds.mean(axis=0)
@@ -89,6 +90,7 @@ def mesh_html(mesh: trimesh.Trimesh, title: str) -> str:
     return string.Template(page).substitute(
         title=html.escape(title),
         facts=f"{extents} cm, {len(mesh.faces)} faces",
+        origin=json.dumps((-centre / radius).round(6).tolist()),
         vertices=_base64((shown - centre) / radius, np.float32),
         faces=_base64(np.asarray(corners.faces), np.uint32),
         normals=_base64(np.asarray(corners.vertex_normals)[corners.faces], np.float32),

@@ -13,7 +13,7 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match
 from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Background, Renderer, background_image, phasor_to_range_m, predicted_range_std
-from phasemark.render.figures import draw_difference, draw_range
+from phasemark.render.figures import draw_range, draw_sigma, landmark_limits_m
 from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
 
@@ -29,6 +29,13 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
     background : Background, optional
         What the model is composed with, as in the matcher.
     """
+    return model_image(bank, match, background)[0]
+
+
+def model_image(
+    bank: Bank, match: Match, background: Background | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what :func:`model_range_m` does, and the share of each pixel on the landmark; (rows, cols) each."""
     name = match.class_name or match.alternatives[0].class_name
     if match.covariance is not None:
         mesh = bank.mesh(name)
@@ -40,7 +47,7 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
             background=match.background or background,
         )
         counted = counts(rendered.phasor[0], rendered.intensity[0], bank.sensor)
-        return np.where(counted, rendered.range_m[0], np.nan)
+        return np.where(counted, rendered.range_m[0], np.nan), rendered.coverage[0]
     i = int(np.abs(bank.distance_m - match.distance_m).argmin())
     turned = wrap_delta_difference_rad(bank.delta_rad - match.delta_rad, delta_period_rad(match.symmetry))
     j = int(np.abs(turned).argmin())
@@ -52,7 +59,7 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
         phasor, intensity = phasor + free * behind.phasor[0], intensity + free * behind.intensity[0]
     noise = predicted_range_std(np.abs(phasor), intensity, bank.sensor) / bank.sensor.metres_per_radian
     limit = bank.sensor.max_phase_std_rad or np.inf
-    return np.where(noise <= limit, phasor_to_range_m(phasor, bank.sensor), np.nan)
+    return np.where(noise <= limit, phasor_to_range_m(phasor, bank.sensor), np.nan), image.coverage[0]
 
 
 def match_figure(
@@ -64,7 +71,9 @@ def match_figure(
     *,
     title: bool = True,
 ) -> Figure:
-    """Draw a filtered frame beside the best model image and their difference.
+    """Draw a filtered frame beside the best model image, and their difference in standard deviations of the filter.
+
+    The colours of the ranges span the landmark of the model: what lies farther away, a wall for one, is grey.
 
     Parameters
     ----------
@@ -83,19 +92,18 @@ def match_figure(
     """
     frames = frames.without_offset()
     measured = frames.range_m[index]
-    model = np.full_like(measured, np.nan)
+    model, coverage = np.full_like(measured, np.nan), np.zeros_like(measured)
     if math.isfinite(match.distance_m):
-        model = model_range_m(bank, match, background)
-    both = np.concatenate([measured[np.isfinite(measured)], model[np.isfinite(model)]])
-    near, far = (float(both.min()), float(both.max())) if both.size else (0.0, 1.0)
+        model, coverage = model_image(bank, match, background)
+    near, far = landmark_limits_m(model, coverage)
     figure = Figure(figsize=(13.2, 4.2), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     left.set_title("measured, filtered")
     draw_range(left, measured, near_m=near, far_m=far)
     middle.set_title("best model image")
     draw_range(middle, model, near_m=near, far_m=far)
-    right.set_title("measured − model")
-    draw_difference(right, wrap_difference_m(measured - model, frames.sensor))
+    right.set_title("(measured − model) / σ")
+    draw_sigma(right, wrap_difference_m(measured - model, frames.sensor) / frames.std_m[index])
     if title:
         figure.suptitle(describe(match))
     return figure

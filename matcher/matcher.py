@@ -107,6 +107,12 @@ class Matcher:
     edges) is added to the variance. Its p-value is therefore approximate. With "refine" it is that of the fit.
     """
 
+    def __repr__(self) -> str:
+        """Say in one line how frames are matched, and against what."""
+        usual = (None, False, "all", "ranges")
+        stated = [f"{name}={value!r}" for name, value in self.options.items() if value not in usual]
+        return f"Matcher({', '.join([self.method, *stated])}, {self.bank!r})"
+
     def __init__(
         self,
         bank: Bank,

@@ -38,6 +38,13 @@ RANGE_COLOURS = (
 )
 """What the colours of a range image say, for captions."""
 
+SIGMA_SPAN = 5.0
+"""Where the colours of a residual in σ end, to both sides."""
+_LANDMARK_COVERAGE = 0.5
+_LANDMARK_PERCENTILES = (2, 98)
+_LEAST_SPAN_M = 0.02
+
+_BEYOND = "#b4bac1"
 _NOTHING = "#efe3d0"
 _NOTHING_HATCH = "#b58a55"
 
@@ -101,7 +108,7 @@ def range_figure(
     range_m : (rows, cols) ndarray
         Metres; NaN where nothing returned, drawn hatched.
     near_m, far_m : float, optional
-        Ranges drawn white and black; by default the image's own nearest and farthest.
+        Ranges drawn white and black; by default the image's own nearest and farthest. What lies farther is grey.
     title : str, optional
 
     Returns
@@ -134,12 +141,56 @@ def draw_range(
     near, far = _limits(range_m, near_m, far_m)
     # What is NaN stays unpainted and shows the hatched paper behind.
     axes.patch.set(facecolor=_NOTHING, edgecolor=_NOTHING_HATCH, hatch="////", linewidth=0)
-    image = _draw_pixels(axes, range_m, cmap=PAPER_CMAP, vmin=near, vmax=far)
+    image = _draw_pixels(axes, range_m, cmap=PAPER_CMAP.with_extremes(over=_BEYOND), vmin=near, vmax=far)
     if colour_bar:
         _colour_bar(axes, image, "range (m)")
     if np.isnan(range_m).any():
         hatched = Patch(facecolor=_NOTHING, edgecolor=_NOTHING_HATCH, hatch="////", linewidth=0, label="no range")
         _legend_below(axes, [hatched])
+    return image
+
+
+def landmark_limits_m(
+    range_m: NDArray[np.float64], coverage: NDArray[np.float64]
+) -> tuple[float, float] | tuple[None, None]:
+    """Return the ranges between which a landmark lies, for the colours of a range image with a wall behind it.
+
+    Parameters
+    ----------
+    range_m : (rows, cols) float64
+        Metres; NaN where nothing returned.
+    coverage : (rows, cols) float64
+        Share of each pixel on the landmark. Pixels that are half covered or more count.
+
+    Returns
+    -------
+    near_m, far_m : float or None
+        From the 2nd to the 98th percentile, at least 2 cm apart; None if the landmark covers no pixel that returned.
+    """
+    seen = range_m[np.isfinite(range_m) & (coverage >= _LANDMARK_COVERAGE)]
+    if not seen.size:
+        return None, None
+    near, far = (float(one) for one in np.percentile(seen, _LANDMARK_PERCENTILES))
+    widen = max(0.0, _LEAST_SPAN_M - (far - near)) / 2
+    return near - widen, far + widen
+
+
+def draw_sigma(axes: Axes, residual: NDArray[np.float64]) -> AxesImage:
+    """Draw residuals in standard deviations into axes of a larger figure; the colours end at ±5 σ.
+
+    Parameters
+    ----------
+    axes : matplotlib.axes.Axes
+    residual : (rows, cols) ndarray
+        Residual over its standard deviation; what is NaN stays grey.
+
+    Returns
+    -------
+    matplotlib.image.AxesImage
+    """
+    axes.set_facecolor("#d0d0d0")
+    image = _draw_pixels(axes, residual, cmap="RdBu", vmin=-SIGMA_SPAN, vmax=SIGMA_SPAN)
+    _colour_bar(axes, image, "residual (σ)")
     return image
 
 
@@ -183,7 +234,8 @@ def phasor_figure(images: PhasorImages, index: int = 0) -> Figure:
     figure = Figure(figsize=(12.4, 4.0), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     left.set_title("range")
-    draw_range(left, images.range_m[index])
+    near, far = landmark_limits_m(images.range_m[index], images.coverage[index])
+    draw_range(left, images.range_m[index], near_m=near, far_m=far)
     draw_map(middle, images.amplitude[index], "amplitude", "amplitude |S| (1: albedo 1 at 1 m)", cmap="gray", vmin=0.0)
     draw_map(
         right, images.coverage[index], "coverage", "share of the pixel on the landmark", cmap="gray", vmin=0, vmax=1
@@ -254,7 +306,7 @@ def terminal_figure(
         `range_m` is not an image.
     """
     near, far = _limits(range_m, near_m, far_m)
-    rgba = PAPER_CMAP((range_m - near) / (far - near), bytes=True)
+    rgba = PAPER_CMAP.with_extremes(over=_BEYOND)((range_m - near) / (far - near), bytes=True)
     rgba[np.isnan(range_m)] = [*bytes.fromhex(_NOTHING_HATCH[1:]), 255]
     scale = max(1, width // range_m.shape[1])
     rgb = rgba[..., :3].repeat(scale, axis=0).repeat(scale, axis=1)
@@ -309,7 +361,10 @@ def draw_map(axes: Axes, values: NDArray[np.float64], title: str, label: str, **
 def _colour_bar(axes: Axes, image: AxesImage, label: str) -> None:
     figure = axes.get_figure(root=True)
     if figure is not None:
-        figure.colorbar(image, ax=axes, label=label, shrink=0.9, pad=0.04, aspect=18)
+        values, (low, high) = np.ma.filled(np.ma.asarray(image.get_array(), np.float64), np.nan), image.get_clim()
+        ends = bool(np.nanmin(values, initial=np.inf) < low), bool(np.nanmax(values, initial=-np.inf) > high)
+        extend = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[ends]
+        figure.colorbar(image, ax=axes, label=label, shrink=0.9, pad=0.04, aspect=18, extend=extend)
 
 
 def _draw_flags(axes: Axes, flags: NDArray[np.uint8]) -> None:

@@ -170,6 +170,13 @@ class Renderer:
     ((1, 16, 16), 1.0)
     """
 
+    def __repr__(self) -> str:
+        """Say in one line what is rendered, and with which camera."""
+        faces = self.topology.faces
+        size = " × ".join(f"{100 * side:.3g}" for side in np.ptp(self.topology.vertices, axis=0)) if len(faces) else ""
+        landmark = f"{size} cm, {len(faces)} faces, albedo {self.albedo:g}" if size else "no landmark"
+        return f"Renderer({landmark}, {self.sensor!r})"
+
     def __init__(
         self,
         mesh: trimesh.Trimesh | None,

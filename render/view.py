@@ -20,6 +20,10 @@ FARTHEST_M = 1e6
 """No distance and no height is larger: beyond it float32 images and squared ranges lose their meaning."""
 VIEW_FIELDS = ("distance_m", "delta_rad", "bearing_rad", "height_m", "pitch_rad", "roll_rad")
 """What a view is made of."""
+_SHOWN = (
+    ("distance_m", "D", " m"), ("delta_rad", "δ", "°"), ("bearing_rad", "bearing", "°"), ("height_m", "height", " m"),
+    ("pitch_rad", "pitch", "°"), ("roll_rad", "roll", "°"),
+)  # fmt: skip
 _PLUMB = 1e-9
 """A landmark's axis nearer to the optical axis than this (sine of an angle) leaves roll and bearing open."""
 
@@ -107,6 +111,17 @@ class Views:
         for name in VIEW_FIELDS[4:]:
             if getattr(self, name) is None:
                 object.__setattr__(self, name, np.zeros(len(self.distance_m)))
+
+    def __repr__(self) -> str:
+        """Say in one line how many views there are, and over what; what is 0 in all of them is left out."""
+        spans = []
+        for name, label, unit in _SHOWN:
+            values = getattr(self, name)
+            values = np.degrees(values) if unit == "°" else values
+            if len(values) and (name in VIEW_FIELDS[:2] or values.any()):
+                ends = dict.fromkeys(f"{end:.4g}" for end in (values.min(), values.max()))
+                spans.append(f"{label} {' … '.join(ends)}{unit}")
+        return f"Views({len(self.distance_m)}{': ' * bool(spans)}{', '.join(spans)})"
 
     @classmethod
     def broadcast(

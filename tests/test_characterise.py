@@ -228,16 +228,20 @@ def folder(tmp_path_factory):
 def test_the_report_is_one_small_page_that_loads_nothing(folder):
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert len(page.encode()) < 3_000_000
-    assert not re.search(r"""(?:src|href)=["'](?!data:)|https?://|@import|url\(""", page)
+    assert not re.search(r"""src=["'](?!data:)|https?://|@import|url\(""", page)
     assert len(re.findall('src="data:image/png;base64', page)) == 6
-    opening = re.search(r"</h1>\s*<p>(.*?)</p>", page, re.DOTALL)[1]
+    for link in re.findall(r'href="([^"]*)"', page):
+        assert f'id="{link[1:]}"' in page if link.startswith("#") else (folder / link).is_file()
+    opening = " ".join(re.search(r'</h1>\s*<p class="answer">(.*?)</p>\s*<p>(.*?)</p>', page, re.DOTALL).groups())
     assert opening.count(". ") + opening.rstrip().endswith(".") >= 3
     assert "agrees with the prediction: χ² = " in opening
 
 
 def test_every_figure_is_a_picture_too(folder):
+    numbers = {path.stem for path in folder.glob("*.csv")} - {"points"}
     names = {"photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold"}
-    assert {path.stem for path in folder.glob("*.png")} == names
+    assert {path.stem for path in folder.glob("*.png")} == names == numbers
+    assert all(path.read_text(encoding="utf-8").count("\n") > 5 for path in folder.glob("*.csv"))
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in folder.glob("*.png"))
 
 

@@ -1,18 +1,21 @@
 """The paper's experiment at a small size: the same whatever the workers, and a report that stands alone."""
 
 import csv
+import html
 import io
 import math
+import re
 from html.parser import HTMLParser
 from typing import Any
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, look
 
 from phasemark import OutputExistsError, UsageError
 from phasemark.data.seeds import stream
-from phasemark.matcher.demo.report import summary_rows, write_demo
-from phasemark.matcher.demo.run import LANDMARK_XY_M, cells_csv, run_demo, trials_csv
+from phasemark.matcher.demo.report import answer, summary_rows, write_demo
+from phasemark.matcher.demo.run import LANDMARK_XY_M, LIKELIHOOD, NEAREST, cells_csv, run_demo, trials_csv
 
 SMALL: dict[str, Any] = {
     "classes": ("cone", "post"),
@@ -64,7 +67,8 @@ def test_another_seed_gives_other_frames(result):
 def test_the_table_of_cells_follows_from_the_table_of_trials(result):
     trials = list(csv.DictReader(io.StringIO(trials_csv(result.cells))))
     for row in csv.DictReader(io.StringIO(cells_csv(result.cells))):
-        own = [t for t in trials if all(t[key] == row[key] for key in ("class", "shifted", "distance_m", "delta_deg"))]
+        same = ("class", "shifted", "method", "distance_m", "delta_deg")
+        own = [t for t in trials if all(t[key] == row[key] for key in same)]
         assert len(own) == int(row["trials"]) == 3
         errors = [1e3 * abs(float(t["found_distance_m"]) - float(t["distance_m"])) for t in own]
         # both tables are rounded, to 1e-6 m and 1e-4 mm
@@ -103,8 +107,11 @@ def test_the_report_loads_nothing_and_its_tags_are_balanced(written):
     page = _Sources()
     page.feed(written.read_text(encoding="utf-8"))
     assert page.open == []
-    assert page.sources
-    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
+    pictures = [source for source in page.sources if source.startswith("data:image/png;base64,")]
+    assert len(pictures) == 10  # two a class, four matches, classes and errors
+    text = written.read_text(encoding="utf-8")
+    for link in set(page.sources) - set(pictures):
+        assert f'id="{link[1:]}"' in text if link.startswith("#") else (written.parent / link).is_file()
 
 
 def test_the_report_states_the_seed_the_versions_and_each_class(written, result):
@@ -113,6 +120,57 @@ def test_the_report_states_the_seed_the_versions_and_each_class(written, result)
     assert "numpy" in text
     for name in result.bank.classes:
         assert f"<h3>{name}</h3>" in text
+
+
+def test_maximum_likelihood_is_as_accurate_as_its_covariance_between_grid_points(result):
+    """24 errors of two parameters over their standard deviations: mean square 1, ± 3.3 √(2 / 24)."""
+    own = result.select(shifted=True, method=LIKELIHOOD)
+    assert all(cell.class_right.all() for cell in own)
+    squares = [
+        (error**2 / [match.covariance[k, k] for match in cell.matches]).mean()
+        for cell in own
+        for k, error in enumerate((cell.distance_error_m, cell.delta_error_rad))
+    ]
+    assert abs(np.mean(squares) - 1) < 3.3 * math.sqrt(2 / 24)
+
+
+def test_the_page_leads_with_maximum_likelihood_between_grid_points(written, result):
+    text = html.unescape(re.sub("<[^>]*>", "", written.read_text(encoding="utf-8").split("<main>")[1]))
+    assert answer(result) in text
+    assert text.index(answer(result)) < text.index("Errors between grid points")
+    headings = [text.index(title) for title in ("Maximum likelihood, between grid", "Nearest image, between grid")]
+    assert headings == sorted(headings)
+    assert "it named the very grid point in 12 of 12 trials" in text
+    assert text.count("0.00") < 10  # no rows of errors that cannot be anything else
+    for name in ("distance_m", "delta_deg", "median_abs"):
+        assert name not in text
+    assert text.rstrip().split("Make this page again")[-1].split()[:2] == ["phasemark", "demo"]
+
+
+def test_the_answer_is_the_root_mean_square_error_of_its_cells(result):
+    own = result.select(shifted=True, method=LIKELIHOOD)
+    error = np.concatenate([cell.distance_error_m for cell in own])
+    assert f"you get {1e3 * math.sqrt(np.mean(error**2)):.2g} mm" in answer(result)
+
+
+def test_no_panel_of_the_report_is_empty(written):
+    """Every panel of the errors has a point for each angle and distance, and errors that are not 0."""
+    rows = list(csv.DictReader(io.StringIO((written.parent / "errors.csv").read_text(encoding="utf-8"))))
+    assert {row["panel"] for row in rows} == {LIKELIHOOD, NEAREST}
+    assert len(rows) == 2 * 3 * 2
+    assert all(float(row["high"]) > 0 for row in rows)
+    classes = list(csv.DictReader(io.StringIO((written.parent / "classes.csv").read_text(encoding="utf-8"))))
+    assert sum(float(row["value"]) for row in classes) == 2 * 2 * 2 * 3
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+@pytest.mark.parametrize("width_px", [390, 1280])
+def test_a_browser_shows_the_whole_report_on_a_phone_and_on_a_desktop(written, tmp_path, width_px):
+    seen = look(written, width_px, tmp_path)
+    assert seen["width"] <= width_px
+    assert seen["cut"] == []
+    assert seen["console"] == []
+    assert all(seen["images"])
 
 
 def test_reports_are_not_overwritten_unasked(written, result):

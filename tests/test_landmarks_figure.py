@@ -2,6 +2,7 @@
 
 import base64
 import io
+import json
 import re
 import struct
 import zlib
@@ -107,6 +108,22 @@ def test_the_page_is_whole_and_loads_nothing(mesh):
     code = re.sub(r'decode\("[^"]*"', "", page)  # base64 spells anything
     assert not re.search(r"https?:|url\(|@import|\bfetch\(|XMLHttpRequest|import\(", code)
     assert not re.search(r"\$\{?[a-z]", code)  # every placeholder is filled
+
+
+def test_axes_and_the_line_of_sight_at_delta_0_start_where_the_landmark_has_its_origin():
+    """The page scales the mesh into a ball about the middle of its bounding box; (0, 0, 0) goes with it."""
+    moved = BOX.copy()
+    moved.apply_translation((0.3, -0.1, 0.15))
+    page = mesh_html(moved, "part")
+    origin = np.array(json.loads(re.search(r"const origin = (\[.*?\])", page)[1]))
+    vertices = next(arrays_of(page))
+    radius = 0.5 * np.linalg.norm(moved.extents)
+    assert np.linalg.norm(vertices, axis=1).max() == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(origin, -np.array([0.3, -0.1, 0.15]) / radius, atol=1e-6)
+    for name in ("x′", "y′", "z′", "δ = 0"):
+        assert f'"{name}"' in page
+    # the camera stands on the side of −x' (PHYSICS section 8), and looks along x'
+    assert "[origin[0] - 1.5, origin[1], origin[2]], [origin[0] - 0.75, origin[1], origin[2]]" in page
 
 
 @pytest.mark.parametrize(

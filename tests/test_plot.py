@@ -5,12 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.style import Style
 
 from phasemark import UsageError
-from phasemark.render import Flag, Frames, PhasorImages, Views, preset
-from phasemark.render.figures import PAPER_CMAP, RANGE_COLOURS, range_figure, terminal_figure
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.render import Background, Flag, Frames, PhasorImages, Renderer, Views, preset
+from phasemark.render.figures import (
+    PAPER_CMAP,
+    RANGE_COLOURS,
+    draw_sigma,
+    landmark_limits_m,
+    range_figure,
+    terminal_figure,
+)
 
 SENSOR = preset("ideal")
 
@@ -158,3 +167,32 @@ def test_unknown_names_are_attribute_errors():
 
     with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
         phasemark.render.nonsense  # noqa: B018
+
+
+def test_the_colours_span_the_landmark_and_not_the_wall_behind_it():
+    image = Renderer(build_mesh(catalog()["cone"]), preset("pmd-16x16")).render(
+        1.0, 0.5, background=Background(wall_m=3.0)
+    )
+    near, far = landmark_limits_m(image.range_m[0], image.coverage[0])
+    whole = image.range_m[0][image.coverage[0] > 0.999]
+    assert 0.8 < near < 0.95
+    assert far < 1.1
+    shown = (whole - near) / (far - near)
+    assert np.quantile(shown, 0.75) - np.quantile(shown, 0.25) > 0.25  # the landmark is not one flat colour
+    axes = image.plot().axes[0]
+    assert axes.images[0].get_clim() == (near, far)
+    assert axes.images[0].colorbar.extend in ("max", "both")
+
+
+def test_without_a_landmark_the_colours_span_the_image():
+    assert landmark_limits_m(np.full((2, 2), 1.0), np.zeros((2, 2))) == (None, None)
+    assert landmark_limits_m(np.full((2, 2), np.nan), np.ones((2, 2))) == (None, None)
+    near, far = landmark_limits_m(np.full((2, 2), 1.0), np.ones((2, 2)))
+    assert far - near == pytest.approx(0.02)
+
+
+def test_residuals_in_sigma_have_one_scale():
+    axes = Figure().add_subplot()
+    image = draw_sigma(axes, np.array([[0.1, -0.2], [0.3, np.nan]]))
+    assert image.get_clim() == (-5, 5)
+    assert draw_sigma(Figure().add_subplot(), np.array([[7.0, -0.2]])).colorbar.extend == "max"

@@ -1,5 +1,6 @@
 """The fields of a sensor: ranges, contradictions, presets."""
 
+import json
 import math
 import re
 import tomllib
@@ -12,6 +13,7 @@ from oracles.noise_law import FALSE_ALARM
 from scipy import stats
 
 from phasemark import UsageError
+from phasemark.cli import main
 from phasemark.inputs.toml_file import toml_value
 from phasemark.matcher import kalman_filter
 from phasemark.matcher.filters.filtered_frames import assumed_std_m
@@ -28,7 +30,9 @@ from phasemark.render import (
     preset_names,
 )
 from phasemark.render.exposure import ablate
-from phasemark.render.sensor.sensor_file import sensor_toml
+from phasemark.render.sensor.sensor_file import read_sources, sensor_toml
+from phasemark.render.sensor.shipped_sensors import preset_sources
+from phasemark.render.sensor.sources import kind_of_source
 
 PMD = preset("pmd-16x16")
 DIRECT = preset("vl53l5cx-8x8")
@@ -115,12 +119,82 @@ def test_every_term_is_neutral_by_default():
 @pytest.mark.parametrize("name", [name for name in preset_names() if name != "ideal"])
 def test_every_number_of_a_preset_says_where_it_comes_from(name):
     text = resources.files("phasemark.render.sensor").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")
-    lines = [line for line in text.splitlines() if line and not line.startswith(("#", "["))]
     fields = tomllib.loads(text)
-    assert len(lines) == len(fields | fields.pop("histogram", {}))
-    for line in lines:
-        source = line.split("#")[1].strip()
-        assert source.split()[0].rstrip(":,;") in {"published", "measured", "assumed", "follows", "one", "none"}, line
+    sources = fields.pop("source")
+    assert sources == preset_sources(name)
+    of_table = {f"histogram.{key}" for key in fields.pop("histogram", {})}
+    assert set(sources) == set(fields) | of_table
+    assert all(kind_of_source(source) for source in sources.values())
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ('colour = "assumed"', "'source.colour' is of no field"),
+        ('"rows.bins" = "assumed"', "'source.rows.bins' is of no field"),
+        (
+            'rows = "guessed"',
+            "'source.rows' must be a text that begins with measured, published, assumed, got",
+        ),
+        ("rows = 3", "'source.rows' must be a text"),
+    ],
+)
+def test_a_source_that_says_nothing_is_refused(tmp_path, source, words):
+    path = tmp_path / "camera.toml"
+    path.write_text(f"rows = 4\ncols = 4\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\n[source]\n{source}\n")
+    for read in (Sensor.from_toml, read_sources):
+        with pytest.raises(UsageError, match=re.escape(f"{path}: {words}")):
+            read(path)
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_what_is_shown_of_a_sensor_is_its_file_again_with_its_sources(name, tmp_path, capsys):
+    assert main(["sensor", "show", name]) == 0
+    path = tmp_path / "again.toml"
+    path.write_text(capsys.readouterr().out, encoding="utf-8")
+    assert Sensor.from_toml(path) == preset(name)
+    assert read_sources(path) == preset_sources(name)
+
+
+def test_what_is_shown_counts_sources_and_leaves_out_the_other_kind(capsys):
+    assert main(["sensor", "show", "pmd-16x16"]) == 0
+    text = capsys.readouterr().out
+    assert "# 0 measured, 6 published, 7 assumed" in text
+    assert "frame_rate_hz = 3.0  # published\n" in text
+    assert "# read-out, at their defaults: full_well_e not set" in text
+    assert "zone_offset_m" not in text
+    assert main(["sensor", "show", "ideal"]) == 0
+    assert "where its numbers come from is not stated" in capsys.readouterr().out
+    assert main(["sensor", "show", "pmd-16x16", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sources"]["rows"] == "published"
+
+
+def test_a_file_without_the_table_may_state_sources_in_comments(tmp_path):
+    path = tmp_path / "camera.toml"
+    path.write_text("rows = 4  # published\ncols = 4  # four of them\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\n")
+    assert read_sources(path) == {"rows": "published"}
+
+
+def test_sources_change_nothing_of_the_sensor(tmp_path):
+    path = tmp_path / "camera.toml"
+    bare = "rows = 4\ncols = 4\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\n"
+    path.write_text(bare)
+    without = Sensor.from_toml(path)
+    assert read_sources(path) == {}
+    path.write_text(bare + '[source]\nrows = "published: data sheet"\n')
+    assert Sensor.from_toml(path) == without
+    assert read_sources(path) == {"rows": "published: data sheet"}
+
+
+def test_a_written_sensor_file_keeps_its_sources(tmp_path):
+    path = tmp_path / "camera.toml"
+    comments = {"signal_e": "measured, ± 3 (standard error): four boards", "contrast": "calibrated"}
+    path.write_text(sensor_toml(PMD, comments, header=[], otherwise="assumed: as in pmd-16x16"))
+    sources = read_sources(path)
+    assert sources["signal_e"] == comments["signal_e"]
+    assert sources["contrast"] == "measured: calibrated"
+    assert sources["rows"] == "assumed: as in pmd-16x16"
+    assert Sensor.from_toml(path) == PMD
 
 
 def test_the_noise_law_counts_quantisation_once():

@@ -334,11 +334,16 @@ def test_the_command_writes_a_sensor_file_that_says_what_was_measured(folder, tm
     answer = json.loads(capsys.readouterr().out)
     text = out.read_text(encoding="utf-8")
     sensor = Sensor.from_toml(out)
-    assert sensor == Sensor(**tomllib.loads(text)) == Sensor(**answer["sensor"])
+    table = tomllib.loads(text)
+    sources = table.pop("source")
+    assert sensor == Sensor(**table) == Sensor(**answer["sensor"])
+    assert sources["signal_e"].startswith("measured, ± ")
+    assert sources["rows"] == "assumed: as in pmd-16x16"
     assert sensor.signal_e == pytest.approx(PMD.signal_e, rel=0.01)
-    for line in text.splitlines():  # every number says where it comes from
+    for line in text.split("[source]")[0].splitlines():  # every number says where it comes from
         assert line.startswith("#") or not line or "  # measured" in line or "  # assumed: " in line
     assert main(["sensor", "show", str(out)]) == 0
+    assert f"# {sources['signal_e']}" in capsys.readouterr().out
     assert main(["sensor", "characterise", str(out), "-o", str(tmp_path / "sheet"), "--frames", "4"]) == 0
     assert run(*boards, "-o", out) == 4  # it exists
     assert "exists already" in capsys.readouterr().err

@@ -1,6 +1,9 @@
 """What is made of a finished sweep: report, figures, single trials taken again, comparison, and the command line."""
 
+import csv
 import dataclasses
+import html
+import io
 import json
 import math
 import re
@@ -18,8 +21,10 @@ from phasemark.data import build_bank, read_frames
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
 from phasemark.landmarks.spec import Box, Cylinder
 from phasemark.matcher.filters.filtered_frames import kalman_filter
+from phasemark.matcher.sweep.answer import answer, answer_cells
 from phasemark.matcher.sweep.compare import compare_cells
 from phasemark.matcher.sweep.examples import sweep_frames
+from phasemark.matcher.sweep.figures.errors import maps
 from phasemark.matcher.sweep.figures.trust import confusion
 from phasemark.matcher.sweep.job import Round, SweepJob
 from phasemark.matcher.sweep.plan import Method, SweepPlan
@@ -76,7 +81,10 @@ def folder(tmp_path_factory):
 def test_the_report_is_one_page_that_loads_nothing(folder):
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert len(page.encode()) < 3_000_000
-    assert re.findall(r'(?:src|href)="(?!data:)', page) == []
+    assert re.findall(r'src="(?!data:)', page) == []
+    assert page.count("figures/worst-") == 2 * 3  # each link names its file
+    for link in re.findall(r'href="([^"]*)"', page):
+        assert f'id="{link[1:]}"' in page if link.startswith("#") else (folder / link).is_file()
     assert "<script" not in page
     figures = sorted(path.stem for path in (folder / "figures").glob("*.png"))
     assert figures == sorted(path.stem for path in (folder / "figures").glob("*.svg"))
@@ -98,6 +106,74 @@ def test_a_browser_shows_the_whole_report_on_a_phone_and_on_a_desktop(folder, tm
     assert seen["console"] == []
     assert len(seen["images"]) > 10
     assert all(seen["images"])
+
+
+def read_rows(path):
+    return list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
+
+
+def test_the_page_answers_first_and_ends_with_its_command(folder):
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    text = html.unescape(re.sub("<[^>]*>", "", page[page.index("<main>") :]))
+    assert re.match(r"\s*small\s+At 1\.05 m you get [\d.]+ mm and [\d.]+° \(1 σ\) with [\w ]+; class right", text)
+    assert "The bound: cone at 1.05 m, δ 0 … " in text
+    assert text.index("you get") < text.index("Errors against distance D (m)")
+    last = text.split("Make this page again")[-1].split("\n")
+    commands = [line.strip() for line in last if line.strip()]
+    assert commands == [
+        f"phasemark sweep run {folder}/plan.json --out {folder}-again --trust-plan", f"phasemark sweep report {folder}"
+    ]  # fmt: skip
+    assert "distance_m" not in text
+    assert "class_name" not in text
+
+
+def test_the_answer_is_of_the_method_nearest_to_the_bound(folder):
+    cells = [cell for cell in read_sweep(folder)[1].cells() if not cell.stranger]
+    own = answer_cells(cells)
+    assert {cell.condition.distance_m for cell in own} == {1.05}
+    assert len(own) == 4  # two classes, two angles
+    assert len({cell.method for cell in own}) == 1
+    far = [cell for cell in cells if cell.condition.distance_m == 1.05]
+    pooled = {
+        method: max(
+            math.sqrt(np.mean([cell.ratio[name].value ** 2 for cell in far if cell.method == method]))
+            for name in ("distance_m", "delta_rad")
+        )
+        for method in ("nearest", "planar")
+    }
+    assert own[0].method not in pooled or pooled[own[0].method] == min(pooled.values())
+    assert answer([]) == "No method found distance and angle in the middle of the design."
+
+
+def test_the_command_at_the_end_makes_the_same_trials(folder, tmp_path, capsys):
+    again = tmp_path / "again"
+    assert main(["sweep", "run", str(folder / "plan.json"), "--out", str(again), "--trust-plan", "--trials", "2"]) == 0
+    first = [row for row in read_rows(folder / "trials.csv") if row["trial"] in "01"]
+    for one, other in zip(first, read_rows(again / "trials.csv"), strict=True):
+        assert {**one, "seconds": ""} == {**other, "seconds": ""}
+
+
+def test_a_plan_that_is_no_plan_is_refused(tmp_path, capsys):
+    (tmp_path / "plan.json").write_text("[1]")
+    assert main(["sweep", "run", str(tmp_path / "plan.json"), "--out", str(tmp_path / "out")]) == 3
+    assert "cannot be read as the plan of a sweep" in capsys.readouterr().err
+
+
+def test_the_numbers_of_a_map_are_those_of_its_cells(folder):
+    rows = read_rows(folder / "figures" / "map-ratio.csv")
+    cells = [cell for cell in read_sweep(folder)[1].cells() if not cell.stranger and cell.method == "nearest"]
+    own = [row for row in rows if row["panel"] == "nearest: distance"]
+    assert len(own) == 4  # two distances and two angles
+    for row in own:
+        d, delta = (0.95, 1.05)[round(float(row["y"]))], (20.0, 70.0)[round(float(row["x"]))]
+        both = [c for c in cells if (c.condition.distance_m, c.condition.delta_deg) == (d, delta)]
+        assert float(row["value"]) == pytest.approx(np.median([c.ratio["distance_m"].value for c in both]))
+
+
+def test_maps_of_ratios_share_one_scale_about_1(folder):
+    _, trials = read_sweep(folder)
+    figure = maps([cell for cell in trials.cells() if not cell.stranger], "ratio")
+    assert {axes.images[0].get_clim() for axes in figure.axes if axes.images} == {(0.25, 4.0)}
 
 
 def test_a_report_regenerates_bit_for_bit(folder):

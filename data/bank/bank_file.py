@@ -251,6 +251,15 @@ class Bank:
         """Close the file; arrays read before stay usable."""
         self._file.close()
 
+    def __repr__(self) -> str:
+        """Say in one line what the bank holds, open or closed."""
+        delta_deg = np.degrees(self.delta_rad)
+        return (
+            f"Bank({self.path.name}: {', '.join(self.classes)}; D {self.distance_m[0]:g} … {self.distance_m[-1]:g} m"
+            f" × {len(self.distance_m)}, δ {delta_deg[0]:g} … {delta_deg[-1]:g}° × {len(delta_deg)}, {self.layout},"
+            f" {self.plan.sensor})"
+        )
+
     def _repr_html_(self) -> str:
         """Show in a notebook what the bank holds, open or closed."""
         delta_deg = np.degrees(self.delta_rad)

@@ -140,15 +140,13 @@ class PlanWithDistances(Protocol):
         """Return the greatest distance of each key that has one."""
 
 
-def sensor_text(name_or_file: str) -> str:
-    """Return the text of a preset or a sensor file."""
-    from phasemark.inputs.reading import MOST_TOML_BYTES, read_text
+def read_sensor_sources(name_or_file: str) -> dict[str, str]:
+    """Return where the numbers of a preset or of a sensor file come from, by field."""
     from phasemark.render import preset_names
-    from phasemark.render.sensor.shipped_sensors import preset_text
+    from phasemark.render.sensor.sensor_file import read_sources
+    from phasemark.render.sensor.shipped_sensors import preset_sources
 
-    if name_or_file in preset_names():
-        return preset_text(name_or_file)
-    return read_text(Path(name_or_file), most_bytes=MOST_TOML_BYTES)
+    return preset_sources(name_or_file) if name_or_file in preset_names() else read_sources(name_or_file)
 
 
 def read_sensor(name_or_file: str) -> Sensor:

@@ -56,7 +56,7 @@ def render_frame(
 ) -> None:
     """Render one noise-free frame: a figure, the phasors, and a sketch in the terminal."""
     from phasemark.render import Renderer, Views
-    from phasemark.render.figures import terminal_figure
+    from phasemark.render.figures import landmark_limits_m, terminal_figure
 
     refuse_unless_one(class_name, mesh_file, mesh_reading, "render")
     if out.suffix.lower() != ".png":
@@ -79,7 +79,8 @@ def render_frame(
     if sys.stdout.isatty():
         from rich.console import Console
 
-        Console().print(terminal_figure(image.range_m[0], width=48))
+        near, far = landmark_limits_m(image.range_m[0], image.coverage[0])
+        Console().print(terminal_figure(image.range_m[0], width=48, near_m=near, far_m=far))
     typer.echo(out)
     typer.echo(data)
 

@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import json
+import textwrap
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,7 +15,7 @@ import typer
 from phasemark import UsageError
 from phasemark.data.commands.command import Without
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
-from phasemark.data.commands.inputs import note_too_far, read_sensor, sensor_text
+from phasemark.data.commands.inputs import note_too_far, read_sensor, read_sensor_sources
 from phasemark.data.commands.options import (
     Force,
     FrameReading,
@@ -24,8 +26,11 @@ from phasemark.data.commands.options import (
 )
 from phasemark.data.commands.outputs import output_folder, refuse_existing
 from phasemark.inputs.numbers import in_words
+from phasemark.inputs.toml_file import toml_value
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from phasemark.render import Sensor
     from phasemark.render.bench.fit.fitted_sensor import FittedField
 
@@ -86,12 +91,17 @@ def sensor_show(
     as_json: Json = False,
     force: Force = False,
 ) -> None:
-    """Print every field of a sensor; the text is a sensor file again."""
-    sensor = read_sensor(name_or_file)
+    """Print a sensor in groups, and of each number whether it is measured, published or assumed.
+
+    The text is a sensor file again. Fields at their defaults stand in a line of comment; --json prints every field.
+    """
+    from phasemark.render.sensor.sensor_file import source_lines
+
+    sensor, sources = read_sensor(name_or_file), read_sensor_sources(name_or_file)
     if picture is not None:
         _write_picture(sensor, picture, force)
     if as_json:
-        echo_json({"name": name_or_file, **sensor.as_dict()})
+        echo_json({"name": name_or_file, **sensor.as_dict(), "sources": sources})
         return
     if sensor.kind == "direct":
         axis = "z, along the optical axis" if sensor.quantity == "z" else "the range along the ray"
@@ -99,19 +109,58 @@ def sensor_show(
     else:
         scales = ", ".join(f"{camera.metres_per_radian:.6f}" for camera in sensor.by_frequency)
         typer.echo(f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {scales} m per radian")
-    from phasemark.render.sensor.sensor_fields import TABLES
+    typer.echo(f"# {_sources_counted(sources)}")
+    from phasemark.render.sensor.sensor_fields import DIRECT_ONLY, PHASE_ONLY, TABLES
+    from phasemark.render.sensor.sensor_file import TABLE_MODELS
 
     fields = sensor.model_dump(mode="json")
     tables = {name: fields.pop(name) for name in TABLES if name in fields}  # they stand behind all fields
+    foreign = DIRECT_ONLY if sensor.kind == "phase" else PHASE_ONLY
+    for name in foreign:  # a camera of this kind has none of them
+        if fields.get(name) in (None, _default(type(sensor), name)) and name not in sources:
+            fields.pop(name, None)
     for title, names in sensor.field_groups().items():
-        typer.echo(f"\n# {title}")
-        for name in names:
-            if name in fields:
-                _echo_field(name, fields[name])
+        if not any(name in fields for name in names):
+            continue
+        _echo_group(f"# {title}", {name: fields[name] for name in names if name in fields}, type(sensor), sources)
     for title, table in tables.items():
-        typer.echo(f"\n[{title}]")
-        for name, value in table.items():
-            _echo_field(name, value)
+        own = {name.removeprefix(f"{title}."): text for name, text in sources.items() if name.startswith(f"{title}.")}
+        _echo_group(f"[{title}]", table, TABLE_MODELS[title], own)
+    for line in source_lines(sources):
+        typer.echo(line)
+
+
+def _sources_counted(sources: Mapping[str, str]) -> str:
+    """Say how many numbers are measured, published and assumed."""
+    from phasemark.render.sensor.sources import SOURCE_KINDS, kind_of_source
+
+    if not sources:
+        return "where its numbers come from is not stated: a table [source] would say it"
+    kinds = [kind_of_source(text) for text in sources.values()]
+    return ", ".join(f"{kinds.count(kind)} {kind}" for kind in SOURCE_KINDS)
+
+
+def _default(model: type[BaseModel], name: str) -> object:
+    """Return the default of a field as JSON has it."""
+    default = model.model_fields[name].default
+    return list(default) if isinstance(default, tuple) else default
+
+
+def _echo_group(title: str, fields: Mapping[str, object], model: type[BaseModel], sources: Mapping[str, str]) -> None:
+    """Print fields as lines of a sensor file, each with its source; those at their defaults in one comment."""
+    shown, rest = [], []
+    for name, value in fields.items():
+        required = model.model_fields[name].is_required()
+        if value is None or (name not in sources and not required and value == _default(model, name)):
+            rest.append(f"{name} {'not set' if value is None else json.dumps(value)}")
+        else:
+            shown.append(f"{name} = {toml_value(value)}" + (f"  # {sources[name]}" if name in sources else ""))
+    named = "at their defaults" if shown or title.startswith("[") else f"{title.removeprefix('# ')}, at their defaults"
+    typer.echo("" if named != "at their defaults" else f"\n{title}")
+    for line in shown:
+        typer.echo(line)
+    for line in textwrap.wrap(f"{named}: {', '.join(rest)}", 118) if rest else ():
+        typer.echo(f"# {line}")
 
 
 def _write_picture(sensor: Sensor, picture: Path, force: bool) -> None:
@@ -153,7 +202,7 @@ def sensor_import(
     from phasemark.render.sensor.camera_info import read_camera_info
     from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD
     from phasemark.render.sensor.sensor_fields import TABLES
-    from phasemark.render.sensor.sensor_file import comments_of, sensor_toml
+    from phasemark.render.sensor.sensor_file import sensor_toml
 
     if out.suffix != ".toml":
         raise UsageError(f"--out must end in .toml, got '{out}'")
@@ -170,7 +219,7 @@ def sensor_import(
     fields |= base.calibration_without(lambda name: name.startswith(LENS_FIELD) or name in DERIVED)
     sensor = type(base)(**{**fields, **changes, "rows": found.rows, "cols": found.cols, "lens": found.lens})
     origin = readable(str(like))
-    stated = {k: f"{v} ({origin})" for k, v in comments_of(sensor_text(like)).items() if k in type(base).model_fields}
+    stated = {k: f"{v} ({origin})" for k, v in read_sensor_sources(like).items() if k in type(base).model_fields}
     measured = f"measured: {camera_info.name}"
     comments = {name: text for name, text in stated.items() if name not in (*DERIVED, *TABLES, *per_pixel)}
     comments |= {"rows": measured, "cols": measured}
@@ -187,11 +236,6 @@ def sensor_import(
         echo_json({"file": str(out), **sensor.as_dict()})
         return
     typer.echo(out)
-
-
-def _echo_field(name: str, value: object) -> None:
-    """Print a field as a line of a sensor file."""
-    typer.echo(f"# {name} is not set" if value is None else f"{name} = {json.dumps(value)}")
 
 
 def sensor_characterise(

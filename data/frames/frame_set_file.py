@@ -326,6 +326,14 @@ class FrameSet:
         """Return some frames, or a split by its name, as a map-style data set."""
         return FrameSubset(self, self.split(frames) if isinstance(frames, str) else np.asarray(frames), transform)
 
+    def __repr__(self) -> str:
+        """Say in one line what the frame set holds, open or closed."""
+        distance_m = self.truth["distance_m"]
+        return (
+            f"FrameSet({self.path.name}: {len(self)} frames of {self.plan.views} views; {', '.join(self.classes)};"
+            f" D {distance_m.min():.3g} … {distance_m.max():.3g} m, {self.plan.sensor})"
+        )
+
     def _repr_html_(self) -> str:
         """Show in a notebook what the frame set holds, open or closed."""
         distance_m = self.truth["distance_m"]

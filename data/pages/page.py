@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
+import re
 from typing import TYPE_CHECKING
 
 import jinja2
@@ -19,7 +20,8 @@ _DPI = 110
 def page_template(package: str, name: str) -> jinja2.Template:
     """Return a template of a package; it may extend ``base.html.j2``, which has the style, a title and a content block.
 
-    Its filter ``number`` is :func:`short_number`.
+    Its filter ``number`` is :func:`short_number`, and ``anchor`` makes the name of a heading that links lead to.
+    ``macros.html.j2`` has the parts that pages share.
     """
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader(
@@ -29,6 +31,7 @@ def page_template(package: str, name: str) -> jinja2.Template:
         undefined=jinja2.StrictUndefined,
     )
     environment.filters["number"] = short_number
+    environment.filters["anchor"] = _anchor
     return environment.get_template(name)
 
 
@@ -47,6 +50,11 @@ def figure_png(figure: Figure) -> bytes:
 def embedded_png(png: bytes, alternative: str) -> Markup:
     """Return an image element that holds a PNG; `alternative` says in words what it shows."""
     return Markup('<img alt="{}" src="data:image/png;base64,{}">').format(alternative, base64.b64encode(png).decode())
+
+
+def _anchor(title: str) -> str:
+    """Return a title as the name of an anchor."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def short_number(value: float) -> str:

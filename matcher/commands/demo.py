@@ -25,13 +25,12 @@ def demo_report(
 ) -> None:
     """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°."""
     from phasemark.data.shards.run import outputs_of
-    from phasemark.matcher.demo.report import summary_rows, write_demo
+    from phasemark.matcher.demo.report import DEMO_FILES, HALVES, answer, on_grid, summary_rows, write_demo
     from phasemark.matcher.demo.run import run_demo
 
     bank = out / "bank.h5"
     refuse_existing([bank], force)
-    names = ("report.html", "cells.csv", "trials.csv")
-    with output_folder(out, "demo", names, force, also=[path.name for path in outputs_of(bank)]):
+    with output_folder(out, "demo", DEMO_FILES, force, also=[path.name for path in outputs_of(bank)]):
         with LongWork("matching") as progress:
             result = run_demo(bank, seed=seed, workers=workers, force=force, progress=progress)
         with LongWork("writing the report"):
@@ -40,8 +39,13 @@ def demo_report(
         echo_json({"report": str(report), **result.as_dict()})
         return
     header = ("D (cm)", "δ (°)", "class right", "|ΔD| mm", "worst", "|Δδ| °", "worst", "position mm", "worst")
-    for title, shifted in (("on the bank's grid", False), ("between grid points", True)):
+    typer.echo(answer(result))
+    typer.echo("")
+    for shifted, method, title in HALVES:
+        if not shifted:
+            typer.echo(f"{title}: {on_grid(result)}")
+            continue
         typer.echo(f"{title}: medians and worst over the classes")
-        echo_table(header, summary_rows(result.select(shifted=shifted)))
+        echo_table(header, summary_rows(result.select(shifted=shifted, method=method)))
         typer.echo("")
     typer.echo(report)

@@ -34,6 +34,8 @@ from phasemark.render.view import delta_period_rad
 SENSOR = "pmd-16x16"
 WALL_M = 3.0
 LANDMARK_XY_M = (2.0, 1.0)
+LIKELIHOOD, NEAREST = "maximum likelihood", "nearest image"
+"""The methods: between the bank's grid points both, on them the nearest image alone."""
 SHIFT_STEPS = 0.37
 """How far, in steps of the bank, the second half of the cells lies off the grid."""
 
@@ -64,6 +66,8 @@ class CellResult:
     Parameters
     ----------
     cell : Cell
+    method : str
+        :data:`LIKELIHOOD` or :data:`NEAREST`.
     matches : Matches
     class_right : bool
     distance_error_m, delta_error_rad : float64
@@ -75,6 +79,7 @@ class CellResult:
     """
 
     cell: Cell
+    method: str
     matches: Matches
     class_right: NDArray[np.bool_]
     distance_error_m: NDArray[np.float64]
@@ -90,6 +95,7 @@ class DemoResult:
     Parameters
     ----------
     cells : tuple of CellResult
+        Between grid points with maximum likelihood, then with the nearest image; the nearest image on grid points last.
     bank : Bank
         Open for reading.
     background : Background
@@ -106,9 +112,9 @@ class DemoResult:
     repetitions: int
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def select(self, *, shifted: bool) -> tuple[CellResult, ...]:
-        """Return the cells on the bank's grid, or those between."""
-        return tuple(result for result in self.cells if result.cell.shifted == shifted)
+    def select(self, *, shifted: bool, method: str = NEAREST) -> tuple[CellResult, ...]:
+        """Return a method's cells on the bank's grid, or those between."""
+        return tuple(r for r in self.cells if r.cell.shifted == shifted and r.method == method)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the times and the cells as plain numbers, for JSON; None where nothing was found."""
@@ -133,8 +139,9 @@ def run_demo(
     """Run the paper's experiment on simulated frames.
 
     Each landmark is put before a wall at 3 m, at each distance and angle and again 0.37 of a bank step further in
-    both; `repetitions` times `n_frames` noisy frames are captured, filtered and matched, and the robot is placed. Every
-    cell has its own random stream, so the result does not depend on the number of workers.
+    both; `repetitions` times `n_frames` noisy frames are captured, filtered and matched, and the robot is placed. The
+    nearest image matches all of them, maximum likelihood those between grid points. Every cell has its own random
+    stream, so the result does not depend on the number of workers.
 
     Parameters
     ----------
@@ -178,7 +185,8 @@ def run_demo(
     plan = BankPlan(**fields)
     bank = build_bank(plan, bank_path, force=force, workers=workers)
     background = Background(wall_m=WALL_M)
-    matcher = Matcher(bank, background=background)
+    nearest = Matcher(bank, background=background)
+    likelihood = Matcher(bank, "refine", background=background, workers=1)
     seconds = {"bank": time.perf_counter() - started, "render": 0.0, "capture": 0.0, "filter": 0.0, "match": 0.0}
     specs = catalog()
     renderers = {
@@ -186,7 +194,7 @@ def run_demo(
     }
     cells = _cells(bank, distances_m, np.deg2rad(deltas_deg))
 
-    def run(index: int) -> CellResult:
+    def run(index: int) -> list[CellResult]:
         cell = cells[index]
         clock = _Clock(seconds)
         image = renderers[cell.class_name].render(cell.distance_m, cell.delta_rad, background=background)
@@ -197,16 +205,18 @@ def run_demo(
         clock.lap("capture")
         filtered = kalman_filter(frames)
         clock.lap("filter")
-        matches = matcher.match(filtered)
+        methods = {LIKELIHOOD: likelihood, NEAREST: nearest} if cell.shifted else {NEAREST: nearest}
+        found = [_judge(cell, name, matcher.match(filtered), filtered) for name, matcher in methods.items()]
         clock.lap("match")
-        return _judge(cell, matches, filtered)
+        return found
 
     results: list[CellResult] = []
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
-        for result in pool.map(run, range(len(cells))):
-            results.append(result)
+        for done, found in enumerate(pool.map(run, range(len(cells))), start=1):
+            results += found
             if progress is not None:
-                progress(len(results), len(cells))
+                progress(done, len(cells))
+    results.sort(key=lambda result: (not result.cell.shifted, result.method != LIKELIHOOD))  # stable: cells keep order
     seconds["total"] = time.perf_counter() - started
     return DemoResult(tuple(results), bank, background, seed, n_frames, repetitions, seconds)
 
@@ -252,12 +262,13 @@ def _repeated(image: PhasorImages, n: int) -> PhasorImages:
     )
 
 
-def _judge(cell: Cell, matches: Matches, filtered: FilteredFrames) -> CellResult:
+def _judge(cell: Cell, method: str, matches: Matches, filtered: FilteredFrames) -> CellResult:
     found = np.array([name is not None for name in matches.class_name])
     period = np.array([delta_period_rad(match.symmetry) for match in matches])
     error = np.where(found[:, None], view_errors(matches, cell, VIEW[:2], period), np.nan)
     return CellResult(
         cell=cell,
+        method=method,
         matches=matches,
         class_right=np.array([name == cell.class_name for name in matches.class_name]),
         distance_error_m=error[:, 0],
@@ -276,7 +287,7 @@ def _position_error_m(cell: Cell, match: Match) -> float:
 
 
 CELL_COLUMNS = (
-    "class", "shifted", "distance_m", "delta_deg", "trials", "class_right", "accepted",
+    "class", "shifted", "method", "distance_m", "delta_deg", "trials", "class_right", "accepted",
     "median_abs_distance_error_mm", "worst_abs_distance_error_mm",
     "median_abs_delta_error_deg", "worst_abs_delta_error_deg",
     "median_position_error_mm", "worst_position_error_mm",
@@ -299,6 +310,7 @@ def cell_rows(results: Sequence[CellResult]) -> list[dict[str, str | int | float
         values: tuple[str | int | float, ...] = (
             result.cell.class_name,
             int(result.cell.shifted),
+            result.method,
             round(result.cell.distance_m, 6),
             round(math.degrees(result.cell.delta_rad), 6),
             len(result.matches),
@@ -326,13 +338,14 @@ def cells_csv(results: Sequence[CellResult]) -> str:
 def trials_csv(results: Sequence[CellResult]) -> str:
     """Return the table of trials as CSV: truth, estimate and the test of the fit."""
     header = (
-        "class", "shifted", "distance_m", "delta_deg", "repetition",
+        "class", "shifted", "method", "distance_m", "delta_deg", "repetition",
         "found_class", "found_distance_m", "found_delta_deg", "accepted", "chi2", "dof", "p_value", "position_error_mm",
     )  # fmt: skip
     rows = [
         [
             result.cell.class_name,
             int(result.cell.shifted),
+            result.method,
             round(result.cell.distance_m, 6),
             round(math.degrees(result.cell.delta_rad), 6),
             k,

@@ -87,6 +87,17 @@ class RobotPose:
     covariance: NDArray[np.float64] | None = None
     mahalanobis: float = math.nan
 
+    def __repr__(self) -> str:
+        """Say in one line where the robot stands, with standard deviations if there are any."""
+        std = ["", "", ""]
+        if self.covariance is not None:
+            x, y, heading = (math.sqrt(max(float(self.covariance[k, k]), 0.0)) for k in range(3))
+            std = [f" ± {x:.2g}", f" ± {y:.2g}", f" ± {math.degrees(heading):.2g}"]
+        return (
+            f"RobotPose(x {self.x_m:.4f}{std[0]} m, y {self.y_m:.4f}{std[1]} m,"
+            f" heading {math.degrees(self.heading_rad):.2f}{std[2]}°)"
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """Return position and heading as plain numbers, in degrees, for JSON; the covariance is in radians."""
         covariance = self.covariance

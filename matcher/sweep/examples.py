@@ -74,13 +74,13 @@ def sweep_frames(folder: str | os.PathLike[str], condition: int, trial: int) -> 
     most = plan.max_trials if plan.until_percent is not None else plan.trials
     if not 0 <= trial < (most or plan.trials):
         raise UsageError(f"{folder}: has trials 0 … {(most or plan.trials) - 1} of a condition, got {trial}")
-    job = _job(plan)
+    job = job_of_plan(plan)
     return job.raw_frames(condition, job.image(condition, job.views(condition, trial, trial + 1)), trial)
 
 
 def worst_examples(plan: SweepPlan, trials: SweepTrials, n: int) -> list[Example]:
     """Return pictures of the n worst trials of each method, one of a condition: the largest error over its bound."""
-    job = _job(plan)
+    job = job_of_plan(plan)
     error = trials.error
     examples = []
     for m, method in enumerate(plan.methods):
@@ -100,7 +100,8 @@ def worst_examples(plan: SweepPlan, trials: SweepTrials, n: int) -> list[Example
     return examples
 
 
-def _job(plan: SweepPlan) -> SweepJob:
+def job_of_plan(plan: SweepPlan) -> SweepJob:
+    """Return the first round of a sweep, which renders what its conditions show."""
     return SweepJob(plan, Round(0, tuple(range(len(plan.conditions()))), 0, plan.trials))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import os
 from collections.abc import Collection
@@ -14,11 +15,12 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
-from phasemark import UsageError
+from phasemark import InputFileError, UsageError
 from phasemark.data import BankPlan
 from phasemark.data.plans.bank_plan import MeshPlan, PlanModel, ScenePlan, common_symmetry, factored_refusal, read_plan
 from phasemark.data.plans.grid_axis import parse_grid
 from phasemark.data.seeds import stream
+from phasemark.inputs import MOST_TOML_BYTES, read_text
 from phasemark.landmarks import LandmarkSpec
 from phasemark.matcher.likelihood.images import LEVEL_VIEW, VIEW
 
@@ -395,7 +397,7 @@ def refuse_programs(plan: SweepPlan, trusted: Collection[str], where: str) -> No
 
 
 def read_sweep_plan(name_or_file: str | os.PathLike[str]) -> SweepPlan:
-    """Return a shipped plan, or read one from a TOML file.
+    """Return a shipped plan, or read one from a TOML file or from the ``plan.json`` of a sweep.
 
     Parameters
     ----------
@@ -408,7 +410,7 @@ def read_sweep_plan(name_or_file: str | os.PathLike[str]) -> SweepPlan:
     Raises
     ------
     InputFileError
-        The file cannot be read or is not TOML.
+        The file cannot be read, or is neither TOML nor the plan of a sweep.
     UsageError
         There is no such plan; or with one line that names the file, the key, the value and what would be right.
     """
@@ -418,4 +420,19 @@ def read_sweep_plan(name_or_file: str | os.PathLike[str]) -> SweepPlan:
             return read_plan(path, SweepPlan)
     if not (name.endswith(".toml") or Path(name).exists()):
         raise UsageError(f"unknown sweep '{name}': give {', '.join(SHIPPED_SWEEPS)}, or a .toml file")
-    return read_plan(Path(name), SweepPlan)
+    return stored_plan(Path(name)) if name.endswith(".json") else read_plan(Path(name), SweepPlan)
+
+
+def stored_plan(path: Path) -> SweepPlan:
+    """Read the plan that a sweep has written into its folder.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, or is no plan.
+    """
+    text = read_text(path, most_bytes=MOST_TOML_BYTES)
+    try:
+        return SweepPlan(**json.loads(text))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise InputFileError(f"{path}: cannot be read as the plan of a sweep ({error})") from None

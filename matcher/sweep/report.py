@@ -16,10 +16,13 @@ import numpy as np
 from phasemark.data.files.atomic_write import storage_errors, write_atomically
 from phasemark.data.files.folder_marker import OwnedFiles
 from phasemark.data.files.provenance import versions
+from phasemark.data.pages.figure_data import figure_csv
 from phasemark.data.pages.page import embedded_png, figure_png, page_template
 from phasemark.matcher.statistics import Interval
-from phasemark.matcher.sweep.examples import worst_examples
+from phasemark.matcher.sweep.answer import SAID, answer, answer_cells, card_of
+from phasemark.matcher.sweep.examples import job_of_plan, worst_examples
 from phasemark.matcher.sweep.figures.sheet import sweep_figures
+from phasemark.matcher.sweep.figures.style import COLUMN_NAME
 from phasemark.matcher.sweep.plan import SweepPlan
 from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, condition_axes
 from phasemark.matcher.sweep.run import read_plan_of, read_sweep, sweep_folder, write_cells
@@ -29,12 +32,7 @@ _MOST_ROWS = 80
 _READABLE_IN = 6.5
 """Wider figures keep their size on a phone, to be moved about."""
 _MOST_EXAMPLES = 8
-_SAID = {
-    "class_name": "{}", "distance_m": "D = {:g} m", "delta_deg": "δ = {:g}°", "noise_factor": "{:g} times the noise",
-    "n_frames": "{:g} frames", "bearing_deg": "a bearing of {:g}°", "height_m": "a height of {:g} m",
-    "pitch_deg": "a pitch of {:g}°", "albedo": "an albedo of {:g}", "wall_m": "a wall at {:g} m",
-    "wiggling": "wiggling of {:g}", "unit": "unit {:g}", "dimension_error": "dimensions off by {:g}",
-}  # fmt: skip
+_AGAIN = "Make this page again"
 _ALWAYS_SAID = ("class_name", "distance_m", "delta_deg", "noise_factor", "n_frames")
 _PARAMETERS = (("distance_m", "distance", " mm", 1e3), ("delta_rad", "angle", "°", 180 / math.pi))
 
@@ -75,28 +73,44 @@ def _write_report(ours: OwnedFiles) -> Path:
         (folder / "figures").mkdir(exist_ok=True)
     shown = []
     figures = list(sweep_figures(plan, trials, cells))
-    ours.claim(*(f"figures/{figure.name}.{kind}" for figure in figures for kind in ("png", "svg")))
+    ours.claim(*(f"figures/{figure.name}.{kind}" for figure in figures for kind in ("png", "svg", "csv")))
     for figure in figures:
         png, svg = figure_png(figure.figure), io.BytesIO()
         with matplotlib.rc_context({"svg.hashsalt": "phasemark"}):  # or the names inside would differ each time
             figure.figure.savefig(svg, format="svg", metadata={"Date": None})
-        for kind, content in (("png", png), ("svg", svg.getvalue())):
+        files = {"png": png, "svg": svg.getvalue(), "csv": figure_csv(figure.figure)}
+        for kind, content in files.items():
             write_atomically(folder / "figures" / f"{figure.name}.{kind}", content, force=True)
         wide = figure.figure.get_figwidth() > _READABLE_IN
         shown.append(
-            {"title": figure.title, "text": figure.text, "image": embedded_png(png, figure.title), "wide": wide}
+            {
+                "title": figure.title,
+                "text": figure.text,
+                "image": embedded_png(png, figure.title),
+                "wide": wide,
+                "data": f"figures/{figure.name}.csv",
+            }
         )
+    card = card_of(job_of_plan(plan), landmarks)
+    examples = _examples(plan, trials, ours)
     axes = condition_axes([cell.condition for cell in cells])
     page = page_template("phasemark.matcher.sweep", "page.html.j2").render(
         plan=plan,
+        answer=answer(landmarks),
+        card=None if card is None else f"{_first_class(landmarks)} {card.line()}",
         summary=summary(trials, cells),
+        contents=[*(one["title"] for one in shown), "Cells", "Worst trials", "Where this comes from", _AGAIN],
         figures=shown,
-        examples=_examples(plan, trials, folder),
-        header=(*axes, "method", "n", "D RMSE (mm)", "bound", "ratio", "δ RMSE (°)", "bound", "ratio", "outliers",
-                "class right", "NEES/p", "95 % coverage"),
+        examples=examples,
+        header=(
+            *(COLUMN_NAME[name] for name in axes), "method", "trials", "RMSE of D (mm)", "bound on D (mm)",
+            "RMSE / bound, D", "RMSE of δ (°)", "bound on δ (°)", "RMSE / bound, δ", "share of outliers",
+            "share of classes right", "NEES per parameter", "coverage of the 95 % ellipsoid",
+        ),
         rows=[_row(cell, axes) for cell in _worst_first(landmarks)[:_MOST_ROWS]],
         n_cells=len(landmarks),
         facts=_facts(plan, trials),
+        commands=_commands(plan, folder),
     )  # fmt: skip
     return write_atomically(folder / "report.html", page.encode(), force=True)
 
@@ -155,7 +169,7 @@ def _where(cell: Cell, cells: Sequence[Cell]) -> str:
         for name in axes
         if name in _ALWAYS_SAID or getattr(cell.condition, name) != getattr(first, name)
     ]
-    return ", ".join(_SAID[name].format(value) if name in _SAID else f"{name} = {value:g}" for name, value in values)
+    return ", ".join(SAID[name].format(value) if name in SAID else f"{name} = {value:g}" for name, value in values)
 
 
 def _badness(cell: Cell) -> float:
@@ -183,18 +197,36 @@ def _row(cell: Cell, axes: Sequence[str]) -> list[str]:
     return out
 
 
-def _examples(plan: SweepPlan, trials: SweepTrials, folder: Path) -> list[dict[str, Any]]:
+def _first_class(cells: Sequence[Cell]) -> str:
+    return answer_cells(cells)[0].condition.class_name
+
+
+def _commands(plan: SweepPlan, folder: Path) -> list[str]:
+    """Return what runs the sweep again into a new folder, and what writes this page from the trials that are there."""
     where = shlex.quote(str(folder))
+    run = f"phasemark sweep run {shlex.quote(str(folder / 'plan.json'))} --out {shlex.quote(f'{folder}-again')}"
+    trusted = " --trust-plan" if any(method.is_program for method in plan.methods) else ""
+    return [run + trusted, f"phasemark sweep report {where}"]
+
+
+def _examples(plan: SweepPlan, trials: SweepTrials, ours: OwnedFiles) -> list[dict[str, Any]]:
+    where = shlex.quote(str(ours.folder))
     of_each = max(1, _MOST_EXAMPLES // len(plan.methods))
-    return [
-        {
-            "title": f"{example.method}: condition {example.condition}, trial {example.trial}",
-            "text": example.text,
-            "image": embedded_png(figure_png(example.figure), example.text),
-            "command": f"phasemark sweep frames {where} {example.condition} {example.trial} -o frames.npz",
-        }
-        for example in worst_examples(plan, trials, of_each)
-    ]
+    shown: list[dict[str, Any]] = []
+    for example in worst_examples(plan, trials, of_each):
+        name = f"figures/worst-{len(shown) + 1}.csv"
+        ours.claim(name)
+        write_atomically(ours.folder / name, figure_csv(example.figure), force=True)
+        shown.append(
+            {
+                "title": f"{example.method}: condition {example.condition}, trial {example.trial}",
+                "text": example.text,
+                "image": embedded_png(figure_png(example.figure), example.text),
+                "data": name,
+                "command": f"phasemark sweep frames {where} {example.condition} {example.trial} -o frames.npz",
+            }
+        )
+    return shown
 
 
 def _facts(plan: SweepPlan, trials: SweepTrials) -> dict[str, Any]:

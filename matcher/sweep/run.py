@@ -25,9 +25,8 @@ from phasemark.data.progress import Progress
 from phasemark.data.shards.build import difference
 from phasemark.data.shards.remote import check_scheduler
 from phasemark.data.shards.run import outputs_of, produce
-from phasemark.inputs import MOST_TOML_BYTES, read_text
 from phasemark.matcher.sweep.job import FORMAT, SCHEMA_VERSION, Round, SweepJob, check_matcher
-from phasemark.matcher.sweep.plan import SweepPlan
+from phasemark.matcher.sweep.plan import SweepPlan, stored_plan
 from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, csv_bytes, trials_csv
 
 TRIALS_AT_ONCE = 50
@@ -35,7 +34,7 @@ TRIALS_AT_ONCE = 50
 _PLAN = "plan.json"
 _TABLES = ("trials.csv", "cells.csv", "sweep.json", "report.html")
 _OF_A_SWEEP = re.compile(
-    r"(plan\.json|trials\.csv|cells\.csv|sweep\.json|report\.html|figures/[\w-]+\.(png|svg)"
+    r"(plan\.json|trials\.csv|cells\.csv|sweep\.json|report\.html|figures/[\w-]+\.(png|svg|csv)"
     r"|trials-\d{3}\.h5(\.sha256|\.partial|\.manifest)?)"
 )
 
@@ -189,11 +188,7 @@ def _stored_plan(folder: Path) -> SweepPlan | None:
     path = folder / _PLAN
     if not os.path.lexists(path):
         return None
-    text = read_text(path, most_bytes=MOST_TOML_BYTES)
-    try:
-        return SweepPlan(**json.loads(text))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise InputFileError(f"{path}: cannot be read as the plan of a sweep ({error})") from None
+    return stored_plan(path)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD, Lens, chang
 from phasemark.render.sensor.sensor_checks import check_fields
 from phasemark.render.sensor.sensor_fields import CALIBRATION, OPTICS
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
+from phasemark.render.sensor.sources import without_sources
 
 # What is no error of a camera with taps, beside its optics.
 _WITHOUT_ERRORS = ("frame_rate_hz", "phase_interval_s", "contrast", "signal_e")
@@ -413,12 +414,28 @@ class Sensor(SensorQuantities):
         path = Path(path)
         table = read_toml(path)
         try:
-            sensor = cls(**table)
+            sensor = cls(**without_sources(table)[0])
             if sensor.lens is not None:
                 check_image_size(sensor.lens, sensor.rows, sensor.cols)
             return sensor
         except UsageError as error:
             raise UsageError(f"{path}: {error}") from None
+
+    def __repr__(self) -> str:
+        """Say in one line what kind of camera it is: pixels, field of view and modulation."""
+        view = f"{2 * self.half_angle_v_deg:.4g}° × {2 * self.half_angle_h_deg:.4g}°"
+        parts = [f"{self.rows} × {self.cols} pixels", view]
+        if self.kind == "direct":
+            parts.append("direct" if self.max_range_m is None else f"direct, up to {self.max_range_m:g} m")
+        else:
+            parts.append(f"{' + '.join(f'{hz / 1e6:g}' for hz in self.frequencies_hz)} MHz")
+        if self.lens is not None:
+            parts.append(f"lens {self.lens.model}")
+        return f"Sensor({', '.join(parts)})"
+
+    def __str__(self) -> str:
+        """Return :meth:`__repr__`."""
+        return repr(self)
 
     def optics_difference(self, other: Sensor) -> str | None:
         """Say in what the noise-free images of two cameras differ, e.g. ``'rows' is 16 here and 8 there``.

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
-from phasemark.inputs.toml_file import toml_value
+from phasemark import UsageError
+from phasemark.inputs.reading import MOST_TOML_BYTES, read_text
+from phasemark.inputs.toml_file import read_toml, toml_value
 from phasemark.render.sensor.histogram_fields import Histogram
 from phasemark.render.sensor.lens_fields import DERIVED, Lens
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.sensor_fields import TABLES
+from phasemark.render.sensor.sources import SOURCE_TABLE, kind_of_source, without_sources
 
-_MODELS: dict[str, type[BaseModel]] = {"lens": Lens, "histogram": Histogram}
+TABLE_MODELS: dict[str, type[BaseModel]] = {"lens": Lens, "histogram": Histogram}
+"""What a table of its own in a sensor file holds."""
 _DIGITS = 7  # of a number in a sensor file
 
 
 def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence[str], otherwise: str) -> str:
-    """Return a sensor as the text of a file that :meth:`Sensor.from_toml` reads.
+    """Return a sensor as the text of a file that :meth:`Sensor.from_toml` reads, with its table ``[source]``.
 
     Parameters
     ----------
@@ -35,6 +40,7 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
     tables = {name: fields.pop(name) for name in TABLES if name in fields}
     derived = DERIVED if sensor.lens is not None else ()
     lines = [f"# {line}" for line in header]
+    sources: dict[str, str] = {}
     for title, names in Sensor.field_groups().items():
         own = [
             name
@@ -47,13 +53,54 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
         if own:
             lines += ["", f"# {title}"]
         lines += [f"{name} = {toml_value(fields[name])}  # {comments.get(name, otherwise)}" for name in own]
+        sources |= {name: comments.get(name, otherwise) for name in own}
     for title, table in tables.items():
         lines += ["", f"[{title}]"]
         for name, value in table.items():
             comment = comments.get(f"{title}.{name}")
-            if comment is not None or (value is not None and value != _default_of(_MODELS[title], name)):
+            if comment is not None or (value is not None and value != _default_of(TABLE_MODELS[title], name)):
                 lines.append(f"{name} = {toml_value(value)}  # {comment or otherwise}")
+                sources[f"{title}.{name}"] = comment or otherwise
+    lines += source_lines({name: _as_source(text) for name, text in sources.items()})
     return "\n".join(lines) + "\n"
+
+
+def source_lines(sources: Mapping[str, str]) -> list[str]:
+    """Return the table ``[source]`` of a sensor file, an empty line before it; nothing if there is none."""
+    if not sources:
+        return []
+    keys = {name: f'"{name}"' if "." in name else name for name in sources}
+    return ["", f"[{SOURCE_TABLE}]", *(f"{keys[name]} = {toml_value(text)}" for name, text in sources.items())]
+
+
+def read_sources(path: str | Path) -> dict[str, str]:
+    """Return where the numbers of a sensor file come from, by field; empty if it does not say.
+
+    A file without the table ``[source]`` may say it in comments behind its numbers.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read or is not TOML.
+    UsageError
+        A source is of no field, or does not begin with measured, published or assumed.
+    """
+    path = Path(path)
+    table = read_toml(path)
+    if SOURCE_TABLE not in table:
+        stated = comments_of(read_text(path, most_bytes=MOST_TOML_BYTES))
+        return {name: text for name, text in stated.items() if kind_of_source(text) is not None}
+    try:
+        return without_sources(table)[1]
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
+
+
+def _as_source(comment: str) -> str:
+    """Return a comment as a source, which begins with one of three words."""
+    if kind_of_source(comment) is not None:
+        return comment
+    return f"{'measured' if 'measured' in comment or 'calibrated' in comment else 'assumed'}: {comment}"
 
 
 def rounded(value: Any) -> Any:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
@@ -28,6 +29,11 @@ from phasemark.matcher.sweep.figures.style import (
 from phasemark.matcher.sweep.plan import Method
 from phasemark.matcher.sweep.result_tables import Cell, SweepTrials
 
+RATIO_SPAN = (0.25, 4.0)
+"""Ends of the colours of a map of ratios, about 1 in the middle; what lies beyond has the colour of the end."""
+RATIO_TICKS = (0.25, 0.5, 1.0, 2.0, 4.0)
+RATIO_DARK = 2.4
+"""From this factor on the colours are dark, and numbers on them white."""
 _BINS = 10
 _APART, _BESIDE = 0.08, 0.3
 """How far apart methods stand where an axis has nothing between its values, and how far the bound is drawn there."""
@@ -95,18 +101,30 @@ def maps(cells: Sequence[Cell], quantity: str) -> Figure:
                     for d in y
                 ]
             )
-            shown = panel.imshow(table, aspect="auto", origin="lower", cmap="cividis")
+            if quantity == "ratio":  # a scale of its own would spend all its contrast on 0.97 … 1.02
+                low, high = RATIO_SPAN
+                shown = panel.imshow(table, aspect="auto", origin="lower", cmap="RdBu_r", norm=LogNorm(low, high))
+            else:
+                shown = panel.imshow(table, aspect="auto", origin="lower", cmap="cividis")
             middle = np.nanmean([np.nanmin(table), np.nanmax(table)]) if np.isfinite(table).any() else 0.0
             for i, j in np.ndindex(table.shape):
                 if math.isfinite(table[i, j]):
-                    colour = "white" if table[i, j] < middle else "black"
+                    if quantity == "ratio":
+                        ratio = max(float(table[i, j]), 1e-9)
+                        colour = "white" if max(ratio, 1 / ratio) > RATIO_DARK else "black"
+                    else:
+                        colour = "white" if table[i, j] < middle else "black"
                     panel.text(j, i, f"{table[i, j]:.3g}", ha="center", va="center", color=colour, fontsize=7)
             panel.set_xticks(range(len(x)), [f"{a:g}" for a in x])
             panel.set_yticks(range(len(y)), [f"{d:g}" for d in y])
             panel.set_xlabel(AXIS_LABEL["delta_deg"])
             panel.set_ylabel(AXIS_LABEL["distance_m"])
             panel.set_title(f"{as_written(method)}: {label}", fontsize=9)
-            figure.colorbar(shown, ax=panel, label="RMSE / bound" if quantity == "ratio" else f"RMSE ({unit})")
+            if quantity == "ratio":
+                bar = figure.colorbar(shown, ax=panel, label="RMSE / bound", extend="both")
+                logarithmic(bar.ax.yaxis, RATIO_TICKS)
+            else:
+                figure.colorbar(shown, ax=panel, label=f"RMSE ({unit})")
     return figure
 
 

@@ -45,7 +45,12 @@ def _error_figures(plan: SweepPlan, trials: SweepTrials, cells: Sequence[Cell]) 
         )
     if {"distance_m", "delta_deg"} <= set(axes) and plan.design == "grid":
         for quantity, title, text in (
-            ("ratio", "Error over bound, by distance and angle", "1 is the best an unbiased method can do."),
+            (
+                "ratio",
+                "Error over bound, by distance and angle",
+                "1 is the best an unbiased method can do. The colours are the same in every report, from a quarter to "
+                "four times.",
+            ),
             ("rmse", "Error by distance and angle", "Root mean square error without outliers."),
         ):
             yield SweepFigure(

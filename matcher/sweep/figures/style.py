@@ -28,6 +28,8 @@ AXIS_LABEL = {
     "albedo": "albedo", "wall_m": "wall (m)", "wiggling": "wiggling, relative to square against square",
     "unit": "unit, with its fixed pattern", "dimension_error": "relative error of the dimensions",
 }  # fmt: skip
+COLUMN_NAME = {**AXIS_LABEL, "class_name": "class"}
+"""What a table calls an axis of a design."""
 LOGARITHMIC = ("distance_m", "noise_factor", "n_frames", "albedo")
 NOMINAL = ("unit", "wall_m")
 """Axes whose values lie beside one another without anything between them; 0 stands for none."""

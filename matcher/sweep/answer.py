@@ -1,0 +1,126 @@
+"""What a sweep's page says first: how accurate the best method is in the middle of the design, and its bound."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+
+import numpy as np
+
+from phasemark.landmarks import mesh_symmetry
+from phasemark.matcher.accuracy.accuracy_card import AccuracyCard, accuracy_card, sides_of
+from phasemark.matcher.sweep.job import SweepJob
+from phasemark.matcher.sweep.result_tables import Cell, condition_axes
+from phasemark.render import Renderer
+from phasemark.render.view import delta_period_rad
+
+SAID = {
+    "class_name": "{}", "distance_m": "D = {:g} m", "delta_deg": "δ = {:g}°", "noise_factor": "{:g} times the noise",
+    "n_frames": "{:g} frames", "bearing_deg": "a bearing of {:g}°", "height_m": "a height of {:g} m",
+    "pitch_deg": "a pitch of {:g}°", "albedo": "an albedo of {:g}", "wall_m": "a wall at {:g} m",
+    "wiggling": "wiggling of {:g}", "unit": "unit {:g}", "dimension_error": "dimensions off by {:g}",
+}  # fmt: skip
+"""A condition in words, by the name of its axis."""
+_POOLED = ("class_name", "distance_m", "delta_deg")
+
+
+def answer_cells(cells: Sequence[Cell]) -> list[Cell]:
+    """Return the cells that a page answers with: one method's, of all classes and angles, at one distance.
+
+    The distance is the middle one of the design, the other axes are at their first values, and the method is the one
+    whose errors are nearest to the bound there. The error itself would favour a method that answers with grid points,
+    which may be nearer to the truth than what the frames tell.
+
+    Parameters
+    ----------
+    cells : sequence of Cell
+        Of landmarks, no strangers.
+
+    Returns
+    -------
+    list of Cell
+        Empty if no method found distance and angle in such a cell.
+    """
+    if not cells:
+        return []
+    first = cells[0].condition
+    others = [field.name for field in fields(first) if field.name not in _POOLED]
+    plain = [one for one in cells if all(getattr(one.condition, name) == getattr(first, name) for name in others)]
+    distances = sorted({one.condition.distance_m for one in plain})
+    middle = distances[len(distances) // 2]
+    by_method: dict[str, list[Cell]] = {}
+    for one in plain:
+        if one.condition.distance_m == middle and _found(one):
+            by_method.setdefault(one.method, []).append(one)
+    return min(by_method.values(), key=_badness, default=[])
+
+
+def answer(cells: Sequence[Cell]) -> str:
+    """Say in one sentence how accurate the best method is in the middle of the design.
+
+    Parameters
+    ----------
+    cells : sequence of Cell
+        Of landmarks, no strangers.
+    """
+    own = answer_cells(cells)
+    if not own:
+        return "No method found distance and angle in the middle of the design."
+    condition = own[0].condition
+    axes = [name for name in condition_axes([one.condition for one in cells]) if name not in _POOLED]
+    where = ", ".join(SAID[name].format(getattr(condition, name)) for name in axes)
+    trials = sum(one.n for one in own)
+    right = sum(round(one.class_right.value * one.n) for one in own)
+    lost = sum(round(one.outliers.value * one.answered.value * one.n) for one in own if one.answered.value)
+    return (
+        f"At {condition.distance_m:g} m{f' ({where})' if where else ''} you get"
+        f" {1e3 * _rms([one.rmse['distance_m'].value for one in own]):.2g} mm and"
+        f" {math.degrees(_rms([one.rmse['delta_rad'].value for one in own])):.2g}° (1 σ) with {own[0].method}; class"
+        f" right {100 * right / trials:.4g} % of {trials} trials{f', {lost} outliers left out' if lost else ''}."
+    )
+
+
+def card_of(job: SweepJob, cells: Sequence[Cell]) -> AccuracyCard | None:
+    """Return the bound at the condition of :func:`answer`, from all sides, for the first class of it; None without one.
+
+    Parameters
+    ----------
+    job : SweepJob
+        What renders the conditions.
+    cells : sequence of Cell
+        Of landmarks, no strangers.
+    """
+    own = answer_cells(cells)
+    if not own:
+        return None
+    number, condition = own[0].number, own[0].condition
+    sensor = job.believed_sensor(number)
+    period = delta_period_rad(mesh_symmetry(job.objects[condition.class_name].mesh))
+    others = {
+        name: Renderer(job.objects[name].mesh, sensor, albedo=condition.albedo)
+        for name in job.class_names
+        if name != condition.class_name
+    }
+    return accuracy_card(
+        job.renderer(number, sensor),
+        sides_of(condition.distance_m, period),
+        others=others,
+        n_frames=condition.n_frames,
+        background=job.background(number),
+    )
+
+
+def _found(cell: Cell) -> bool:
+    """Return whether a method has an error of distance and of angle."""
+    return all(name in cell.rmse and math.isfinite(cell.rmse[name].value) for name in ("distance_m", "delta_rad"))
+
+
+def _badness(cells: Sequence[Cell]) -> float:
+    """Return the larger of the ratios of distance and angle to the bound, pooled; infinite where there is no bound."""
+    ratios = [_rms([one.ratio[name].value for one in cells]) for name in ("distance_m", "delta_rad")]
+    return max(ratios) if all(map(math.isfinite, ratios)) else math.inf
+
+
+def _rms(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
