@@ -4,6 +4,7 @@ import contextlib
 import csv
 import importlib
 import io
+import json
 import os
 import runpy
 import subprocess
@@ -254,6 +255,49 @@ def test_every_example_explains_itself(path, tmp_path):
     done = run_example(path.name, "--help", folder=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "usage:" in done.stdout
+
+
+def written_match(path, **changes):
+    """Write what `phasemark match --json` prints of a pose of three numbers, heights and pitches trading."""
+    covariance = [[1e-6, 0, 0], [0, 4e-6, -3e-6], [0, -3e-6, 4e-6]]
+    match = {
+        "accepted": True, "free": ["distance_m", "height_m", "pitch_rad"], "covariance": covariance,
+        "distance_m": 1.02, "height_m": 0.01, "pitch_deg": 2.0, **changes,
+    }  # fmt: skip
+    path.write_text(json.dumps({"matches": [match]}))
+    return path
+
+
+def test_a_pose_is_printed_with_its_standard_deviations_and_drawn(tmp_path):
+    done = run_example("camera_to_pose.py", written_match(tmp_path / "pose.json"), folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = [line.split() for line in done.stdout.splitlines()]
+    assert lines[:2] == [["D", "1020.000", "±", "1", "mm"], ["height", "10.000", "±", "2", "mm"]]
+    assert lines[2] == ["pitch", "2.000", "±", "0.11", "°"]  # 2 mrad
+    assert (tmp_path / "out" / "pose.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("D = 1", "not what phasemark match --json prints"),
+        ('{"matches": 3}', "not what phasemark match --json prints"),
+        ('{"matches": []}', "no match was accepted"),
+    ],
+)
+def test_a_file_without_a_pose_is_refused_in_one_line(tmp_path, text, part):
+    (tmp_path / "pose.json").write_text(text)
+    done = run_example("camera_to_pose.py", "pose.json", folder=tmp_path)
+    assert done.returncode == 3
+    assert part in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_pose_without_a_covariance_is_refused_in_one_line(tmp_path):
+    path = written_match(tmp_path / "pose.json", covariance=None)
+    done = run_example("camera_to_pose.py", path, folder=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert "give --method refine" in done.stderr
 
 
 def test_a_part_from_cad_is_found_in_its_own_bank(tmp_path):

@@ -200,7 +200,7 @@ def sensor_import(
     """Make a sensor file from the intrinsics that ROS or OpenCV calibrated."""
     from phasemark.data.files.atomic_write import write_atomically
     from phasemark.render.sensor.camera_info import read_camera_info
-    from phasemark.render.sensor.lens_fields import DERIVED
+    from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD
     from phasemark.render.sensor.sensor_fields import TABLES
     from phasemark.render.sensor.sensor_file import sensor_toml
 
@@ -216,6 +216,7 @@ def sensor_import(
     fields = {name: value for name, value in base.model_dump().items() if name not in (*DERIVED, *TABLES)}
     if base.histogram is not None:
         raise UsageError(f"--like must be a camera without [histogram], got '{like}': zones have no lens of this kind")
+    fields |= base.calibration_without(lambda name: name.startswith(LENS_FIELD) or name in DERIVED)
     sensor = type(base)(**{**fields, **changes, "rows": found.rows, "cols": found.cols, "lens": found.lens})
     origin = readable(str(like))
     stated = {k: f"{v} ({origin})" for k, v in read_sensor_sources(like).items() if k in type(base).model_fields}

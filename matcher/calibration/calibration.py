@@ -22,7 +22,15 @@ from phasemark.data.progress import Progress, counter
 from phasemark.matcher.calibration.judgement import doubts_about, likely_cause
 from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
 from phasemark.matcher.calibration.mounting_fit import Fit, Knowledge, Place
-from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel, Mounting
+from phasemark.matcher.calibration.mounting_model import (
+    ALL_NAMES,
+    HALF_ANGLES,
+    MOUNTING_NAMES,
+    NAMES,
+    PARAMETERS,
+    CalibrationModel,
+    Mounting,
+)
 from phasemark.matcher.calibration.notes import advice, named, observability_notes, odd_pose_notes
 from phasemark.matcher.calibration.pose_errors import estimate_pose_std
 from phasemark.matcher.calibration.pose_track import LONGEST_GAP_S, PoseTrack
@@ -42,6 +50,7 @@ from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.pixel_agreement import MIN_RETURNS
 from phasemark.render import Background, Frames, Sensor
 from phasemark.render.phasor_images import wrap_difference_m, wrap_range_m
+from phasemark.render.sensor.lens_fields import DERIVED, TERMS, Lens
 from phasemark.render.sensor.sensor_file import rounded
 
 FEWEST_POSES = 3
@@ -90,20 +99,76 @@ _UNITS = {
 }
 
 
-def check_names(names: Sequence[str], what: str) -> tuple[str, ...]:
-    """Return names of parameters in their order; ``fov`` stands for both half angles.
+def check_names(names: Sequence[str], what: str, lens: Lens | None = None) -> tuple[str, ...]:
+    """Return names of parameters in their order; ``fov`` stands for both half angles, ``lens`` for all of a lens.
+
+    Parameters
+    ----------
+    names : sequence of str
+    what : str
+        Name of the argument, for messages.
+    lens : Lens, optional
+        That of the camera.
 
     Raises
     ------
     UsageError
-        A name is unknown.
+        A name is unknown, or means what this camera has not.
     """
+    groups = {"fov": HALF_ANGLES, "lens": () if lens is None else tuple(lens.terms)}
     spelled: set[str] = set()
     for name in names:
-        spelled |= {"half_angle_h", "half_angle_v"} if name == "fov" else {name}
-        if name != "fov" and name not in ALL_NAMES:
-            raise UsageError(f"{what} must be among {', '.join(ALL_NAMES)} and fov (both half angles), got {name!r}")
+        if name not in groups and name not in ALL_NAMES:
+            raise UsageError(
+                f"{what} must be among {', '.join(MOUNTING_NAMES)} and fov (both half angles), or the terms of a lens"
+                f" {', '.join(TERMS)} and lens (all of them), got {name!r}"
+            )
+        _check_lens_name(name, what, lens)
+        spelled |= set(groups.get(name, (name,)))
     return tuple(name for name in ALL_NAMES if name in spelled)
+
+
+def _check_lens_name(name: str, what: str, lens: Lens | None) -> None:
+    """Refuse a half angle of a camera with a lens, and a term of a lens that the camera has not."""
+    if lens is None:
+        if name == "lens" or name in TERMS:
+            raise UsageError(
+                f"{what}: {name!r} belongs to a sensor with a lens, and this one has none: give it a table [lens] in"
+                " its sensor file ('phasemark sensor import CAMERA_INFO' writes one)"
+            )
+    elif name == "fov" or name in HALF_ANGLES:
+        raise UsageError(
+            f"{what}: {name!r} follows from the lens of this sensor: name its terms instead, {', '.join(lens.terms)} or"
+            " lens (all of them)"
+        )
+    elif name in TERMS and name not in lens.terms:
+        raise UsageError(
+            f"{what}: the lens of this sensor has no {name!r}: it has {', '.join(lens.terms)}; state the coefficient in"
+            " 'lens.distortion', 0 if it is not known"
+        )
+
+
+def _assumed(start: Mounting | None, sensor: Sensor, albedo: float) -> Mounting:
+    """Return the initial guess of the mounting, with the lens of the sensor unless it states its own.
+
+    Raises
+    ------
+    UsageError
+        Its lens is of another kind than that of the sensor, or not for this image.
+    """
+    if start is None:
+        return Mounting.of_sensor(sensor, albedo)
+    if start.lens is None:
+        return start if sensor.lens is None else replace(start, lens=sensor.lens)
+    start.on(sensor)
+    assert sensor.lens is not None
+    if (start.lens.model, tuple(start.lens.terms)) != (sensor.lens.model, tuple(sensor.lens.terms)):
+        raise UsageError(
+            "'start' must have a lens of the model and with the number of coefficients of the sensor's,"
+            f" '{sensor.lens.model}' with {len(sensor.lens.distortion)}, got '{start.lens.model}' with"
+            f" {len(start.lens.distortion)}"
+        )
+    return start
 
 
 def filter_poses(frames: Sequence[Frames], on: ResidualKind | Literal["auto"] = "auto") -> FilteredFrames:
@@ -191,8 +256,9 @@ def calibrate(
         :func:`~phasemark.matcher.phasor_mean`.
     poses : KnownPoses
     free : sequence of str, optional
-        What to estimate, :data:`NAMES`; None: all of it. On ranges the albedo is told only by pixels that mix the
-        landmark with a background of known albedo, and left out where there is none.
+        What to estimate: :data:`NAMES`, and of a sensor with a lens fx, fy, cx, cy and the coefficients that it states
+        (all of them: ``lens``) in place of half angles. None: all of it but the lens. On ranges the albedo is told only
+        by pixels that mix the landmark with a background of known albedo, and left out where there is none.
     fixed : sequence of str
         What of that to leave as it is.
     start : Mounting, optional
@@ -241,7 +307,10 @@ def calibrate(
     if zones and sensor.kind != "direct":
         raise UsageError("offsets of zones belong to sensors of 'kind' = 'direct'")
     quantity: ResidualKind = ("phasors" if has_light and not recorded else "ranges") if on == "auto" else on
-    names = (ALL_NAMES if moving else NAMES) if free is None else check_names(free, "'free'")
+    lens = sensor.lens
+    names = (MOUNTING_NAMES if moving else NAMES) if free is None else check_names(free, "'free'", lens)
+    if lens is not None:
+        names = tuple(name for name in names if name not in HALF_ANGLES)
     if "delay" in names and not moving:
         raise UsageError("the delay takes a moving camera: give moving=True, and time stamps of frames and poses")
     if recorded:
@@ -254,9 +323,9 @@ def calibrate(
     if free is None and not lit:
         names = tuple(name for name in names if name != "albedo")
     sensor.refuse_several_frequencies("a calibration")
-    kept = check_names(fixed, "'fixed'")
+    kept = check_names(fixed, "'fixed'", lens)
     names = tuple(name for name in names if name not in kept)
-    assumed = start or Mounting.of_sensor(sensor, albedo)
+    assumed = _assumed(start, sensor, albedo)
     z = sensor.quantity == "z" if reports_z is None else reports_z
     rendered = counter(progress, _USUAL_RENDERINGS)
     if recorded:
@@ -300,7 +369,7 @@ def calibrate(
     _check_observable(knowledge.information, fit, poses)
     found = _concluded(fit, place, knowledge, frames, assumed, edges, estimated)
     held_out = _leave_one_out(fit, place, found)
-    doubts = doubts_about(place.theta, assumed.vector, names, held_out)
+    doubts = doubts_about(place.theta, assumed.vector, names, held_out, scale=model.scale)
     cause = ""
     if doubts:
         job = _Job(mesh, background, assumed, tuple(n for n in names if n != "albedo"), z, False, workers, rendered)
@@ -473,7 +542,7 @@ def _from_recording(job: _Job, frames: FilteredFrames, poses: KnownPoses, moving
         )
     untold = [
         name for name, one in zip(job.names, std, strict=True)
-        if one > _FROM_PRIOR * prior_std(name, job.assumed.vector)
+        if one > _FROM_PRIOR * prior_std(name, job.assumed.vector, recording.model.scale)
     ]  # fmt: skip
     if untold:
         notes.append(
@@ -481,11 +550,13 @@ def _from_recording(job: _Job, frames: FilteredFrames, poses: KnownPoses, moving
             " the standard deviations shown."
         )
     notes += _recording_notes(found, left_out)
-    doubts = doubts_about(found.theta, job.assumed.vector, job.names, found.held_out_m, left_out)
+    doubts = doubts_about(
+        found.theta, job.assumed.vector, job.names, found.held_out_m, left_out, scale=recording.model.scale
+    )
     if moving and "delay" not in job.names:
         doubts += _delay_doubts(job, frames, poses, recording, track)
     cause = _cause(job, frames, poses, recording.edges, track) if doubts else ""
-    mounting = Mounting.of_vector(found.theta)
+    mounting = recording.model.mounting(found.theta)
     if moving and track is not None and frames.time_s is not None:
         poses = _poses_at(track, frames.time_s + mounting.delay_s)
     beside = found.residual_m - _of_pose_errors(recording, found)
@@ -830,7 +901,7 @@ def _concluded(
         k = int(np.flatnonzero(pose_residuals == 0)[0])
         notes.append(f"{unseen} of {len(poses)} poses tell nothing: no pixel counts, first at {poses.where(k)}.")
     notes += observability_notes(fit.free, covariance, fit.scale, poses)
-    mounting = Mounting.of_vector(place.theta)
+    mounting = model.mounting(place.theta)
     if mounting.albedo > 1 and "albedo" in fit.free:
         notes.append(
             f"An albedo of {mounting.albedo:.3g} cannot be: signal_e of the sensor is too low, or the amplitudes are"
@@ -873,7 +944,8 @@ def _calibrated(
 ) -> Sensor:
     """Return a sensor with its mounting and what is common to all its frames: the covariance of what was estimated.
 
-    What an earlier calibration estimated and this one left stays, uncorrelated with the rest.
+    What an earlier calibration estimated and this one left stays, uncorrelated with the rest; not half angles beside
+    terms of a lens, from which they follow.
     """
     there = _mounted(sensor, mounting, free)
     known = [name for name in free if PARAMETERS[name].field is not None]
@@ -881,7 +953,8 @@ def _calibrated(
     unit = np.array([PARAMETERS[name].shown if PARAMETERS[name].unit == "°" else 1.0 for name in known])
     index = [list(free).index(name) for name in known]
     own = covariance[np.ix_(index, index)] * np.outer(unit, unit)
-    older = [k for k, name in enumerate(sensor.calibration_fields) if name not in fields]
+    replaced = {*fields, *(DERIVED if set(free) & set(TERMS) else ())}
+    older = [k for k, name in enumerate(sensor.calibration_fields) if name not in replaced]
     n = len(fields)
     whole = np.zeros((n + len(older), n + len(older)))
     whole[:n, :n] = (own + own.T) / 2
@@ -905,8 +978,12 @@ def _mounted(sensor: Sensor, mounting: Mounting, free: Sequence[str]) -> Sensor:
     """Return a sensor with the fields that were estimated, or stated anew, to the digits of a sensor file."""
     there, before = mounting.on(sensor), Mounting.of_sensor(sensor, mounting.albedo)
     changed = [
-        parameter.field
+        name
         for name, parameter in PARAMETERS.items()
-        if name in free or getattr(mounting, parameter.attribute) != getattr(before, parameter.attribute)
+        if parameter.field is not None and (name in free or mounting.number(name) != before.number(name))
     ]
-    return sensor.with_(**{field: rounded(getattr(there, field)) for field in changed if field is not None})
+    if sensor.lens is not None:
+        changed = [name for name in changed if name not in HALF_ANGLES]
+    return sensor.with_numbers(
+        {field: rounded(there.number(field)) for field in (str(PARAMETERS[name].field) for name in changed)}
+    )

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.calibration.mounting_model import ALL_NAMES, PARAMETERS, clipped
+from phasemark.matcher.calibration.mounting_model import ALL_NAMES, PARAMETERS, SCALE, clipped
 from phasemark.matcher.calibration.notes import TITLES
 from phasemark.matcher.calibration.recording_fit import prior_std
 
@@ -28,18 +28,22 @@ def doubts_about(
     free: Iterable[str],
     held_out_m: tuple[float, float],
     left_out: float = 0.0,
+    *,
+    scale: NDArray[np.float64] = SCALE,
 ) -> list[str]:
     """Say why a calibration cannot be trusted.
 
     Parameters
     ----------
-    theta, assumed : (9,) float64
+    theta, assumed : (21,) float64
         What was found, and what was assumed.
     free : iterable of str
     held_out_m : (before, after)
         Root mean square of held-out residuals, metres; NaN where it is not known.
     left_out : float
         Share of the pixels on the landmark that disagreed.
+    scale : (21,) float64
+        Natural units.
 
     Returns
     -------
@@ -51,11 +55,11 @@ def doubts_about(
         if name == "albedo":
             continue
         k, parameter = ALL_NAMES.index(name), PARAMETERS[name]
-        std = prior_std(name, assumed)
+        std = prior_std(name, assumed, scale)
         moved = theta[k] - assumed[k]
         at_bound = clipped(theta + 1e-9 * np.sign(moved))[k] != theta[k] + 1e-9 * np.sign(moved)
         if abs(moved) > TRUSTED * std or at_bound:
-            space = " " if parameter.unit[0] == "m" else ""
+            space = "" if parameter.unit in ("", "°") else " "
             doubts.append(
                 f"the {TITLES[name]} ran to {parameter.shown * theta[k]:.3g}{space}{parameter.unit}, more than"
                 f" {parameter.shown * TRUSTED * std:.3g}{space}{parameter.unit} from the assumed"

@@ -25,11 +25,8 @@ from scipy import ndimage
 from phasemark.matcher.calibration.mounting_model import (
     ALL_NAMES,
     LONGEST_STEP,
-    SCALE,
-    STEP,
     CalibrationModel,
     Images,
-    clipped,
 )
 from phasemark.matcher.calibration.registration import OUTLINE, register
 from phasemark.matcher.information import covariance_of
@@ -69,7 +66,7 @@ class Place:
 
     Parameters
     ----------
-    theta : (9,) float64
+    theta : (21,) float64
         Mounting, in the order of :data:`~phasemark.matcher.calibration.mounting_model.ALL_NAMES`.
     u : (K, q) float64
         Errors of the poses, of unit variance each.
@@ -193,7 +190,7 @@ class Fit:
     ) -> None:
         self.model, self.evidence, self.free = model, evidence, tuple(free)
         self.columns = np.array([ALL_NAMES.index(name) for name in free])
-        self.scale = SCALE[self.columns]
+        self.scale = model.scale[self.columns]
         k = len(evidence.weight)
         self.factor = np.zeros((k, 3, 0)) if factor is None else factor
         self.edges = edges
@@ -250,7 +247,7 @@ class Fit:
 
         Parameters
         ----------
-        theta : (9,) float64
+        theta : (21,) float64
         use : (K, pixels) bool
         shift : (K, 3) float64, optional
             Errors of the poses to start from; None: none.
@@ -364,12 +361,13 @@ class Fit:
     def _linearise_wide(self, place: Place, widths: Sequence[float] = (1.0,)) -> _Linear:
         """Take slopes over multiples of the standard deviations that slopes at the place give."""
         narrow = self._linearise(place)
+        scale = self.model.scale
         std = np.zeros(len(ALL_NAMES))
         std[self.columns] = np.sqrt(np.diag(covariance_of(narrow.information, self.scale, weak="wide")))
         std[ALL_NAMES.index("range_offset")] = 0.0  # its slope is exact
-        if (max(widths) * std <= STEP).all():
+        if (max(widths) * std <= self.model.step).all():
             return narrow
-        return self._linearise(place, *(np.minimum(width * np.nan_to_num(std), 0.5 * SCALE) for width in widths))
+        return self._linearise(place, *(np.minimum(width * np.nan_to_num(std), 0.5 * scale) for width in widths))
 
     def _descend(self, place: Place) -> Place:
         """Run Levenberg–Marquardt; slopes, which cost most, are taken anew when following them leads no farther."""
@@ -410,9 +408,10 @@ class Fit:
         own_gradient: NDArray[np.float64],
         step: NDArray[np.float64],
     ) -> Place:
-        theta = place.theta.copy()
-        theta[self.columns] += step
-        return self._at(clipped(theta), place.u + linear.own_step(own_gradient, step), place.use)
+        whole = np.zeros(len(ALL_NAMES))
+        whole[self.columns] = step
+        theta = self.model.moved(place.theta, whole)
+        return self._at(theta, place.u + linear.own_step(own_gradient, step), place.use)
 
     def _lower(self, place: Place) -> Place:
         """Descend from the best places within six standard deviations along what the poses tell least."""

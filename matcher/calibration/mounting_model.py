@@ -3,6 +3,7 @@
 The mounting is nine numbers, :class:`Mounting`. Four of them turn or widen the camera itself (pitch, roll and both
 half angles), two move the landmark in its image (height and bearing), one delays the light (range offset), one the time
 stamps (delay, for a moving camera), and one is the brightness of the landmark (albedo), which is not the camera's.
+Where the camera has a lens, its terms follow these nine, and both half angles follow from it.
 """
 
 from __future__ import annotations
@@ -16,10 +17,13 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from phasemark import UsageError
 from phasemark.matcher.calibration.known_poses import KnownPoses
+from phasemark.matcher.calibration.lens_terms import farthest_lens, lens_of, natural_units, numbers_of
 from phasemark.matcher.calibration.pose_track import PoseTrack
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
+from phasemark.render.sensor.lens_fields import LENS_FIELD, TERMS, Lens
 
 
 @dataclass(frozen=True)
@@ -30,10 +34,11 @@ class Parameter:
     ----------
     name : str
         As options have it, e.g. ``pitch``.
-    attribute : str
-        Of :class:`Mounting`, with its unit inside the program.
+    attribute : str, optional
+        Of :class:`Mounting`, with its unit inside the program; None: a term of its lens.
     scale : float
-        Its natural unit: 1°, 1 cm, a tenth of albedo; what steps and conditions are told in.
+        Its natural unit: 1°, 1 cm, a tenth of albedo; what steps and conditions are told in. That of a term of a lens
+        depends on the image, see :attr:`CalibrationModel.scale`.
     shown : float
         Multiplies it for people: degrees, millimetres.
     unit : str
@@ -43,7 +48,7 @@ class Parameter:
     """
 
     name: str
-    attribute: str
+    attribute: str | None
     scale: float
     shown: float
     unit: str
@@ -63,22 +68,30 @@ PARAMETERS = {
         Parameter("range_offset", "range_offset_m", _CM, 1e3, "mm", "range_offset_m"),
         Parameter("albedo", "albedo", 0.1, 1.0, "", None),
         Parameter("delay", "delay_s", 0.01, 1e3, "ms", "delay_s"),
+        *(
+            Parameter(name, None, 1.0, 1.0, "px" if name in ("fx", "fy", "cx", "cy") else "", LENS_FIELD + name)
+            for name in TERMS
+        ),
     )
 }
 """What a calibration can estimate, by name."""
 ALL_NAMES = tuple(PARAMETERS)
 """The order of the parameter vector."""
-NAMES = ALL_NAMES[:-1]
+MOUNTING_NAMES = tuple(name for name in ALL_NAMES if name not in TERMS)
+"""All but the terms of a lens, which follow in the vector."""
+HALF_ANGLES = ("half_angle_h", "half_angle_v")
+NAMES = MOUNTING_NAMES[:-1]
 """What frames from still poses can tell; the delay takes a moving camera."""
 SCALE = np.array([parameter.scale for parameter in PARAMETERS.values()])
-"""Natural units, in the order of :data:`ALL_NAMES`."""
+"""Natural units, in the order of :data:`ALL_NAMES`; 1 for the terms of a lens."""
 LONGEST_STEP = 1.0
 """No descent steps farther at once, in natural units: slopes jump where edges pass corners of pixels."""
 STEP = 2e-4
 """Half the width of a difference, radians or metres: 1/60 of a pixel, wide enough to average what jumps where an edge
 passes a corner of a pixel, narrow enough to be the slope."""
-_LEAST = np.array([-0.75, -0.75, -2.0, -1.2, 0.01, 0.01, -np.inf, 1e-3, -10.0])
-_MOST = np.array([0.75, 0.75, 2.0, 1.2, 1.4, 1.4, np.inf, np.inf, 10.0])
+_LENS = np.full(len(TERMS), np.inf)
+_LEAST = np.array([-0.75, -0.75, -2.0, -1.2, 0.01, 0.01, -np.inf, 1e-3, -10.0, *-_LENS])
+_MOST = np.array([0.75, 0.75, 2.0, 1.2, 1.4, 1.4, np.inf, np.inf, 10.0, *_LENS])
 POSE = ("distance_m", "delta_rad", "bearing_rad")
 """What of a pose may be uncertain."""
 
@@ -101,6 +114,8 @@ class Mounting:
         Of the landmark.
     delay_s : float
         Added to the stamp of a frame to get the time at which the camera was where the frame shows it.
+    lens : Lens, optional
+        Of the camera; then both half angles follow from it. None: the ideal lens.
     """
 
     pitch_rad: float
@@ -112,6 +127,7 @@ class Mounting:
     range_offset_m: float
     albedo: float
     delay_s: float = 0.0
+    lens: Lens | None = None
 
     @classmethod
     def of_sensor(cls, sensor: Sensor, albedo: float) -> Mounting:
@@ -126,30 +142,67 @@ class Mounting:
             sensor.range_offset_m,
             albedo,
             sensor.delay_s,
+            sensor.lens,
         )
 
     @classmethod
-    def of_vector(cls, theta: NDArray[np.float64]) -> Mounting:
-        """Take numbers in the order of :data:`ALL_NAMES`."""
-        return cls(*theta.tolist())
+    def of_vector(cls, theta: NDArray[np.float64], sensor: Sensor) -> Mounting:
+        """Take numbers in the order of :data:`ALL_NAMES`.
+
+        Parameters
+        ----------
+        theta : (21,) float64
+        sensor : Sensor
+            Whose kind of lens the terms belong to, if it has one.
+
+        Raises
+        ------
+        UsageError
+            The terms make no lens.
+        ValueError
+            The lens folds inside the image.
+        """
+        mounting = cls(*theta[: len(MOUNTING_NAMES)].tolist())
+        if sensor.lens is None:
+            return mounting
+        lens = lens_of(sensor.lens, theta[len(MOUNTING_NAMES) :])
+        across, along = lens.before(sensor.rows, sensor.cols).tan_half_angles
+        return replace(mounting, half_angle_h_rad=math.atan(across), half_angle_v_rad=math.atan(along), lens=lens)
 
     @property
     def vector(self) -> NDArray[np.float64]:
-        """The numbers in the order of :data:`ALL_NAMES`, (9,)."""
-        return np.array([getattr(self, parameter.attribute) for parameter in PARAMETERS.values()])
+        """The numbers in the order of :data:`ALL_NAMES`, (21,); 0 for terms that no lens has."""
+        own = [getattr(self, str(PARAMETERS[name].attribute)) for name in MOUNTING_NAMES]
+        return np.concatenate([own, numbers_of(self.lens)])
+
+    def number(self, name: str) -> float:
+        """Return one of the numbers by its name."""
+        return float(self.vector[ALL_NAMES.index(name)])
 
     def on(self, sensor: Sensor) -> Sensor:
-        """Return a sensor mounted like this."""
-        return sensor.with_(
-            pitch_deg=math.degrees(self.pitch_rad),
-            roll_deg=math.degrees(self.roll_rad),
-            bearing_offset_deg=math.degrees(self.bearing_rad),
-            height_offset_m=self.height_m,
-            half_angle_h_deg=math.degrees(self.half_angle_h_rad),
-            half_angle_v_deg=math.degrees(self.half_angle_v_rad),
-            range_offset_m=self.range_offset_m,
-            delay_s=self.delay_s,
-        )
+        """Return a sensor mounted like this; one with a lens gets that of the mounting, if it has one.
+
+        Raises
+        ------
+        UsageError
+            The lens folds inside the image, or the sensor has none.
+        """
+        if self.lens is not None and sensor.lens is None:
+            raise UsageError("a mounting with a lens belongs to a sensor with a lens, and this one has none")
+        changes: dict[str, object] = {
+            "pitch_deg": math.degrees(self.pitch_rad),
+            "roll_deg": math.degrees(self.roll_rad),
+            "bearing_offset_deg": math.degrees(self.bearing_rad),
+            "height_offset_m": self.height_m,
+            "range_offset_m": self.range_offset_m,
+            "delay_s": self.delay_s,
+        }
+        if sensor.lens is None:
+            changes["half_angle_h_deg"] = math.degrees(self.half_angle_h_rad)
+            changes["half_angle_v_deg"] = math.degrees(self.half_angle_v_rad)
+        elif self.lens is not None:
+            changes["lens"] = self.lens
+        return sensor.with_(**changes)
 
 
 def clipped(theta: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -216,6 +269,10 @@ class CalibrationModel:
         stamp_s: NDArray[np.float64] | None = None,
     ) -> None:
         self._track, self._stamp_s = track, stamp_s
+        self.scale = np.concatenate([SCALE[: len(MOUNTING_NAMES)], natural_units(sensor)])
+        """Natural units, in the order of :data:`ALL_NAMES`; those of the lens of this sensor."""
+        self.step = np.where(np.isin(ALL_NAMES, TERMS), self.scale / _DEGREE, 1.0) * STEP
+        """Half the width of a difference in each: for terms of the lens, what moves the image by :data:`STEP`."""
         self.sensor, self.poses, self.workers, self._rendered = sensor, poses, workers, rendered
         self._axis_cosine = sensor.axis_cosine() if reports_z else None
         self._albedo = albedo
@@ -229,6 +286,37 @@ class CalibrationModel:
             self._scenes = [
                 (np.flatnonzero(walls == wall), replace(base, wall_m=float(wall))) for wall in np.unique(walls)
             ]
+
+    def mounting(self, theta: NDArray[np.float64]) -> Mounting:
+        """Return the mounting that numbers in the order of :data:`ALL_NAMES` mean."""
+        return Mounting.of_vector(theta, self.sensor)
+
+    def moved(self, theta: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where a step leads within what a camera can have.
+
+        Where the terms of the lens would fold it inside the image, or make none, their step is halved until they make
+        one that does not.
+
+        Parameters
+        ----------
+        theta, step : (21,) float64
+            In the order of :data:`ALL_NAMES`; the first has a lens that does not fold.
+        """
+        there = clipped(theta + step)
+        n = len(MOUNTING_NAMES)
+        there[n:] = farthest_lens(self.sensor, theta[n:], there[n:])
+        return there
+
+    def beside(self, theta: NDArray[np.float64], column: int, away: float) -> NDArray[np.float64]:
+        """Return numbers with one of them moved, as far as :meth:`moved` lets it."""
+        step = np.zeros(len(theta))
+        step[column] = away
+        return self.moved(theta, step)
+
+    def span(self, theta: NDArray[np.float64], column: int, half: float) -> float:
+        """Return how far apart the ends of a difference are: less than twice its half width next to a fold."""
+        ends = [float(self.beside(theta, column, side * half)[column]) for side in (1.0, -1.0)]
+        return ends[0] - ends[1] or 2 * half
 
     @property
     def has_background(self) -> bool:
@@ -245,7 +333,7 @@ class CalibrationModel:
 
         Parameters
         ----------
-        theta : (9,) float64
+        theta : (21,) float64
             Initial guess of the mounting.
         slack_m : float
 
@@ -253,7 +341,7 @@ class CalibrationModel:
         ------
         UsageError
         """
-        views = self._views(theta, np.zeros((len(self.poses), 3))).in_camera(Mounting.of_vector(theta).on(self.sensor))
+        views = self._views(theta, np.zeros((len(self.poses), 3))).in_camera(self.mounting(theta).on(self.sensor))
         views = replace(views, distance_m=views.distance_m - slack_m, height_m=views.height_m + slack_m)
         for which, background in self._scenes:
             if background is not None:
@@ -271,14 +359,14 @@ class CalibrationModel:
 
         Parameters
         ----------
-        theta : (9,) float64
+        theta : (21,) float64
             The mounting.
         shift : (K, 3) or (K, 4) float64
             What is added to the poses, :data:`POSE` and the height.
         need_alone : bool
             Whether the landmark alone is wanted even where nothing else is made of it.
         """
-        mounting = Mounting.of_vector(theta)
+        mounting = self.mounting(theta)
         views = self._views(theta, shift)
         image = self._render(mounting, views)
         alone = image
@@ -319,8 +407,8 @@ class CalibrationModel:
         on : {"ranges", "phasors"}
         of_poses : bool
             Whether the poses are uncertain too.
-        width : (9,) float64, optional
-            Half width of each difference; at least :data:`STEP`.
+        width : (21,) float64, optional
+            Half width of each difference; at least :attr:`step`.
 
         Returns
         -------
@@ -330,12 +418,14 @@ class CalibrationModel:
         (K, 3, pixels) complex128
             By :data:`POSE`; (K, 0, pixels) without `of_poses`.
         """
-        half = np.full(len(ALL_NAMES), STEP) if width is None else np.maximum(width, STEP)
+        half = self.step if width is None else np.maximum(width, self.step)
 
         def moved(name: str | None, column: int, side: float) -> NDArray[np.complex128]:
             there, shifted = theta.copy(), shift.copy()
             if name is None:
                 shifted[:, column] += side * STEP
+            elif name in TERMS:
+                there = self.beside(theta, column, side * half[column])
             else:
                 there[column] += side * half[column]
             return self.images(there, shifted).phasor
@@ -343,6 +433,8 @@ class CalibrationModel:
         def difference(job: tuple[str | None, int]) -> NDArray[np.complex128]:
             name, column = job
             span = 2 * (STEP if name is None else half[column])
+            if name in TERMS:
+                span = self.span(theta, column, half[column])
             high, low = moved(name, column, 1.0), moved(name, column, -1.0)
             if on == "phasors":
                 return np.asarray((high - low) / span)
@@ -372,7 +464,7 @@ class CalibrationModel:
 
     def coverage(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the share of each pixel that sees the landmark, (K, pixels)."""
-        mounting = Mounting.of_vector(theta)
+        mounting = self.mounting(theta)
         views = self._views(theta, np.zeros((len(self.poses), 3)))
         return self._render(mounting, views, alone=True).coverage.reshape(len(views), -1)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.calibration.known_poses import KnownPoses
 from phasemark.matcher.calibration.mounting_model import PARAMETERS
 from phasemark.render.integral.rounding import error_text
+from phasemark.render.sensor.lens_fields import TERMS
 
 TITLES = {
     "pitch": "pitch",
@@ -22,6 +23,11 @@ TITLES = {
     "range_offset": "range offset",
     "albedo": "albedo",
     "delay": "delay",
+    "fx": "focal length fx",
+    "fy": "focal length fy",
+    "cx": "principal point cx",
+    "cy": "principal point cy",
+    **{name: f"distortion {name}" for name in TERMS[4:]},
 }
 _POORLY = 0.5
 """Natural units (1°, 1 cm, 0.1): a standard deviation from which a number is called poorly known."""
@@ -35,10 +41,10 @@ _BEARINGS_RAD = math.radians(3.0)
 _WRONG_POSE = 4.0
 """χ² of a pose's residuals over the median of all poses, from which it is named."""
 _MOST_NAMED = 3
-_ALIKE_AT_ONE_DISTANCE = (("pitch", "height"), ("range_offset", "half_angle_h", "half_angle_v"))
+_ALIKE_AT_ONE_DISTANCE = (("pitch", "height"), ("range_offset", "half_angle_h", "half_angle_v", "fx", "fy"))
 """What looks the same at one distance but for what landmark and light are known to be."""
-_BY_DISTANCE = {"pitch", "height", "range_offset", "half_angle_h", "half_angle_v"}
-_BY_BEARING = {"roll", "bearing", "half_angle_h"}
+_BY_DISTANCE = {"pitch", "height", "range_offset", "half_angle_h", "half_angle_v", "fx", "fy"}
+_BY_BEARING = {"roll", "bearing", "half_angle_h", "fx"}
 
 
 def named(names: Sequence[str]) -> str:
@@ -57,6 +63,11 @@ def advice(names: Sequence[str], poses: KnownPoses) -> str:
     if set(names) & _BY_BEARING and np.ptp(poses.bearing_rad) < _BEARINGS_RAD:
         hints.append(
             "all have the landmark at one place between left and right: add some with a bearing of a few degrees"
+        )
+    if set(names) & set(TERMS):
+        hints.append(
+            "a lens shows where the image is far from its middle: add some with the landmark near the corners of the"
+            " image, with bearings to both sides and heights above and below"
         )
     if not hints:
         hints.append("add poses at other distances and sides, and with the landmark off the image's middle")
@@ -90,7 +101,7 @@ def observability_notes(
     for name in poor:
         parameter = PARAMETERS[name]
         error = error_text(parameter.shown * float(std[free.index(name)]))
-        value = f"± {error}{' ' if parameter.unit == 'mm' else ''}{parameter.unit}"
+        value = f"± {error}{' ' if parameter.unit in ('mm', 'px') else ''}{parameter.unit}"
         others = [b if a == name else a for a, b, _ in pairs if name in (a, b)]
         trades = f", for it trades with the {named(others)}" if others else ""
         notes.append(f"The {TITLES[name]} is poorly known, {value}{trades}: {advice([name, *others], poses)}.")

@@ -25,9 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
-from phasemark.matcher.calibration.mounting_model import ALL_NAMES, SCALE, STEP, CalibrationModel, Images, clipped
+from phasemark.matcher.calibration.mounting_model import ALL_NAMES, STEP, CalibrationModel, Images
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.render import Sensor
+from phasemark.render.sensor.lens_fields import TERMS
 from phasemark.render.sensor.range_noise import direct_range_std
 
 _Float = NDArray[np.float64]
@@ -42,9 +43,15 @@ PRIOR_STD = {
     "half_angle_v": 0.05,
     "range_offset": 0.05,
     "delay": 0.2,
+    "fx": 0.05,
+    "fy": 0.05,
+    **dict.fromkeys(("cx", "cy"), 2.0),
+    **dict.fromkeys(TERMS[4:], 3.0),
 }
-"""How far a mounting is from the assumed one, standard deviations; half angles relative. Also the range in which the
-model is trusted: a result beyond three of them is not."""
+"""How far a mounting is from the assumed one, standard deviations; half angles and focal lengths relative, principal
+point and distortion in natural units. Also the range in which the model is trusted: a result beyond three of them is
+not."""
+_OF_ITSELF = ("half_angle_h", "half_angle_v", "fx", "fy")
 _FULL = 1 - 1e-6
 _ZONE_UNIT_M = 1e-3
 _SIZE_UNIT = np.array([1e-3, math.radians(0.1), math.radians(0.1), 1e-3, 5e-3])
@@ -180,7 +187,7 @@ class Recorded:
 
     Parameters
     ----------
-    theta : (9,) float64
+    theta : (21,) float64
     covariance : (p, p) float64
         Of the free parameters; radians, metres, seconds.
     zone_m, zone_std_m : (pixels,) float64
@@ -229,7 +236,7 @@ class Recording:
         Ranges, one position a frame, in the order of time.
     free : sequence of str
         Parameters to estimate; never the albedo.
-    assumed : (9,) float64
+    assumed : (21,) float64
     block : (K,) int64
         Block of time of each frame, ascending.
     edges : bool
@@ -255,12 +262,12 @@ class Recording:
         self.least = np.array([0.0, 0.0, 0.0, 0.0, jitter_s])
         self.model, self.evidence, self.free, self.assumed = model, evidence, tuple(free), assumed
         self.columns = np.array([ALL_NAMES.index(name) for name in free])
-        self.scale = SCALE[self.columns]
+        self.scale = model.scale[self.columns]
         self.edges, self.zones = edges, zones
         self.start = np.flatnonzero(np.concatenate([[True], np.diff(block) != 0]))
         self.sensor: Sensor = model.sensor
         self.pixels = self.sensor.rows * self.sensor.cols
-        self.prior = np.array([prior_std(name, assumed) for name in free]) / self.scale
+        self.prior = np.array([prior_std(name, assumed, model.scale) for name in free]) / self.scale
         self.single = len(self.start) == len(block)
 
     # the model
@@ -293,15 +300,21 @@ class Recording:
 
         def difference(job: tuple[str | None, int]) -> _Float:
             name, column = job
+            half = STEP if name is None else self.model.step[ALL_NAMES.index(name)]
+            span = 2 * half
+            if name in TERMS:
+                span = self.model.span(theta, ALL_NAMES.index(name), half)
             ends = []
             for side in (1.0, -1.0):
                 there, shift = theta.copy(), np.zeros((k, 4))
                 if name is None:
-                    shift[:, column] = side * STEP
+                    shift[:, column] = side * half
+                elif name in TERMS:
+                    there = self.model.beside(theta, ALL_NAMES.index(name), side * half)
                 else:
-                    there[ALL_NAMES.index(name)] += side * STEP
+                    there[ALL_NAMES.index(name)] += side * half
                 ends.append(self.model.images(there, shift).phasor)
-            return np.asarray(scale * np.angle(ends[0] * ends[1].conj()) / (2 * STEP))
+            return np.asarray(scale * np.angle(ends[0] * ends[1].conj()) / span)
 
         jobs: list[tuple[str | None, int]] = [(name, 0) for name in rendered] + [(None, i) for i in range(4)]
         with ThreadPoolExecutor(self.model.workers) as pool:
@@ -370,9 +383,9 @@ class Recording:
 
     def moved(self, theta: _Float, zone: _Float, step: _Float) -> tuple[_Float, _Float]:
         """Return the place a step leads to."""
-        there = theta.copy()
-        there[self.columns] += self.scale * step[: len(self.free)]
-        return clipped(there), zone + _ZONE_UNIT_M * step[len(self.free) :] if self.zones else zone
+        whole = np.zeros(len(theta))
+        whole[self.columns] = self.scale * step[: len(self.free)]
+        return self.model.moved(theta, whole), zone + _ZONE_UNIT_M * step[len(self.free) :] if self.zones else zone
 
     # sizes of errors
 
@@ -506,7 +519,7 @@ class Recording:
 
         Parameters
         ----------
-        theta : (9,) float64
+        theta : (21,) float64
             A place from :meth:`approach`.
         """
         zone = self.sensor.zone_offsets.ravel()
@@ -605,10 +618,19 @@ class Recording:
         return _rms(before[judged]), _rms(after[judged])
 
 
-def prior_std(name: str, assumed: _Float) -> float:
-    """Return the prior standard deviation of a parameter: radians, metres, seconds."""
-    relative = name in ("half_angle_h", "half_angle_v")
-    return PRIOR_STD[name] * (float(assumed[ALL_NAMES.index(name)]) if relative else 1.0)
+def prior_std(name: str, assumed: _Float, scale: _Float) -> float:
+    """Return the prior standard deviation of a parameter in its unit: radians, metres, seconds, pixels.
+
+    Parameters
+    ----------
+    name : str
+    assumed, scale : (21,) float64
+        What is assumed, and natural units.
+    """
+    column = ALL_NAMES.index(name)
+    if name in _OF_ITSELF:
+        return PRIOR_STD[name] * float(assumed[column])
+    return PRIOR_STD[name] * (float(scale[column]) if name in TERMS else 1.0)
 
 
 def _rms(values: _Float) -> float:

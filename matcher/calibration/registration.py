@@ -7,12 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.calibration.mounting_model import ALL_NAMES, LONGEST_STEP, SCALE, CalibrationModel, clipped
+from phasemark.matcher.calibration.mounting_model import ALL_NAMES, LONGEST_STEP, CalibrationModel, clipped
 from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.render.sensor.lens_fields import TERMS
 
-OUTLINE = ("pitch", "roll", "height", "bearing", "half_angle_h", "half_angle_v")
+OUTLINE = ("pitch", "roll", "height", "bearing", "half_angle_h", "half_angle_v", *TERMS)
 """What an outline tells."""
-_OUTLINE_STD = np.array([3.0, 3.0, 3.0, 3.0, 0.7, 0.7])
+_OUTLINE_STD = np.array([3.0, 3.0, 3.0, 3.0, *[0.7] * (len(OUTLINE) - 4)])
 """Standard deviation of each about its initial guess, in natural units; the registration alone uses it."""
 _OUTLINE_NOISE = 0.2
 """Of a pixel: how much of it the model says returns, against whether it did."""
@@ -43,14 +44,14 @@ def register(
     ----------
     model : CalibrationModel
     evidence : Evidence
-    theta : (9,) float64
+    theta : (21,) float64
         Initial guess of the mounting.
     free : sequence of str
         What may move.
 
     Returns
     -------
-    (9,) float64
+    (21,) float64
     """
     if not free:
         return theta
@@ -62,7 +63,7 @@ def register(
         known = np.ones_like(known)  # nothing was told apart: what is missing returned nothing
     enough = _PREVAILS_FROM if (seen.returned & ~near).mean() > _BESIDE else _RETURNS_FROM
     columns = np.array([ALL_NAMES.index(name) for name in free])
-    scale = SCALE[columns]
+    scale = model.scale[columns]
     prior = np.array([_OUTLINE_STD[OUTLINE.index(name)] for name in free])
 
     def difference(at: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -73,25 +74,32 @@ def register(
         away = (at - theta)[columns] / scale / prior
         return float((difference(at) ** 2).sum() + (away**2).sum())
 
+    def slope(at: NDArray[np.float64], column: int) -> NDArray[np.float64]:
+        move = np.eye(len(ALL_NAMES))[column] * model.scale[column] * _OUTLINE_WIDTH
+        if ALL_NAMES[column] not in TERMS:
+            return np.asarray((difference(at - move) - difference(at + move)).ravel() / (2 * _OUTLINE_WIDTH))
+        low, high = model.moved(at, -move), model.moved(at, move)
+        span = model.span(at, column, float(move[column])) / model.scale[column]
+        return np.asarray((difference(low) - difference(high)).ravel() / span)
+
     tried = [theta]
     for name in ("pitch", "bearing"):
         if name in free:
-            steps = np.eye(len(ALL_NAMES))[ALL_NAMES.index(name)] * SCALE[ALL_NAMES.index(name)]
+            steps = np.eye(len(ALL_NAMES))[ALL_NAMES.index(name)] * model.scale[ALL_NAMES.index(name)]
             tried = [clipped(one + side * steps) for one in tried for side in _TRIED]
     best = min(tried, key=cost)
     for _ in range(_OUTLINE_STEPS):
         rows = []
         for column in columns:
-            move = np.eye(len(ALL_NAMES))[column] * SCALE[column] * _OUTLINE_WIDTH
-            rows.append((difference(best - move) - difference(best + move)).ravel() / (2 * _OUTLINE_WIDTH))
+            rows.append(slope(best, column))
         design = np.array(rows)
         away = (best - theta)[columns] / scale
         matrix = design @ design.T + np.diag(1 / prior**2)
         step = np.linalg.solve(matrix, design @ difference(best).ravel() - away / prior**2)
         step /= max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
-        moved = best.copy()
-        moved[columns] += scale * step
-        moved = clipped(moved)
+        whole = np.zeros(len(ALL_NAMES))
+        whole[columns] = scale * step
+        moved = model.moved(best, whole)
         if cost(moved) >= cost(best):
             break
         best = moved

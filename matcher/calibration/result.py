@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.calibration.known_poses import POSE_UNITS, KnownPoses
-from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, Mounting
+from phasemark.matcher.calibration.mounting_model import HALF_ANGLES, MOUNTING_NAMES, NAMES, PARAMETERS, Mounting
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.render import Sensor
 from phasemark.render.integral.rounding import error_text, value_and_error
+from phasemark.render.sensor.lens_fields import TERMS
 from phasemark.render.sensor.sensor_file import sensor_toml
 
 USES = {"albedo": "of the landmark: phasemark bank build --albedo, or 'albedo' in a plan"}
@@ -49,7 +50,7 @@ class Calibration:
     free : tuple of str
         Names of what was estimated (:data:`NAMES`); the other numbers of `mounting` are assumptions.
     covariance : (p, p) float64
-        In the order of `free`; radians, metres.
+        In the order of `free`; radians, metres, pixels.
     covariance_from : str
         What it was made of, in words.
     chi2, dof, p_value : float, int, float
@@ -102,8 +103,8 @@ class Calibration:
     left_out: float = 0.0
 
     def value(self, name: str) -> float:
-        """Return one number of the mounting, radians, metres or albedo."""
-        return float(getattr(self.mounting, PARAMETERS[name].attribute))
+        """Return one number of the mounting, radians, metres, pixels or albedo."""
+        return self.mounting.number(name)
 
     def std(self, name: str) -> float:
         """Return its standard deviation; 0 if it was not free."""
@@ -127,7 +128,7 @@ class Calibration:
                     "value": PARAMETERS[name].shown * self.value(name),
                     "std": PARAMETERS[name].shown * self.std(name) if name in self.free else None,
                     "unit": {"°": "deg"}.get(PARAMETERS[name].unit, PARAMETERS[name].unit) or None,
-                    "assumed": PARAMETERS[name].shown * float(getattr(self.assumed, PARAMETERS[name].attribute)),
+                    "assumed": PARAMETERS[name].shown * self.assumed.number(name),
                     "sensor_field": PARAMETERS[name].field,
                 }
                 for name in shown_names(self)
@@ -169,10 +170,16 @@ class Calibration:
             What the camera is called that gave all that was not estimated.
         """
         comments = {}
+        distortion = []
         for name in self.free:
             parameter = PARAMETERS[name]
-            if parameter.field is not None:
-                comments[parameter.field] = f"calibrated, ± {error_text(_file_std(self, name))} (standard deviation)"
+            error = error_text(_file_std(self, name))
+            if name in TERMS[4:]:
+                distortion.append(f"{name} ± {error}")
+            elif parameter.field is not None:
+                comments[parameter.field] = f"calibrated, ± {error} (standard deviation)"
+        if distortion:
+            comments["lens.distortion"] = f"calibrated, {', '.join(distortion)} (standard deviations)"
         for field, what in _COMMON.items():
             if field not in comments and getattr(self.sensor, field) != getattr(self.base, field):
                 comments[field] = what
@@ -194,8 +201,11 @@ class Calibration:
 
 
 def shown_names(found: Calibration) -> tuple[str, ...]:
-    """Return the names of the numbers to show: the delay only where it was estimated or is stated."""
-    return ALL_NAMES if "delay" in found.free or found.mounting.delay_s else NAMES
+    """Return the names of the numbers to show: a delay where it was estimated or is stated, half angles or a lens."""
+    names = MOUNTING_NAMES if "delay" in found.free or found.mounting.delay_s else NAMES
+    if found.mounting.lens is None:
+        return names
+    return (*(name for name in names if name not in HALF_ANGLES), *found.mounting.lens.terms)
 
 
 def shown(found: Calibration, name: str) -> str:

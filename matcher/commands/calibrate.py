@@ -127,7 +127,9 @@ def calibrate_camera(
 
     Pitch, roll, height, bearing, field of view, range offset, from amplitudes the landmark's albedo, and with --moving
     the delay of the stamps: --free and --fix take pitch, roll, height, bearing, half_angle_h, half_angle_v (both: fov),
-    range_offset, albedo and delay. A result that cannot be trusted is not written without --force (exit code 3).
+    range_offset, albedo and delay. A sensor with a lens has its terms in place of half angles, estimated where --free
+    names them: fx, fy, cx, cy, k1, k2 ... (all: lens). A result that cannot be trusted is not written without --force
+    (exit code 3).
     """
     from phasemark.data.shards.executor import processors
     from phasemark.matcher import calibrate

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
+from phasemark.render.sensor.lens_fields import LENS_FIELD
+from phasemark.render.sensor.lens_rates import lens_rates
 
 Systematic = Literal["calibration", "declared", "motion"]
 """What a calibration leaves of the sensor's fields, what the sensor declares of a pose, and the jitter of stamps."""
@@ -31,6 +33,8 @@ _STEPS = {
     "height_offset_m": 2e-4,
 }
 """Fields that move an image, and the width of a difference in them."""
+_LENS_STEP_RAD = math.radians(0.02)
+"""How far the width of a difference in a term of the lens moves the point of an image that it moves most."""
 _OFFSET = "range_offset_m"
 _REACH_S = 0.25
 """Estimates farther away in time do not tell how fast a view changes."""
@@ -106,7 +110,9 @@ def rates_of_views(
 
 def calibrated_fields(sensor: Sensor) -> tuple[str, ...]:
     """Return which of a sensor's calibrated fields move what a frame shows."""
-    return tuple(name for name in sensor.calibration_fields if name in _STEPS or name == _OFFSET)
+    return tuple(
+        name for name in sensor.calibration_fields if name in _STEPS or name == _OFFSET or name.startswith(LENS_FIELD)
+    )
 
 
 def calibrated_covariance(sensor: Sensor) -> NDArray[np.float64]:
@@ -149,14 +155,26 @@ def calibrated_slopes(
         if name == _OFFSET:
             out[:, k] = by_range
             continue
-        step = _STEPS[name]
-        moved = renderer.sensor.with_(**{name: getattr(renderer.sensor, name) + step})
+        moved, step = _beside(renderer.sensor, name)
         there = renderer.seen_by(moved).render_views(views, background=background, workers=workers)
         out[:, k] = (there.phasor - phasor) / step
-        if sensor.quantity == "z" and name.startswith("half_angle"):
+        if sensor.quantity == "z" and name.startswith(("half_angle", LENS_FIELD)):
             stretch = sensor.axis_cosine() / moved.axis_cosine() - 1
             out[:, k] -= by_range * np.nan_to_num(image.range_m) * stretch / step
     return out
+
+
+def _beside(sensor: Sensor, name: str) -> tuple[Sensor, float]:
+    """Return a sensor with one field a little different, and by how much: to the side where its lens does not fold."""
+    if sensor.lens is not None and name.startswith(LENS_FIELD):
+        step = _LENS_STEP_RAD / lens_rates(sensor.lens, sensor.rows, sensor.cols)[name.removeprefix(LENS_FIELD)]
+    else:
+        step = _STEPS[name]
+    value = sensor.number(name)
+    try:
+        return sensor.with_numbers({name: value + step}), step
+    except UsageError:
+        return sensor.with_numbers({name: value - step}), -step
 
 
 def carried_covariance(

@@ -20,6 +20,15 @@ _Coefficient = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 _COUNTS = {"opencv": (0, 4, 5, 8), "fisheye": (0, 4)}
 _ORDERS = {"opencv": "k1 k2 p1 p2, then k3, then k4 k5 k6", "fisheye": "k1 k2 k3 k4"}
 
+_NAMES = {"opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "fisheye": ("k1", "k2", "k3", "k4")}
+_INTRINSICS = ("fx", "fy", "cx", "cy")
+
+TERMS = (*_INTRINSICS, *_NAMES["opencv"])
+"""Names of all numbers that a lens may have; a lens has those of its model, as many as it states."""
+
+LENS_FIELD = "lens."
+"""What stands before a term where it is named among the fields of a sensor, as in `calibration_fields`."""
+
 _MOST_PIXELS = 4096  # along a side of an image
 _OFF_CENTRE = 0.4  # of the image's size, how far from its centre the principal point of a whole image may lie
 _PARTS_OFF = 1.0  # the same of a camera that reads a part of an image
@@ -88,6 +97,31 @@ class Lens(BaseModel):
                 f" ({_ORDERS[self.model]}), got {len(self.distortion)}"
             )
         return self
+
+    @property
+    def terms(self) -> dict[str, float]:
+        """The numbers of the lens by their names: fx, fy, cx, cy, and the coefficients that it states."""
+        distortion = zip(_NAMES[self.model], self.distortion, strict=False)
+        return {**{name: getattr(self, name) for name in _INTRINSICS}, **dict(distortion)}
+
+    def with_terms(self, **changes: float) -> Lens:
+        """Return a lens with some of its :attr:`terms` changed, validated again.
+
+        Raises
+        ------
+        UsageError
+            The lens has no such term, or a value is out of range.
+        """
+        terms = self.terms
+        for name in changes:
+            if name not in terms:
+                raise UsageError(
+                    f"a lens of the model '{self.model}' with {len(self.distortion)} coefficients has the"
+                    f" terms {', '.join(terms)}, got {name!r}"
+                )
+        terms |= changes
+        distortion = tuple(terms[name] for name in _NAMES[self.model][: len(self.distortion)])
+        return Lens(model=self.model, **{name: terms[name] for name in _INTRINSICS}, distortion=distortion)
 
     @property
     def is_ideal(self) -> bool:

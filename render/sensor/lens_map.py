@@ -175,8 +175,8 @@ class LensMap:
         """Refuse a lens that folds inside the image."""
         u = np.linspace(0.0, self.cols, min(self.cols, _CHECKED) + 1)
         v = np.linspace(0.0, self.rows, min(self.rows, _CHECKED) + 1)
-        seen = self._normalised(*np.meshgrid(u, v))[2]
-        if seen.all():
+        x, y, seen = self._normalised(*np.meshgrid(u, v))
+        if seen.all() and not self._folds_before(x, y):
             return
         corners = np.array([[a, b] for a in (0, self.cols) for b in (0, self.rows)], float) - self.centre_px
         reach = f"its farthest corner is {np.hypot(*corners.T).max():.4g} pixels from the principal point"
@@ -189,6 +189,14 @@ class LensMap:
         raise ValueError(
             f"'lens' must see no farther than {MOST_DEG:g}° from the optical axis inside the image, and {reach}"
         )
+
+    def _folds_before(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> bool:
+        """Return True if the lens folds between its axis and the border: Newton's method may have crossed the fold."""
+        border = np.ones(x.shape, bool)
+        border[1:-1, 1:-1] = False
+        share = np.linspace(0.0, 1.0, _CHECKED)[:, None]
+        _, _, xx, xy, yy = distort(self.model, self.k, share * x[border], share * y[border])
+        return not bool((xx * yy - xy * xy > 0).all())
 
     def _fold(self) -> tuple[float, float] | None:
         """Return where the lens folds nearest to the principal point: pixels from there, and the tangent."""

@@ -103,7 +103,12 @@ class Region(NamedTuple):
             "hot_pixels": self._moved(sensor.hot_pixels),
         }
         changes |= self._ideal_geometry(sensor) if sensor.lens is None else {"lens": self._of_lens(sensor.lens)}
-        return sensor.with_(**changes, **(_added_up(sensor, self.binning) if self.binning > 1 else {}))
+        there = sensor.with_(**changes, **(_added_up(sensor, self.binning) if self.binning > 1 else {}))
+        if not sensor.calibration_fields:
+            return there
+        rate = np.array([_rate(sensor, there, name, self.binning) for name in sensor.calibration_fields])
+        covariance = sensor.calibration_matrix * np.outer(rate, rate)
+        return there.with_(calibration_covariance=tuple(tuple(row) for row in covariance.tolist()))
 
     def blocks(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return the pixels of each block of images (…, rows, cols) along the last axis, (…, rows, cols, binning²)."""
@@ -137,6 +142,17 @@ class Region(NamedTuple):
             if self.first_row <= row < self.stop_row and self.first_col <= col < self.stop_col
         }
         return tuple(sorted(inside))
+
+
+def _rate(sensor: Sensor, there: Sensor, name: str, binning: int) -> float:
+    """Return how much a field of a camera that reads a region changes with that of the whole camera."""
+    if name in ("lens.fx", "lens.fy", "lens.cx", "lens.cy"):
+        return 1 / binning
+    if name in ("half_angle_h_deg", "half_angle_v_deg") and sensor.lens is None:
+        # tan α' = tan α · share
+        whole, part = (math.radians(getattr(one, name)) for one in (sensor, there))
+        return math.sin(2 * part) / math.sin(2 * whole)
+    return 1.0
 
 
 def _added_up(sensor: Sensor, n: int) -> dict[str, Any]:

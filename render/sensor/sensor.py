@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -14,7 +15,7 @@ from pydantic import model_validator
 from phasemark import UsageError
 from phasemark.inputs.numbers import in_words
 from phasemark.inputs.toml_file import read_toml
-from phasemark.render.sensor.lens_fields import DERIVED, Lens, changed_lens, check_image_size
+from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD, Lens, changed_lens, check_image_size
 from phasemark.render.sensor.sensor_checks import check_fields
 from phasemark.render.sensor.sensor_fields import CALIBRATION, OPTICS
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
@@ -145,7 +146,7 @@ class Sensor(SensorQuantities):
         Added to the time stamp of a frame to get the time at which the camera was where the frame shows it; -0.075
         for frames that show the pose 75 ms before their stamp.
     calibration_fields : tuple of str
-        Names of the fields that a calibration estimated, e.g. "pitch_deg".
+        Names of the fields that a calibration estimated, e.g. "pitch_deg", or "lens.k1" for a term of the lens.
     calibration_covariance : tuple of rows of float
         Covariance of these fields in their own units, symmetric and positive semidefinite. Its errors are common to
         all frames of the camera.
@@ -185,6 +186,61 @@ class Sensor(SensorQuantities):
                 except (TypeError, ValueError) as error:
                     raise UsageError(str(error)) from None
         return Sensor(**fields)
+
+    def number(self, field: str) -> float:
+        """Return one number of the sensor by the name of its field, ``lens.k1`` for a term of its lens.
+
+        Raises
+        ------
+        UsageError
+            The sensor has no such number.
+        """
+        term = field.removeprefix(LENS_FIELD)
+        if term != field and self.lens is not None and term in self.lens.terms:
+            return self.lens.terms[term]
+        value = getattr(self, field) if field in type(self).model_fields else None
+        if not isinstance(value, float):
+            raise UsageError(f"the sensor has no number '{field}'")
+        return value
+
+    def with_numbers(self, values: Mapping[str, float]) -> Sensor:
+        """Return a copy with some numbers changed, named as in :meth:`number`, validated again.
+
+        Raises
+        ------
+        UsageError
+            A number belongs to a lens that the sensor has not, or is out of range.
+
+        Examples
+        --------
+        >>> lens = Lens(fx=16, fy=16, cx=7.5, cy=7.5, distortion=(-0.2, 0, 0, 0))
+        >>> Sensor(rows=16, cols=16, lens=lens).with_numbers({"lens.k1": -0.1, "pitch_deg": 1.0}).lens.distortion
+        (-0.1, 0.0, 0.0, 0.0)
+        """
+        terms = {name.removeprefix(LENS_FIELD): value for name, value in values.items() if name.startswith(LENS_FIELD)}
+        changes: dict[str, Any] = {name: value for name, value in values.items() if not name.startswith(LENS_FIELD)}
+        if terms:
+            if self.lens is None:
+                raise UsageError(
+                    f"'{LENS_FIELD}{next(iter(terms))}' belongs to a sensor with a lens: this one has none"
+                )
+            changes["lens"] = self.lens.with_terms(**terms)
+        return self.with_(**changes)
+
+    def calibration_without(self, left_out: Callable[[str], bool]) -> dict[str, Any]:
+        """Return the two fields of the covariance that a calibration leaves, without some of the fields it estimated.
+
+        Parameters
+        ----------
+        left_out : callable
+            Whether the field of a name is left out.
+        """
+        kept = [k for k, name in enumerate(self.calibration_fields) if not left_out(name)]
+        matrix = self.calibration_matrix[np.ix_(kept, kept)]
+        return {
+            "calibration_fields": tuple(self.calibration_fields[k] for k in kept),
+            "calibration_covariance": tuple(tuple(row) for row in matrix.tolist()),
+        }
 
     @property
     def by_frequency(self) -> tuple[Sensor, ...]:

@@ -9,6 +9,7 @@ import numpy as np
 from phasemark.inputs.numbers import in_words
 from phasemark.render.sensor.correlation import SQUARE_PEAK, correlation_peak, pulse_harmonics
 from phasemark.render.sensor.frequencies import check_frequencies
+from phasemark.render.sensor.lens_fields import LENS_FIELD
 from phasemark.render.sensor.sensor_fields import CALIBRATION, DIRECT_ONLY, PHASE_ONLY, SensorFields
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
 
@@ -184,9 +185,7 @@ def check_tables(sensor: SensorQuantities) -> None:
         _check_table("zone_offset_m", sensor.zone_offset_m, sensor.rows, sensor.cols, "rows x cols of the sensor")
     names = sensor.calibration_fields
     for name in names:
-        number = name in SensorFields.model_fields and isinstance(getattr(sensor, name), float)
-        if not number or name in CALIBRATION:
-            raise ValueError(f"'calibration_fields' must name fields of the sensor that are numbers, got '{name}'")
+        _check_calibrated_field(sensor, name)
         if names.count(name) > 1:
             raise ValueError(f"'calibration_fields' must name each field once, got '{name}' twice")
     covariance = sensor.calibration_covariance
@@ -206,6 +205,19 @@ def check_tables(sensor: SensorQuantities) -> None:
             f"'calibration_covariance' must be positive semidefinite, but its correlation matrix has the eigenvalue"
             f" {lowest:.3g}"
         )
+
+
+def _check_calibrated_field(sensor: SensorQuantities, name: str) -> None:
+    """Refuse the name of what is no number of the sensor or of its lens."""
+    if name.startswith(LENS_FIELD):
+        terms = {} if sensor.lens is None else sensor.lens.terms
+        if name.removeprefix(LENS_FIELD) not in terms:
+            has = f"has {', '.join(terms)}" if terms else "is not stated"
+            raise ValueError(f"'calibration_fields' must name terms of the lens, which {has}, got '{name}'")
+        return
+    number = name in SensorFields.model_fields and isinstance(getattr(sensor, name), float)
+    if not number or name in CALIBRATION:
+        raise ValueError(f"'calibration_fields' must name fields of the sensor that are numbers, got '{name}'")
 
 
 def check_fields(sensor: SensorQuantities) -> None:
