@@ -319,7 +319,7 @@ def _case(code, *arguments, contains):
 
 MISTAKES = [
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--auto-background", contains="leave --wall"),
-    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--free", "yaw", contains="bearing or height"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--free", "yaw", contains="bearing, height, pitch or roll"),
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--free", "bearing", contains="goes with --method refine"),
     _case(3, "match", "none.h5", "frames.csv", *MATCH, contains="none.h5"),
     _case(3, "match", "frames.csv", "frames.csv", *MATCH, contains="not a bank"),

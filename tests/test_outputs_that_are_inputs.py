@@ -39,6 +39,7 @@ CASES = {
     "sensor characterise": ("cam.toml", "dir/points.csv", "cam.toml --out dir"),
     "sensor fit": ("frames.csv", "out.toml", "frames.csv --distance 1 --out out.toml"),
     "sensor fit-direct": ("frames.csv", "out.toml", "ladder.npz --object frames.csv,part.stl --out out.toml"),
+    "sensor import": ("cam.toml", "out.toml", "frames.csv --like cam.toml --out out.toml"),
     "landmark show": ("part.stl", "dir/part.png", "part.stl --unit m --out dir"),
     "landmark export": ("cone", "out.stl", "cone --out out.stl"),
     "landmark design": ("design.toml", "dir/pareto.csv", "design.toml --out dir"),

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy import special
 
 from phasemark import UsageError
 from phasemark.matcher.statistics import Interval, mean_interval, rms_interval
@@ -218,7 +218,8 @@ def percentile_interval(values: ArrayLike, share: float) -> Interval:
     n = len(ordered)
     if not n:
         return Interval(math.nan, 0.0, math.inf)
-    low, high = int(stats.binom.ppf(_TAIL, n, share)), int(stats.binom.ppf(1 - _TAIL, n, share)) + 1
+    below = special.bdtr(np.arange(n + 1), n, share)  # probability of at most k values below the percentile
+    low, high = int(np.searchsorted(below, _TAIL)), int(np.searchsorted(below, 1 - _TAIL)) + 1
     return Interval(
         float(np.quantile(ordered, share)),
         float(ordered[low - 1]) if low >= 1 else 0.0,
