@@ -13,6 +13,7 @@ from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColor
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import offset_copy
 from numpy.typing import NDArray
 from rich.color import Color
 from rich.style import Style
@@ -20,6 +21,7 @@ from rich.text import Text
 
 from phasemark import UsageError
 from phasemark.render.frames import Flag
+from phasemark.render.view import Views
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -240,12 +242,18 @@ def phasor_figure(images: PhasorImages, index: int = 0) -> Figure:
     draw_map(
         right, images.coverage[index], "coverage", "share of the pixel on the landmark", cmap="gray", vmin=0, vmax=1
     )
-    views = images.views
-    figure.suptitle(
-        f"view {index}: D = {views.distance_m[index]:.3f} m, δ = {math.degrees(views.delta_rad[index]):.2f}°, "
-        f"b = {math.degrees(views.bearing_rad[index]):.2f}°, h = {views.height_m[index]:.3f} m"
-    )
+    figure.suptitle(f"view {index}: {_view_in_words(images.views, index)}")
     return figure
+
+
+def _view_in_words(views: Views, index: int) -> str:
+    """Return the numbers of a view; pitch and roll only where it is tilted."""
+    angles = {"δ": views.delta_rad, "b": views.bearing_rad, "pitch": views.pitch_rad, "roll": views.roll_rad}
+    told = {name: f"{name} = {math.degrees(values[index]):.2f}°" for name, values in angles.items()}
+    words = [f"D = {views.distance_m[index]:.3f} m", told["δ"], told["b"], f"h = {views.height_m[index]:.3f} m"]
+    if views.pitch_rad[index] or views.roll_rad[index]:
+        words += [told["pitch"], told["roll"]]
+    return ", ".join(words)
 
 
 def frame_figure(frames: Frames, index: int = 0, frame: int = 0) -> Figure:
@@ -385,11 +393,17 @@ def _draw_flags(axes: Axes, flags: NDArray[np.uint8]) -> None:
     _legend_below(axes, [Patch(facecolor=_FLAG_COLOURS[name], edgecolor="0.5", label=name) for name in present])
 
 
+_LABEL_POINTS = 36.0
+"""Room below an image for ticks and the label of its axis."""
+
+
 def _legend_below(axes: Axes, handles: list[Patch]) -> None:
+    """Put a legend below the label of the axis, whatever the image's shape."""
     axes.legend(
         handles=handles,
         loc="upper center",
-        bbox_to_anchor=(0.5, -0.16),
+        bbox_to_anchor=(0.5, 0.0),
+        bbox_transform=offset_copy(axes.transAxes, fig=axes.get_figure(root=True), y=-_LABEL_POINTS, units="points"),
         ncols=len(handles),
         frameon=False,
         fontsize="small",
