@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
-from phasemark.matcher.accuracy.pose_report import ErrorSummary, percentile_interval, pose_report, views_as_poses
+from phasemark.matcher.accuracy.pose_errors import ErrorSummary, percentile_interval, pose_report, views_as_poses
 from phasemark.matcher.recordings.pose_table import read_pose_table
 from phasemark.render import Views
 

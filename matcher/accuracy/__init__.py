@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
-    from phasemark.matcher.accuracy.accuracy_card import AccuracyCard, accuracy_card, sides_of
     from phasemark.matcher.accuracy.cramer_rao import Bound, confusion_probability
+    from phasemark.matcher.accuracy.expected_accuracy import AccuracyCard, accuracy_card, sides_of
     from phasemark.matcher.accuracy.grid_spacing import GridLoss, SpacingLoss, grid_loss
+    from phasemark.matcher.accuracy.pose_errors import PoseReport, pose_report
     from phasemark.matcher.accuracy.trials import Trials, TrialSetup, TrialSummary, run_trials
 else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)
@@ -16,6 +17,7 @@ __all__ = [
     "AccuracyCard",
     "Bound",
     "GridLoss",
+    "PoseReport",
     "SpacingLoss",
     "TrialSetup",
     "TrialSummary",
@@ -23,6 +25,7 @@ __all__ = [
     "accuracy_card",
     "confusion_probability",
     "grid_loss",
+    "pose_report",
     "run_trials",
     "sides_of",
 ]

@@ -45,7 +45,7 @@ def accuracy_line(
     catalogue explains a frame better.
     """
     from phasemark.landmarks import catalog
-    from phasemark.matcher.accuracy.accuracy_card import accuracy_card, sides_of
+    from phasemark.matcher.accuracy.expected_accuracy import accuracy_card, sides_of
     from phasemark.render import Renderer, Views
 
     refuse_unless_one(class_name, mesh_file, mesh_reading, "judge")

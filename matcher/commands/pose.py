@@ -45,7 +45,7 @@ def pose_report_command(
     """
     import numpy as np
 
-    from phasemark.matcher.accuracy.pose_report import pose_report, views_as_poses
+    from phasemark.matcher.accuracy.pose_errors import pose_report, views_as_poses
     from phasemark.matcher.recordings.pose_table import read_pose_table
 
     found, true = read_pose_table(measured), read_pose_table(truth)

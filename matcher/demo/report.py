@@ -16,7 +16,7 @@ from phasemark.data.files.provenance import versions
 from phasemark.data.pages.figure_data import figure_csv
 from phasemark.data.pages.page import embedded_png, figure_png, page_template, short_number
 from phasemark.landmarks import build_mesh, catalog, mesh_figure
-from phasemark.matcher.accuracy.accuracy_card import accuracy_card, sides_of
+from phasemark.matcher.accuracy.expected_accuracy import accuracy_card, sides_of
 from phasemark.matcher.demo.run import (
     LANDMARK_XY_M,
     LIKELIHOOD,

@@ -9,7 +9,7 @@ from dataclasses import fields
 import numpy as np
 
 from phasemark.landmarks import mesh_symmetry
-from phasemark.matcher.accuracy.accuracy_card import AccuracyCard, accuracy_card, sides_of
+from phasemark.matcher.accuracy.expected_accuracy import AccuracyCard, accuracy_card, sides_of
 from phasemark.matcher.sweep.job import SweepJob
 from phasemark.matcher.sweep.result_tables import Cell, condition_axes
 from phasemark.render import Renderer

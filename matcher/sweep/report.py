@@ -204,9 +204,11 @@ def _first_class(cells: Sequence[Cell]) -> str:
 def _commands(plan: SweepPlan, folder: Path) -> list[str]:
     """Return what runs the sweep again into a new folder, and what writes this page from the trials that are there."""
     where = shlex.quote(str(folder))
-    run = f"phasemark sweep run {shlex.quote(str(folder / 'plan.json'))} --out {shlex.quote(f'{folder}-again')}"
-    trusted = " --trust-plan" if any(method.is_program for method in plan.methods) else ""
-    return [run + trusted, f"phasemark sweep report {where}"]
+    given, again = shlex.quote(str(folder / "plan.json")), shlex.quote(f"{folder}-again")
+    run = f"phasemark sweep run {given} --out {again}"
+    if any(method.is_program for method in plan.methods):
+        run = f"phasemark sweep run {given} --out {again} --trust-plan"
+    return [run, f"phasemark sweep report {where}"]
 
 
 def _examples(plan: SweepPlan, trials: SweepTrials, ours: OwnedFiles) -> list[dict[str, Any]]:
