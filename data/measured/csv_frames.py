@@ -77,7 +77,7 @@ def parse_csv(content: bytes, shape: tuple[int, int], path: Path, n_frequencies:
     path : Path
         For messages.
     n_frequencies : int
-        Modulation frequencies of the sensor. A line that has so many values for each pixel holds one frequency after
+        Modulation frequencies of the sensor. A line with a value for each pixel and frequency holds one frequency after
         the other, and its arrays are called ``frequency_range`` and so on.
 
     Raises

@@ -17,7 +17,7 @@ _INFINITE = 1.15
 
 
 def pareto_figure(design: Design) -> Figure:
-    """Draw every box that was tried: its worst position bound, and how well classes and sides are told apart.
+    """Draw every box that was tried: its worst position bound, and how far apart classes and sides are.
 
     Parameters
     ----------

@@ -99,7 +99,7 @@ class DesignPlan(PlanModel):
     distance_m : (near, far)
         Working range.
     n_classes : int
-        How many landmarks that are told apart.
+        How many landmarks the set has, each a class of its own.
     n_frames : int
         Frames averaged for one measurement.
     albedo : float

@@ -38,7 +38,7 @@ _FINER = 4
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A box with the set of upper parts that are told apart best on it.
+    """A box with the set of upper parts that differ most on it.
 
     Parameters
     ----------
