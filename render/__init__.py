@@ -1,4 +1,4 @@
-"""How the camera sees the landmark: from a mesh and a sensor to phasor images, and from those to noisy frames."""
+"""Rendering: from a mesh and a sensor to phasor images, and from those to noisy frames."""
 
 from typing import TYPE_CHECKING
 

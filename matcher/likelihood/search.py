@@ -155,7 +155,7 @@ def _retry_with_prior(
     fits: Fits,
     poor: NDArray[np.int64],
 ) -> list[Fits]:
-    """Search poor frames anew with the bearing free: turned, heading kept, then from shifted minima of the bank.
+    """Search poor frames again with the bearing free: turned, heading kept, then from shifted minima of the bank.
 
     A scout knows no bearing.
     """
@@ -192,7 +192,7 @@ def _retry_without_prior(
     fits: Fits,
     poor: NDArray[np.int64],
 ) -> list[Fits]:
-    """Search poor frames from more minima and angles; what would still be refused, around its best fits and anew."""
+    """Search poor frames from more minima and angles; those still refused, around their best fits and afresh."""
     policy, all_classes = setup.policy, _all_classes(setup, evidence)
 
     def refused(found: list[Fits]) -> NDArray[np.int64]:

@@ -26,7 +26,7 @@ _HOLLOW = 1e-9
 
 
 class MeshTopology(NamedTuple):
-    """What the renderer needs to know of a mesh, in float64 and contiguous.
+    """Mesh in the form that the renderer needs, float64 and contiguous.
 
     Parameters
     ----------
