@@ -293,7 +293,7 @@ def frame_figure(
     panels = figure.subplots(1, n_panels)
     panels[0].set_title("range")
     range_m = frames.range_m[index, frame]
-    near, far = landmark_limits_m(range_m, _nearest(range_m) if coverage is None else coverage)
+    near, far = nearest_limits_m(range_m) if coverage is None else landmark_limits_m(range_m, coverage)
     draw_range(panels[0], range_m, near_m=near, far_m=far)
     if frames.amplitude_e is not None:
         draw_map(panels[1], frames.amplitude_e[index, frame], "amplitude", "amplitude (e-)", cmap="gray", vmin=0.0)
@@ -302,11 +302,22 @@ def frame_figure(
     return figure
 
 
-def _nearest(range_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return 1 for pixels of the nearest surface and up to 0.4 m behind it, and 0 for the others."""
+def nearest_limits_m(range_m: NDArray[np.float64]) -> tuple[float, float] | tuple[None, None]:
+    """Return the ranges between which the nearest surface lies, for the colours of a measured frame.
+
+    Parameters
+    ----------
+    range_m : (rows, cols) float64
+        Metres; NaN where nothing returned.
+
+    Returns
+    -------
+    near_m, far_m : float or None
+        Those of :func:`landmark_limits_m`, where a landmark reaches from the nearest surface to 0.4 m behind it.
+    """
     seen = range_m[np.isfinite(range_m)]
     nearest = np.percentile(seen, _LANDMARK_PERCENTILES[0]) if seen.size else np.nan
-    return (range_m <= nearest + _LANDMARK_DEPTH_M).astype(np.float64)
+    return landmark_limits_m(range_m, (range_m <= nearest + _LANDMARK_DEPTH_M).astype(np.float64))
 
 
 def terminal_figure(
