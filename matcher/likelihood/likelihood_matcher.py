@@ -69,11 +69,11 @@ class LikelihoodMatcher:
         workers: int | None = None,
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
-        near = free is None
+        has_prior = free is None  # the default frees the bearing, with a prior
         names = check_free((*VIEW[:2], "bearing_rad") if free is None else free)
         _check_choices(bank, background, on, pixels, names)
         known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
-        if near:
+        if has_prior:
             known["bearing_rad"] = bearing_std_rad
         prior = tuple(known.get(name, math.inf) for name in names)
         unknown = background == "unknown"
@@ -85,8 +85,8 @@ class LikelihoodMatcher:
             bank=bank,
             shapes=Shapes.of_bank(bank),
             free=names,
-            prior_std=prior if near or min(prior) < math.inf else (),
-            bearing_has_prior=near,
+            prior_std=prior if has_prior or min(prior) < math.inf else (),
+            bearing_has_prior=has_prior,
             on=on,
             background_is_known=self._stated is not None,
             unknown=unknown,
@@ -94,14 +94,15 @@ class LikelihoodMatcher:
             huber=ROBUST_FROM if robust or unknown else None,
             false_alarm=false_alarm,
             tolerance={name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW},
-            widest_rad=policy.prior_sigma * bearing_std_rad if near else math.inf,
+            widest_rad=policy.prior_sigma * bearing_std_rad if has_prior else math.inf,
             policy=policy,
         )
         behind = None if self._stated is None else background_of(bank, self._stated)
         self._exact, self._scout = self._bank_models(behind)
         self._stride = self._search_stride()
-        search = self._new_search(behind, 0.0 if near else self._setup.widest_rad)
-        wide = self._new_search(behind, self._setup.widest_rad) if near else search
+        # with a prior the first search takes the bearing for 0, and repeated ones shift the frame
+        search = self._new_search(behind, 0.0 if has_prior else self._setup.widest_rad)
+        wide = self._new_search(behind, self._setup.widest_rad) if has_prior else search
         self._auto = background == "auto"
         if self._auto or self._exact is None:
             self._check_distances()
@@ -163,8 +164,8 @@ class LikelihoodMatcher:
         setup, policy = self._setup, self._setup.policy
         fixed = setup.free == VIEW[:2]
         is_exact = fixed and setup.on == "ranges" and self._stated is None
-        is_exact = is_exact and BankModel.fits(self._bank, *policy.fine_grid)
-        scouts = (fixed or setup.bearing_has_prior) and BankModel.fits(self._bank, *policy.coarse_grid)
+        is_exact = is_exact and BankModel.grid_is_fine_enough(self._bank, *policy.fine_grid)
+        scouts = (fixed or setup.bearing_has_prior) and BankModel.grid_is_fine_enough(self._bank, *policy.coarse_grid)
         if not (is_exact or scouts):
             return None, None
         model = BankModel(self._bank)
@@ -202,7 +203,7 @@ class LikelihoodMatcher:
         """Return a search before some background, over bearings up to a widest where they are free."""
         widest = widest_rad if self._setup.bearing_is_free else 0.0
         setup = self._setup
-        upward = Upward(setup.std_before("height_m"), setup.std_before("pitch_rad"), setup.policy.prior_sigma)
+        upward = Upward(setup.prior_std_of("height_m"), setup.prior_std_of("pitch_rad"), setup.policy.prior_sigma)
         capped = setup.unknown or not setup.is_upright  # edges between rows: no pixel may decide alone where it starts
         return Search(self._bank, behind, self._stride, widest, upward, capped=capped)
 
