@@ -1,4 +1,4 @@
-"""What a matcher answers: one :class:`Match` a position, and :class:`Matches`, a sequence of them."""
+"""Answers of a matcher: one :class:`Match` a position, and :class:`Matches`, a sequence of them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """What one filtered frame shows.
+    """Answer for one filtered frame: class, view, uncertainty and acceptance.
 
     Parameters
     ----------

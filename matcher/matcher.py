@@ -30,7 +30,7 @@ METHODS = ("nearest", "refine")
 
 
 class MatchMethod(Protocol):
-    """What a method of matching does."""
+    """Interface of a method of matching."""
 
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Return one answer for each of n filtered frames, whose range offset was taken off."""

@@ -1,11 +1,10 @@
-"""How the camera sees the landmark: from a mesh and a sensor to phasor images, and from those to noisy frames."""
+"""Rendering: from a mesh and a sensor to phasor images, and from those to noisy frames."""
 
 from typing import TYPE_CHECKING
 
 from phasemark.inputs import on_use
 from phasemark.render import compile_cache  # noqa: F401 - first, for the modules below compile functions
 from phasemark.render.background import Background
-from phasemark.render.bench.data_sheet.characterise import characterise
 from phasemark.render.exposure.capture import capture
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m
@@ -18,7 +17,11 @@ from phasemark.render.unwrapping import unwrap_ranges, unwrapping_error_probabil
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    import matplotlib.figure
+
+    from phasemark.render.bench.data_sheet.characterise import characterise
+else:
+    __getattr__, __dir__ = on_use.imported_on_use(__name__)  # the bench takes time to import, and few need it
 
 
 __all__ = [
@@ -43,14 +46,14 @@ __all__ = [
 ]
 
 
-def _figure_of_frame(frames: Frames, index: int, frame: int) -> "Figure":
+def _figure_of_frame(frames: Frames, index: int, frame: int) -> "matplotlib.figure.Figure":
     """Draw range, amplitude and flags of one frame."""
     from phasemark.render.figures import frame_figure
 
     return frame_figure(frames, index, frame)
 
 
-def _figure_of_image(images: PhasorImages, index: int) -> "Figure":
+def _figure_of_image(images: PhasorImages, index: int) -> "matplotlib.figure.Figure":
     """Draw range, amplitude and coverage of one view."""
     from phasemark.render.figures import phasor_figure
 
@@ -59,8 +62,3 @@ def _figure_of_image(images: PhasorImages, index: int) -> "Figure":
 
 Frames.figure = staticmethod(_figure_of_frame)
 PhasorImages.figure = staticmethod(_figure_of_image)
-
-
-def __getattr__(name: str) -> object:
-    """Find names that moved."""
-    return on_use.moved_name(__name__, name)

@@ -78,7 +78,7 @@ class BankModel:
 
     @staticmethod
     def grid_is_fine_enough(bank: Bank, step_m: float, step_rad: float) -> bool:
-        """Whether a bank's grid is regular, and no wider than some steps."""
+        """Return True if a bank's grid is regular and no wider than some steps."""
         return all(
             len(grid) >= 4
             and grid[-1] - grid[0] <= (len(grid) - 1) * step * (1 + 1e-6)
@@ -135,7 +135,7 @@ class BankModel:
         return np.stack([(one - other) / 2 for one, other in ends], axis=1)
 
     def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
-        """Interpolate anew."""
+        """Interpolate images at turned views, and keep the slopes of the views before."""
         return replace(self.images(class_index, view, ()), slope=like.slope)
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:

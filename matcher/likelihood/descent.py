@@ -18,7 +18,7 @@ def descend(problem: Problem, state: State, settled: float) -> State:
     """Run Levenberg–Marquardt, each candidate with its own damping.
 
     Where a step promises little, slopes that were rendered before serve again; when a step with them fails, they are
-    rendered anew.
+    rendered again.
     """
     damping = np.full(len(state.theta), _FIRST_DAMPING)
     slopes_are_old = np.zeros(len(state.theta), np.bool_)

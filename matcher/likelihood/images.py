@@ -1,4 +1,4 @@
-"""What a model of images gives the likelihood: images of views anywhere, and how they change with the view."""
+"""Interface of image models: images of views anywhere, and their derivatives by the view."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class ModelImages:
 
 
 class ImageModel(Protocol):
-    """What the refinement asks of a model.
+    """Interface that the refinement needs of an image model.
 
     Parameters
     ----------

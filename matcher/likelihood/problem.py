@@ -30,7 +30,7 @@ _STEEPEST_RAD = 1.2
 
 @dataclass(frozen=True)
 class DescentSettings:
-    """What is estimated, and from what.
+    """Free parameters and evidence of a descent.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class DescentSettings:
 
 @dataclass(eq=False)
 class State:
-    """Where m candidates are: parameters (view and albedo, (m, 7)), pixels in use, images and sums there."""
+    """State of m candidates: parameters (view and albedo, (m, 7)), pixels in use, images and sums there."""
 
     theta: NDArray[np.float64]
     use: NDArray[np.bool_]

@@ -113,7 +113,7 @@ def _descend_near(problem: Problem, state: State) -> State:
 
 
 def _recounted(problem: Problem, state: State) -> State:
-    """Decide anew which pixels count, and descend again where others do."""
+    """Decide again which pixels count, and descend again where they changed."""
     policy = problem.policy
     use = problem.pixels_at(state.images, state.theta)
     changed = np.flatnonzero((use != state.use).any(axis=1) & (state.sums.cost <= problem.rival + policy.margin_cost))

@@ -1,4 +1,4 @@
-"""How well model images explain filtered frames, and how that changes with the view: Gauss–Newton's sums.
+"""Residuals between model images and filtered frames, and their derivatives by the view: Gauss–Newton's sums.
 
 On *ranges*, each pixel leaves the residual y − (c/4πf) arg S, wrapped, with the variance of the filter. On *phasors*
 it leaves two, real and imaginary part of z − S, where z is the filtered amplitude · exp(iφ) in units of |S|; both have
@@ -138,7 +138,7 @@ def gauss_newton_sums(
         ∂S/∂parameter.
     evidence : Evidence
     frame : (m,) int64
-        Which frame each model is held against.
+        Number of the frame that each model is compared with.
     use : (m, pixels) bool
         Which pixels count. On ranges, one of them that returns where the model has no light costs
         :data:`~phasemark.matcher.pixel_agreement.DISAGREEMENT`.

@@ -158,7 +158,7 @@ def _retry_with_prior(
     fits: Fits,
     poor: NDArray[np.int64],
 ) -> list[Fits]:
-    """Search poor frames anew with the bearing free: turned, heading kept, then from shifted minima of the bank.
+    """Search poor frames again with the bearing free: turned, heading kept, then from shifted minima of the bank.
 
     Interpolated images have bearing 0, so these searches use rendered images from the start.
     """

@@ -1,4 +1,4 @@
-"""What a likelihood matcher estimates, from what, and before which background; fixed while frames are matched."""
+"""Setup of a likelihood matcher: free parameters, evidence and background, fixed while frames are matched."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def check_free(free: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """What the search knows of the landmarks of a bank, in the order of its classes.
+    """Landmarks of a bank as the search needs them, in the order of its classes.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class Shapes:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What is estimated, and by which rules.
+    """Free parameters of a matcher, and the rules of its search.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ class Setup:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stands behind the landmark, with the models and searches that know it.
+    """Background with the image models and searches that include it.
 
     Parameters
     ----------

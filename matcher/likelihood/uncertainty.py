@@ -1,4 +1,4 @@
-"""How well a solution is known: its covariance, the slopes that make it, and what single pixels contribute."""
+"""Uncertainty of a solution: its covariance, the slopes behind it, and the contributions of single pixels."""
 
 from __future__ import annotations
 
