@@ -363,14 +363,22 @@ def test_a_match_tells_weights_condition_and_weak_direction(bank, renderers):
     [
         ({"free": ("distance_m", "yaw")}, "'free' must be among"),
         ({"free": ("distance_m",)}, "must name distance_m and delta_rad"),
-        ({"on": "volts"}, "'on' must be ranges or phasors"),
-        ({"pixels": "upper"}, "'pixels' must be all or lower"),
-        ({"background": "wall"}, "'background' must be a Background"),
+        ({"on": "volts"}, "'on' must be 'ranges' or 'phasors', got 'volts'$"),
+        ({"on": np.ones((16, 16))}, "'on' must be 'ranges' or 'phasors', got ndarray$"),
+        ({"pixels": "upper"}, "'pixels' must be 'all' or 'lower', got 'upper'$"),
+        ({"pixels": np.ones((16, 16), bool)}, "'pixels' must be 'all' or 'lower', got ndarray$"),
+        ({"background": "wall"}, "'background' must be a Background, None, 'auto' or 'unknown', got 'wall'$"),
+        ({"background": np.ones((16, 16))}, "'background' must be a Background, None, .* got ndarray$"),
+        ({"background": 4.0}, "'background' must be a Background, None, .* got float$"),
+        ({"method": np.ones(2)}, "'method' must be 'nearest' or 'refine', got ndarray$"),
     ],
 )
-def test_wrong_options_are_refused_in_one_line(bank, options, message):
+@pytest.mark.parametrize("method", ["refine", "nearest"])
+def test_wrong_options_are_refused_in_one_line(bank, options, message, method):
+    if method == "nearest" and "free" in options:
+        message = "belong to method 'refine'"
     with pytest.raises(UsageError, match=message) as error:
-        Matcher(bank, "refine", **options)
+        Matcher(bank, **{"method": method, **options})
     assert "\n" not in str(error.value)
 
 
