@@ -10,7 +10,7 @@ from scipy.special import ndtr
 
 from phasemark import UsageError
 from phasemark.render.direct.footprints import histogram_of
-from phasemark.render.direct.transients import PARTS, RangeAxis
+from phasemark.render.direct.transients import RangeAxis
 from phasemark.render.sensor.histogram_fields import Histogram
 from phasemark.render.sensor.sensor import Sensor
 
@@ -85,7 +85,7 @@ def signal_counts(
     (n, zones, bins) float64
     """
     histogram = histogram_of(sensor)
-    albedos = np.broadcast_to(np.asarray(albedo, dtype=np.float64), (PARTS,))
+    albedos = np.broadcast_to(np.asarray(albedo, dtype=np.float64), transients.shape[1:2])
     light = np.einsum("npzr,p->nzr", transients, albedos)
     response = bin_response(sensor, axis)
     gain = np.array(histogram.zone_gain or ((1.0,) * sensor.cols,) * sensor.rows).ravel()
@@ -113,9 +113,27 @@ def expected_counts(
     -------
     (n, zones, bins) float64
     """
+    return detected_counts(signal_counts(transients, sensor, axis, albedo), sensor)
+
+
+def detected_counts(signal: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
+    """Return expected counts λ, pile-up included, from expected signal counts.
+
+    Ambient light, dark counts and the crosstalk of a cover glass are added, then pile-up takes what the first photon of
+    a cycle leaves (PHYSICS section 11).
+
+    Parameters
+    ----------
+    signal : (..., zones, bins) float64
+        From :func:`signal_counts`, or their sum over parts of a scene.
+    sensor : Sensor
+
+    Returns
+    -------
+    (..., zones, bins) float64
+    """
     histogram = histogram_of(sensor)
-    counts = signal_counts(transients, sensor, axis, albedo)
-    counts += histogram.cycles * (histogram.ambient + histogram.dark)
+    counts = signal + histogram.cycles * (histogram.ambient + histogram.dark)
     if histogram.crosstalk > 0:
         edges = histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1)
         counts += histogram.crosstalk * np.diff(response_share(edges - histogram.crosstalk_range_m, histogram))
