@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.special import ndtr
+from scipy.stats import chi2
 
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.render import Background, Renderer, Sensor, Views, preset
-from phasemark.render.direct import HistogramRenderer, piled_up
+from phasemark.render import Background, Flag, Renderer, Sensor, Views, capture, preset
+from phasemark.render.direct import HistogramFrames, HistogramRenderer, piled_up
 
 ZONES = preset("vl53l5cx-8x8")
 CYLINDER = build_mesh(catalog()["cylinder"])
@@ -124,3 +125,74 @@ def test_what_cannot_be_rendered_is_refused_in_one_line(call: object, message: s
     with pytest.raises(UsageError, match=message) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+def test_capture_of_histograms_has_targets_and_the_same_noise_in_pieces() -> None:
+    images = HistogramRenderer(CYLINDER, ZONES).render_views(VIEWS, background=BEHIND)
+    whole = capture(images, ZONES, rng=np.random.default_rng(3), n_frames=4)
+    assert isinstance(whole, HistogramFrames)
+    assert whole.counts.shape == (3, 4, 8, 8, 128)
+    assert whole.targets.distance_m.shape == (3, 4, 8, 8, ZONES.histogram.max_targets)
+    part = capture(
+        HistogramRenderer(CYLINDER, ZONES).render_views(VIEWS[1:2], background=BEHIND),
+        ZONES, rng=np.random.default_rng(3), n_frames=2, first_view=1, first_frame=2, workers=2,
+    )  # fmt: skip
+    np.testing.assert_array_equal(part.counts[0], whole.counts[1, 2:])
+
+
+def test_counts_of_captured_histograms_are_poisson_about_the_expectation() -> None:
+    images = HistogramRenderer(CYLINDER, ZONES).render(0.8, background=Background(wall_m=1.6))
+    n = 400
+    counts = capture(images, ZONES, rng=np.random.default_rng(8), n_frames=n).counts[0].reshape(n, -1)
+    mean = images.expected.ravel()
+    lit = mean > 0.5  # where the mean of 400 frames is near to normal
+    statistic = float((n * (counts.mean(axis=0) - mean)[lit] ** 2 / mean[lit]).sum())
+    low, high = chi2.ppf([5e-4, 1 - 5e-4], int(lit.sum()))
+    assert low < statistic < high
+
+
+def test_ranges_of_histograms_are_those_of_the_nearest_target_along_the_ray() -> None:
+    sensor = ZONES.with_(dead_pixels=((2, 3),))
+    assert sensor.histogram.reports == "z"
+    images = HistogramRenderer(None, sensor).render(1.0, background=Background(wall_m=1.2, wall_albedo=0.9))
+    frames = capture(images, sensor, rng=np.random.default_rng(1), n_frames=5)
+    nearest = frames.ranges
+    assert (nearest.flags[:, :, 2, 3] == int(Flag.DEAD | Flag.MISSING)).all()
+    assert (frames.counts[:, :, 2, 3] == 0).all()
+    alive = nearest.valid
+    np.testing.assert_allclose(nearest.z_m[alive], frames.targets.distance_m[..., 0][alive], rtol=1e-12)
+    assert np.abs(nearest.z_m[alive] - 1.2).max() < 0.03  # half a bin is 19 mm
+
+
+def test_histograms_of_another_table_and_options_of_phase_cameras_are_refused() -> None:
+    images = HistogramRenderer(None, ZONES).render(1.0, background=Background(wall_m=1.2))
+    rng = np.random.default_rng(0)
+    brighter = ZONES.with_(histogram={**ZONES.histogram.model_dump(), "photons": 0.5})
+    with pytest.raises(UsageError, match=r"rendered for another sensor: 'histogram.photons' differs"):
+        capture(images, brighter, rng=rng)
+    with pytest.raises(UsageError, match="'keep_taps' must be left out for a direct sensor"):
+        capture(images, ZONES, rng=rng, keep_taps=True)
+    with pytest.raises(UsageError, match=r"has no \[histogram\] table"):
+        capture(images, preset("pmd-16x16"), rng=rng)
+    one = ZONES.with_(histogram={**ZONES.histogram.model_dump(), "max_targets": 1})
+    assert capture(images, one, rng=rng).targets.distance_m.shape[-1] == 1
+
+
+def test_vignetting_dims_a_zone_by_the_fourth_power_of_the_cosine() -> None:
+    plain, dimmed = (
+        HistogramRenderer(None, ZONES.with_(vignetting=on)).render(1.0, background=Background(wall_m=1.2)).signal[0]
+        for on in (False, True)
+    )
+    cosine = ZONES.axis_cosine()
+    np.testing.assert_allclose(dimmed / plain, cosine**4, rtol=5e-3)  # the mean over a zone of 5.6 degrees
+
+
+def test_histograms_draw_themselves() -> None:
+    images = HistogramRenderer(CYLINDER, ZONES).render(0.8)
+    frames = capture(images, ZONES, rng=np.random.default_rng(0))
+    for figure in (images.plot(), frames.plot()):
+        assert len(figure.axes) >= 2
+    with pytest.raises(UsageError, match="there is no view 1: they count from 0 to 0"):
+        images.plot(1)
+    with pytest.raises(UsageError, match="there is no frame 3"):
+        frames.plot(0, 3)

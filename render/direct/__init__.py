@@ -8,7 +8,12 @@ if TYPE_CHECKING:
     from phasemark.render.direct.bin_counts import detected_counts, expected_counts, piled_up, without_pile_up
     from phasemark.render.direct.fit_sensor import DirectFit, fit_direct_sensor, score_zone_orders
     from phasemark.render.direct.footprints import footprint_grid
-    from phasemark.render.direct.histogram_frames import HistogramFrames, capture_histograms, reference_centroid
+    from phasemark.render.direct.histogram_frames import (
+        HistogramFrames,
+        capture_histograms,
+        nearest_ranges,
+        reference_centroid,
+    )
     from phasemark.render.direct.histogram_images import HistogramImages, HistogramRenderer
     from phasemark.render.direct.recordings import (
         ObjectRecording,
@@ -40,6 +45,7 @@ __all__ = [
     "fit_direct_sensor",
     "footprint_grid",
     "label_object",
+    "nearest_ranges",
     "piled_up",
     "plane_samples",
     "range_axis",

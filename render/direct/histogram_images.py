@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
 from phasemark.render.background import Background
-from phasemark.render.direct.bin_counts import bin_response, detected_counts, signal_counts
+from phasemark.render.direct.bin_counts import bin_response, counts_of_light, detected_counts
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
 from phasemark.render.direct.scene_samples import BACKGROUND, SceneMesh
 from phasemark.render.direct.transients import range_axis, zone_transients
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _VIEWS_AT_ONCE = 4
-_SCENE_PARTS = BACKGROUND + 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +103,7 @@ class HistogramRenderer:
         self.sensor = sensor
         self.albedo = float(albedo)
         self._exact = Renderer(mesh, sensor, albedo=albedo, intersector=intersector)
-        self._mesh, self._intersector = mesh, intersector
+        self._scene = SceneMesh(mesh, intersector=intersector)
         self.grid = footprint_grid(sensor)
         self.axis = range_axis(sensor)
 
@@ -187,16 +186,16 @@ class HistogramRenderer:
         tasks = [slice(k, min(k + _VIEWS_AT_ONCE, len(views))) for k in range(0, len(views), _VIEWS_AT_ONCE)]
 
         def run(lane: list[slice]) -> None:
-            scene = SceneMesh(self._mesh, intersector=self._intersector)  # its scratch belongs to one thread
+            scene = self._scene.for_thread()
             for task in lane:
                 samples = scene.samples_of_views(
                     seen[task], self.grid, background=background, finest_m=0.5 * histogram.bin_width_m,
                     farthest_m=self.axis.nodes_m[-1],
                 )  # fmt: skip
-                light = zone_transients(samples, self.sensor, self.axis, parts=_SCENE_PARTS)
-                out[task, 0] = signal_counts(light, self.sensor, self.axis, (1.0, 1.0, 0.0))
-                if background is not None:
-                    out[task, 1] = signal_counts(light, self.sensor, self.axis, (0.0, 0.0, 1.0))
+                samples = samples._replace(part=(samples.part == BACKGROUND).astype(np.int8))
+                light = zone_transients(samples, self.sensor, self.axis)
+                for part in range(1 if background is None else 2):
+                    out[task, part] = counts_of_light(light[:, part], self.sensor, self.axis)
 
         if workers == 1 or len(tasks) <= 1:
             run(tasks)

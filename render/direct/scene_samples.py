@@ -7,6 +7,7 @@ landmark leaves free, cell by cell.
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import NamedTuple
 
@@ -84,6 +85,12 @@ class SceneMesh:
         self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
         self._room: tuple[tuple[int, int], _Buffers] | None = None
+
+    def for_thread(self) -> SceneMesh:
+        """Return the same scene with scratch of its own, for another thread."""
+        other = copy.copy(self)
+        other._room = None
+        return other
 
     def samples(self, landmark2cam: ArrayLike, grid: Camera) -> SceneSamples:
         """Sample what a grid of cells sees.

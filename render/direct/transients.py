@@ -23,7 +23,7 @@ from phasemark.render.kernel import kernel
 from phasemark.render.sensor.sensor import Sensor
 
 PARTS = 2
-"""Parts of a mesh that may differ in albedo."""
+"""Parts of a scene that may differ in albedo."""
 
 _NODES_PER_BIN = 16
 _BORDER = 2  # nodes beyond either end, for the outermost Lagrange weights
@@ -60,7 +60,7 @@ def range_axis(sensor: Sensor, *, longest_m: float | None = None) -> RangeAxis:
 
 
 def zone_transients(
-    samples: SceneSamples, sensor: Sensor, axis: RangeAxis, *, footprints: Footprints | None = None, parts: int = PARTS
+    samples: SceneSamples, sensor: Sensor, axis: RangeAxis, *, footprints: Footprints | None = None
 ) -> NDArray[np.float64]:
     """Return the transients of all zones.
 
@@ -72,8 +72,6 @@ def zone_transients(
     axis : RangeAxis
     footprints : Footprints, optional
         Without it those of the sensor.
-    parts : int
-        How many parts the samples have: 2, or 3 of a landmark with something behind it.
 
     Returns
     -------
@@ -82,7 +80,7 @@ def zone_transients(
         left out.
     """
     zones = footprints_of(sensor) if footprints is None else footprints
-    out = np.zeros((samples.n_views, parts, len(zones.centre), axis.n))
+    out = np.zeros((samples.n_views, PARTS, len(zones.centre), axis.n))
     amplitude = samples.amplitude
     if sensor.vignetting:
         amplitude = amplitude / (1 + (samples.tangents**2).sum(axis=1)) ** 2
