@@ -8,7 +8,7 @@ import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, overload
+from typing import Any, Literal, Self, overload
 
 import h5py
 import numpy as np
@@ -348,6 +348,18 @@ class FrameSet:
         """Return one dataset of some frames."""
         numbers = np.arange(len(self))[index if isinstance(index, slice) else np.asarray(index)]
         return self._checked(name, self._take(name, numbers))
+
+    def reported_quantity(self) -> Literal["range", "z"]:
+        """Return what the chip reports as the distance of targets.
+
+        Raises
+        ------
+        UsageError
+            The frame set holds no histograms.
+        """
+        self._refuse_without_histograms()
+        assert self.sensor.histogram is not None
+        return self.sensor.histogram.reports
 
     def _refuse_without_histograms(self) -> None:
         if not self.plan.histograms:
