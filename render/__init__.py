@@ -6,7 +6,9 @@ from phasemark.inputs import on_use
 from phasemark.render import compile_cache  # noqa: F401 - first, for the modules below compile functions
 from phasemark.render.background import Background
 from phasemark.render.bench.data_sheet.characterise import characterise
-from phasemark.render.exposure.capture import capture
+from phasemark.render.direct.capture import capture
+from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m
 from phasemark.render.renderer import Renderer, background_image
@@ -57,7 +59,23 @@ def _figure_of_image(images: PhasorImages, index: int) -> "Figure":
     return phasor_figure(images, index)
 
 
+def _figure_of_histograms(frames: HistogramFrames, index: int, frame: int) -> "Figure":
+    """Draw histograms of one frame and the range of the nearest target."""
+    from phasemark.render.direct.figures import histogram_figure
+
+    return histogram_figure(frames, index, frame)
+
+
+def _figure_of_expected_histograms(images: HistogramImages, index: int) -> "Figure":
+    """Draw the expected histograms of one view."""
+    from phasemark.render.direct.figures import expected_figure
+
+    return expected_figure(images, index)
+
+
 Frames.figure = staticmethod(_figure_of_frame)
+HistogramFrames.figure = staticmethod(_figure_of_histograms)
+HistogramImages.figure = staticmethod(_figure_of_expected_histograms)
 PhasorImages.figure = staticmethod(_figure_of_image)
 
 

@@ -264,7 +264,7 @@ def frames_show(
     if is_frame_set(frames):
         with open_frame_set(frames) as opened:
             _refuse_index(index, len(opened))
-            figure = opened.frames([index]).plot()
+            figure = opened.histograms([index]).plot() if opened.plan.histograms else opened.frames([index]).plot()
     else:
         measured = reading.read(frames, read_sensor(sensor))
         _refuse_index(index, len(measured) * measured.n_frames)
