@@ -87,14 +87,7 @@ class HistogramMatcher:
         return [build_table(self.signals, self.grid, b, self._workers) for b in self.bearings_rad]
 
     def match(self, frames: HistogramFrames) -> list[Match]:
-        """Return an answer for every position, whose frames are added up.
-
-        Raises
-        ------
-        UsageError
-            The histograms were taken with another sensor than the bank's.
-        """
-        refuse_other_sensor(self.sensor, frames.sensor)
+        """Return an answer for every position of the bank's sensor, whose frames are added up."""
         counted, _ = counted_frames(frames), self.tables
         if self._workers == 1 or len(counted) < 2:
             return [self._match(one) for one in counted]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import threading
 from collections.abc import Sequence
@@ -98,9 +97,6 @@ class ViewSignals:
 
     def _counts(self, views: Views) -> NDArray[np.float64]:
         if not hasattr(self._own, "scene"):
-            self._own.scene = copy.copy(self._scene)
-        rotation, translation = views.in_camera(self.sensor).landmark2cam()
-        pose = np.zeros((len(views), 4, 4))
-        pose[:, :3, :3], pose[:, :3, 3], pose[:, 3, 3] = rotation, translation, 1.0
-        samples = self._own.scene.samples(pose, self._grid)
+            self._own.scene = self._scene.for_thread()
+        samples = self._own.scene.samples_of_views(views.in_camera(self.sensor), self._grid)
         return signal_of_samples(samples, self.sensor, self.albedo)
