@@ -38,7 +38,7 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
 from phasemark.render import Background, PhasorImages, Views
 from phasemark.render.phasor_images import wrap_difference_m
 
-__all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TILT_STD_RAD", "LikelihoodMatcher", "Pixels"]
+__all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TILT_STD_RAD", "LikelihoodMatcher", "Pixels", "usual_workers"]
 
 Pixels = Literal["all", "lower"]
 ROBUST_FROM = 3.0
@@ -80,7 +80,7 @@ class LikelihoodMatcher:
         unknown = background == "unknown"
         self._bank = bank
         self._systematic = systematic
-        self._workers = workers or _usual_workers()
+        self._workers = workers or usual_workers()
         self._stated = background if isinstance(background, Background) else None
         self._setup = Setup(
             bank=bank,
@@ -274,5 +274,6 @@ def _check_choices(bank: Bank, background: object, on: str, free: tuple[str, ...
         )
 
 
-def _usual_workers() -> int:
+def usual_workers() -> int:
+    """Return how many threads match where nobody says: one for each processor, at most eight."""
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8)
