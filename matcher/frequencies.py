@@ -288,6 +288,10 @@ class _OneFrequencyGroup(BankGroup):
         self.__dict__.update({name: value for name, value in vars(group).items() if name not in _IMAGES})
         self._group, self._one = group, one
 
+    def part(self, *which: slice) -> BankGroup:
+        """Return the group with some of its views alone."""
+        return _OneFrequencyGroup(self._group.part(*which), self._one)
+
     @property
     def phasor(self) -> NDArray[np.complex64]:
         """S, (views, row, col)."""

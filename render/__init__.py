@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 from phasemark.render import compile_cache  # noqa: F401 - first, for the modules below compile functions
 from phasemark.render.background import Background
-from phasemark.render.exposure.capture import capture
+from phasemark.render.direct.capture import capture
+from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m
 from phasemark.render.renderer import Renderer, background_image
@@ -64,5 +66,21 @@ def _figure_of_image(images: PhasorImages, index: int) -> "matplotlib.figure.Fig
     return phasor_figure(images, index)
 
 
+def _figure_of_histograms(frames: HistogramFrames, index: int, frame: int) -> "matplotlib.figure.Figure":
+    """Draw histograms of one frame and the range of the nearest target."""
+    from phasemark.render.direct.figures import histogram_figure
+
+    return histogram_figure(frames, index, frame)
+
+
+def _figure_of_expected_histograms(images: HistogramImages, index: int) -> "matplotlib.figure.Figure":
+    """Draw the expected histograms of one view."""
+    from phasemark.render.direct.figures import expected_figure
+
+    return expected_figure(images, index)
+
+
 Frames.figure = staticmethod(_figure_of_frame)
+HistogramFrames.figure = staticmethod(_figure_of_histograms)
+HistogramImages.figure = staticmethod(_figure_of_expected_histograms)
 PhasorImages.figure = staticmethod(_figure_of_image)

@@ -253,11 +253,11 @@ def phasor_figure(images: PhasorImages, index: int = 0) -> Figure:
     draw_map(
         right, images.coverage[index], "coverage", "share of the pixel on the landmark", cmap="gray", vmin=0, vmax=1
     )
-    figure.suptitle(f"view {index}: {_view_in_words(images.views, index)}")
+    figure.suptitle(f"view {index}: {view_in_words(images.views, index)}")
     return figure
 
 
-def _view_in_words(views: Views, index: int) -> str:
+def view_in_words(views: Views, index: int) -> str:
     """Return the numbers of a view; pitch and roll only where it is tilted."""
     angles = {"δ": views.delta_rad, "b": views.bearing_rad, "pitch": views.pitch_rad, "roll": views.roll_rad}
     told = {name: f"{name} = {math.degrees(values[index]):.2f}°" for name, values in angles.items()}

@@ -293,6 +293,8 @@ def test_pose_errors_are_those_of_moved_lenses_and_turned_cameras():
         ("distance_m,delta_deg,tilt\n1,30,0\n", "unknown column 'tilt'"),
         ("distance_m,delta_deg\n1,30\n1.2\n", "line 3: 1 values, must have 2"),
         ("distance_m,delta_deg\n1,nan\n", "line 2: 'delta_deg' must be a finite number, got nan"),
+        ("distance_m,delta_deg\n1,\n", "line 2: 'delta_deg' must be a number, got ''"),
+        ("distance_m,delta_deg\n1,1_0\n", "line 2: 'delta_deg' must be a number, got '1_0'"),
         ("distance_m,delta_deg\n1,left\n", "line 2: 'delta_deg' must be a number, got 'left'"),
         ("distance_m,delta_deg\n120,30\n", "line 2: the lens is 120 m from the landmark"),
         ("distance_m,delta_deg\n-1,30\n", "line 2: the lens is -1 m from the landmark"),

@@ -136,7 +136,7 @@ class SearchPolicy:
         Unexplained pixels that must stand against a far view of the same landmark among unknown things.
 
     walls_beyond_m : tuple of float
-        How far behind the landmark a wall is tried that no pixel sees alone.
+        Distances behind the landmark at which a wall is tried where no pixel sees the background alone.
     background_rounds : int
         How often background and views are fitted in turn.
     other_angles : int

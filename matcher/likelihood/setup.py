@@ -13,7 +13,7 @@ from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.landmarks.symmetry import mesh_symmetry
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
-from phasemark.matcher.likelihood.problem import Settings
+from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import SearchPolicy
 from phasemark.matcher.nearest.bank_minima import Search
@@ -125,14 +125,14 @@ class Setup:
         """Whether the camera is level and at the height that was stated."""
         return not set(self.free) & set(VIEW[3:])
 
-    def modes_before(self, background: Background | None) -> int:
+    def n_modes_before(self, background: Background | None) -> int:
         """Return how many minima of the bank each frame is first refined from before a background."""
         policy = self.policy
         if background is None:
             return policy.modes
         return policy.modes_before_background if self.is_upright else policy.modes_again
 
-    def std_before(self, name: str) -> float:
+    def prior_std_of(self, name: str) -> float:
         """Return the standard deviation of a parameter before a frame is seen; 0 of one that is not estimated."""
         if name not in self.free:
             return 0.0
@@ -168,10 +168,10 @@ class Scene:
     search: Search
     wide_search: Search
 
-    def settings(self, setup: Setup) -> Settings:
+    def settings(self, setup: Setup) -> DescentSettings:
         """Return how a descent runs before this background."""
         behind = self.behind
-        return Settings(
+        return DescentSettings(
             setup.free,
             setup.used,
             setup.huber,
