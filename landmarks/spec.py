@@ -151,7 +151,7 @@ class Revolution(_Spec):
 
 
 def _touches_itself(points: NDArray[np.float64]) -> bool:
-    """Whether two segments of a polyline that are not neighbours have a point in common, or neighbours fold back."""
+    """Return True if two segments of a polyline that are not neighbours share a point, or neighbours fold back."""
     start, step = points[:-1], np.diff(points, axis=0)
     n = len(step)
     folds = np.array(

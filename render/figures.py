@@ -73,7 +73,7 @@ def pixel_grid_figure(sensor: Sensor) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        With many pixels only every so many borders are drawn; the title says how many pixels lie between them.
+        With many pixels only every n-th border is drawn; the title states n.
     """
     step = max(1, math.ceil(max(sensor.rows, sensor.cols) / _GRID_LINES))
     figure = Figure(figsize=(7.0, 7.0 * min(1.4, max(0.6, sensor.rows / sensor.cols))), layout="constrained")

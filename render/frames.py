@@ -22,7 +22,7 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 class Flag(IntFlag):
-    """Why a pixel's range is not valid; 0 where it is."""
+    """Reasons why a pixel's range is not valid; 0 where it is valid."""
 
     NO_RETURN = 1
     """The amplitude is below the validity threshold: nothing came back. This is data."""

@@ -1,4 +1,4 @@
-"""What a command checks of the files and folders that it is about to write."""
+"""Checks of the files and folders that a command is about to write."""
 
 # Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
 

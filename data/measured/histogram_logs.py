@@ -34,7 +34,7 @@ _TARGET_COLUMNS = ("mm", "sigma_mm", "signal", "status")
 
 @dataclass(frozen=True, eq=False)
 class HistogramLog:
-    """What a log of histograms holds.
+    """Content of a log of histograms.
 
     Parameters
     ----------

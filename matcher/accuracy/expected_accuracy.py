@@ -29,7 +29,7 @@ _SIDES = 12
 
 @dataclass(frozen=True, eq=False)
 class AccuracyCard:
-    """What one measurement can tell at best, at n views.
+    """Best possible accuracy of one measurement at n views.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def accuracy_card(
 
     Standard deviations are the Cramér–Rao bound on ranges (PHYSICS section 7), what the calibration of the sensor
     leaves, and what the sensor declares. With P the covariance of the noise and I_e the information of the edge pixels,
-    P I_e P is what the noise of edge pixels contributes.
+    P I_e P is the contribution of the noise of edge pixels.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ NEAREST_M, FURTHEST_M = 0.2, 100.0
 
 @dataclass(frozen=True)
 class Part:
-    """What one measurement adds to the whole."""
+    """Contribution of one measurement to the data sheet."""
 
     comparisons: tuple[Comparison, ...] = ()
     quantities: tuple[SheetQuantity, ...] = ()
