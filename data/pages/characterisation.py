@@ -17,7 +17,10 @@ from phasemark.render.integral.rounding import value_and_error
 from phasemark.render.sensor.range_noise import predicted_range_std
 
 REPORT = "report.html"
-FIGURES = ("photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold")
+FIGURES = (
+    "photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold", "histogram", "merging",
+    "ambient",
+)  # fmt: skip
 _OF_FIGURES = tuple(f"{name}.{kind}" for name in FIGURES for kind in ("png", "csv"))
 NAMES = (REPORT, "characterisation.json", "points.csv", *_OF_FIGURES)
 """What :func:`write_characterisation` may write; a sensor that lacks a figure lacks its picture."""
@@ -39,6 +42,12 @@ _DIRECT_CAPTIONS = {
     " figure that the sensor states.",
     "linearity": "Error of the mean range against distance, beside the sensor's global offset.",
     "threshold": "Share of frames in which a pixel drops out, against distance.",
+    "histogram": "Mean counts of the zones in the middle and in the corner before a plane of albedo 0.8, beside a"
+    " quadrature of the zone, the response, ambient light and pile-up.",
+    "merging": "Share of frames in which the chip reports two targets of equal light, against their separation. The"
+    " prediction is two standard deviations of response and bin, or the least separation that the chip keeps.",
+    "ambient": "Distance at which half of the frames find a surface, against ambient light. The prediction is that of"
+    " Poisson counts above the threshold over their median.",
 }
 
 

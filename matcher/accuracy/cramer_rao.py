@@ -88,7 +88,8 @@ def cramer_rao(
 
     Pixels count where one frame measures the range to 0.1 rad or better (0.24 m at 10 MHz). Of several modulation
     frequencies the information is the sum of that of each. A :class:`~phasemark.render.direct.HistogramRenderer` has
-    the bound of histograms: the Poisson information, the landmark's brightness and the ambient light of every zone unknown.
+    the bound of histograms: the Poisson information, with the landmark's brightness and the ambient light of every
+    zone unknown.
 
     Parameters
     ----------

@@ -2,8 +2,8 @@
 
 The expected report is computed from the expected counts by the chip's own estimator: merged peaks and estimates drawn
 to one side follow by themselves. A target is compared with the nearest one expected in its zone, with the sigma that
-came with it. A target that must be seen and is missing, and one that nothing explains, cost a disagreement. Chips report peaks
-of the noise too: how many of these are expected follows from the ambient light and the threshold.
+came with it. A target that must be seen and is missing, and one that nothing explains, cost a disagreement. Chips
+report peaks of the noise too: how many of these are expected follows from the ambient light and the threshold.
 """
 
 from __future__ import annotations
