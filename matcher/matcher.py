@@ -127,7 +127,7 @@ class Matcher:
     """
 
     def __repr__(self) -> str:
-        """Say in one line how frames are matched, and against what."""
+        """Describe in one line the method and the bank."""
         usual = (None, False, "all", "ranges")
         stated = [f"{name}={value!r}" for name, value in self.options.items() if value not in usual]
         return f"Matcher({', '.join([self.method, *stated])}, {self.bank!r})"

@@ -171,7 +171,7 @@ class Renderer:
     """
 
     def __repr__(self) -> str:
-        """Say in one line what is rendered, and with which camera."""
+        """Describe in one line the landmark and the camera."""
         faces = self.topology.faces
         size = " × ".join(f"{100 * side:.3g}" for side in np.ptp(self.topology.vertices, axis=0)) if len(faces) else ""
         landmark = f"{size} cm, {len(faces)} faces, albedo {self.albedo:g}" if size else "no landmark"
