@@ -20,6 +20,8 @@ from phasemark.render.view import Views
 
 if TYPE_CHECKING:
     import matplotlib.figure
+    import numpy as np
+    import numpy.typing
 
     from phasemark.render.bench.data_sheet.characterise import characterise
 else:
@@ -51,11 +53,13 @@ __all__ = [
 ]
 
 
-def _figure_of_frame(frames: Frames, index: int, frame: int) -> "matplotlib.figure.Figure":
+def _figure_of_frame(
+    frames: Frames, index: int, frame: int, coverage: "numpy.typing.NDArray[np.float64] | None"
+) -> "matplotlib.figure.Figure":
     """Draw range, amplitude and flags of one frame."""
     from phasemark.render.figures import frame_figure
 
-    return frame_figure(frames, index, frame)
+    return frame_figure(frames, index, frame, coverage=coverage)
 
 
 def _figure_of_image(images: PhasorImages, index: int) -> "matplotlib.figure.Figure":

@@ -220,7 +220,7 @@ class PhasorImages:
         Raises
         ------
         UsageError
-            The images do not tell parts apart.
+            The images do not distinguish parts.
         """
         if self.upper_coverage is None:
             raise UsageError("these images do not tell the landmark's parts apart: 'upper_coverage' is None")

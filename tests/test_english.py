@@ -27,7 +27,7 @@ AVOIDED = {
     "so many": "state the number, or write 'that number of'",
     "(?<!no )such(?! as| that)": "name the thing",
     "thought to be": "write 'assumed to be'",
-    "(?:told|tell|tells|telling) apart": "write 'distinguish'",
+    "(?:told|tell|tells|telling)(?: \\w+){0,3} apart": "write 'distinguish'",
     "says so": "say what is stated",
     "lest": "write 'so that … not'",
     "is what": "name the thing",

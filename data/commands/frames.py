@@ -274,7 +274,10 @@ def frames_show(
     if is_frame_set(frames):
         with open_frame_set(frames) as opened:
             _refuse_index(index, len(opened))
-            figure = opened.histograms([index]).plot() if opened.plan.histograms else opened.frames([index]).plot()
+            if opened.plan.histograms:
+                figure = opened.histograms([index]).plot()
+            else:
+                figure = opened.frames([index]).plot(coverage=opened[index]["coverage"])
     elif is_histogram_log(frames):
         log = read_histograms(frames, sensor=read_sensor(sensor)).frames
         _refuse_index(index, len(log))

@@ -386,7 +386,7 @@ _TRUTH = (
 
 
 class _Group(NamedTuple):
-    """What views that are rendered together have in common."""
+    """Landmark, albedo and background of views that are rendered together."""
 
     class_index: int
     albedo: float

@@ -52,7 +52,7 @@ _DIRECT_CAPTIONS = {
 
 
 def write_characterisation(
-    found: Characterisation, name: str, folder: Path, *, seed: int, force: bool = False
+    found: Characterisation, name: str, folder: Path, *, seed: int, bound: str | None = None, force: bool = False
 ) -> list[Path]:
     """Write ``report.html``, ``characterisation.json``, ``points.csv``, and a PNG and a CSV for each figure.
 
@@ -67,6 +67,8 @@ def write_characterisation(
         It exists.
     seed : int
         What the noise was drawn from, for the report.
+    bound : str, optional
+        Best accuracy of a match with this sensor in one line, for the report.
     force : bool
         Whether files may be replaced.
 
@@ -86,7 +88,7 @@ def write_characterisation(
     pictures = {title: figure_png(figure) for title, figure in figures.items()}
     facts = {"name": name, "seed": seed, "versions": versions(), **found.as_dict()}
     files = {
-        REPORT: _report(found, name, seed, pictures).encode(),
+        REPORT: _report(found, name, seed, pictures, bound).encode(),
         "characterisation.json": (json_text(facts, indent=1, allow_nan=False) + "\n").encode(),
         "points.csv": _points_csv(found).encode(),
         **{f"{title}.png": png for title, png in pictures.items()},
@@ -158,12 +160,13 @@ def _agreement_sentence(found: Characterisation) -> str:
     return f"The simulation does NOT agree with the prediction in {where}: {statistics}."
 
 
-def _report(found: Characterisation, name: str, seed: int, pictures: dict[str, bytes]) -> str:
+def _report(found: Characterisation, name: str, seed: int, pictures: dict[str, bytes], bound: str | None) -> str:
     sensor = found.sensor
     captions = _CAPTIONS if sensor.kind == "phase" else _DIRECT_CAPTIONS
     return page_template("phasemark.data.pages", "characterisation.html.j2").render(
         name=name,
         summary=summary_sentences(found, name),
+        bound=bound,
         notes=found.notes,
         contents=[
             *(["Data sheet"] if found.quantities else []),

@@ -1,4 +1,4 @@
-"""What a direct sensor counts and finds, by other arithmetic than the simulation's (PHYSICS section 11).
+"""The counts and targets of a direct sensor by other arithmetic than the simulation's (PHYSICS section 11).
 
 A zone is integrated by midpoints, pile-up is the recursion over bins, and a target is found where a bin exceeds the
 threshold about the median.

@@ -45,7 +45,7 @@ class Targets(NamedTuple):
 
 
 class Counted(Protocol):
-    """What has histograms: :class:`~phasemark.render.direct.HistogramFrames`."""
+    """Protocol of frames with counts: :class:`~phasemark.render.direct.HistogramFrames`."""
 
     counts: NDArray[np.float64]
     sensor: Sensor
