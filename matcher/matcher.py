@@ -161,7 +161,9 @@ class Matcher:
         self._one: OneFrequency | None = None
         self._systematic = check_systematic(systematic)
         if len(bank.sensor.frequencies_hz) > 1:
-            bank = OneFrequencyBank(bank, "combined" if method == "refine" and on == "ranges" else "stacked")
+            # mixed pixels have no range that the frequencies agree on, and before a background they are at every edge
+            unwraps = method == "refine" and on == "ranges" and not isinstance(background, Background)
+            bank = OneFrequencyBank(bank, "combined" if unwraps else "stacked")
             self._one = bank.one
         self._method: MatchMethod
         if method == "refine":

@@ -44,6 +44,7 @@ class BankModel:
     """
 
     slopes_are_free = True
+    alone = None
 
     def __init__(self, bank: Bank) -> None:
         self._sensor = bank.sensor
