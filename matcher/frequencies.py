@@ -1,6 +1,6 @@
 """Cameras of several modulation frequencies as matchers see them: as a camera of one frequency (PHYSICS section 10).
 
-Two such cameras stand for one of m frequencies f_j.
+Two cameras of one frequency stand for one camera of m frequencies f_j.
 
 *Stacked*, for phases: m images above one another, with every phase as if it were one at the first frequency. A phase's
 residual is wrapped and weighed with its own noise, so that nothing has to be unwrapped. The upper halves of all images
@@ -38,7 +38,7 @@ Way = Literal["stacked", "combined"]
 
 
 class OneFrequency:
-    """How a camera of several frequencies becomes one of a single frequency.
+    """Conversion of a camera of several frequencies to a camera of one frequency.
 
     Parameters
     ----------

@@ -117,7 +117,7 @@ def _temporary_folders() -> list[Path]:
 
 
 def _make_private(folder: Path) -> bool:
-    """Make a folder that nobody else can write to; whoever can write there could have us run their code."""
+    """Make a folder that nobody else can write to, because compiled code in it is run."""
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         status = folder.lstat()

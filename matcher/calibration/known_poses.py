@@ -1,4 +1,4 @@
-"""Where a camera stood when it took the frames of a calibration: what a user measured, read from a CSV file."""
+"""Known poses of the camera for a calibration, measured by the user and read from a CSV file."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class KnownPoses:
     wall_m : (K,) float64, optional
         Distance of a wall behind the landmark from the lens.
     frames : (K,) int64, optional
-        How many frames were taken at each, where the file says so.
+        Number of frames taken at each, where the file states it.
     place : tuple of str
         Where each stands in its file, for messages.
     time_s : (K,) float64, optional
@@ -137,7 +137,7 @@ class KnownPoses:
 
 @dataclass(frozen=True)
 class PoseStd:
-    """How well the poses are known: standard deviations, independent from pose to pose.
+    """Standard deviations of the stated poses, independent from pose to pose.
 
     Parameters
     ----------

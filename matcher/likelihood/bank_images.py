@@ -43,7 +43,7 @@ class BankModel:
         Its grid must be regular, with at least four distances and four angles.
     """
 
-    slopes_are_free = True
+    slopes_are_cheap = True
     alone = None
 
     def __init__(self, bank: Bank) -> None:
@@ -77,8 +77,8 @@ class BankModel:
         return other
 
     @staticmethod
-    def fits(bank: Bank, step_m: float, step_rad: float) -> bool:
-        """Whether a bank's grid is regular, and no wider than some steps."""
+    def grid_is_fine_enough(bank: Bank, step_m: float, step_rad: float) -> bool:
+        """Return True if a bank's grid is regular and no wider than some steps."""
         return all(
             len(grid) >= 4
             and grid[-1] - grid[0] <= (len(grid) - 1) * step * (1 + 1e-6)
@@ -134,9 +134,9 @@ class BankModel:
         ]
         return np.stack([(one - other) / 2 for one, other in ends], axis=1)
 
-    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
-        """Interpolate anew."""
-        return replace(self.images(class_index, view, ()), slope=before.slope)
+    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
+        """Interpolate images at turned views, and keep the slopes of the views before."""
+        return replace(self.images(class_index, view, ()), slope=like.slope)
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels are smooth enough."""

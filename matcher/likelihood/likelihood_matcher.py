@@ -38,7 +38,7 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
 from phasemark.render import Background, PhasorImages, Views
 from phasemark.render.phasor_images import wrap_difference_m
 
-__all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TILT_STD_RAD", "LikelihoodMatcher", "Pixels"]
+__all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TILT_STD_RAD", "LikelihoodMatcher", "Pixels", "usual_workers"]
 
 Pixels = Literal["all", "lower"]
 ROBUST_FROM = 3.0
@@ -70,25 +70,25 @@ class LikelihoodMatcher:
         workers: int | None = None,
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
-        near = free is None
+        has_prior = free is None  # the default frees the bearing, with a prior
         names = check_free((*VIEW[:2], "bearing_rad") if free is None else free)
         _check_choices(bank, background, on)
         known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
-        if near:
+        if has_prior:
             known["bearing_rad"] = bearing_std_rad
         prior = tuple(known.get(name, math.inf) for name in names)
         unknown = background == "unknown"
         self._bank = bank
         self._systematic = systematic
-        self._workers = workers or _usual_workers()
+        self._workers = workers or usual_workers()
         self._stated = background if isinstance(background, Background) else None
         self._auto = background == "auto"
         self._setup = Setup(
             bank=bank,
             shapes=Shapes.of_bank(bank),
             free=names,
-            prior_std=prior if near or min(prior) < math.inf else (),
-            bearing_has_prior=near,
+            prior_std=prior if has_prior or min(prior) < math.inf else (),
+            bearing_has_prior=has_prior,
             on=on,
             background_is_known=self._stated is not None,
             unknown=unknown,
@@ -96,7 +96,7 @@ class LikelihoodMatcher:
             huber=ROBUST_FROM if robust or unknown else None,
             false_alarm=false_alarm,
             tolerance={name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW},
-            widest_rad=policy.prior_sigma * bearing_std_rad if near else math.inf,
+            widest_rad=policy.prior_sigma * bearing_std_rad if has_prior else math.inf,
             policy=policy,
         )
         behind = None if self._stated is None else background_of(bank, self._stated)
@@ -104,7 +104,8 @@ class LikelihoodMatcher:
         thinned = ThinnedBank(bank, self._search_stride())
         self._thinned = thinned if self._auto else None  # backgrounds that are estimated ask for other templates
         wide = self._new_search(thinned, behind)
-        search = wide.over(0.0) if near else wide
+        # with a prior the first search takes the bearing for 0, and repeated ones shift the frame
+        search = wide.over(0.0) if has_prior else wide
         if self._auto or self._exact is None:
             self._check_distances()
         if self._stated is not None and self._stated.floor_m is not None and "height_m" not in self._setup.free:
@@ -167,8 +168,8 @@ class LikelihoodMatcher:
         setup, policy = self._setup, self._setup.policy
         fixed = setup.free == VIEW[:2]
         is_exact = fixed and setup.on == "ranges" and self._stated is None
-        is_exact = is_exact and BankModel.fits(self._bank, *policy.fine_grid)
-        scouts = (fixed or setup.bearing_has_prior) and BankModel.fits(self._bank, *policy.coarse_grid)
+        is_exact = is_exact and BankModel.grid_is_fine_enough(self._bank, *policy.fine_grid)
+        scouts = (fixed or setup.bearing_has_prior) and BankModel.grid_is_fine_enough(self._bank, *policy.coarse_grid)
         if not (is_exact or scouts):
             return None, None
         model = BankModel(self._bank)
@@ -206,7 +207,7 @@ class LikelihoodMatcher:
         """Return a search before some background, over all bearings that are looked for where they are free."""
         setup = self._setup
         widest = setup.widest_rad if setup.bearing_is_free else 0.0
-        upward = Upward(setup.std_before("height_m"), setup.std_before("pitch_rad"), setup.policy.prior_sigma)
+        upward = Upward(setup.prior_std_of("height_m"), setup.prior_std_of("pitch_rad"), setup.policy.prior_sigma)
         capped = setup.unknown or not setup.is_upright  # edges between rows: no pixel may decide alone where it starts
         return Search(thinned, behind, widest, upward, capped=capped)
 
@@ -264,5 +265,6 @@ def _check_choices(bank: Bank, background: object, on: str) -> None:
         raise UsageError('background="auto" takes on="ranges" with several modulation frequencies')
 
 
-def _usual_workers() -> int:
+def usual_workers() -> int:
+    """Return how many threads match where nobody says: one for each processor, at most eight."""
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8)

@@ -38,7 +38,7 @@ class RenderedModel:
         it depends on the bearing and the tilt of the view.
     """
 
-    slopes_are_free = False
+    slopes_are_cheap = False
 
     def __init__(
         self, bank: Bank, background: Background | None = None, cache_bytes: int = 0, *, splits_light: bool = False
@@ -142,9 +142,9 @@ class RenderedModel:
             return new
         return ModelImages(*(np.stack([cast(Any, row[part]) for row in rows]) for part in range(len(rows[0]))))
 
-    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
+    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
         """Render the rows that δ changes."""
-        phasor, intensity, coverage = before.phasor.copy(), before.intensity.copy(), before.coverage.copy()
+        phasor, intensity, coverage = like.phasor.copy(), like.intensity.copy(), like.coverage.copy()
         rows, first = self._changing_rows("delta_rad", view)
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
@@ -152,10 +152,10 @@ class RenderedModel:
             for values, new in ((phasor, image.phasor), (intensity, image.intensity), (coverage, image.coverage)):
                 values[of, first:] = new.reshape(len(of), -1)
         alone = self.alone
-        if alone is None or before.behind is None:
-            return ModelImages(phasor, before.slope, intensity, coverage)
-        landmark = alone.turned(class_index, view, replace(before, phasor=before.phasor - before.behind)).phasor
-        return ModelImages(phasor, before.slope, intensity, coverage, phasor - landmark, before.behind_slope)
+        if alone is None or like.behind is None:
+            return ModelImages(phasor, like.slope, intensity, coverage)
+        landmark = alone.turned(class_index, view, replace(like, phasor=like.phasor - like.behind)).phasor
+        return ModelImages(phasor, like.slope, intensity, coverage, phasor - landmark, like.behind_slope)
 
     def wide_slopes(
         self,

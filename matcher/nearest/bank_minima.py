@@ -1,4 +1,4 @@
-"""Where to start: the best views of a thinned bank, several modes of the likelihood, any bearing.
+"""Initial guesses: the best views of a thinned bank, several modes of the likelihood, any bearing.
 
 A bearing moves the image sideways, a height or a pitch up and down. The rays of a turned camera meet the landmark at
 the same ranges, so a frame shifted by whole columns and rows is compared with the bank's images ahead; what is
@@ -62,7 +62,7 @@ class Starts:
 
 
 class Upward(NamedTuple):
-    """What is known before of what moves the landmark up and down in the image.
+    """Prior knowledge of the parameters that move the landmark up and down in the image.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ class Search:
         return self._shifts[index][0] * self._row_rad
 
     def _shifted(self, seen: Observation, shift: tuple[int, int]) -> Observation:
-        """Move frames so that what was so many rows above and columns right of the middle comes to the middle."""
+        """Move frames by a shift (rows up, columns right), so that the shifted point comes to the middle."""
         up, side = shift
         if up == 0 and side == 0:
             return seen

@@ -129,7 +129,8 @@ class Templates:
         wraps : bool
             As an attribute.
         """
-        seen, cover = (values.reshape(-1, *values.shape[-2:]) for values in (phasor, np.asarray(coverage)))
+        seen = phasor.reshape(-1, *phasor.shape[-2:])
+        cover = np.asarray(coverage).reshape(-1, *seen.shape[1:])
         at_once = max(_PIXELS_AT_ONCE // math.prod(seen.shape[1:]), 1)
         some = [slice(first, first + at_once) for first in range(0, len(seen), at_once)]
         return cls.of_parts(((seen[k], cover[k]) for k in some), sensor, background, rows, wraps=wraps)
