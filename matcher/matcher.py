@@ -154,7 +154,7 @@ class Matcher:
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
         _check_word("method", method, METHODS)
-        _check_word("on", on, ("ranges", "phasors"))
+        _check_word("on", on, ("ranges", "phasors", *DIRECT_KINDS))
         _check_word("pixels", pixels, ("all", "lower"))
         if background is not None and not isinstance(background, Background):
             _check_word("background", background, ("auto", "unknown"), "a Background, None, ")
@@ -198,7 +198,9 @@ class Matcher:
             )
             return
         if len(bank.sensor.frequencies_hz) > 1:
-            bank = OneFrequencyBank(bank, "combined" if method == "refine" and on == "ranges" else "stacked")
+            # mixed pixels have no range that the frequencies agree on, and before a background they are at every edge
+            unwraps = method == "refine" and on == "ranges" and not isinstance(background, Background)
+            bank = OneFrequencyBank(bank, "combined" if unwraps else "stacked")
             self._one = bank.one
         self._method: MatchMethod
         if method == "refine":

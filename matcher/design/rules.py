@@ -218,7 +218,10 @@ class AllowedDimensions:
     def _light(self) -> Iterator[Check]:
         far = self.plan.distance_m[1]
         amplitude = self.plan.albedo * _SLANT_COSINE / far**2
-        std = float(predicted_range_std(amplitude, amplitude, self.sensor)) / self.sensor.metres_per_radian
+        std = max(
+            float(predicted_range_std(amplitude, amplitude, camera)) / camera.metres_per_radian
+            for camera in self.sensor.by_frequency
+        )
         yield Check("reflecting enough, far end", std, self.plan.limits.most_phase_std_rad, "rad", True)
 
     def _unambiguous(self, radius_m: float) -> Iterator[Check]:

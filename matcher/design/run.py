@@ -38,7 +38,6 @@ def run_design(plan: DesignPlan, *, workers: int | None = None, progress: Progre
     InputFileError
         The sensor file cannot be read.
     """
-    plan.build_sensor().refuse_several_frequencies("the search for a set of landmarks")
     search = Search(plan, workers or os.cpu_count() or 1)
     step = counter(progress, plan.search.boxes + plan.search.uppers + _USUAL_REFINEMENT)
     search.look_at_uppers(step)

@@ -16,7 +16,7 @@ from phasemark import UsageError
 from phasemark.inputs.numbers import in_words
 from phasemark.inputs.toml_file import read_toml
 from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD, Lens, changed_lens, check_image_size
-from phasemark.render.sensor.sensor_checks import check_fields
+from phasemark.render.sensor.sensor_checks import check_fields, check_principal_point_of_file
 from phasemark.render.sensor.sensor_fields import CALIBRATION, OPTICS
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
 from phasemark.render.sensor.sources import without_sources
@@ -417,6 +417,7 @@ class Sensor(SensorQuantities):
             sensor = cls(**without_sources(table)[0])
             if sensor.lens is not None:
                 check_image_size(sensor.lens, sensor.rows, sensor.cols)
+            check_principal_point_of_file(sensor)
             return sensor
         except UsageError as error:
             raise UsageError(f"{path}: {error}") from None
