@@ -44,7 +44,7 @@ _STEPS = 6
 _DONE = 0.1
 _LEAST_STD_M = 1e-5
 _WIDER = 6.0
-"""Slopes of targets are taken over this multiple of the steps of counts: estimates jump where the highest bin changes."""
+"""Slopes of targets are taken over this multiple of the steps of counts: estimates jump as the highest bin changes."""
 _LONGEST = {"m": 0.04, "rad": math.radians(4.0)}
 
 
