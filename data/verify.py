@@ -1,4 +1,4 @@
-"""Whether a bank or a frame set is what it claims to be: checksum, schema, values, and some of it rendered again."""
+"""Verification of a bank or a frame set: checksum, schema, values, and some images rendered again."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ METHODS = ("nearest", "refine")
 
 
 class MatchMethod(Protocol):
-    """What a method of matching does."""
+    """Interface of a method of matching."""
 
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Return one answer for each of n filtered frames, whose range offset was taken off."""
@@ -153,10 +153,11 @@ class Matcher:
         workers: int | None = None,
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
-        if method not in METHODS:
-            raise UsageError(f"unknown method {method!r}: the methods are {', '.join(METHODS)}")
-        if isinstance(background, str) and background not in ("auto", "unknown"):
-            raise UsageError(f'\'background\' must be a Background, "auto", "unknown" or None, got {background!r}')
+        _check_word("method", method, METHODS)
+        _check_word("on", on, ("ranges", "phasors"))
+        _check_word("pixels", pixels, ("all", "lower"))
+        if background is not None and not isinstance(background, Background):
+            _check_word("background", background, ("auto", "unknown"), "a Background, None, ")
         stated = {
             "bearing_std_rad": bearing_std_rad,
             "height_std_m": height_std_m,
@@ -299,3 +300,10 @@ class Matcher:
             if difference is None:
                 return read_region(frames, bank.region)
         raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
+
+
+def _check_word(name: str, value: object, words: tuple[str, ...], before: str = "") -> None:
+    """Refuse what is not one of some words; an array, which other functions take there, is named by its type."""
+    if not isinstance(value, str) or value not in words:
+        shown = repr(value) if isinstance(value, str) else type(value).__name__
+        raise UsageError(f"'{name}' must be {before}{' or '.join(map(repr, words))}, got {shown}")

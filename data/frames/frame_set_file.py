@@ -8,7 +8,7 @@ import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, overload
+from typing import Any, Literal, Self, overload
 
 import h5py
 import numpy as np
@@ -349,6 +349,18 @@ class FrameSet:
         numbers = np.arange(len(self))[index if isinstance(index, slice) else np.asarray(index)]
         return self._checked(name, self._take(name, numbers))
 
+    def reported_quantity(self) -> Literal["range", "z"]:
+        """Return what the chip reports as the distance of targets.
+
+        Raises
+        ------
+        UsageError
+            The frame set holds no histograms.
+        """
+        self._refuse_without_histograms()
+        assert self.sensor.histogram is not None
+        return self.sensor.histogram.reports
+
     def _refuse_without_histograms(self) -> None:
         if not self.plan.histograms:
             raise UsageError(f"{self.path} holds no histograms: {self._why_no_histograms()}")
@@ -547,7 +559,7 @@ def is_frame_set(path: str | os.PathLike[str]) -> bool:
         False also if the file cannot be read.
     """
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):  # what is read of a pipe is gone for whoever reads it next
+        if not stat.S_ISREG(os.stat(path).st_mode):  # bytes read from a pipe are gone for the next reader
             return False
         with open(path, "rb") as file:
             if file.read(8) != b"\x89HDF\r\n\x1a\n":

@@ -1,4 +1,4 @@
-"""Which arrays a bank and a frame set hold: their dimensions, types and units, before any file is made."""
+"""Arrays of a bank and of a frame set: dimensions, types and units, known before any file is made."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a frame set is made of: landmarks, a camera, and how the views are spread over distance, angle and the rest."""
+"""Plan of a frame set: landmarks, a camera, and the distribution of views over distance, angle and the rest."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _Pair = tuple[_Finite, _Finite]
 
 
 class Distribution(PlanModel):
-    """How a quantity is spread over the views: exactly one of the four.
+    """Distribution of a quantity over the views: exactly one of the four.
 
     Parameters
     ----------
@@ -303,7 +303,7 @@ class FramePlan(ScenePlan):
         return {name: spread.highest for name, spread in spreads.items() if spread is not None}
 
     def landmark_names(self) -> list[str]:
-        """Names of the classes of a resolved plan, in the order of their numbers."""
+        """Return the names of the classes of a resolved plan, in the order of their numbers."""
         parts: list[LandmarkSpec | MeshPlan] = [*self.landmarks, *self.meshes]
         return [part.name for part in parts]
 

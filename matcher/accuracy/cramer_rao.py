@@ -1,4 +1,4 @@
-"""What can be known at best: Fisher information, Cramér–Rao bounds and class confusion.
+"""Best possible accuracy: Fisher information, Cramér–Rao bounds and class confusion.
 
 All bounds are those of PHYSICS section 7, for Gaussian residuals with the variance of the noise law: say of every
 number which pixels count, whether ranges or phasors are measured, what is free, and what stands behind the landmark.
@@ -40,7 +40,7 @@ NUISANCES = ("albedo", "wall_m", "wall_albedo")
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """What filtered frames of n views can tell.
+    """Information and bounds of filtered frames at n views.
 
     Parameters
     ----------

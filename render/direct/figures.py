@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.render.direct.footprints import histogram_of
-from phasemark.render.direct.histogram_frames import HistogramFrames, nearest_ranges
+from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.direct.targets import Status
-from phasemark.render.figures import draw_map, draw_range, view_in_words
+from phasemark.render.figures import draw_range, view_in_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,7 +50,7 @@ def histogram_figure(frames: HistogramFrames, index: int = 0, frame: int = 0) ->
     figure, left, right = _panels()
     _draw_histograms(left, counts, one, "counts")
     right.set_title("range of the nearest target")
-    draw_range(right, nearest_ranges(one.targets, frames.sensor).range_m[0, 0])
+    draw_range(right, one.ranges.range_m[0, 0])
     figure.suptitle(f"position {index}, frame {frame}")
     return figure
 
@@ -73,7 +73,8 @@ def expected_figure(images: HistogramImages, index: int = 0) -> Figure:
     one = HistogramFrames(expected, sensor=images.sensor)
     figure, left, right = _panels()
     _draw_histograms(left, expected, one, "expected counts")
-    draw_map(right, np.log10(np.maximum(images.signal[index], 1.0)), "signal", "log10 of signal counts", cmap="gray")
+    right.set_title("range of the nearest target")
+    draw_range(right, one.ranges.range_m[0, 0])
     figure.suptitle(f"view {index}: {view_in_words(images.views, index)}")
     return figure
 

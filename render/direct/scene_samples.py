@@ -1,4 +1,4 @@
-"""What a direct sensor's zones can see: samples with direction, range and amplitude, from the exact integral.
+"""Scene samples of a direct sensor: direction, range and amplitude, from the exact integral.
 
 The integral of section 3 cuts every cell of a grid along the edges of the mesh and places a few points in each smooth
 piece. Here these points keep their path lengths instead of being added to phasors. A wall and a floor fill what the

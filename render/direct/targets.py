@@ -1,4 +1,4 @@
-"""What the chip makes of its histograms: targets with range, sigma, signal and status (PHYSICS section 11)."""
+"""Targets that the chip computes from its histograms: range, sigma, signal and status (PHYSICS section 11)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from phasemark.render.sensor.sensor import Sensor
 
 
 class Status(IntEnum):
-    """Why a target is or is not there."""
+    """Status of a target: valid, or the reason why it is missing."""
 
     VALID = 0
     """A target."""
