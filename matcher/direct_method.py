@@ -1,4 +1,4 @@
-"""How a matcher matches what a direct sensor counted or reported, and which of its options go with that."""
+"""Matching of what a direct sensor counted or reported, and the options that go with it."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class MatchMethod(Protocol):
 
 
 class DirectMethod(Protocol):
-    """What matches the histograms or the targets of a direct sensor."""
+    """A method that matches the histograms or the targets of a direct sensor."""
 
     def match(self, frames: Any) -> list[Match]:
         """Return one answer for each of n positions."""
@@ -154,7 +154,7 @@ class Matcher:
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
         _check_word("method", method, METHODS)
-        _check_word("on", on, ("ranges", "phasors"))
+        _check_word("on", on, ("ranges", "phasors", *DIRECT_KINDS))
         _check_word("pixels", pixels, ("all", "lower"))
         if background is not None and not isinstance(background, Background):
             _check_word("background", background, ("auto", "unknown"), "a Background, None, ")

@@ -63,7 +63,7 @@ class Table(NamedTuple):
 
 
 class TableGrid(NamedTuple):
-    """Where a table has its nodes, and which bins it holds: known before anything is rendered.
+    """The nodes of a table and the bins it holds, known before anything is rendered.
 
     Parameters
     ----------

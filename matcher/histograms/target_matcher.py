@@ -1,9 +1,9 @@
 """Class and view of a landmark from the targets that a direct sensor's chip reports (PHYSICS sections 7 and 11).
 
-What the chip makes of expected counts is what it is expected to report: merged peaks and estimates drawn to one side
-follow by themselves. A target is compared with the nearest one expected in its zone, with the sigma that came with it.
-A target that must be seen and is missing, and one that nothing explains, cost a disagreement. Chips report peaks
-of the noise too: how many of these are expected follows from the ambient light and the threshold.
+The chip is expected to report the targets that its estimator finds in expected counts: merged peaks and estimates drawn
+to one side follow by themselves. A target is compared with the nearest one expected in its zone, with the sigma that
+came with it. A target that must be seen and is missing, and one that nothing explains, cost a disagreement. Chips
+report peaks of the noise too: how many of these are expected follows from the ambient light and the threshold.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _LONGEST = {"m": 0.04, "rad": math.radians(4.0)}
 
 
 class Reported(NamedTuple):
-    """What the chip reported at one position; k targets of all frames.
+    """The targets that the chip reported at one position; k in all frames.
 
     Parameters
     ----------
