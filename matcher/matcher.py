@@ -48,6 +48,10 @@ class MatchMethod(Protocol):
 class DirectMethod(Protocol):
     """A method that matches the histograms or the targets of a direct sensor."""
 
+    @property
+    def table_bytes(self) -> int:
+        """How much memory the table takes that is rendered when frames come first."""
+
     def match(self, frames: Any) -> list[Match]:
         """Return one answer for each of n positions."""
 
@@ -233,6 +237,11 @@ class Matcher:
             tolerance_m=tolerance_m,
             tolerance_rad=tolerance_rad,
         )
+
+    @property
+    def table_bytes(self) -> int:
+        """How much memory a table of histograms takes, which is rendered when frames come first; 0 on ranges."""
+        return 0 if self._direct is None else self._direct.table_bytes
 
     def match(self, frames: FilteredFrames | HistogramFrames | Targets) -> Matches:
         """Match a batch of filtered frames, or of what a direct sensor counted or reported.

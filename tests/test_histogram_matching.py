@@ -325,4 +325,4 @@ def test_the_table_states_its_size_before_it_is_made() -> None:
 
     direct = matcher_of()._direct
     assert isinstance(direct, HistogramMatcher)
-    assert direct.table_bytes == sum(table.n_bytes for table in direct.tables)
+    assert matcher_of().table_bytes == sum(table.n_bytes for table in direct.tables)

@@ -103,6 +103,7 @@ def _match_directly(
 ) -> None:
     """Match a log of histograms or targets."""
     from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.data.plans.size import format_size
     from phasemark.matcher.recordings.direct_positions import read_positions
 
     _refuse_turned(reading)
@@ -112,6 +113,7 @@ def _match_directly(
         matcher = search.matcher(opened)
         positions = read_positions(frames, opened.camera, search.on, moving=moving, valid_status=reading.valid_status)
         refuse_unwritable_files(results.files({}), results.force)
+        tell(f"note: histograms are rendered first, a table of {format_size(matcher.table_bytes)}")
         printed = _Answers(search, place, results, landmarks, {}, moving)
         printed.match_all(matcher, positions)
         if results.as_json:

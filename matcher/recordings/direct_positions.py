@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,11 @@ class DirectPositions:
     def __getitem__(self, positions: slice) -> Self:
         """Return some positions."""
         frames = self.frames
-        some = frames[positions] if isinstance(frames, HistogramFrames) else Targets(*(f[positions] for f in frames))
+        some = (
+            frames[positions]
+            if isinstance(frames, HistogramFrames)
+            else _each(frames, lambda values: values[positions])
+        )
         return type(self)(some, None if self.time_s is None else self.time_s[positions])
 
 
@@ -82,7 +86,7 @@ def read_positions(
         if on == "histograms":
             raise UsageError(f"{path}: CSV holds targets, not histograms: match it --on targets")
         targets = read_targets(path, sensor=sensor, valid_status=valid_status or _VALID_STATUS)
-        return DirectPositions(Targets(*(np.swapaxes(values, 0, 1) for values in targets)) if moving else targets)
+        return DirectPositions(_each(targets, lambda values: np.swapaxes(values, 0, 1)) if moving else targets)
     if valid_status is not None:
         raise UsageError(f"--valid-status goes with targets from CSV: {path} has histograms")
     log = read_histograms(path, sensor=sensor).frames
@@ -109,6 +113,11 @@ def match_directly(matcher: Matcher, positions: DirectPositions, *, at_once: int
     for start in range(0, len(positions), at_once):
         some = positions[start : start + at_once]
         yield DirectBatch(start, some, matcher.match(some.frames))
+
+
+def _each(targets: Targets, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Targets:
+    """Return targets whose arrays were all changed."""
+    return Targets(change(targets.distance_m), change(targets.sigma_m), change(targets.signal), change(targets.status))
 
 
 def _added(log: HistogramFrames) -> HistogramFrames:
