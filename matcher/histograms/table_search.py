@@ -55,7 +55,7 @@ def ambient_light(counts: NDArray[np.float64], extra: NDArray[np.float64]) -> ND
     for _ in range(_TRIMS):
         use = net <= (level + _TRIM_SIGMA * np.sqrt(np.maximum(level, 1.0)))[:, None]
         level = np.where(use, net, 0.0).sum(axis=1) / np.maximum(use.sum(axis=1), 1)
-    return np.maximum(level, LEAST_COUNT)
+    return np.asarray(np.maximum(level, LEAST_COUNT), dtype=np.float64)
 
 
 def find_hills(

@@ -100,6 +100,11 @@ class TargetMatcher:
         self._limits = view_limits(self.grid)
         self._faint, self._sure = (_with_threshold(self.sensor, share) for share in (_FAINT, _SURE))
 
+    @property
+    def table_bytes(self) -> int:
+        """How large the histograms are that the table of targets is made of; they are not kept."""
+        return self.grid.n_bytes(self.sensor, len(self.signals))
+
     @cached_property
     def table(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Targets that are expected on the grid, (classes, distances, angles, zones, targets), and which are sure."""
