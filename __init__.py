@@ -55,7 +55,7 @@ def _quoted(text: str) -> str:
 class PhasemarkError(Exception):
     """Base of every error the user can mend; its message is one line that says what to do.
 
-    ``exit_code`` is what the command line returns for it.
+    ``exit_code`` is the exit code of the command line for it.
     """
 
     exit_code = 1

@@ -19,7 +19,19 @@ from phasemark import PhasemarkError, StorageError, UsageError, __version__
 from phasemark.data.commands import bank, frames, landmark, render, sensor, sensor_direct
 from phasemark.data.commands.command import Commands
 from phasemark.data.commands.console import report_error, tell, warnings_as_notes
-from phasemark.matcher.commands import accuracy, calibrate, demo, design, drive, match, plan, pose, sweep, verify
+from phasemark.matcher.commands import (
+    accuracy,
+    calibrate,
+    characterise,
+    demo,
+    design,
+    drive,
+    match,
+    plan,
+    pose,
+    sweep,
+    verify,
+)
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -128,7 +140,7 @@ _add_group(
         "list": sensor.sensor_list,
         "show": sensor.sensor_show,
         "import": sensor.sensor_import,
-        "characterise": sensor.sensor_characterise,
+        "characterise": characterise.sensor_characterise,
         "fit": sensor.sensor_fit,
         "fit-direct": sensor_direct.sensor_fit_direct,
     },
@@ -145,7 +157,7 @@ _add_group(
 )
 _add_group(
     "sweep",
-    "Accuracy sweeps: how accurate, where, and says who.",
+    "Accuracy sweeps: errors of each method over conditions, with intervals.",
     {
         "run": sweep.sweep_run,
         "report": sweep.sweep_report,

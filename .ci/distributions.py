@@ -48,7 +48,7 @@ def normalise(sdist: Path, epoch: int) -> None:
 def build(work: Path, epoch: int) -> dict[str, bytes]:
     """Return wheel and sdist of a fresh copy of the repository, by their names."""
     run("git", "clone", "--quiet", ROOT, work / "source", cwd=ROOT)
-    # one umask for whoever builds: modes of files are in the archives
+    # the archives hold the modes of files, so the umask of the builder must not matter
     run("chmod", "-R", "u=rwX,go=rX", work / "source", cwd=ROOT)
     run(sys.executable, "-m", "build", "--outdir", work / "dist", cwd=work / "source", epoch=epoch)
     (sdist,) = (work / "dist").glob("*.tar.gz")

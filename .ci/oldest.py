@@ -1,6 +1,6 @@
 """Install the oldest versions of dependencies that pyproject.toml allows, and run fast tests against them.
 
-The environment is made anew. What no version is found of, or no wheel for this Python, is named.
+The environment is made from scratch. A package without a version, or without a wheel for this Python, is named.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main() -> int:
     subprocess.run([*pip, "install", "--no-deps", "--editable", ROOT], check=True)
     shown = subprocess.run([python, "-m", "pip", "--disable-pip-version-check", "list"], capture_output=True, text=True)
     print(shown.stdout)
-    # compiled code of another numba would be thrown away, and compiled again by whoever runs next
+    # with one cache for both, the next run of the other numba would have to compile everything again
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(arguments.venv.absolute() / "numba")}
     subprocess.run([python, "-c", IMPORT_ALL], check=True, env=environment)
     # what is deprecated in an old version is not ours to mend: only errors count here

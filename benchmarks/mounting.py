@@ -1,4 +1,4 @@
-"""How long it takes to calibrate a mounting on 50 poses, and to design a landmark."""
+"""Benchmark of calibrating a mounting on 50 poses, and of designing a landmark."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each tuning number of the likelihood search does to accuracy and to the number of views that are rendered."""
+"""Effect of each tuning number of the likelihood search on accuracy and on the number of rendered views."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NO_SEARCH = (
 
 @dataclass(frozen=True)
 class Setting:
-    """How frames are matched, and how many of each class."""
+    """Conditions of a trial: the way frames are matched, and their number for each class."""
 
     title: str
     options: dict[str, Any]

@@ -1,4 +1,4 @@
-"""What is kept: plans, banks of model images, frame sets, measured frames, and files that are whole or not there."""
+"""Stored data: plans, banks of model images, frame sets, measured frames; every file is written whole or not at all."""
 
 from typing import TYPE_CHECKING
 

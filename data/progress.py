@@ -1,4 +1,4 @@
-"""How long work tells whoever waits for it how far it has come."""
+"""Progress callbacks for long-running work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a bank or a frame set is what it claims to be: checksum, schema, values, and some of it rendered again."""
+"""Verification of a bank or a frame set: checksum, schema, values, and some images rendered again."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from phasemark.data.files.hdf5_reading import reading
 from phasemark.data.files.provenance import mesh_sha256
 from phasemark.data.frames.build_frames import FrameJob
 from phasemark.data.frames.frame_set_file import FrameSet, open_frames
+from phasemark.data.plans.arrays import HISTOGRAM_FIELDS
 from phasemark.data.seeds import stream
 from phasemark.inputs import verify_checksum
 from phasemark.render.phasor_images import wrap_difference_m
@@ -28,6 +29,8 @@ TOLERANCE = 1e-5
 _NOISY_SHARE = 0.01
 """Share of a view's noisy pixels that may differ: where rounding decides about a photon or a threshold."""
 _BLOCK_BYTES = 1 << 24
+_MAY_BE_NAN = ("wall", "floor", "target_distance", "target_sigma")
+_NOISY = ("range", "amplitude", "intensity", "taps", "range_shot", *HISTOGRAM_FIELDS)
 
 
 def verify_bank(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0) -> dict[str, Any]:
@@ -120,7 +123,7 @@ def _check_values(file: h5py.File, path: Path) -> int:
         nonlocal count
         if not isinstance(item, h5py.Dataset) or item.dtype.kind != "f":
             return
-        may_be_nan = name.startswith(("range", "frequency_range")) or name in ("wall", "floor")
+        may_be_nan = name.startswith(("range", "frequency_range")) or name in _MAY_BE_NAN
         per_row = max(1, item.nbytes // max(1, len(item)))
         step = max(1, _BLOCK_BYTES // per_row)
         for start in range(0, len(item), step):
@@ -175,7 +178,7 @@ def _compare(
         else:
             limit = TOLERANCE * float(np.nanmax(np.abs(old), initial=1e-30))
         wrong = nan_differs | (np.abs(gap) > limit)
-        noisy = name in ("range", "amplitude", "intensity", "taps", "range_shot")
+        noisy = name in _NOISY
         if float(np.mean(wrong)) > (_NOISY_SHARE if noisy else 0.0):
             place = np.unravel_index(int(np.argmax(np.abs(gap) + nan_differs)), gap.shape)
             raise InputFileError(

@@ -78,14 +78,14 @@ def section(path: str, command: Any) -> str:
     for paragraph in paragraphs:
         lines += [paragraph, ""]
     if arguments:
-        lines += ["| argument | |", "|---|---|"]
+        lines += ["| argument | meaning |", "|---|---|"]
         lines += [
             f"| `{cell(word)}` | {cell(getattr(one, 'help', None) or '')} |"
             for word, one in zip(words, arguments, strict=True)
         ]
         lines.append("")
     if options:
-        lines += ["| option | default | |", "|---|---|---|", *map(option_row, options), ""]
+        lines += ["| option | default | meaning |", "|---|---|---|", *map(option_row, options), ""]
     return "\n".join(lines)
 
 

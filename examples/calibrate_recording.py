@@ -5,7 +5,7 @@
 The CSV file is that of ``examples/real_recording.py``, with the truth of motion capture: ``panel_x_m``, ``panel_y_m``,
 ``panel_z_m`` (a marker on the panel minus the camera, world axes, x along the panel's normal) and ``yaw_deg``. What
 comes out is a sensor file with tilt, bearing, field of view, range offset, the delay of the stamps, offsets of the
-zones, a noise law and systematic errors, held against frames that were left out, and a figure of the residuals.
+zones, a noise law and systematic errors, tested on frames that were left out, and a figure of the residuals.
 """
 
 from __future__ import annotations

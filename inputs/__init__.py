@@ -1,4 +1,4 @@
-"""How files are read: opened once, no larger than such a file is, and compared with the checksum beside them."""
+"""Reading of input files: opened once, limited in size, and compared with the checksum beside them."""
 
 from phasemark.inputs.checksum import checksum_line, checksum_path, read_checksum, sha256_of, verify_checksum
 from phasemark.inputs.reading import MOST_TOML_BYTES, opened, pipes_read_once, read_text, read_whole

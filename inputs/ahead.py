@@ -1,7 +1,7 @@
 """Digests that a thread computes while the program imports what will read the file.
 
 Computing a digest and reading a file need no Python, so on a second processor they take no time of their own.
-Nothing of a file is parsed before its digest is known and compared: whoever opens the file waits for the thread.
+Nothing of a file is parsed before its digest is known and compared: the reader of the file waits for the thread.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class _Reader(threading.Thread):
         self.digest: str | None = None
 
     def run(self) -> None:
-        """Compute the digest; a file that cannot be read is reported by whoever opens it."""
+        """Compute the digest; a file that cannot be read is reported when it is opened."""
         digest, buffer = hashlib.sha256(), bytearray(_BLOCK_BYTES)
         try:
             with open(self._path, "rb", buffering=0) as file:

@@ -1,4 +1,4 @@
-"""How numbers are written in messages."""
+"""Numbers as messages write them."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ _delivered: ContextVar[dict[tuple[int, int, int], bytes] | None] = ContextVar("d
 
 @contextmanager
 def pipes_read_once() -> Iterator[None]:
-    """Read each pipe once within the block: whoever asks for it again is given what it delivered the first time.
+    """Read each pipe once within the block, and return the same bytes whenever it is read again.
 
     A plan and its sensor are read when they are checked and again when they are used.
 
@@ -73,7 +73,7 @@ def opened(path: Path, *, most_bytes: int) -> Iterator[BinaryIO]:
 
 
 def read_whole(path: str | os.PathLike[str], *, most_bytes: int) -> bytes:
-    """Return the content of a file that is opened once, is not too large, and is what its checksum says.
+    """Return the content of a file: opened once, limited in size, and compared with its checksum.
 
     Parameters
     ----------
@@ -155,4 +155,4 @@ def _read(file: BinaryIO, path: Path, most_bytes: int) -> bytes:
 
 
 def _too_large(path: Path, most_bytes: int) -> str:
-    return f"{path}: has more than {most_bytes / 1e6:.3g} MB, which is far too large for such a file"
+    return f"{path}: has more than {most_bytes / 1e6:.3g} MB, which is far too large for a file of this kind"

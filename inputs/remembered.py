@@ -24,7 +24,7 @@ _MOST_BYTES = 1 << 20
 
 
 def cache_file() -> Path | None:
-    """Return the file that holds the digests, in the user's folder for such things; None if there is no such folder."""
+    """Return the file that holds the digests, in the user's cache folder; None if there is no cache folder."""
     folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     return Path(folder) / "phasemark" / "digests.json" if os.path.isabs(folder) else None
 

@@ -1,4 +1,4 @@
-"""Whether the checksum beside a file vouches for it, asked whenever a file is read."""
+"""Comparison of a file with the checksum beside it, made whenever a file is read."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _takes_long(path: Path) -> bool:
         if not verifying() or not os.path.lexists(checksum_path(with_checksum(path))):
             return False
         status = path.stat()
-    except (OSError, ValueError):  # whoever opens it says why it cannot be read
+    except (OSError, ValueError):  # opening it raises the error that explains why
         return False
     return is_worth_remembering(status) and remembered_digest(status) is None
 

@@ -1,4 +1,4 @@
-"""What stands in the world: the parts, the catalogue, and meshes from files."""
+"""Landmarks: their parts, the catalogue, and meshes from files."""
 
 from typing import TYPE_CHECKING
 

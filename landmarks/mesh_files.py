@@ -46,7 +46,7 @@ class MeshWarning(UserWarning):
 
 @dataclass(frozen=True)
 class MeshReport:
-    """What a mesh holds.
+    """Size, extent and defects of a mesh.
 
     Parameters
     ----------

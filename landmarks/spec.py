@@ -54,7 +54,7 @@ class Cylinder(_Spec):
     Parameters
     ----------
     kind : {"cylinder"}
-        Tells the shapes apart in plans.
+        Name of the shape in plans.
     radius_m, height_m : float
         Metres, in (0, 10].
     """
@@ -74,7 +74,7 @@ class Cone(_Spec):
     Parameters
     ----------
     kind : {"cone"}
-        Tells the shapes apart in plans.
+        Name of the shape in plans.
     radius_m : float
         Radius of the base, metres, in (0, 10].
     height_m : float
@@ -96,7 +96,7 @@ class Sphere(_Spec):
     Parameters
     ----------
     kind : {"sphere"}
-        Tells the shapes apart in plans.
+        Name of the shape in plans.
     radius_m : float
         Metres, in (0, 10].
     """
@@ -115,7 +115,7 @@ class Revolution(_Spec):
     Parameters
     ----------
     kind : {"revolution"}
-        Tells the shapes apart in plans.
+        Name of the shape in plans.
     profile_m : sequence of (r, z)
         Radius and height along the outline, metres, from its foot at z = 0 to its top; straight between the points.
         An end that is not on the axis is closed by a disc. The curve may not touch itself, and only its ends may lie
@@ -151,7 +151,7 @@ class Revolution(_Spec):
 
 
 def _touches_itself(points: NDArray[np.float64]) -> bool:
-    """Whether two segments of a polyline that are not neighbours have a point in common, or neighbours fold back."""
+    """Return True if two segments of a polyline that are not neighbours share a point, or neighbours fold back."""
     start, step = points[:-1], np.diff(points, axis=0)
     n = len(step)
     folds = np.array(

@@ -1,4 +1,4 @@
-"""What the robot concludes: filters, matching, and its own position."""
+"""Conclusions of the robot: filtered frames, matches, and its own position."""
 
 from typing import TYPE_CHECKING
 

@@ -1,6 +1,6 @@
 """Cameras of several modulation frequencies as matchers see them: as a camera of one frequency (PHYSICS section 10).
 
-Two such cameras stand for one of m frequencies f_j.
+Two cameras of one frequency stand for one camera of m frequencies f_j.
 
 *Stacked*, for phases: m images above one another, with every phase as if it were one at the first frequency. A phase's
 residual is wrapped and weighed with its own noise, so that nothing has to be unwrapped. The upper halves of all images
@@ -37,7 +37,7 @@ Way = Literal["stacked", "combined"]
 
 
 class OneFrequency:
-    """How a camera of several frequencies becomes one of a single frequency.
+    """Conversion of a camera of several frequencies to a camera of one frequency.
 
     Parameters
     ----------
@@ -287,6 +287,10 @@ class _OneFrequencyGroup(BankGroup):
     def __init__(self, group: BankGroup, one: OneFrequency) -> None:
         self.__dict__.update({name: value for name, value in vars(group).items() if name not in _IMAGES})
         self._group, self._one = group, one
+
+    def part(self, *which: slice) -> BankGroup:
+        """Return the group with some of its views alone."""
+        return _OneFrequencyGroup(self._group.part(*which), self._one)
 
     @property
     def phasor(self) -> NDArray[np.complex64]:

@@ -1,4 +1,4 @@
-"""What a matcher answers: one :class:`Match` a position, and :class:`Matches`, a sequence of them."""
+"""Answers of a matcher: one :class:`Match` a position, and :class:`Matches`, a sequence of them."""
 
 from __future__ import annotations
 
@@ -48,16 +48,17 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """What one filtered frame shows.
+    """Answer for one filtered frame: class, view, uncertainty and acceptance.
 
     Parameters
     ----------
     class_name : str or None
         The landmark's class; None: no landmark.
     accepted : bool
-        Whether there is a landmark and the fit passes its test at the matcher's false-alarm rate.
+        Whether the answer is right to within the matcher's tolerances; if not, `reason` says why.
     distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : float
-        The view, PHYSICS sections 1 and 9; NaN if too few pixels returned to tell.
+        The view, PHYSICS sections 1 and 9. Without any fit, as where too few pixels returned, D and δ are NaN and the
+        others 0.
     free : tuple of str
         Which of these were estimated; the others are assumptions.
     covariance : ndarray or None

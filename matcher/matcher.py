@@ -5,10 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, cast
 
 from phasemark import UsageError
 from phasemark.data import Bank
+from phasemark.matcher.direct_method import (
+    DIRECT_KINDS,
+    Measured,
+    direct_frames,
+    direct_method,
+    refuse_direct_options,
+)
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.region import read_region
 from phasemark.matcher.frequencies import OneFrequency, OneFrequencyBank
@@ -25,15 +32,24 @@ from phasemark.matcher.likelihood.systematic import SYSTEMATICS, check_systemati
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.render import Background
+from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.direct.targets import Targets
 
 METHODS = ("nearest", "refine")
 
 
 class MatchMethod(Protocol):
-    """What a method of matching does."""
+    """Interface of a method of matching."""
 
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Return one answer for each of n filtered frames, whose range offset was taken off."""
+
+
+class DirectMethod(Protocol):
+    """What matches the histograms or the targets of a direct sensor."""
+
+    def match(self, frames: Any) -> list[Match]:
+        """Return one answer for each of n positions."""
 
 
 class Matcher:
@@ -58,8 +74,10 @@ class Matcher:
         are compared, and is left out of the test of the fit.
     false_alarm : float
         Share of good frames that the test of the fit may refuse.
-    on : {"ranges", "phasors"}
-        What "refine" explains: ranges, or amplitude · exp(iφ) with the landmark's albedo estimated too. Phasors need
+    on : {"ranges", "phasors", "histograms", "targets"}
+        What "refine" explains: of a direct sensor with a [histogram] table the counts of every bin, Poisson, with the
+        landmark's brightness and the ambient light of every zone estimated too; or the targets that its chip reports.
+        Both take a scene that holds the landmark alone. Otherwise ranges, or amplitude · exp(iφ) with the landmark's albedo estimated too. Phasors need
         frames with amplitudes, best from :func:`~phasemark.matcher.phasor_mean`. Of several modulation frequencies
         ranges are the unwrapped ones with their combined variance; phasors, and the phases that "nearest" compares, are
         those of every frequency, each wrapped by itself: nothing is unwrapped, and mixed pixels count.
@@ -121,7 +139,7 @@ class Matcher:
         free: Sequence[str] | None = None,
         background: Background | Literal["auto", "unknown"] | None = None,
         false_alarm: float = 0.01,
-        on: ResidualKind = "ranges",
+        on: Measured = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
         bearing_std_rad: float = BEARING_STD_RAD,
@@ -134,10 +152,11 @@ class Matcher:
         workers: int | None = None,
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
-        if method not in METHODS:
-            raise UsageError(f"unknown method {method!r}: the methods are {', '.join(METHODS)}")
-        if isinstance(background, str) and background not in ("auto", "unknown"):
-            raise UsageError(f'\'background\' must be a Background, "auto", "unknown" or None, got {background!r}')
+        _check_word("method", method, METHODS)
+        _check_word("on", on, ("ranges", "phasors"))
+        _check_word("pixels", pixels, ("all", "lower"))
+        if background is not None and not isinstance(background, Background):
+            _check_word("background", background, ("auto", "unknown"), "a Background, None, ")
         stated = {
             "bearing_std_rad": bearing_std_rad,
             "height_std_m": height_std_m,
@@ -159,6 +178,24 @@ class Matcher:
         )
         self._one: OneFrequency | None = None
         self._systematic = check_systematic(systematic)
+        self._direct: DirectMethod | None = None
+        if on in DIRECT_KINDS:
+            refuse_direct_options(method, on, background, pixels, robust)
+            known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
+            if free is None:
+                known["bearing_rad"] = bearing_std_rad
+            self._direct = direct_method(
+                bank,
+                on,
+                free=free,
+                known=known,
+                false_alarm=false_alarm,
+                tolerance_m=tolerance_m,
+                tolerance_rad=tolerance_rad,
+                declared="declared" in self._systematic,
+                workers=workers,
+            )
+            return
         if len(bank.sensor.frequencies_hz) > 1:
             bank = OneFrequencyBank(bank, "combined" if method == "refine" and on == "ranges" else "stacked")
             self._one = bank.one
@@ -169,7 +206,7 @@ class Matcher:
                 free=free,
                 background=background,
                 false_alarm=false_alarm,
-                on=on,
+                on=cast(ResidualKind, on),
                 pixels=pixels,
                 robust=robust,
                 bearing_std_rad=bearing_std_rad,
@@ -196,13 +233,15 @@ class Matcher:
             tolerance_rad=tolerance_rad,
         )
 
-    def match(self, frames: FilteredFrames) -> Matches:
-        """Match a batch of filtered frames.
+    def match(self, frames: FilteredFrames | HistogramFrames | Targets) -> Matches:
+        """Match a batch of filtered frames, or of what a direct sensor counted or reported.
 
         Parameters
         ----------
-        frames : FilteredFrames
-            n positions. The range offset that their sensor states is taken off: a bank has none.
+        frames : FilteredFrames, HistogramFrames or Targets
+            n positions. The range offset that their sensor states is taken off: a bank has none. ``on="histograms"``
+            takes histograms, the frames of a position added up; ``on="targets"`` takes targets, or the histograms that
+            the chip makes them of.
 
         Returns
         -------
@@ -212,8 +251,15 @@ class Matcher:
         Raises
         ------
         UsageError
-            The frames come from another camera than the bank.
+            The frames come from another camera than the bank, or are not what is matched on.
         """
+        on = self.options["on"]
+        if self._direct is not None:
+            return Matches(self._direct.match(direct_frames(self.bank, on, frames)))
+        if not isinstance(frames, FilteredFrames):
+            raise UsageError(
+                f'on="{on}" takes filtered frames: match histograms on="histograms", or their targets on="targets"'
+            )
         frames = self.read_out(frames).without_offset().with_pooled_noise()
         return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
 
@@ -253,3 +299,10 @@ class Matcher:
             if difference is None:
                 return read_region(frames, bank.region)
         raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
+
+
+def _check_word(name: str, value: object, words: tuple[str, ...], before: str = "") -> None:
+    """Refuse what is not one of some words; an array, which other functions take there, is named by its type."""
+    if not isinstance(value, str) or value not in words:
+        shown = repr(value) if isinstance(value, str) else type(value).__name__
+        raise UsageError(f"'{name}' must be {before}{' or '.join(map(repr, words))}, got {shown}")

@@ -1,4 +1,4 @@
-"""What a pixel of a frame says against what a model says of it: the one table of PHYSICS section 7.
+"""Comparison of a pixel of a frame with the model: the one table of PHYSICS section 7.
 
 | frame, model | nothing returns | something may return | something must return |
 |---|---|---|---|
@@ -8,7 +8,7 @@
 
 Nothing that a frame shows is free: a return is either compared with the range of light that the model has there, or it
 costs what a residual of five standard deviations does. The only exception are pixels that an edge enters or leaves
-within the uncertainty of the view; such a return costs 1, what a compared pixel costs on average.
+within the uncertainty of the view; a return there costs 1, the average cost of a compared pixel.
 """
 
 from __future__ import annotations

@@ -217,7 +217,7 @@ def wrapped_errors(error: NDArray[np.float64], parameters: Sequence[str], period
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """What a set of errors says of an estimator; intervals are of 95 %.
+    """Statistics of an estimator's errors; intervals are of 95 %.
 
     Parameters
     ----------

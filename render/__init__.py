@@ -1,12 +1,13 @@
-"""How the camera sees the landmark: from a mesh and a sensor to phasor images, and from those to noisy frames."""
+"""Rendering: from a mesh and a sensor to phasor images, and from those to noisy frames."""
 
 from typing import TYPE_CHECKING
 
 from phasemark.inputs import on_use
 from phasemark.render import compile_cache  # noqa: F401 - first, for the modules below compile functions
 from phasemark.render.background import Background
-from phasemark.render.bench.data_sheet.characterise import characterise
-from phasemark.render.exposure.capture import capture
+from phasemark.render.direct.capture import capture
+from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m
 from phasemark.render.renderer import Renderer, background_image
@@ -18,7 +19,13 @@ from phasemark.render.unwrapping import unwrap_ranges, unwrapping_error_probabil
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    import matplotlib.figure
+    import numpy as np
+    import numpy.typing
+
+    from phasemark.render.bench.data_sheet.characterise import characterise
+else:
+    __getattr__, __dir__ = on_use.imported_on_use(__name__)  # the bench takes time to import, and few need it
 
 
 __all__ = [
@@ -43,24 +50,37 @@ __all__ = [
 ]
 
 
-def _figure_of_frame(frames: Frames, index: int, frame: int) -> "Figure":
+def _figure_of_frame(
+    frames: Frames, index: int, frame: int, coverage: "numpy.typing.NDArray[np.float64] | None"
+) -> "matplotlib.figure.Figure":
     """Draw range, amplitude and flags of one frame."""
     from phasemark.render.figures import frame_figure
 
-    return frame_figure(frames, index, frame)
+    return frame_figure(frames, index, frame, coverage=coverage)
 
 
-def _figure_of_image(images: PhasorImages, index: int) -> "Figure":
+def _figure_of_image(images: PhasorImages, index: int) -> "matplotlib.figure.Figure":
     """Draw range, amplitude and coverage of one view."""
     from phasemark.render.figures import phasor_figure
 
     return phasor_figure(images, index)
 
 
+def _figure_of_histograms(frames: HistogramFrames, index: int, frame: int) -> "matplotlib.figure.Figure":
+    """Draw histograms of one frame and the range of the nearest target."""
+    from phasemark.render.direct.figures import histogram_figure
+
+    return histogram_figure(frames, index, frame)
+
+
+def _figure_of_expected_histograms(images: HistogramImages, index: int) -> "matplotlib.figure.Figure":
+    """Draw the expected histograms of one view."""
+    from phasemark.render.direct.figures import expected_figure
+
+    return expected_figure(images, index)
+
+
 Frames.figure = staticmethod(_figure_of_frame)
+HistogramFrames.figure = staticmethod(_figure_of_histograms)
+HistogramImages.figure = staticmethod(_figure_of_expected_histograms)
 PhasorImages.figure = staticmethod(_figure_of_image)
-
-
-def __getattr__(name: str) -> object:
-    """Find names that moved."""
-    return on_use.moved_name(__name__, name)

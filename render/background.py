@@ -1,4 +1,4 @@
-"""What stands behind the landmark: nothing, a wall, a floor, or both (PHYSICS section 3)."""
+"""Background behind the landmark: nothing, a wall, a floor, or both (PHYSICS section 3)."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def background_edge(parameters, cos_b, sin_b, level, camera, out):  # type: igno
     Returns
     -------
     bool
-        Whether there is such a line in the image.
+        Whether the line lies in the image.
     """
     if parameters[1] == 0.0:
         return False

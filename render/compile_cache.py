@@ -1,6 +1,7 @@
 """A place for numba's compiled code that can be written, found before the first function is compiled.
 
 numba keeps compiled code beside the source, or in the user's cache folder. A service or a container often has neither.
+What is kept is used as long as the source files of all compiled functions are the same, not that of the function alone.
 """
 
 from __future__ import annotations
@@ -10,8 +11,10 @@ import stat
 import tempfile
 import warnings
 from pathlib import Path
+from typing import Any
 
 from phasemark import UsageError
+from phasemark.render.compiled_sources import COMPILED_SOURCES, ROOT, compiled_sources_hash
 
 _THREADS = "NUMBA_NUM_THREADS"
 
@@ -52,6 +55,34 @@ def prepare_compile_cache() -> None:
     Dispatcher.enable_caching = lambda self: None  # type: ignore[method-assign]
 
 
+def stamp_with_all_sources(root: Path = ROOT, names: tuple[str, ...] = COMPILED_SOURCES) -> None:
+    """Let numba keep the code of functions below a folder only while none of some source files there changes.
+
+    A function is copied into those of other modules, and numba compares the file of the function itself alone.
+
+    Parameters
+    ----------
+    root : Path
+        Functions of other folders keep numba's own stamp.
+    names : tuple of str
+        Files below `root`.
+    """
+    from numba.core import caching
+
+    locator = getattr(caching, "_SourceFileBackedLocatorMixin", None)
+    if locator is None:  # numba documents no way to say what code depends on
+        return
+    stamp_of_file = locator.get_source_stamp
+    own = str(root) + os.sep
+
+    def stamp(self: Any) -> Any:
+        of_file = stamp_of_file(self)
+        is_own = os.path.realpath(self._py_file).startswith(own)
+        return (of_file, compiled_sources_hash(root, names)) if is_own else of_file
+
+    locator.get_source_stamp = stamp
+
+
 def _note(what: str) -> None:
     warnings.warn(
         f"compiled code can be kept neither beside the package nor in the user's cache folder: {what};"
@@ -86,7 +117,7 @@ def _temporary_folders() -> list[Path]:
 
 
 def _make_private(folder: Path) -> bool:
-    """Make a folder that nobody else can write to; whoever can write there could have us run their code."""
+    """Make a folder that nobody else can write to, because compiled code in it is run."""
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         status = folder.lstat()
@@ -95,4 +126,5 @@ def _make_private(folder: Path) -> bool:
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077
 
 
+stamp_with_all_sources()
 prepare_compile_cache()

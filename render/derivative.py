@@ -1,4 +1,4 @@
-"""How a view's phasors change with the view: ∂S/∂(D, δ, b, h, pitch, roll) by differences of the area integral.
+"""Derivatives of phasors by the view: ∂S/∂(D, δ, b, h, pitch, roll) by differences of the area integral.
 
 The integral is smooth in the view except where an edge passes a corner of a pixel or lies along its border: there its
 slope jumps. Differences of a point-sampled image would be noise; those of the exact integral converge.
@@ -72,7 +72,7 @@ def _derivative(
         return phasor_of(replace(views[which], **{name: moved}))
 
     everywhere = slice(None)
-    # the width is what the floats have between them, not what was asked for
+    # the width is the difference of the rounded floats, not twice the requested step
     high, low = value + STEP, value - STEP
     up, down = at(everywhere, high), at(everywhere, low)
     each = (slice(None), *(None,) * (up.ndim - 1))

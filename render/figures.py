@@ -45,6 +45,10 @@ SIGMA_SPAN = 5.0
 _LANDMARK_COVERAGE = 0.5
 _LANDMARK_PERCENTILES = (2, 98)
 _LEAST_SPAN_M = 0.02
+_OWN_REACH = 0.5
+"""How far beyond the percentiles a range is still the landmark's own where nothing stands beside it; of their span."""
+_LANDMARK_DEPTH_M = 0.4
+"""How far behind the nearest surface a measured frame's landmark is taken to reach, as in estimating backgrounds."""
 
 _BEYOND = "#b4bac1"
 _NOTHING = "#efe3d0"
@@ -73,7 +77,7 @@ def pixel_grid_figure(sensor: Sensor) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        With many pixels only every so many borders are drawn; the title says how many pixels lie between them.
+        With many pixels only every n-th border is drawn; the title states n.
     """
     step = max(1, math.ceil(max(sensor.rows, sensor.cols) / _GRID_LINES))
     figure = Figure(figsize=(7.0, 7.0 * min(1.4, max(0.6, sensor.rows / sensor.cols))), layout="constrained")
@@ -168,11 +172,18 @@ def landmark_limits_m(
     -------
     near_m, far_m : float or None
         From the 2nd to the 98th percentile, at least 2 cm apart; None if the landmark covers no pixel that returned.
+        If no pixel beside the landmark returned, no range is mixed: then from its nearest to its farthest pixel, but
+        for ranges more than half that span outside, which are noise.
     """
-    seen = range_m[np.isfinite(range_m) & (coverage >= _LANDMARK_COVERAGE)]
+    returned = np.isfinite(range_m)
+    seen = range_m[returned & (coverage >= _LANDMARK_COVERAGE)]
     if not seen.size:
         return None, None
     near, far = (float(one) for one in np.percentile(seen, _LANDMARK_PERCENTILES))
+    if not (returned & (coverage == 0.0)).any():
+        reach = _OWN_REACH * (far - near)
+        own = range_m[returned & (range_m >= near - reach) & (range_m <= far + reach)]
+        near, far = float(own.min()), float(own.max())
     widen = max(0.0, _LEAST_SPAN_M - (far - near)) / 2
     return near - widen, far + widen
 
@@ -242,11 +253,11 @@ def phasor_figure(images: PhasorImages, index: int = 0) -> Figure:
     draw_map(
         right, images.coverage[index], "coverage", "share of the pixel on the landmark", cmap="gray", vmin=0, vmax=1
     )
-    figure.suptitle(f"view {index}: {_view_in_words(images.views, index)}")
+    figure.suptitle(f"view {index}: {view_in_words(images.views, index)}")
     return figure
 
 
-def _view_in_words(views: Views, index: int) -> str:
+def view_in_words(views: Views, index: int) -> str:
     """Return the numbers of a view; pitch and roll only where it is tilted."""
     angles = {"δ": views.delta_rad, "b": views.bearing_rad, "pitch": views.pitch_rad, "roll": views.roll_rad}
     told = {name: f"{name} = {math.degrees(values[index]):.2f}°" for name, values in angles.items()}
@@ -256,8 +267,10 @@ def _view_in_words(views: Views, index: int) -> str:
     return ", ".join(words)
 
 
-def frame_figure(frames: Frames, index: int = 0, frame: int = 0) -> Figure:
-    """Draw range, amplitude (if there is one) and flags of one frame side by side.
+def frame_figure(
+    frames: Frames, index: int = 0, frame: int = 0, *, coverage: NDArray[np.float64] | None = None
+) -> Figure:
+    """Draw range, amplitude (if there is one) and flags of one frame side by side; the colours span the landmark.
 
     Parameters
     ----------
@@ -266,6 +279,8 @@ def frame_figure(frames: Frames, index: int = 0, frame: int = 0) -> Figure:
         Which position.
     frame : int
         Which frame of that position.
+    coverage : (rows, cols) float64, optional
+        Share of each pixel on the landmark; without it, the landmark reaches from the nearest surface to 0.4 m behind.
 
     Returns
     -------
@@ -277,12 +292,32 @@ def frame_figure(frames: Frames, index: int = 0, frame: int = 0) -> Figure:
     figure = Figure(figsize=(0.4 + 4.0 * n_panels, 4.0), layout="constrained")
     panels = figure.subplots(1, n_panels)
     panels[0].set_title("range")
-    draw_range(panels[0], frames.range_m[index, frame])
+    range_m = frames.range_m[index, frame]
+    near, far = nearest_limits_m(range_m) if coverage is None else landmark_limits_m(range_m, coverage)
+    draw_range(panels[0], range_m, near_m=near, far_m=far)
     if frames.amplitude_e is not None:
         draw_map(panels[1], frames.amplitude_e[index, frame], "amplitude", "amplitude (e-)", cmap="gray", vmin=0.0)
     _draw_flags(panels[-1], frames.flags[index, frame])
     figure.suptitle(f"position {index}, frame {frame}")
     return figure
+
+
+def nearest_limits_m(range_m: NDArray[np.float64]) -> tuple[float, float] | tuple[None, None]:
+    """Return the ranges between which the nearest surface lies, for the colours of a measured frame.
+
+    Parameters
+    ----------
+    range_m : (rows, cols) float64
+        Metres; NaN where nothing returned.
+
+    Returns
+    -------
+    near_m, far_m : float or None
+        Those of :func:`landmark_limits_m`, where a landmark reaches from the nearest surface to 0.4 m behind it.
+    """
+    seen = range_m[np.isfinite(range_m)]
+    nearest = np.percentile(seen, _LANDMARK_PERCENTILES[0]) if seen.size else np.nan
+    return landmark_limits_m(range_m, (range_m <= nearest + _LANDMARK_DEPTH_M).astype(np.float64))
 
 
 def terminal_figure(

@@ -22,7 +22,7 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 class Flag(IntFlag):
-    """Why a pixel's range is not valid; 0 where it is."""
+    """Reasons why a pixel's range is not valid; 0 where it is valid."""
 
     NO_RETURN = 1
     """The amplitude is below the validity threshold: nothing came back. This is data."""
@@ -283,9 +283,13 @@ class Frames:
         """Frames at each position."""
         return int(self.range_m.shape[1])
 
-    def plot(self, index: int = 0, frame: int = 0) -> Figure:
-        """Draw range, amplitude and flags of one frame for a first look."""
-        return type(self).figure(self, index, frame)
+    def plot(self, index: int = 0, frame: int = 0, *, coverage: NDArray[np.float64] | None = None) -> Figure:
+        """Draw range, amplitude and flags of one frame for a first look.
+
+        The colours of the range span the landmark: the pixels that `coverage` (rows, cols) has at least half on it, or
+        without it the nearest surface and what lies up to 0.4 m behind.
+        """
+        return type(self).figure(self, index, frame, coverage)
 
     def _repr_png_(self) -> bytes | None:
         """Show the first frame in a notebook; nothing where there is none."""

@@ -1,4 +1,4 @@
-"""How the loops of the renderer are compiled.
+"""Compiler settings of the renderer's loops.
 
 A kernel borrows the arrays it is given and allocates none. numba is told so (`_nrt`), for it would count references to
 every array at every call and every use of a field of a tuple: atomic operations that took two fifths of the time, and

@@ -29,7 +29,7 @@ def phasor_to_range_m(phasor: NDArray[np.complexfloating], sensor: Sensor) -> ND
     phasor : (...) complex
         S_1.
     sensor : Sensor
-        The camera; its modulation frequency f, the first of several, is what counts.
+        The camera; only its modulation frequency f counts, the first of several.
 
     Returns
     -------
@@ -107,7 +107,7 @@ class PhasorImages:
     views : Views
     upper_coverage : (n, rows, cols) float64, or None
         Share of the active area that sees the landmark's upper part; the rest of `coverage` sees the lower one. None
-        where parts are not told apart.
+        where parts are not distinguished.
     harmonics : mapping of int to (n, rows, cols) complex128
         S_k for the orders k > 1 that were asked for, of the first modulation frequency.
     by_hz : mapping of float to (n, rows, cols) complex128
@@ -133,7 +133,7 @@ class PhasorImages:
     def range_m(self) -> NDArray[np.float64]:
         """Range along the ray, in [0, c/2f), NaN where nothing returns; (n, rows, cols).
 
-        Of several frequencies it is what :func:`~phasemark.render.unwrap_ranges` finds, in [0, c / (2 · gcd)).
+        Of several frequencies it is the range of :func:`~phasemark.render.unwrap_ranges`, in [0, c / (2 · gcd)).
         """
         if len(self.sensor.frequencies_hz) == 1:
             return phasor_to_range_m(self.phasor, self.sensor)
@@ -214,13 +214,13 @@ class PhasorImages:
     def part_labels(self) -> NDArray[np.int8]:
         """What most of each pixel sees: 0 background or nothing, 1 the lower part, 2 the upper one; (n, rows, cols).
 
-        Of images rendered with ``variant="hard"`` this is what the centre ray sees. Where shares are equal the smaller
-        number is returned.
+        Of images rendered with ``variant="hard"`` this is the surface that the centre ray meets. Where shares
+        are equal the smaller number is returned.
 
         Raises
         ------
         UsageError
-            The images do not tell parts apart.
+            The images do not distinguish parts.
         """
         if self.upper_coverage is None:
             raise UsageError("these images do not tell the landmark's parts apart: 'upper_coverage' is None")

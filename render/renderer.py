@@ -453,6 +453,22 @@ class Renderer:
         """Refuse what cannot be rendered."""
         if workers < 1:
             raise UsageError(f"'workers' must be at least 1, got {workers!r}")
+        self.check_can_be_seen(views, background)
+
+    def check_can_be_seen(self, views: Views, background: Background | None) -> None:
+        """Refuse a lens inside the landmark, a wall before it and a floor above its foot.
+
+        Parameters
+        ----------
+        views : Views
+            As the camera itself has them, :meth:`~phasemark.render.Views.in_camera`.
+        background : Background, optional
+
+        Raises
+        ------
+        UsageError
+            Naming the view.
+        """
         self._check_lens_outside(views)
         if background is not None:
             background.check_behind(self.topology.vertices, views)

@@ -91,7 +91,7 @@ def unwrapped(
     found = unwrap_ranges(np.stack(list(range_m)), np.hypot(noise, offset_m[each]), sensor)
     if not offset_m.any():
         return found
-    # the mean is weighted with both errors; the noise of such a mean
+    # the mean is weighted with both errors; this is its noise
     weight = np.hypot(noise, offset_m[each]) ** -2.0
     std = np.sqrt(np.sum((weight * noise) ** 2, axis=0)) / weight.sum(axis=0)
     return found._replace(std_m=np.where(np.isnan(found.range_m), np.nan, std))

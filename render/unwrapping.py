@@ -28,7 +28,7 @@ _LEAST_STD_RAD = 1e-6
 
 
 class Unwrapped(NamedTuple):
-    """What the wrapped ranges of several frequencies say together; arrays (...).
+    """Unwrapped range of several frequencies, with its quality; arrays (...).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Where the landmark is seen from: distance, side, bearing, height, pitch and roll (PHYSICS sections 1 and 9)."""
+"""Views of a landmark: distance, side, bearing, height, pitch and roll (PHYSICS sections 1 and 9)."""
 
 from __future__ import annotations
 
@@ -245,7 +245,7 @@ class Views:
         ------
         UsageError
             A matrix is not a rotation with a translation. Or the lens is on the landmark's axis (D = 0), where bearing
-            and δ cannot be told from each other, or the optical axis is vertical (pitch = ± 90°), where bearing and
+            and δ cannot be distinguished, or the optical axis is vertical (pitch = ± 90°), where bearing and
             roll cannot.
 
         Examples

@@ -12,7 +12,7 @@ HTML comments directly above a block change how it is run:
 ``<!-- test: as in PAGE -->``
     do not run the block, whose commands a block that is run on that page of the same folder or above prints too.
 ``<!-- test: prints -->``
-    what stands below the commands of a console block is what they print.
+    the text below the commands of a console block is their output.
 ``<!-- test: skip REASON -->``
     do not run the block.
 """

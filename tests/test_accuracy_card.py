@@ -141,3 +141,17 @@ def test_the_command_refuses_what_cannot_be(capsys):
     assert "--class NAME or --mesh NAME=FILE" in capsys.readouterr().err
     assert main(["accuracy", "--class", "cylinder", "--distance", "-1"]) == 2
     assert main(["accuracy", "--class", "cylinder", "--distance", "1", "--frames", "0"]) == 2
+
+
+def test_a_sensor_without_noise_has_no_bound(capsys):
+    assert main(["accuracy", "--class", "cylinder", "--distance", "1", "--sensor", "ideal"]) == 2
+    assert (
+    assert capsys.readouterr().err.startswith("error: the sensor has no noise, so that there is no bound: set its")
+    )
+
+
+@pytest.mark.parametrize(("sensor", "known"), [("pmd-16x16", True), ("ideal", False)])
+def test_the_page_of_a_sensor_carries_the_card(tmp_path, sensor, known):
+    assert main(["sensor", "characterise", sensor, "--frames", "2", "-o", str(tmp_path / "out")]) == 0
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert ("The bound of a match with this camera: cylinder at 1 m, δ 0 … 165°, 50 frames: D 0." in page) is known

@@ -193,7 +193,7 @@ def test_refused_answers_say_why_and_claim_no_precision(panel):
 
 
 def test_sides_that_are_the_same_have_the_same_weight(tmp_path):
-    # a table with four equal legs whose bank was told of no symmetry
+    # a table with four equal legs, and a bank that states no symmetry
     parts = [((0.3, 0.3, 0.02), (0, 0, 0.1))]
     parts += [((0.03, 0.03, 0.22), (x, y, 0)) for x in (-0.12, 0.12) for y in (-0.12, 0.12)]
     trimesh.boolean.union([box(*part) for part in parts]).export(tmp_path / "table.stl")

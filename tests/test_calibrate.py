@@ -99,7 +99,7 @@ def phasor_trials():
 
 
 def test_true_mountings_lie_within_their_ellipses_on_phasors(phasor_trials):
-    # the sum of 2 NEES of 8 numbers is χ²(16); 99.9 % corrected for the 3 such tests of this file
+    # the sum of 2 NEES of 8 numbers is χ²(16); 99.9 % corrected for the 3 tests of this kind in the file
     total = sum(value for value, _ in phasor_trials)
     assert stats.chi2.ppf(1e-3 / 6, 16) < total < stats.chi2.ppf(1 - 1e-3 / 6, 16)
 
@@ -238,7 +238,7 @@ def test_a_plain_board_does_not_tell_a_height_and_is_refused():
     poses = KnownPoses.polar([0.8, 1.0, 1.2, 1.4], [0.0, 0.3, -0.3, 0.1])
     image = Renderer(board, PMD).render_views(Views.broadcast(poses.distance_m, poses.delta_rad))
     frames = capture(image, PMD, rng=np.random.default_rng(1), n_frames=20)
-    with pytest.raises(UsageError, match=r"height cannot be told from these poses: .* fixed=height"):
+    with pytest.raises(UsageError, match=r"height cannot be determined from these poses: .* fixed=height"):
         calibrate(board, filtered(frames), poses, free=("pitch", "height"))
 
 
@@ -293,6 +293,8 @@ def test_pose_errors_are_those_of_moved_lenses_and_turned_cameras():
         ("distance_m,delta_deg,tilt\n1,30,0\n", "unknown column 'tilt'"),
         ("distance_m,delta_deg\n1,30\n1.2\n", "line 3: 1 values, must have 2"),
         ("distance_m,delta_deg\n1,nan\n", "line 2: 'delta_deg' must be a finite number, got nan"),
+        ("distance_m,delta_deg\n1,\n", "line 2: 'delta_deg' must be a number, got ''"),
+        ("distance_m,delta_deg\n1,1_0\n", "line 2: 'delta_deg' must be a number, got '1_0'"),
         ("distance_m,delta_deg\n1,left\n", "line 2: 'delta_deg' must be a number, got 'left'"),
         ("distance_m,delta_deg\n120,30\n", "line 2: the lens is 120 m from the landmark"),
         ("distance_m,delta_deg\n-1,30\n", "line 2: the lens is -1 m from the landmark"),
@@ -714,7 +716,7 @@ def test_a_moving_camera_takes_time_stamps_in_one_clock_and_the_unit_stated():
     still = replace(
         poses, distance_m=0 * poses.distance_m + 0.7, delta_rad=0 * poses.delta_rad, bearing_rad=0 * poses.delta_rad
     )
-    with pytest.raises(UsageError, match="the delay cannot be told from this recording"):
+    with pytest.raises(UsageError, match="the delay cannot be determined from this recording"):
         calibrate(BOARD, replace(frames, range_m=frames.range_m[:1].repeat(20, axis=0)), still, free=FREE, moving=True)
 
 

@@ -393,7 +393,7 @@ def test_files_that_are_read_whole_have_a_size_they_may_have(tmp_path):
     for name, read in (("a.stl", lambda path: read_mesh(path, unit="m")), ("a.toml", Sensor.from_toml)):
         with (tmp_path / name).open("wb") as file:
             file.truncate(1 << 40)
-        with pytest.raises(InputFileError, match="far too large for such a file"):
+        with pytest.raises(InputFileError, match="far too large for a file of this kind"):
             read(tmp_path / name)
     with pytest.raises(InputFileError, match="far too large"):
         read_whole(Path("/dev/zero"), most_bytes=1000)

@@ -189,7 +189,7 @@ def test_the_package_runs_as_a_module(arguments: list[str], code: int, tmp_path:
 
 
 class Clock:
-    """Time that passes when the test says so."""
+    """Time that passes when the test moves it."""
 
     seconds = 0.0
 

@@ -247,7 +247,7 @@ def test_the_upper_part_does_not_change_the_bound_of_the_lower_pixels():
     np.testing.assert_allclose(bounds[0].position_std_m, bounds[1].position_std_m, rtol=5e-3)  # kinks, PHYSICS 7
 
 
-# telling apart
+# distinguishing landmarks
 
 
 def test_the_distance_of_two_classes_is_the_matchers_cost_without_noise(design):

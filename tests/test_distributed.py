@@ -1,4 +1,4 @@
-"""The same bytes from worker processes and clusters, whoever dies on the way; and no process outlives the command."""
+"""The same bytes from worker processes and clusters, even if some die; and no process outlives the command."""
 
 import os
 import signal
@@ -91,7 +91,7 @@ def test_a_worker_process_that_dies_is_replaced(reference, tmp_path):
 
 
 def test_a_script_without_a_main_guard_may_have_worker_processes(reference, tmp_path):
-    """The standard library's pools import such a script again in each worker, and end with BrokenProcessPool."""
+    """The standard library's pools import an unguarded script again in each worker, and end with BrokenProcessPool."""
     script = tmp_path / "script.py"
     script.write_text(
         "from phasemark.data import FramePlan, build_frames\n"

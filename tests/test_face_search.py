@@ -61,7 +61,7 @@ def test_the_search_from_a_neighbouring_sample_finds_the_face_that_an_intersecto
         tried += 1
         h, t = found(topology.search, topology.grid, f, o, e)
         if h < 0:
-            missed += 1  # such a sample is cast
+            missed += 1  # a missed sample is cast
             continue
         # float32 may take the face on the other side of an edge, where the surface is the same
         plane = topology.planes[g]

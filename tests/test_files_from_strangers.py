@@ -37,7 +37,7 @@ def frames_bytes(tmp_path_factory):
 
 @pytest.fixture
 def canary(tmp_path):
-    """A pipe: whoever opens it to read waits for ever, so that it cannot be opened unnoticed."""
+    """A pipe: opening it to read waits for ever, so that it cannot be opened unnoticed."""
     path = tmp_path / "canary"
     os.mkfifo(path)
     return path

@@ -72,7 +72,7 @@ def test_the_cost_is_the_whitened_squared_distance_with_the_no_return_rule():
     # four pixels: a return on the landmark, a lost return, a missing return, agreement on nothing
     phasor = np.array([[[0.8 * np.exp(1j * 1.0 / SENSOR.metres_per_radian), 0, 0.8, 0]]])
     coverage = np.array([[[1.0, 0.0, 0.31, 0.004]]])
-    templates = Templates.build(phasor, np.abs(phasor), coverage, SENSOR, None, (0, 1))
+    templates = Templates.build(phasor, coverage, SENSOR, None, (0, 1))
     seen = Observation(
         range_m=np.array([[1.03, 2.0, 0.0, 0.0]]),
         weight=np.array([[1 / 0.01**2, 1e4, 0.0, 0.0]]),
@@ -104,7 +104,7 @@ def test_matrix_product_and_exact_sum_agree_on_random_frames(bank):
 def test_a_range_beyond_the_wrap_is_compared_across_it():
     far = SENSOR.unambiguous_range_m - 0.01
     phasor = np.array([[[np.exp(1j * far / SENSOR.metres_per_radian)]]])
-    templates = Templates.build(phasor, np.abs(phasor), np.ones((1, 1, 1)), SENSOR, None, (0, 1))
+    templates = Templates.build(phasor, np.ones((1, 1, 1)), SENSOR, None, (0, 1))
     seen = Observation(np.array([[0.01]]), np.array([[1e4]]), np.array([[True]]), np.array([[False]]))
     # 1 cm before the wrap and 1 cm after it are 2 cm apart
     assert templates.exact_costs(seen, 0, np.array([0]))[0] == pytest.approx(1e4 * 0.02**2, rel=1e-3)
@@ -225,7 +225,7 @@ def test_a_noisier_camera_of_the_same_optics_is_welcome(bank):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"method": "guess"}, "the methods are nearest"),
+        ({"method": "guess"}, "'method' must be 'nearest' or 'refine', got 'guess'"),
         ({"false_alarm": 0.0}, "false_alarm"),
         ({"false_alarm": 1.5}, "false_alarm"),
     ],

@@ -11,7 +11,7 @@ from rich.style import Style
 
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.render import Background, Flag, Frames, PhasorImages, Renderer, Views, preset
+from phasemark.render import Background, Flag, Frames, PhasorImages, Renderer, Views, capture, preset
 from phasemark.render.figures import (
     PAPER_CMAP,
     RANGE_COLOURS,
@@ -66,8 +66,8 @@ def test_a_surface_half_way_is_blue_too_and_every_caption_says_so():
     red, _, blue = (int(c) for c in pixel_colour(range_figure(range_m), 0, 2))
     assert blue > red + 100
     root = Path(__file__).resolve().parent.parent
-    readme = " ".join((root / "README.md").read_text(encoding="utf-8").split())
-    assert RANGE_COLOURS in readme
+    tour = " ".join((root / "docs" / "tour.md").read_text(encoding="utf-8").split())
+    assert RANGE_COLOURS in tour
     for page in (root / "README.md", *root.glob("docs/*.md"), *root.glob("*/**/*.j2")):
         text = " ".join(page.read_text(encoding="utf-8").replace(RANGE_COLOURS, "").split())
         assert "blue is a pixel" not in text, page.name
@@ -166,7 +166,7 @@ def test_unknown_names_are_attribute_errors():
     import phasemark.render
 
     with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
-        phasemark.render.nonsense  # noqa: B018
+        getattr(phasemark.render, "nonsense")  # noqa: B009
 
 
 def test_the_colours_span_the_landmark_and_not_the_wall_behind_it():
@@ -196,3 +196,26 @@ def test_residuals_in_sigma_have_one_scale():
     image = draw_sigma(axes, np.array([[0.1, -0.2], [0.3, np.nan]]))
     assert image.get_clim() == (-5, 5)
     assert draw_sigma(Figure().add_subplot(), np.array([[7.0, -0.2]])).colorbar.extend == "max"
+
+
+def test_without_anything_beside_it_no_part_of_the_landmark_is_beyond_the_colours():
+    for name in ("cone", "cylinder"):
+        for distance in (1.0, 1.5):
+            image = Renderer(build_mesh(catalog()[name]), preset("pmd-16x16")).render(distance, 0.5)
+            near, far = landmark_limits_m(image.range_m[0], image.coverage[0])
+            seen = image.range_m[0][np.isfinite(image.range_m[0])]
+            assert (near, far) == (seen.min(), seen.max())
+    noisy = image.range_m[0].copy()
+    noisy[np.unravel_index(np.nanargmax(noisy), noisy.shape)] = 9.0  # one weak pixel
+    assert landmark_limits_m(noisy, image.coverage[0])[1] < far
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_colours_of_a_frame_span_the_landmark(known):
+    sensor = preset("pmd-16x16")
+    image = Renderer(build_mesh(catalog()["cone"]), sensor).render(1.0, 0.5, background=Background(wall_m=3.0))
+    frames = capture(image, sensor, rng=np.random.default_rng(3), n_frames=2)
+    shown = frames.plot(0, 1, coverage=image.coverage[0] if known else None).axes[0].images[0]
+    near, far = shown.get_clim()
+    assert 0.75 < near < 0.95
+    assert 1.0 < far < 1.3  # the wall stands at 3 m

@@ -159,6 +159,7 @@ def test_files_that_do_not_belong_together(files, capsys, tmp_path):
         ("distance_m,bearing_deg\n1,2\n", "no column 'delta_deg'"),
         ("distance_m,delta_deg\n1,2\n1\n", "line 3: 1 values, must have 2"),
         ("distance_m,delta_deg\n1,east\n", "line 2: 'delta_deg' must be a number, got 'east'"),
+        ("distance_m,delta_deg\n1,1_0\n", "line 2: 'delta_deg' must be a number, got '1_0'"),
         ("distance_m,delta_deg\n1,inf\n", "line 2: 'delta_deg' must be a finite number"),
     ],
 )

@@ -13,12 +13,15 @@ from hypothesis import HealthCheck, given, settings
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
+from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, phasor_mean
 from phasemark.matcher.accuracy.trials import TrialSetup, noisy_frames, run_trials
 from phasemark.matcher.filters import noise_free
 from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.problem import Problem, Settings
+from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher
+from phasemark.matcher.likelihood.look_alikes import _most_promising
+from phasemark.matcher.likelihood.problem import DescentSettings, Problem
+from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import std_without_one_pixel, view_covariance
@@ -185,7 +188,7 @@ def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, render
     used = np.ones(evidence.value.shape[1], bool)
     problem = Problem(
         RenderedModel(bank), evidence, np.zeros(1, np.int64), np.array([bank.classes.index("cone")]),
-        Settings(free, used, huber), np.full(1, np.inf),
+        DescentSettings(free, used, huber), np.full(1, np.inf),
     )  # fmt: skip
     state = problem.start(np.array([[1.02, 0.5, 0.0, 0.0, 0.0, 0.0]]), False)
     p = len(problem.columns)
@@ -317,7 +320,7 @@ def test_rendering_only_the_rows_that_turn_gives_the_whole_image(bank, on):
         dim, SENSOR, Views.broadcast(1.0, [0.6, 1.1]), TrialSetup(on=on, background=WALL), np.random.default_rng(4)
     )
     behind = Renderer(None, SENSOR).render(1.0, background=WALL).phasor.reshape(-1)
-    settings = Settings(VIEW[:2], np.ones(256, bool), background=behind)
+    settings = DescentSettings(VIEW[:2], np.ones(256, bool), phasor_behind=behind)
     cone, evidence = np.full(2, bank.classes.index("cone")), Evidence.from_frames(frames, on)
     problem = Problem(RenderedModel(bank, WALL), evidence, np.arange(2), cone, settings, np.full(2, np.inf))
     state = problem.start(np.array([[1.0, 0.6, 0, 0, 0, 0], [1.0, 1.1, 0, 0, 0, 0]]), False)
@@ -360,14 +363,22 @@ def test_a_match_tells_weights_condition_and_weak_direction(bank, renderers):
     [
         ({"free": ("distance_m", "yaw")}, "'free' must be among"),
         ({"free": ("distance_m",)}, "must name distance_m and delta_rad"),
-        ({"on": "volts"}, "'on' must be ranges or phasors"),
-        ({"pixels": "upper"}, "'pixels' must be all or lower"),
-        ({"background": "wall"}, "'background' must be a Background"),
+        ({"on": "volts"}, "'on' must be 'ranges' or 'phasors', got 'volts'$"),
+        ({"on": np.ones((16, 16))}, "'on' must be 'ranges' or 'phasors', got ndarray$"),
+        ({"pixels": "upper"}, "'pixels' must be 'all' or 'lower', got 'upper'$"),
+        ({"pixels": np.ones((16, 16), bool)}, "'pixels' must be 'all' or 'lower', got ndarray$"),
+        ({"background": "wall"}, "'background' must be a Background, None, 'auto' or 'unknown', got 'wall'$"),
+        ({"background": np.ones((16, 16))}, "'background' must be a Background, None, .* got ndarray$"),
+        ({"background": 4.0}, "'background' must be a Background, None, .* got float$"),
+        ({"method": np.ones(2)}, "'method' must be 'nearest' or 'refine', got ndarray$"),
     ],
 )
-def test_wrong_options_are_refused_in_one_line(bank, options, message):
+@pytest.mark.parametrize("method", ["refine", "nearest"])
+def test_wrong_options_are_refused_in_one_line(bank, options, message, method):
+    if method == "nearest" and "free" in options:
+        message = "belong to method 'refine'"
     with pytest.raises(UsageError, match=message) as error:
-        Matcher(bank, "refine", **options)
+        Matcher(bank, **{"method": method, **options})
     assert "\n" not in str(error.value)
 
 
@@ -393,3 +404,22 @@ def two_matchers():
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damaged_frames_get_an_answer_and_never_a_view_that_is_not_a_number(two_matchers, renderers, **damage):
     check_damaged(two_matchers, renderers["post"], **damage)
+
+
+def test_look_alikes_are_chosen_by_how_well_ranges_agree_on_phasors_too(bank, renderers):
+    image = renderers["cone"].render(distance_m=1.1, delta_rad=0.5, bearing_rad=0.05)
+    frames = phasor_mean(capture(image, SENSOR, rng=np.random.default_rng(5), n_frames=50))
+    c = bank.classes.index("cone")
+    true = np.array([[1.1, 0.5, 0.05, 0.0, 0.0, 0.0]])
+    rng = np.random.default_rng(6)
+    views = np.repeat(true, 60, axis=0)
+    views[:, 1:3] += np.column_stack([rng.uniform(-0.3, 0.3, 60), rng.uniform(-0.02, 0.02, 60)])
+    kept = []
+    for on in ("ranges", "phasors"):
+        matcher = LikelihoodMatcher(bank, free=VIEW[:3], on=on)
+        scene, evidence = matcher._scene, Evidence.from_frames(frames, on)
+        first, of_class = np.zeros(1, np.int64), np.full(60, c)
+        fits = refine(scene.final, evidence, first, of_class[:1], true, scene.settings(matcher._setup))
+        kept.append(_most_promising(matcher._setup, scene.final, evidence, fits, np.repeat(first, 60), of_class, views))
+    assert len(kept[0][2]) == matcher._setup.policy.slides_refined
+    np.testing.assert_array_equal(kept[0][2], kept[1][2])

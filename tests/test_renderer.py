@@ -129,7 +129,7 @@ def test_an_edge_shares_a_pixel_where_it_cuts_it():
 
 
 def test_a_slanted_edge_cuts_off_the_polygons_area():
-    # from (4, 2) to (6, 10) in the image; the sheet is what lies left of that line
+    # from (4, 2) to (6, 10) in the image; the sheet lies left of that line
     (ua, va), (ub, vb) = (4.0, 2.0), (6.0, 10.0)
 
     def at(u, v):

@@ -92,7 +92,7 @@ def test_photon_transfer_finds_the_electrons_of_an_arbitrary_unit():
 
 
 def test_a_bad_day_is_recovered_within_its_intervals():
-    # square waves, patterns, stray light, converter, defects, told apart from 8 distances of 100 frames
+    # square waves, patterns, stray light, converter and defects, distinguished by 8 distances of 100 frames
     fit = fitted(BAD_DAY, NEAR, 100)
     unit = camera_unit(BAD_DAY)
     alive = ~(unit.dead | unit.hot)
@@ -227,7 +227,7 @@ def test_a_direct_sensor_has_an_offset_and_one_figure_of_noise():
 
 def test_one_distance_says_that_offset_and_wiggling_cannot_be_told_apart():
     fit = fitted(PMD, (1.0,), amplitude=False, intensity=False)
-    assert any("cannot be told apart from one distance" in note for note in fit.notes)
+    assert any("cannot be distinguished from one distance" in note for note in fit.notes)
     assert any("one number of noise" in note for note in fit.notes)
     assert meets(fit, "signal_e", PMD.signal_e)  # the assumed K and no ambient light happen to be right
     assert meets(fit, "range_offset_m", 0.0)

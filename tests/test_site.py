@@ -150,9 +150,15 @@ def test_what_a_cell_shows_stands_below_it(tmp_path):
         ("1. a\n   more", "1. a\n    more"),
         ("```\n- a\n  b\n```", "```\n- a\n  b\n```"),
         ("- a\n\ntext\n\n    code", "- a\n\ntext\n\n    code"),
+        (r"| `a\|b` | \|S\| |", r"| `a|b` | \|S\| |"),
+        (
+            "| `test_folders.py::test_a_folder_is_kept` |",
+            "| <code>test&#95;<wbr>folders.py::<wbr>test&#95;<wbr>a&#95;<wbr>folder&#95;<wbr>is&#95;<wbr>kept</code> |",
+        ),
+        ("```\n| `a\\|b` |\n```", "```\n| `a\\|b` |\n```"),
     ],
 )
-def test_lists_are_indented_as_the_sites_builder_reads_them(text, expected):
+def test_lists_and_tables_are_written_as_the_sites_builder_reads_them(text, expected):
     assert module("markdown_dialect").for_site(text) == expected
 
 

@@ -158,7 +158,7 @@ def test_the_bound_carries_the_same_terms(bank):
     np.testing.assert_allclose(declared.covariance - plain.covariance, [np.diag([9e-6, 0.0])], atol=1e-18)
     both = cramer_rao(renderer, views, systematic=("calibration", "declared"))
     assert (np.linalg.eigvalsh(both.covariance - declared.covariance) > -1e-12).all()
-    # a range offset moves the distance one for one: at least its variance is in the bound
+    # a range offset moves the distance by its own value: at least its variance is in the bound
     assert both.covariance[0, 0, 0] > declared.covariance[0, 0, 0] + 0.5 * STD[-1] ** 2
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -33,6 +34,8 @@ from phasemark.render import PhasorImages, Sensor, Views
 
 FORMAT = "phasemark-bank"
 SCHEMA_VERSION = 1
+_IMAGES = ("_phasors", "intensity", "coverage")
+_PART_BYTES = 1 << 24
 _COVERAGE_SLACK = 0.01
 """How far a coverage may lie outside 0 … 1: more than any error of the integral, less than damage."""
 
@@ -67,6 +70,7 @@ class BankGroup:
 
     def __init__(self, name: GroupName, group: h5py.Group, path: Path, sensor: Sensor) -> None:
         self._group, self._path = group, path
+        self._which: tuple[slice, ...] = ()
         self.name: GroupName = name
         view_dims = VIEW_DIMS[name]
         coordinates = {dim: self._coordinate(dim) for dim in (*view_dims, *PHASOR_DIMS)}
@@ -91,6 +95,38 @@ class BankGroup:
         self.order: NDArray[np.int64] = frozen(order)
         self.classes: tuple[str, ...] = tuple(coordinates.get("landmark_class", np.empty(0)).tolist())
         self._check_coordinates(sensor)
+
+    @property
+    def n_views(self) -> tuple[int, ...]:
+        """How many classes, distances and angles the views have, in the order of the arrays."""
+        sizes = {"distance": len(self.distance_m), "delta": len(self.delta_rad), "landmark_class": len(self.classes)}
+        return tuple(sizes[dim] for dim in VIEW_DIMS[self.name])
+
+    def part(self, *which: slice) -> BankGroup:
+        """Return the group with some of its views alone, whose images it reads when they are asked for.
+
+        Parameters
+        ----------
+        *which : slice
+            Along the first axes of the views. The grids and classes stay those of the whole group.
+        """
+        some: BankGroup = object.__new__(type(self))
+        some.__dict__.update({name: value for name, value in vars(self).items() if name not in _IMAGES})
+        some._which = which
+        for name in _IMAGES:
+            if name in vars(self):
+                some.__dict__[name] = vars(self)[name][which]
+        return some
+
+    def parts(self) -> Iterator[tuple[tuple[slice, ...], BankGroup]]:
+        """Yield all views in order, some at a time with their places, so that only those are held in memory."""
+        *outer, rows, last = self.n_views
+        images = (len(self.frequency_hz) * 2 + 2) * len(self.row) * len(self.col)
+        at_once = max(_PART_BYTES // (4 * last * images), 1)
+        for index in np.ndindex(*outer):
+            for first in range(0, rows, at_once):
+                which = (*(slice(k, k + 1) for k in index), slice(first, min(first + at_once, rows)))
+                yield which, self.part(*which)
 
     @property
     def phasor(self) -> NDArray[np.complex64]:
@@ -144,7 +180,7 @@ class BankGroup:
 
     def _read(self, name: str) -> NDArray[np.float32]:
         with reading(self._path):
-            values = np.ascontiguousarray(self._group[name][...], dtype=np.float32)
+            values = np.ascontiguousarray(self._group[name][self._which], dtype=np.float32)
         if not np.isfinite(values).all():
             raise InputFileError(f"{self._path}: '{self.name}/{name}' must be finite, got NaN or infinity")
         return values

@@ -1,4 +1,4 @@
-"""What commands print: tables, JSON and facts to standard output; notes, errors and progress to standard error."""
+"""Output of commands: tables, JSON and facts to standard output; notes, errors and progress to standard error."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ from phasemark.data.commands.outputs import refuse_existing, refuse_input_files,
 if TYPE_CHECKING:
     from phasemark.render import Sensor, Views
 
-ExportFormat = Literal["npz", "csv", "png16", "ply", "bop", "rosbag"]
+ExportFormat = Literal["npz", "csv", "jsonl", "png16", "ply", "bop", "rosbag"]
 
 _RECORDED_PIXELS = 5_000_000
 """Most pixels of a simulated recording, all frames together: some hundred bytes of memory each."""
@@ -106,12 +106,19 @@ def frames_export(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
     to: Annotated[
         ExportFormat,
-        typer.Option("--to", metavar="FORMAT", help="npz, csv, png16, ply, bop or rosbag."),
+        typer.Option("--to", metavar="FORMAT", help="npz, csv, jsonl, png16, ply, bop or rosbag."),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The file (npz, csv) or folder to write.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The file (npz, csv, jsonl) or folder to write.")],
     quantity: Annotated[
         QuantityWord | None,
         typer.Option("--quantity", help="range or z, in npz, csv and png16; BOP and ROS have z."),
+    ] = None,
+    content: Annotated[
+        Literal["range", "targets", "histogram"] | None,
+        typer.Option(
+            "--content",
+            help="Of histograms: range (of the nearest target), targets (npz, csv) or histogram (npz, jsonl).",
+        ),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -120,7 +127,7 @@ def frames_export(
     with open_frame_set(frames) as opened:
         from phasemark.data.export import export_frames
 
-        typer.echo(export_frames(opened, out, to, quantity=quantity, force=force))
+        typer.echo(export_frames(opened, out, to, quantity=quantity, content=content, force=force))
 
 
 def frames_import(
@@ -245,7 +252,9 @@ def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
 
 def frames_show(
     *,
-    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, or measured frames.")],
+    frames: Annotated[
+        Path, typer.Argument(metavar="FRAMES", help="A frame set, measured frames, or a log of histograms.")
+    ],
     out: Annotated[Path, typer.Option("-o", "--out", help="The figure, .png.")],
     index: Annotated[int, typer.Option("--index", min=0, help="Number of the frame.")] = 0,
     sensor: SensorName = "pmd-16x16",
@@ -257,6 +266,7 @@ def frames_show(
 
     from phasemark.data.files.atomic_write import write_atomically
     from phasemark.data.frames.frame_set_file import is_frame_set
+    from phasemark.data.measured.histogram_logs import is_histogram_log, read_histograms
 
     if out.suffix.lower() != ".png":
         raise UsageError(f"the figure must be a .png file, got '{out}'")
@@ -264,7 +274,14 @@ def frames_show(
     if is_frame_set(frames):
         with open_frame_set(frames) as opened:
             _refuse_index(index, len(opened))
-            figure = opened.frames([index]).plot()
+            if opened.plan.histograms:
+                figure = opened.histograms([index]).plot()
+            else:
+                figure = opened.frames([index]).plot(coverage=opened[index]["coverage"])
+    elif is_histogram_log(frames):
+        log = read_histograms(frames, sensor=read_sensor(sensor)).frames
+        _refuse_index(index, len(log))
+        figure = log.plot(index)
     else:
         measured = reading.read(frames, read_sensor(sensor))
         _refuse_index(index, len(measured) * measured.n_frames)

@@ -1,4 +1,4 @@
-"""What arguments name: sensors, landmarks, banks, and what stands behind a landmark."""
+"""Objects that arguments name: sensors, landmarks, banks and backgrounds."""
 
 # Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
 
@@ -108,7 +108,7 @@ def note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None]) -> Non
     Raises
     ------
     UsageError
-        The sensor has several modulation frequencies, which are there to tell such a distance, and they do not.
+        The sensor has several modulation frequencies, and even together they are ambiguous at this distance.
     """
     from phasemark.render.sensor.sensor_quantities import SPEED_OF_LIGHT_M_S
 

@@ -96,7 +96,7 @@ Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; 
 
 @dataclass(frozen=True)
 class FrameReading:
-    """How measured frames are read: what their numbers mean, and how the camera is turned."""
+    """Options for reading measured frames: the meaning of their numbers, and the orientation of the camera."""
 
     unit: FramesUnit = None
     quantity: Quantity = None
@@ -127,7 +127,7 @@ class FrameReading:
 
 @dataclass(frozen=True)
 class MeshReading:
-    """How a mesh file is read."""
+    """Options for reading a mesh file."""
 
     unit: MeshUnit = None
     up: Up = "z"
@@ -136,7 +136,7 @@ class MeshReading:
 
 @dataclass(frozen=True)
 class Building:
-    """How a bank or a frame set is built: by whom, how much of it, and over what."""
+    """Options for building a bank or a frame set: workers, shards and existing output."""
 
     workers: Workers = None
     resume: Resume = False

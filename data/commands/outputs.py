@@ -1,4 +1,4 @@
-"""What a command checks of the files and folders that it is about to write."""
+"""Checks of the files and folders that a command is about to write."""
 
 # Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
 
@@ -21,7 +21,7 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
-        raise UsageError(f"{path}: is no folder, or lies in something that is none") from None
+        raise UsageError(f"{path}: is not a directory, or a parent of it is a file") from None
 
 
 def refuse_input_files(outputs: Iterable[Path], plan: BaseModel | None = None) -> None:

@@ -24,6 +24,7 @@ from phasemark.data.commands.outputs import refuse_existing
 
 if TYPE_CHECKING:
     from phasemark.render import PhasorImages
+    from phasemark.render.direct import HistogramImages
 
 
 def render_frame(
@@ -54,7 +55,10 @@ def render_frame(
     ] = "exact",
     force: Force = False,
 ) -> None:
-    """Render one noise-free frame: a figure, the phasors, and a sketch in the terminal."""
+    """Render one noise-free frame: a figure, the phasors, and a sketch in the terminal.
+
+    Of a direct sensor with a [histogram] table the figure and the data have the expected counts of every zone's bins.
+    """
     from phasemark.render import Renderer, Views
     from phasemark.render.figures import landmark_limits_m, terminal_figure
 
@@ -70,12 +74,14 @@ def render_frame(
     angles = {name: math.radians(value) for name, value in (("pitch_rad", pitch), ("roll_rad", roll))}
     views = Views.broadcast(distance, math.radians(delta), math.radians(bearing), height, **angles)
     renderer.check_in_view(views)
-    image = renderer.render_views(
-        views,
-        background=background_of(wall, floor),
-        variant=variant,
-    )
-    _write_image(image, out, data, force)
+    background = background_of(wall, floor)
+    image = renderer.render_views(views, background=background, variant=variant)
+    histograms = None
+    if camera.histogram is not None and variant == "exact":
+        from phasemark.render.direct import HistogramRenderer
+
+        histograms = HistogramRenderer(mesh, camera, albedo=renderer.albedo).render_views(views, background=background)
+    _write_image(image, histograms, out, data, force)
     if sys.stdout.isatty():
         from rich.console import Console
 
@@ -85,8 +91,8 @@ def render_frame(
     typer.echo(data)
 
 
-def _write_image(image: PhasorImages, out: Path, data: Path, force: bool) -> None:
-    """Write the figure of an image, and its arrays."""
+def _write_image(image: PhasorImages, histograms: HistogramImages | None, out: Path, data: Path, force: bool) -> None:
+    """Write the figure of an image, or of its histograms where there are any, and the arrays."""
     import io as bytes_io
 
     import numpy as np
@@ -103,8 +109,10 @@ def _write_image(image: PhasorImages, out: Path, data: Path, force: bool) -> Non
     }
     if len(image.sensor.frequencies_hz) > 1:
         arrays |= {"frequency": np.array(image.sensor.frequencies_hz), "frequency_phasor": image.phasors[0]}
+    if histograms is not None:
+        arrays |= {"expected_counts": histograms.expected[0], "signal_counts": histograms.signal[0]}
     buffer, figure = bytes_io.BytesIO(), bytes_io.BytesIO()
     np.savez(buffer, **arrays)
-    image.plot().savefig(figure, format="png", dpi=120)
+    (image if histograms is None else histograms).plot().savefig(figure, format="png", dpi=120)
     write_atomically(data, buffer.getvalue(), force=force)
     write_atomically(out, figure.getvalue(), force=force)

@@ -1,4 +1,4 @@
-"""Commands of ``phasemark sensor``: presets, sensor files, their data sheet and their fit."""
+"""Commands of ``phasemark sensor``: presets, sensor files and their fit."""
 
 # Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
 
@@ -14,17 +14,16 @@ import typer
 
 from phasemark import UsageError
 from phasemark.data.commands.command import Without
-from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
+from phasemark.data.commands.console import echo_json, echo_table, readable
 from phasemark.data.commands.inputs import note_too_far, read_sensor, read_sensor_sources
 from phasemark.data.commands.options import (
     Force,
     FrameReading,
     Json,
-    Seed,
     SensorName,
     a_preset,
 )
-from phasemark.data.commands.outputs import output_folder, refuse_existing
+from phasemark.data.commands.outputs import refuse_existing
 from phasemark.inputs.numbers import in_words
 from phasemark.inputs.toml_file import toml_value
 
@@ -66,7 +65,7 @@ Frequency = Annotated[
 ]
 
 
-def _which_frequency(sensor: Sensor, hz: float | None) -> int:
+def which_frequency(sensor: Sensor, hz: float | None) -> int:
     """Return the number of the frequency that an option names; one that has no other needs no name."""
     known = sensor.frequencies_hz
     if hz is None and len(known) == 1:
@@ -238,38 +237,6 @@ def sensor_import(
     typer.echo(out)
 
 
-def sensor_characterise(
-    name_or_file: Annotated[
-        str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=a_preset)
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, its pictures and numbers.")],
-    n_frames: Annotated[
-        int | None, typer.Option("--frames", min=2, help="Frames at each point; by default 51200 readings a point.")
-    ] = None,
-    seed: Seed = 2005,
-    frequency: Frequency = None,
-    as_json: Json = False,
-    force: Force = False,
-) -> None:
-    """Measure a sensor before flat fields, as EMVA 1288 would, and compare it with what its numbers predict."""
-    from phasemark.data.pages.characterisation import NAMES, summary_sentences, write_characterisation
-    from phasemark.data.seeds import stream
-    from phasemark.render import characterise
-
-    sensor = read_sensor(name_or_file)
-    sensor = sensor.by_frequency[_which_frequency(sensor, frequency)]
-    with output_folder(out, "sensor characterise", NAMES, force), LongWork("measuring"):
-        found = characterise(sensor, rng=stream(seed, "characterise", 0), n_frames=n_frames)
-        report = write_characterisation(found, readable(name_or_file), out, seed=seed, force=force)[0]
-    if as_json:
-        facts = found.as_dict()
-        echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
-        return
-    for sentence in (*summary_sentences(found, name_or_file), *found.notes):
-        typer.echo(sentence)
-    typer.echo(report)
-
-
 def sensor_fit(
     *,
     frames: Annotated[
@@ -314,7 +281,7 @@ def sensor_fit(
         raise UsageError(f"the sensor must be a .toml file, got '{out}'")
     refuse_existing([out], force)
     base = read_sensor(sensor)
-    which = _which_frequency(base, frequency)
+    which = which_frequency(base, frequency)
     measured = [reading.read(path, base) for path in frames]
     note_too_far(base, {"--distance": max(distance)})
     for path, one in zip(frames, measured, strict=True):

@@ -1,14 +1,17 @@
-"""Frame sets for other programs: npz, 16-bit PNG, CSV, PLY point clouds, BOP, ROS 2 bags."""
+"""Frame sets for other programs: npz, 16-bit PNG, CSV, JSON lines, PLY point clouds, BOP, ROS 2 bags."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 from phasemark import UsageError
 from phasemark.data.export.bop import write_bop
 from phasemark.data.export.clouds import write_ply
+from phasemark.data.export.histograms import write_jsonl, write_targets_csv
 from phasemark.data.export.images import write_png16
 from phasemark.data.export.rosbag import write_rosbag
 from phasemark.data.export.tables import write_csv, write_npz
@@ -20,17 +23,27 @@ from phasemark.data.measured.reading import RangeOrZ
 
 __all__ = ["EXPORTS", "export_frames"]
 
+Content = Literal["range", "targets", "histogram"]
 Writer = Callable[[FrameSet, Path, RangeOrZ], None]
 
 EXPORTS: dict[str, tuple[Writer, bool, tuple[RangeOrZ, ...]]] = {
     "npz": (write_npz, False, ("range", "z")),
     "csv": (write_csv, False, ("range", "z")),
+    "jsonl": (write_jsonl, False, ("range",)),
     "png16": (write_png16, True, ("range", "z")),
     "ply": (write_ply, True, ("range",)),
     "bop": (write_bop, True, ("z",)),
     "rosbag": (write_rosbag, True, ("z",)),
 }
 """For each format: who writes it, whether it is a folder, and which quantities it can hold, the usual one first."""
+
+CONTENTS: dict[str, tuple[Content, ...]] = {
+    "npz": ("range", "targets", "histogram"),
+    "csv": ("range", "targets"),
+    "jsonl": ("histogram",),
+}
+"""What formats can hold; those that are not named hold ranges alone."""
+_RANGE_ALONE: tuple[Content, ...] = ("range",)
 
 
 def export_frames(
@@ -39,6 +52,7 @@ def export_frames(
     to: str,
     *,
     quantity: RangeOrZ | None = None,
+    content: Content | None = None,
     force: bool = False,
 ) -> Path:
     """Write a frame set in a format of other programs.
@@ -50,10 +64,13 @@ def export_frames(
     frames : FrameSet
     path : path-like
         The file, or for ``png16``, ``ply``, ``bop`` and ``rosbag`` the folder, to write.
-    to : {"npz", "csv", "png16", "ply", "bop", "rosbag"}
+    to : {"npz", "csv", "jsonl", "png16", "ply", "bop", "rosbag"}
         docs/formats.md says what each holds.
     quantity : {"range", "z"}, optional
         What ``npz``, ``csv`` and ``png16`` hold; range if left out. BOP and ROS prescribe z.
+    content : {"range", "targets", "histogram"}, optional
+        What is wanted of a frame set with histograms. If left out, ``npz`` holds all three, ``jsonl`` histograms, and
+        every other format ranges, which are those of the nearest target.
     force : bool
         Whether an existing file may be replaced, or a folder that an earlier export wrote. Another folder, or one that
         holds a file of somebody else, never is.
@@ -66,8 +83,8 @@ def export_frames(
     Raises
     ------
     UsageError
-        The format is unknown or cannot hold the quantity, what it needs is not installed, or the file is the frame
-        set itself.
+        The format is unknown or cannot hold the quantity or the content, the frame set has no histograms, what it
+        needs is not installed, or the file is the frame set itself.
     OutputExistsError, StorageError
         As :func:`phasemark.data.files.write_atomically`.
     """
@@ -76,6 +93,8 @@ def export_frames(
     write, is_folder, quantities = EXPORTS[to]
     if quantity is not None and quantity not in quantities:
         raise UsageError(f"quantity=… must be {' or '.join(quantities)} for {to}, got '{quantity}'")
+    if content is not None or to == "jsonl":
+        write, quantities = _writer_of(frames, to, content or "histogram", quantity)
     path = Path(path)
     refuse_inputs([path], [frames.path])
     if is_folder:
@@ -87,3 +106,28 @@ def export_frames(
         with replacing(path, force=force) as temporary:
             write(frames, temporary, quantity or quantities[0])
     return path
+
+
+def _writer_of(
+    frames: FrameSet, to: str, content: Content, quantity: RangeOrZ | None
+) -> tuple[Writer, tuple[RangeOrZ, ...]]:
+    """Return what writes one content of a frame set, and which quantity it holds.
+
+    Raises
+    ------
+    UsageError
+        The format cannot hold it, or the frame set does not have it.
+    """
+    write, _, quantities = EXPORTS[to]
+    if content not in CONTENTS.get(to, _RANGE_ALONE):
+        able = [name for name in EXPORTS if content in CONTENTS.get(name, _RANGE_ALONE)]
+        raise UsageError(f"content={content} must go to {' or '.join(able)}, which can hold it, got '{to}'")
+    if content == "range":
+        return (partial(write_npz, content=content) if to == "npz" else write), quantities
+    reported = frames.reported_quantity()
+    if quantity is not None and quantity != reported:
+        why = f"the chip reports {reported}" if content == "targets" else "counts are neither range nor z"
+        raise UsageError(f"quantity=… must be left out of {content}: {why}, got '{quantity}'")
+    if to == "npz":
+        return partial(write_npz, content=content), (reported,)
+    return (write_targets_csv if content == "targets" else write_jsonl), (reported,)

@@ -1,4 +1,4 @@
-"""What all exports need: frames a block at a time, and the quantity that is asked for."""
+"""Input of all exports: frames a block at a time, and the requested quantity."""
 
 from __future__ import annotations
 

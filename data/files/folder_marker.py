@@ -33,7 +33,7 @@ def write_marker(folder: Path, content: str, entries: Iterable[str] | None) -> N
     ----------
     folder : Path
     content : str
-        What the folder holds, for whoever reads the marker.
+        Description of the folder, for readers of the marker.
     entries : iterable of str or None
         Files as paths relative to the folder, folders with a slash at the end. None while the folder is being made.
     """

@@ -42,7 +42,7 @@ _SOFT, _EXTERNAL, _HARD = h5py.h5l.TYPE_SOFT, h5py.h5l.TYPE_EXTERNAL, h5py.h5l.T
 
 
 class Refusal(Exception):
-    """What a file contains and may not."""
+    """Content that a file must not have."""
 
 
 def refusal(path: str | os.PathLike[str], *, expansion: int = EXPANSION, free_bytes: int = FREE_BYTES) -> str | None:
@@ -212,7 +212,7 @@ def first_reading(path: str | os.PathLike[str]) -> str | None:
         return " ".join(child.stdout.decode("utf-8", "replace").split())[:300]
     if child.returncode == -signal.SIGXCPU:
         return f"takes more than {seconds} s of processor time to read"
-    return "crashes HDF5, or needs more memory than such a file should"
+    return "crashes HDF5, or needs more memory than a file of its kind should"
 
 
 def _main(path: str, seconds: int) -> int:

@@ -19,7 +19,7 @@ from phasemark.inputs import checksum_path, is_vouched_for, verifying
 
 
 def open_hdf5(path: Path, what: str, *, untrusted: bool = False, foreign: bool = False) -> h5py.File:
-    """Open an HDF5 file that is what its checksum says and contains nothing which could lead out of it.
+    """Open an HDF5 file after comparing it with its checksum and refusing links that lead out of it.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def open_hdf5(path: Path, what: str, *, untrusted: bool = False, foreign: bool =
     untrusted : bool
         Whether a child process reads the file first, unless ``FILE.sha256`` vouches for it.
     foreign : bool
-        Whether other programs write such files: they have no checksums, and may be packed.
+        Whether another program wrote the file: it has no checksum, and may be packed.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def open_hdf5(path: Path, what: str, *, untrusted: bool = False, foreign: bool =
 def reading(path: Path) -> Iterator[None]:
     """Turn whatever a damaged file makes h5py, json or pydantic say into one line.
 
-    Numbers that do not survive a change of type become infinite or NaN without a warning: whoever reads checks them.
+    Numbers that do not survive a change of type become infinite or NaN without a warning: the caller checks them.
     """
     try:
         with np.errstate(invalid="ignore", over="ignore"):

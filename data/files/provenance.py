@@ -1,4 +1,4 @@
-"""Where a result comes from: the versions that made it and the mesh it was made of."""
+"""Provenance of a result: the versions that made it, and the mesh it was made of."""
 
 from __future__ import annotations
 

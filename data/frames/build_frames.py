@@ -6,8 +6,9 @@ import copy
 import json
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -17,6 +18,7 @@ from phasemark import UsageError
 from phasemark.data.bank.build_bank import StoredMesh, read_landmarks, write_mesh
 from phasemark.data.files.hdf5_layout import Layout
 from phasemark.data.files.json_text import json_text
+from phasemark.data.files.narrow import narrowed
 from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.files.same_file import named_files
 from phasemark.data.frames.frame_set_file import FORMAT, SCHEMA_VERSION, FrameSet, open_frames
@@ -28,6 +30,8 @@ from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
 from phasemark.data.shards.run import produce, refuse_unwritable_output
 from phasemark.render import Background, Flag, Frames, PhasorImages, Renderer, Sensor, Views, capture
+from phasemark.render.direct import HistogramRenderer
+from phasemark.render.direct.targets import Status
 
 _FLAGS = tuple(Flag)
 _KEYS = ("class_index", "albedo", "wall_m", "floor_m")
@@ -113,6 +117,11 @@ class FrameJob:
         self.sensor = self.plan.build_sensor()
         self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
         self._renderers = [Renderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks]
+        self._histograms: list[HistogramRenderer] = []
+        if self.plan.histograms:
+            self._histograms = [
+                HistogramRenderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks
+            ]
         self._shot_sensor = self.sensor.without_errors(shot_noise=True) if "shot" in self.plan.variants else None
 
     @property
@@ -214,6 +223,11 @@ class FrameJob:
                 dataset.attrs["units"] = units
                 if name in ("range", "range_shot", "range_hard", "range_mixed", "frequency_range"):
                     dataset.attrs["quantity"] = "range"
+                if name == "target_distance" and sensor.histogram is not None:
+                    dataset.attrs["quantity"] = sensor.histogram.reports
+                if name == "target_status":
+                    dataset.attrs["flag_values"] = np.array([int(status) for status in Status], np.uint8)
+                    dataset.attrs["flag_meanings"] = " ".join(status.name.lower() for status in Status)
                 if name in ("flags", "frequency_flags"):
                     known = _FLAGS if len(sensor.frequencies_hz) > 1 else _FLAGS[:-1]
                     dataset.attrs["flag_masks"] = np.array([int(flag) for flag in known], np.uint8)
@@ -266,10 +280,7 @@ class FrameJob:
         }
         if hard_range_m is not None:
             stored["range_hard"] = hard_range_m.astype("<f4")
-        frames = capture(
-            image, self.sensor, rng=stream(plan.seed, "frames.noise", 0), n_frames=plan.frames_per_view,
-            first_view=start, keep_taps=plan.keep_taps,
-        )  # fmt: skip
+        frames = self._captured(image, truth, start, stored)
         stored["range"] = frames.range_m.astype("<f4")
         stored["flags"] = frames.flags
         if frames.amplitude_e is not None and frames.intensity_e is not None:
@@ -300,21 +311,43 @@ class FrameJob:
         made = self.make(slab, item, item + 1)
         return {name: values[0] for name, values in zip(self.fields, made, strict=True)}
 
+    def _captured(
+        self, image: PhasorImages, truth: dict[str, NDArray[Any]], start: int, stored: dict[str, NDArray[Any]]
+    ) -> Frames:
+        """Return noisy frames of views; those of histograms leave these and their targets in `stored`."""
+        plan, rng = self.plan, stream(self.plan.seed, "frames.noise", 0)
+        if not plan.histograms:
+            return capture(
+                image, self.sensor, rng=rng, n_frames=plan.frames_per_view, first_view=start, keep_taps=plan.keep_taps
+            )
+        views, expected = _views(truth), None
+        for members, group in _alike(truth):
+            renderer = copy.copy(self._histograms[group.class_index])
+            renderer.albedo = group.albedo
+            background = _background(group.wall_m, group.floor_m, plan)
+            part = renderer.render_views(views[members], background=background)
+            if expected is None:
+                expected = replace(part, expected=np.empty((len(views), *part.expected.shape[1:])), views=views)
+            expected.expected[members] = part.expected
+        assert expected is not None
+        frames = capture(expected, self.sensor, rng=rng, n_frames=plan.frames_per_view, first_view=start)
+        stored["histogram"] = narrowed(frames.counts, "<u4", "counts")
+        stored["target_distance"] = frames.targets.distance_m.astype("<f4")
+        stored["target_sigma"] = frames.targets.sigma_m.astype("<f4")
+        stored["target_signal"] = frames.targets.signal.astype("<f4")
+        stored["target_status"] = frames.targets.status
+        return frames.ranges
+
     def _render(self, truth: dict[str, NDArray[Any]]) -> tuple[PhasorImages, NDArray[np.float64] | None]:
         """Return noise-free images of views, and what their centre rays see; views that share all else go together."""
         views = _views(truth)
-        table = np.stack([np.nan_to_num(truth[key].astype(float), nan=-1.0) for key in _KEYS], axis=1)
-        kinds, group_of = np.unique(table, axis=0, return_inverse=True)
-        group_of = group_of.reshape(-1)
         image: PhasorImages | None = None
         shape = (len(views), self.sensor.rows, self.sensor.cols)
         hard = np.empty(shape) if "hard" in self.plan.variants else None
-        for k in range(len(kinds)):
-            members = np.flatnonzero(group_of == k)
-            one = members[0]
-            renderer = copy.copy(self._renderers[truth["class_index"][one]])
-            renderer.albedo = float(truth["albedo"][one])
-            background = _background(truth["wall_m"][one], truth["floor_m"][one], self.plan)
+        for members, group in _alike(truth):
+            renderer = copy.copy(self._renderers[group.class_index])
+            renderer.albedo = group.albedo
+            background = _background(group.wall_m, group.floor_m, self.plan)
             part = renderer.render_views(views[members], background=background)
             if image is None:
                 image = PhasorImages(
@@ -350,6 +383,26 @@ _TRUTH = (
     ("wall", "wall_m", "m", "distance of the wall behind, NaN if there is none"),
     ("floor", "floor_m", "m", "how far the floor lies below the lens, NaN if there is none"),
 )
+
+
+class _Group(NamedTuple):
+    """What views that are rendered together have in common."""
+
+    class_index: int
+    albedo: float
+    wall_m: float
+    floor_m: float
+
+
+def _alike(truth: dict[str, NDArray[Any]]) -> Iterator[tuple[NDArray[np.intp], _Group]]:
+    """Yield which views agree in landmark, albedo and background, and in what."""
+    table = np.stack([np.nan_to_num(truth[key].astype(float), nan=-1.0) for key in _KEYS], axis=1)
+    kinds, group_of = np.unique(table, axis=0, return_inverse=True)
+    group_of = group_of.reshape(-1)
+    for k in range(len(kinds)):
+        members = np.flatnonzero(group_of == k)
+        class_index, albedo, wall_m, floor_m = (truth[key][members[0]] for key in _KEYS)
+        yield members, _Group(int(class_index), float(albedo), float(wall_m), float(floor_m))
 
 
 def _of_each_frequency(frames: Frames) -> dict[str, NDArray[Any]]:
@@ -403,6 +456,11 @@ def _coordinates(plan: FramePlan, sensor: Sensor) -> Iterator[tuple[str, Any, st
         tau_deg = np.tile(np.arange(4, dtype="<i4") * 90, len(sensor.frequencies_hz))
         yield "phase", tau_deg, "degree", "phase image τ"
         yield "tap", ["a", "b"], "", "tap of the pixel"
+    if plan.histograms and sensor.histogram is not None:
+        histogram = sensor.histogram
+        middle_m = histogram.start_m + histogram.bin_width_m * (np.arange(histogram.bins, dtype="<f8") + 0.5)
+        yield "bin", middle_m, "m", "delay of the middle of the bin, as range"
+        yield "target", np.arange(histogram.max_targets, dtype="<i4"), "1", "target of a zone, nearest first"
     yield "row", np.arange(sensor.rows, dtype="<i4"), "1", "pixel row, 0 at the top"
     yield "col", np.arange(sensor.cols, dtype="<i4"), "1", "pixel column, 0 on the left"
 

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, overload
+from typing import Any, Literal, Self, overload
 
 import h5py
 import numpy as np
@@ -28,10 +28,18 @@ from phasemark.data.files.hdf5_reading import (
     whole_numbers,
 )
 from phasemark.data.pages.notebook import facts_html
-from phasemark.data.plans.arrays import FRAME_FIELDS, FREQUENCY_FIELDS, VIEW_FIELDS, dimension_sizes
+from phasemark.data.plans.arrays import (
+    FRAME_FIELDS,
+    FREQUENCY_FIELDS,
+    HISTOGRAM_FIELDS,
+    TARGET_FIELDS,
+    VIEW_FIELDS,
+    dimension_sizes,
+)
 from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.inputs.numbers import in_words
 from phasemark.render import Frames, Sensor
+from phasemark.render.direct import HistogramFrames, Targets
 
 FORMAT = "phasemark-frames"
 SCHEMA_VERSION = 1
@@ -84,7 +92,7 @@ class FrameSet:
         self._closed = False
         check_format(file, path, "frame set", FORMAT, SCHEMA_VERSION)
         self.sensor = Sensor(**json_attribute(file, path, "sensor"))
-        self.plan = FramePlan(**json_attribute(file, path, "plan"))
+        self.plan = FramePlan(**_with_histograms_stated(json_attribute(file, path, "plan"), self.sensor))
         self.versions: dict[str, str] = json_attribute(file, path, "versions")
         self.classes = tuple(self.plan.landmark_names())
         self.splits = tuple(self.plan.splits)
@@ -101,6 +109,8 @@ class FrameSet:
         if len(self.sensor.frequencies_hz) > 1:
             self._check_frequencies(file)
             wanted += FREQUENCY_FIELDS
+        if self.plan.histograms:
+            wanted += HISTOGRAM_FIELDS
         self._fields = {name: self._field(file, name, sizes) for name in wanted}
         self.view_index = frozen(self._whole(file, "view_index", sizes["frame"]))
         if self.view_index.min() < 0 or self.view_index.max() >= sizes["view"]:
@@ -210,7 +220,9 @@ class FrameSet:
         Keys are ``range_m``, ``amplitude_e``, ``intensity_e``, ``flags``, ``taps_e``, ``range_shot_m``, ``coverage``,
         ``range_hard_m``, ``range_mixed_m`` (those that the file has), ``view``, ``class_name`` and the truth; of
         several modulation frequencies also ``frequency_range_m``, ``frequency_amplitude_e``, ``frequency_intensity_e``
-        and ``frequency_flags``, with an axis of frequencies before the rows.
+        and ``frequency_flags``, with an axis of frequencies before the rows; of histograms ``histogram``, with an axis
+        of bins behind the columns, and ``target_distance_m``, ``target_sigma_m``, ``target_signal`` and
+        ``target_status``, with an axis of targets.
         """
         one = isinstance(index, int | np.integer)
         if one:
@@ -239,7 +251,9 @@ class FrameSet:
 
     def _checked(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
         """Refuse values that no run writes, as soon as they are read: other programs would take them for measured."""
-        if values.dtype.kind != "f":
+        if name == "histogram":
+            self._check_histograms(values)
+        if values.dtype.kind != "f" or name in TARGET_FIELDS:
             return values
         if name == "frequency_range":
             periods = np.array([camera.unambiguous_range_m for camera in self.sensor.by_frequency])[:, None, None]
@@ -252,6 +266,17 @@ class FrameSet:
         if wrong.any():
             raise InputFileError(f"{self.path}: '{name}' must be {limits}, got {values[wrong][0]:g}")
         return values
+
+    def _check_histograms(self, counts: NDArray[Any]) -> None:
+        """Refuse counts that saturate: no run writes them."""
+        histogram = self.sensor.histogram
+        if histogram is None or not histogram.pile_up:
+            return
+        most = int(counts.sum(axis=-1, dtype=np.int64).max(initial=0))
+        if most >= histogram.cycles:
+            raise InputFileError(
+                f"{self.path}: 'histogram' must have fewer than {histogram.cycles:.4g} counts in a zone, got {most}"
+            )
 
     def _take(self, name: str, numbers: NDArray[np.integer]) -> NDArray[Any]:
         """Read some rows of a dataset, in the order asked for."""
@@ -294,6 +319,56 @@ class FrameSet:
             sensor=self.sensor,
             by_frequency=parts,
         )
+
+    def histograms(self, index: slice | Sequence[int] | NDArray[np.integer] = slice(None)) -> HistogramFrames:
+        """Return histograms of frames, one position each, (n, 1, rows, cols, bins).
+
+        Raises
+        ------
+        UsageError
+            The frame set holds no histograms.
+        """
+        self._refuse_without_histograms()
+        counts = self._numbered("histogram", index)
+        return HistogramFrames(counts[:, None], sensor=self.sensor)
+
+    def targets(self, index: slice | Sequence[int] | NDArray[np.integer] = slice(None)) -> Targets:
+        """Return the stored targets of frames, one position each, (n, 1, rows, cols, targets).
+
+        Raises
+        ------
+        UsageError
+            The frame set holds no histograms.
+        """
+        self._refuse_without_histograms()
+        distance_m, sigma_m, signal, status = (self._numbered(name, index)[:, None] for name in TARGET_FIELDS)
+        return Targets(distance_m.astype(float), sigma_m.astype(float), signal.astype(float), status)
+
+    def _numbered(self, name: str, index: slice | Sequence[int] | NDArray[np.integer]) -> NDArray[Any]:
+        """Return one dataset of some frames."""
+        numbers = np.arange(len(self))[index if isinstance(index, slice) else np.asarray(index)]
+        return self._checked(name, self._take(name, numbers))
+
+    def reported_quantity(self) -> Literal["range", "z"]:
+        """Return what the chip reports as the distance of targets.
+
+        Raises
+        ------
+        UsageError
+            The frame set holds no histograms.
+        """
+        self._refuse_without_histograms()
+        assert self.sensor.histogram is not None
+        return self.sensor.histogram.reports
+
+    def _refuse_without_histograms(self) -> None:
+        if not self.plan.histograms:
+            raise UsageError(f"{self.path} holds no histograms: {self._why_no_histograms()}")
+
+    def _why_no_histograms(self) -> str:
+        if self.sensor.histogram is None:
+            return "its sensor has no [histogram] table"
+        return "build it without 'histograms = false'"
 
     def view(self, number: int) -> Frames:
         """Return all frames of one view, (1, frames_per_view, rows, cols).
@@ -374,6 +449,7 @@ class FrameSet:
         of_class = np.bincount(self.truth["class_index"], minlength=len(self.classes))
         of_split = np.bincount(self.truth["split_index"], minlength=len(self.splits))
         distance_m = self.truth["distance_m"]
+        histogram = self.sensor.histogram if self.plan.histograms else None
         return {
             "path": str(self.path),
             "size_bytes": int(file.id.get_filesize()),
@@ -389,6 +465,7 @@ class FrameSet:
             "sensor": self.plan.sensor,
             "rows": self.sensor.rows,
             "cols": self.sensor.cols,
+            **({"bins": histogram.bins, "max_targets": histogram.max_targets} if histogram is not None else {}),
             "mesh_sha256": self.identity()["mesh_sha256"],
             "versions": self.versions,
         }
@@ -419,6 +496,11 @@ class FrameSubset:
         return sample if self.transform is None else self.transform(sample)
 
 
+def _with_histograms_stated(plan: dict[str, Any], sensor: Sensor) -> dict[str, Any]:
+    """Return a file's plan; one that does not mention histograms was written before there were any."""
+    return plan if sensor.histogram is None else {"histograms": False, **plan}
+
+
 def _key(name: str) -> str:
     return {
         "amplitude": "amplitude_e",
@@ -429,6 +511,9 @@ def _key(name: str) -> str:
         "frequency_amplitude": "frequency_amplitude_e",
         "frequency_intensity": "frequency_intensity_e",
         "frequency_flags": "frequency_flags",
+        "histogram": "histogram",
+        "target_signal": "target_signal",
+        "target_status": "target_status",
     }.get(name, f"{name}_m")
 
 
@@ -474,7 +559,7 @@ def is_frame_set(path: str | os.PathLike[str]) -> bool:
         False also if the file cannot be read.
     """
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):  # what is read of a pipe is gone for whoever reads it next
+        if not stat.S_ISREG(os.stat(path).st_mode):  # bytes read from a pipe are gone for the next reader
             return False
         with open(path, "rb") as file:
             if file.read(8) != b"\x89HDF\r\n\x1a\n":

@@ -47,7 +47,7 @@ def read_rosbag(path: Path, topic: str | None) -> tuple[dict[str, NDArray[Any]],
     Raises
     ------
     InputFileError
-        It is no bag, or has no such images.
+        It is no bag, or has no depth images.
     """
     store = ros_types()
     try:

@@ -34,14 +34,14 @@ _MOST_NAMED = 8
 
 @dataclass(frozen=True)
 class CsvFrames:
-    """What a text file holds.
+    """Content of a text file of frames.
 
     Parameters
     ----------
     arrays : mapping of str to (frames, rows · cols) float64
         "range", and "status", "amplitude" and "intensity" if the file has them.
     stated : mapping of str to str
-        "unit" and "quantity", where the file says so.
+        "unit" and "quantity", where the file states them.
     time_s : (frames,) float64, optional
         Time stamps, seconds.
     named : bool

@@ -1,4 +1,4 @@
-"""What a file of frames holds of each modulation frequency, and whether that fits the sensor."""
+"""Frames of each modulation frequency in a file, and the check that they fit the sensor."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import stat
 import zipfile
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -27,12 +28,13 @@ _MOST_VALUES = 1 << 26
 _NAMES = ("histogram", "reference_histogram", "distance_m", "sensor2world", "t_ms", "t_s")
 _SECONDS = {"t_ms": 1e-3, "t_s": 1.0}
 _MOST_LISTED = 16
+_LONGEST_START = 64  # bytes that may stand before the first brace of a line of JSON
 _TARGET_COLUMNS = ("mm", "sigma_mm", "signal", "status")
 
 
 @dataclass(frozen=True, eq=False)
 class HistogramLog:
-    """What a log of histograms holds.
+    """Content of a log of histograms.
 
     Parameters
     ----------
@@ -49,11 +51,38 @@ class HistogramLog:
     sensor2world: NDArray[np.float64] | None
 
 
+def is_histogram_log(path: str | os.PathLike[str]) -> bool:
+    """Return True if a file holds histograms and no ranges: lines of JSON, or NPZ with ``histogram`` alone.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    bool
+        False also if the file cannot be read.
+    """
+    try:
+        if not stat.S_ISREG(os.stat(path).st_mode):  # what is read of a pipe is gone for whoever reads it next
+            return False
+        with open(path, "rb") as file:
+            if file.read(4) != b"PK\x03\x04":
+                file.seek(0)
+                return file.read(_LONGEST_START).lstrip()[:1] == b"{"
+            with zipfile.ZipFile(file) as archive:
+                names = archive.namelist()
+        return "histogram.npy" in names and "range.npy" not in names
+    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
+        return False
+
+
 def read_histograms(path: str | os.PathLike[str], *, sensor: Sensor) -> HistogramLog:
     """Read a log of histograms.
 
     *NPZ*: ``histogram`` (n, zones, bins) or (n, rows, cols, bins), counts; optionally ``reference_histogram``
-    (n, bins), ``distance_m`` (n,), ``sensor2world`` (n, 4, 4), and ``t_ms`` or ``t_s`` (n,). Other arrays are ignored.
+    (n, bins), ``distance_m`` (n,), ``sensor2world`` (n, 4, 4), and ``t_ms`` or ``t_s`` (n,). Other arrays are ignored,
+    and so is ``distance_m`` beside ``class``, where ``phasemark frames export`` has the distance of a landmark.
     *JSON lines*: one frame a line, an object with the same keys, each without the n. Zones stand in the order of the
     log, which `zone_order` of the sensor turns into that of the image.
 
@@ -206,7 +235,9 @@ def _npz(content: bytes, path: Path) -> dict[str, NDArray[Any]]:
             declared = sum(member.file_size for member in archive.zip.infolist())
             if declared > FREE_BYTES + EXPANSION * len(content):
                 raise InputFileError(f"{path}: refused: declares {declared} bytes, far more than its size can hold")
-            return {name: np.asarray(archive[name]) for name in _NAMES if name in archive}
+            of_landmark = "class" in archive  # then distance_m is that of a landmark's axis, and no plane's
+            names = [name for name in _NAMES if name in archive and not (of_landmark and name == "distance_m")]
+            return {name: np.asarray(archive[name]) for name in names}
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
         if isinstance(error, PhasemarkError):
             raise

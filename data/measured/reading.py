@@ -57,7 +57,7 @@ class _Raw:
     """Arrays as the file has them, and what it says about them."""
 
     arrays: Mapping[str, NDArray[Any]]
-    stated: Mapping[str, str] = field(default_factory=dict)  # "unit" and "quantity", where the file says so
+    stated: Mapping[str, str] = field(default_factory=dict)  # "unit" and "quantity", where the file states them
     time_s: NDArray[np.float64] | None = None
     flat: bool = False  # frames are rows of rows · cols values
     named: bool = False  # names of columns state unit or quantity
@@ -80,19 +80,19 @@ def read_frames(
     """Read measured frames; what kind of file it is follows from its content.
 
     *CSV*: one frame a line, row by row from the top left pixel. Values are separated by semicolons (then decimal
-    commas are understood too), tabs, commas or blanks, the first of these that occurs. A first line without a number
-    is a header; empty lines and those that start with ``#`` are skipped, but such a first line may state ``unit=…`` and
-    ``quantity=…``; an empty cell and ``nan`` are invalid pixels. A header may name the columns, which then stand in any
-    order: pixels ``mm_0`` … (this states the unit), ``range_0`` … or ``z_0`` … (this states the quantity); optionally
-    ``status_0`` …, ``amplitude_0`` …, ``intensity_0`` …; and the time stamp, ``t_ms`` or ``t_s``. Other columns are
-    ignored, and a warning names them unless they are ``truth_*``.
-    *NPY*: the ranges. *NPZ*: ``range`` and optionally ``amplitude``, ``intensity`` (electrons per phase image),
-    ``status``, ``valid`` (0: invalid), ``t_ms`` or ``t_s`` (the shape of ``range`` without rows and columns), ``unit``
-    and ``quantity``. *HDF5*: the same arrays as datasets, with the
-    attributes ``units`` and ``quantity`` on ``range``. *PNG*, one or a folder of them in the order of their names: 16
-    bits, grey, 0 is invalid; codes are in the stated unit, or scaled by the text chunk ``metres_per_unit``. *ROS 2
-    bag* (its folder): images of 32FC1, metres, or 16UC1, millimetres; 0 is invalid. Arrays are (frames, rows, cols),
-    (n, frames, rows, cols), or (rows, cols) for a single frame.
+    commas are understood too), tabs, commas or blanks, the first of these that occurs. A first line without a
+    number is a header; empty lines and those that start with ``#`` are skipped, but a first line with ``#`` may
+    state ``unit=…`` and ``quantity=…``; an empty cell and ``nan`` are invalid pixels. A header may name the
+    columns, which then stand in any order: pixels ``mm_0`` … (this states the unit), ``range_0`` … or ``z_0`` …
+    (this states the quantity); optionally ``status_0`` …, ``amplitude_0`` …, ``intensity_0`` …; and the time stamp,
+    ``t_ms`` or ``t_s``. Other columns are ignored, and a warning names them unless they are ``truth_*``. *NPY*: the
+    ranges. *NPZ*: ``range`` and optionally ``amplitude``, ``intensity`` (electrons per phase image), ``status``,
+    ``valid`` (0: invalid), ``t_ms`` or ``t_s`` (the shape of ``range`` without rows and columns), ``unit`` and
+    ``quantity``. *HDF5*: the same arrays as datasets, with the attributes ``units`` and ``quantity`` on ``range``.
+    *PNG*, one or a folder of them in the order of their names: 16 bits, grey, 0 is invalid; codes are in the stated
+    unit, or scaled by the text chunk ``metres_per_unit``. *ROS 2 bag* (its folder): images of 32FC1, metres, or
+    16UC1, millimetres; 0 is invalid. Arrays are (frames, rows, cols), (n, frames, rows, cols), or (rows, cols) for
+    a single frame.
 
     *Several modulation frequencies*: NPZ and HDF5 have ``frequency_range`` and optionally ``frequency_amplitude`` and
     ``frequency_intensity`` with an axis of the sensor's m frequencies before the rows, (frames, m, rows, cols) or (n,
@@ -102,7 +102,7 @@ def read_frames(
     is used where the others are missing.
 
     A range that is not finite is invalid, and so is a 0, by which most sensors mean that they have no reading. So is
-    one that no such camera can measure, and a warning tells how many there are; if it is most of the others, unit or
+    one that the camera cannot measure, and a warning tells how many there are; if it is most of the others, unit or
     sensor are wrong, which is an error. A camera measures no negative range, none beyond c / 2f, and, if it is a direct
     sensor with `max_range_m`, none beyond 1.25 times that.
 
@@ -405,7 +405,7 @@ def _size(file: BinaryIO) -> int:
 
 
 class _Room:
-    """How many values a file may still hold, so that a small file cannot fill the memory."""
+    """Number of values that a file may still hold, so that a small file cannot fill the memory."""
 
     def __init__(self, path: Path, size: int) -> None:
         self._path = path

@@ -17,7 +17,10 @@ from phasemark.render.integral.rounding import value_and_error
 from phasemark.render.sensor.range_noise import predicted_range_std
 
 REPORT = "report.html"
-FIGURES = ("photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold")
+FIGURES = (
+    "photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold", "histogram", "merging",
+    "ambient",
+)  # fmt: skip
 _OF_FIGURES = tuple(f"{name}.{kind}" for name in FIGURES for kind in ("png", "csv"))
 NAMES = (REPORT, "characterisation.json", "points.csv", *_OF_FIGURES)
 """What :func:`write_characterisation` may write; a sensor that lacks a figure lacks its picture."""
@@ -39,11 +42,17 @@ _DIRECT_CAPTIONS = {
     " figure that the sensor states.",
     "linearity": "Error of the mean range against distance, beside the sensor's global offset.",
     "threshold": "Share of frames in which a pixel drops out, against distance.",
+    "histogram": "Mean counts of the zones in the middle and in the corner before a plane of albedo 0.8, beside a"
+    " quadrature of the zone, the response, ambient light and pile-up.",
+    "merging": "Share of frames in which the chip reports two targets of equal light, against their separation. The"
+    " prediction is two standard deviations of response and bin, or the least separation that the chip keeps.",
+    "ambient": "Distance at which half of the frames find a surface, against ambient light. The prediction is that of"
+    " Poisson counts above the threshold over their median.",
 }
 
 
 def write_characterisation(
-    found: Characterisation, name: str, folder: Path, *, seed: int, force: bool = False
+    found: Characterisation, name: str, folder: Path, *, seed: int, bound: str | None = None, force: bool = False
 ) -> list[Path]:
     """Write ``report.html``, ``characterisation.json``, ``points.csv``, and a PNG and a CSV for each figure.
 
@@ -58,6 +67,8 @@ def write_characterisation(
         It exists.
     seed : int
         What the noise was drawn from, for the report.
+    bound : str, optional
+        Best accuracy of a match with this sensor in one line, for the report.
     force : bool
         Whether files may be replaced.
 
@@ -77,7 +88,7 @@ def write_characterisation(
     pictures = {title: figure_png(figure) for title, figure in figures.items()}
     facts = {"name": name, "seed": seed, "versions": versions(), **found.as_dict()}
     files = {
-        REPORT: _report(found, name, seed, pictures).encode(),
+        REPORT: _report(found, name, seed, pictures, bound).encode(),
         "characterisation.json": (json_text(facts, indent=1, allow_nan=False) + "\n").encode(),
         "points.csv": _points_csv(found).encode(),
         **{f"{title}.png": png for title, png in pictures.items()},
@@ -149,12 +160,13 @@ def _agreement_sentence(found: Characterisation) -> str:
     return f"The simulation does NOT agree with the prediction in {where}: {statistics}."
 
 
-def _report(found: Characterisation, name: str, seed: int, pictures: dict[str, bytes]) -> str:
+def _report(found: Characterisation, name: str, seed: int, pictures: dict[str, bytes], bound: str | None) -> str:
     sensor = found.sensor
     captions = _CAPTIONS if sensor.kind == "phase" else _DIRECT_CAPTIONS
     return page_template("phasemark.data.pages", "characterisation.html.j2").render(
         name=name,
         summary=summary_sentences(found, name),
+        bound=bound,
         notes=found.notes,
         contents=[
             *(["Data sheet"] if found.quantities else []),

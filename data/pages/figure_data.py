@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 HEADER = ("panel", "x_axis", "y_axis", "series", "x", "y", "low", "high", "value")
-"""`low` and `high` are the ends of a bar about y; `value` is what a colour shows."""
+"""`low` and `high` are the ends of a bar about y; `value` is the number that a colour stands for."""
 
 
 def figure_csv(*figures: Figure) -> bytes:

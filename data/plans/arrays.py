@@ -1,4 +1,4 @@
-"""Which arrays a bank and a frame set hold: their dimensions, types and units, before any file is made."""
+"""Arrays of a bank and of a frame set: dimensions, types and units, known before any file is made."""
 
 from __future__ import annotations
 
@@ -28,6 +28,10 @@ _OF_FREQUENCY = ("frame", "frequency", "row", "col")
 FREQUENCY_FIELDS = ("frequency_range", "frequency_amplitude", "frequency_intensity", "frequency_flags")
 """What a frame set of several modulation frequencies holds of each; `range` is then unwrapped, and `amplitude` and
 `intensity` are those at the first."""
+_OF_TARGET = ("frame", "row", "col", "target")
+TARGET_FIELDS = ("target_distance", "target_sigma", "target_signal", "target_status")
+HISTOGRAM_FIELDS = ("histogram", *TARGET_FIELDS)
+"""What a frame set holds of a direct sensor's histograms; `range` is then that of the nearest target."""
 FRAME_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "range": (("frame", "row", "col"), "<f4", "m", "range along the ray, NaN where invalid"),
     "amplitude": (("frame", "row", "col"), "<f4", "e-", "amplitude per phase image"),
@@ -39,6 +43,11 @@ FRAME_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "frequency_amplitude": (_OF_FREQUENCY, "<f4", "e-", "amplitude per phase image at each frequency"),
     "frequency_intensity": (_OF_FREQUENCY, "<f4", "e-", "intensity per phase image at each frequency"),
     "frequency_flags": (_OF_FREQUENCY, "|u1", "1", "why a frequency's range is not valid, 0 where it is"),
+    "histogram": (("frame", "row", "col", "bin"), "<u4", "1", "photons counted in each bin of a zone"),
+    "target_distance": (_OF_TARGET, "<f4", "m", "what the chip reports, nearest first, NaN without a target"),
+    "target_sigma": (_OF_TARGET, "<f4", "m", "standard deviation that the counts of the peak leave"),
+    "target_signal": (_OF_TARGET, "<f4", "1", "counts of the peak above ambient light"),
+    "target_status": (_OF_TARGET, "|u1", "1", "whether there is a target"),
 }
 VIEW_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "coverage": (("view", "row", "col"), "<f4", "1", "share of the pixel that sees the landmark"),
@@ -55,7 +64,10 @@ def bank_frequencies_hz(sensor: Sensor, harmonics: Sequence[int]) -> list[float]
 def dimension_sizes(sensor: Sensor) -> dict[str, int]:
     """Return the lengths of those dimensions of a frame set that its sensor decides."""
     m = len(sensor.frequencies_hz)
-    return {"row": sensor.rows, "col": sensor.cols, "frequency": m, "phase": sensor.n_phase_images, "tap": 2}
+    sizes = {"row": sensor.rows, "col": sensor.cols, "frequency": m, "phase": sensor.n_phase_images, "tap": 2}
+    if sensor.histogram is not None:
+        sizes |= {"bin": sensor.histogram.bins, "target": sensor.histogram.max_targets}
+    return sizes
 
 
 def frame_set_fields(plan: FramePlan, sensor: Sensor) -> list[str]:
@@ -63,6 +75,8 @@ def frame_set_fields(plan: FramePlan, sensor: Sensor) -> list[str]:
     per_frame = ["range", "flags"] if sensor.kind == "direct" else ["range", "amplitude", "intensity", "flags"]
     if len(sensor.frequencies_hz) > 1:
         per_frame += FREQUENCY_FIELDS
+    if plan.histograms:
+        per_frame += HISTOGRAM_FIELDS
     if plan.keep_taps:
         per_frame.append("taps")
     if "shot" in plan.variants:

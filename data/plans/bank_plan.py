@@ -150,7 +150,7 @@ class MeshPlan(PlanModel):
 
 
 class ScenePlan(PlanModel, ABC):
-    """What a plan says of the landmarks and the camera.
+    """Landmarks and camera of a plan.
 
     Parameters
     ----------
@@ -485,7 +485,7 @@ def _from_catalog(name: str) -> LandmarkSpec:
 
 
 def _as_usage_error(error: ValidationError, model: type[PlanModel]) -> UsageError:
-    # a key that is misspelt is missing too: the spelling is what helps
+    # a key that is misspelt is missing too: naming the misspelling helps more
     first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
     if first["type"] == "extra_forbidden" and len(first["loc"]) == 1:
         return _unknown_key(str(first["loc"][0]), model)

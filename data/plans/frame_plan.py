@@ -1,4 +1,4 @@
-"""What a frame set is made of: landmarks, a camera, and how the views are spread over distance, angle and the rest."""
+"""Plan of a frame set: landmarks, a camera, and the distribution of views over distance, angle and the rest."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _Pair = tuple[_Finite, _Finite]
 
 
 class Distribution(PlanModel):
-    """How a quantity is spread over the views: exactly one of the four.
+    """Distribution of a quantity over the views: exactly one of the four.
 
     Parameters
     ----------
@@ -195,6 +195,10 @@ class FramePlan(ScenePlan):
         and frames with shot noise alone.
     keep_taps : bool
         Whether to keep what each tap reported.
+    histograms : bool, optional
+        Whether a direct sensor with a [histogram] table is simulated photon by photon: histograms and targets are kept,
+        and `range` is that of the nearest target. False: ranges alone, with the noise that `range_std_m` states. Left
+        out, it is true for a sensor with the table.
     splits : mapping of str to float
         Shares of the views, adding up to 1. All frames of a view are in one split.
 
@@ -225,6 +229,7 @@ class FramePlan(ScenePlan):
     floor_albedo: _Share = 0.5
     variants: tuple[Variant, ...] = ("hard", "mixed")
     keep_taps: bool = False
+    histograms: bool | None = None
     splits: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], _Share] = Field(
         default_factory=lambda: {"train": 0.8, "val": 0.1, "test": 0.1}
     )
@@ -258,9 +263,10 @@ class FramePlan(ScenePlan):
         return self
 
     @model_serializer(mode="wrap")
-    def _without_absent_tilt(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what a level camera does not have: its plans, and the files with them, stay as they are."""
-        return {name: value for name, value in write(self).items() if name not in TILT or value is not None}
+    def _without_absent_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what a level phase camera does not have: its plans, and the files with them, stay as they are."""
+        absent = (*TILT, "histograms")
+        return {name: value for name, value in write(self).items() if name not in absent or value is not None}
 
     def resolve(self) -> Self:
         """Return the plan with every default made explicit; resolving again changes nothing.
@@ -268,7 +274,7 @@ class FramePlan(ScenePlan):
         Raises
         ------
         UsageError
-            A class or sensor is unknown, two landmarks have one name, or the sensor has no taps to keep.
+            A class or sensor is unknown, two landmarks have one name, or the sensor has no taps or histograms to keep.
         InputFileError
             The sensor file cannot be read.
         """
@@ -276,6 +282,9 @@ class FramePlan(ScenePlan):
         sensor = self.build_sensor()
         if sensor.kind == "direct" and (self.keep_taps or "shot" in self.variants):
             raise UsageError("'keep_taps' and the variant 'shot' must be left out: a direct sensor has neither")
+        if self.histograms and sensor.histogram is None:
+            raise UsageError("'histograms' must be left out: the sensor has no [histogram] table")
+        has_table = sensor.histogram is not None
         order: tuple[Variant, ...] = ("hard", "mixed", "shot")
         return self.model_copy(
             update={
@@ -284,6 +293,7 @@ class FramePlan(ScenePlan):
                 "meshes": tuple(find_symmetries(meshes)),
                 "sensor_overrides": sensor.model_dump(mode="json"),
                 "variants": tuple(name for name in order if name in self.variants),
+                "histograms": has_table if self.histograms is None and has_table else self.histograms,
             }
         )
 
@@ -293,7 +303,7 @@ class FramePlan(ScenePlan):
         return {name: spread.highest for name, spread in spreads.items() if spread is not None}
 
     def landmark_names(self) -> list[str]:
-        """Names of the classes of a resolved plan, in the order of their numbers."""
+        """Return the names of the classes of a resolved plan, in the order of their numbers."""
         parts: list[LandmarkSpec | MeshPlan] = [*self.landmarks, *self.meshes]
         return [part.name for part in parts]
 

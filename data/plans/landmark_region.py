@@ -1,4 +1,4 @@
-"""Which pixels of a camera the landmarks of a bank can reach: what is worth storing and matching of a large sensor."""
+"""Region of a camera's pixels that the landmarks of a bank can reach; only these are stored and matched."""
 
 from __future__ import annotations
 

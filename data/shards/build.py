@@ -42,14 +42,14 @@ _SCHEMA_VERSION = 1
 
 @dataclass(frozen=True)
 class Place:
-    """Where a dataset's items begin in the file, and how many bytes each takes."""
+    """Place of a dataset in the file: where its items begin, and the bytes that each takes."""
 
     offset: int
     stride: int
 
 
 class Job(Protocol):
-    """What a file is made of: slabs of items, each item with the same few fields.
+    """Layout of a file: slabs of items, each item with the same fields.
 
     `maker` is ``module:callable``, the function that makes the same job from its `spec` in another process.
     """
@@ -209,7 +209,7 @@ def _publish_again(job: Job, path: Path) -> bool:
 
 @dataclass
 class _Manifest:
-    """What the manifest file says: one JSON object a line, the first about the run, then one for each shard."""
+    """Content of the manifest file: one JSON object a line, the first about the run, then one for each shard."""
 
     identity: dict[str, Any]
     shard_items: int

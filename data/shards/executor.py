@@ -1,4 +1,4 @@
-"""Who does the work: threads here, and what makes shards elsewhere (:mod:`phasemark.data.shards.remote`).
+"""Run shard tasks in a local thread pool, or elsewhere by :mod:`phasemark.data.shards.remote`.
 
 Every shard of a build depends on the job and its range of items alone, so a task may be repeated, done twice or moved
 to another worker, and nothing changes.

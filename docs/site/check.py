@@ -55,7 +55,7 @@ async function look(page, width) {{
 
 
 class Page(HTMLParser):
-    """What a page links to, loads, and offers as anchors."""
+    """Links, loaded files and anchors of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

@@ -118,8 +118,18 @@ def _explained(docstring: str) -> dict[str, str]:
     return found
 
 
-def _default(value: object) -> str:
-    """Return a default as a plan would state it."""
+_LONGEST_DEFAULT = 60
+
+
+def _default(value: object, taken: str) -> str:
+    """Return a default as a plan would state it, or where it is stated if it is a table of its own."""
+    stated = _stated(value)
+    return f"as in {taken}" if len(stated) > _LONGEST_DEFAULT and taken.startswith("[") else stated
+
+
+def _stated(value: object) -> str:
+    if isinstance(value, list) and value and all(isinstance(each, dict) and "name" in each for each in value):
+        return ", ".join(f"one named `{each['name']}`" for each in value)
     if isinstance(value, dict):
         stated = {key: each for key, each in value.items() if each is not None}
         if list(stated) == ["fixed"]:
@@ -132,9 +142,10 @@ def _rows(schema: dict[str, Any], model: dict[str, Any]) -> Iterator[str]:
     required = model.get("required", [])
     explained = _explained(model.get("description", ""))
     for name, key in model.get("properties", {}).items():
-        default = "required" if name in required else _default(key["default"]) if "default" in key else ""
+        taken = _type(schema, key)
+        default = "required" if name in required else _default(key["default"], taken) if "default" in key else ""
         text = " ".join((key.get("description") or explained.get(name, "")).split()).replace("|", "\\|")
-        yield f"| `{name}` | {_type(schema, key)} | {default} | {text} |"
+        yield f"| `{name}` | {taken} | {default} | {text} |"
 
 
 def plans_page() -> str:

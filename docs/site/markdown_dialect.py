@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import re
 
 _ITEM = re.compile(r"(-|\d+\.) ")
@@ -21,11 +22,23 @@ def _kept_lines(text: str) -> list[tuple[str, bool]]:
     return lines
 
 
+_LONG_CODE = 30
+
+
+def _in_a_table(code: str) -> str:
+    """Return code as a table of the site holds it: a long name may break at its underscores and slashes."""
+    if len(code) <= _LONG_CODE or " " in code:
+        return f"`{code}`"
+    breakable = re.sub("(::|/|_)", r"\1<wbr>", html.escape(code))
+    return f"<code>{breakable.replace('_', '&#95;')}</code>"  # an underscore would be read as emphasis
+
+
 def for_site(text: str) -> str:
-    """Return Markdown whose lists the site's builder reads as a code host does.
+    """Return Markdown whose lists and tables the site's builder reads as a code host does.
 
     CommonMark takes what is indented as far as an item's text for a part of the item, and a list may follow a
-    paragraph without an empty line. Python-Markdown wants four columns and the empty line.
+    paragraph without an empty line. Python-Markdown wants four columns and the empty line. In code within a table a
+    code host wants the bar escaped; Python-Markdown would show the backslash.
 
     Parameters
     ----------
@@ -50,6 +63,8 @@ def for_site(text: str) -> str:
         loose = loose or bool(width and not line.strip())
         if width and line.startswith(" " * width):
             line = " " * (4 - width) + line
+        if line.startswith("|") and not fenced:
+            line = re.sub(r"`([^`]+)`", lambda code: _in_a_table(code[1].replace(r"\|", "|")), line)
         done.append(line)
     return "\n".join(done)
 

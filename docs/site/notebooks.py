@@ -25,7 +25,7 @@ _HEADER = re.compile(r"\A---\n.*?^---\n", flags=re.MULTILINE | re.DOTALL)
 
 @dataclass(frozen=True)
 class Shown:
-    """What a cell shows.
+    """Output of a cell.
 
     Parameters
     ----------

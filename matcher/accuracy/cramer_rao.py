@@ -1,4 +1,4 @@
-"""What can be known at best: Fisher information, Cramér–Rao bounds and class confusion.
+"""Best possible accuracy: Fisher information, Cramér–Rao bounds and class confusion.
 
 All bounds are those of PHYSICS section 7, for Gaussian residuals with the variance of the noise law: say of every
 number which pixels count, whether ranges or phasors are measured, what is free, and what stands behind the landmark.
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from phasemark import UsageError
+from phasemark.matcher.accuracy.histogram_bound import histogram_information
 from phasemark.matcher.frequencies import OneFrequency, OneFrequencyRenderer
 from phasemark.matcher.information import covariance_of, eliminated
 from phasemark.matcher.likelihood.images import VIEW
@@ -28,6 +29,7 @@ from phasemark.matcher.likelihood.systematic import (
 )
 from phasemark.matcher.pixel_agreement import counts, pixel_mask
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, predicted_range_std
+from phasemark.render.direct.histogram_images import HistogramRenderer
 from phasemark.render.sensor.range_noise import phase_image_variance
 
 _WALL_STEP_M = 1e-4
@@ -38,7 +40,7 @@ NUISANCES = ("albedo", "wall_m", "wall_albedo")
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """What filtered frames of n views can tell.
+    """Information and bounds of filtered frames at n views.
 
     Parameters
     ----------
@@ -70,7 +72,7 @@ class Bound:
 
 
 def cramer_rao(
-    renderer: Renderer,
+    renderer: Renderer | HistogramRenderer,
     views: Views,
     *,
     free: Sequence[str] = VIEW[:2],
@@ -85,11 +87,12 @@ def cramer_rao(
     """Return the Cramér–Rao bound at some views (PHYSICS section 7).
 
     Pixels count where one frame measures the range to 0.1 rad or better (0.24 m at 10 MHz). Of several modulation
-    frequencies the information is the sum of that of each.
+    frequencies the information is the sum of that of each. A :class:`~phasemark.render.direct.HistogramRenderer` has the
+    bound of histograms: the Poisson information, the landmark's brightness and the ambient light of every zone unknown.
 
     Parameters
     ----------
-    renderer : Renderer
+    renderer : Renderer or HistogramRenderer
         The landmark and the camera.
     views : Views
     free : sequence of str
@@ -125,12 +128,24 @@ def cramer_rao(
     >>> [round(float(bound.std(name)[0]), 5) for name in bound.free]
     [0.00036, 0.00531]
     """
+    if isinstance(renderer, HistogramRenderer):
+        if on != "ranges" or pixels != "all" or background is not None or nuisances is not None:
+            raise UsageError(
+                "of histograms all zones count, brightness and ambient light are unknown, and nothing stands behind the"
+                " landmark: leave 'on', 'pixels', 'background' and 'nuisances' out"
+            )
+        _check_free(free)
+        information = histogram_information(renderer, views, free, n_frames, workers)
+        everywhere = np.ones((len(views), renderer.sensor.rows, renderer.sensor.cols), np.bool_)
+        declared = None
+        if "declared" in check_systematic(systematic):
+            declared = np.broadcast_to(declared_covariance(renderer.sensor, free), information.shape)
+        return Bound(tuple(free), information, everywhere, declared)
     nuisances = (("albedo",) if on == "phasors" else ()) if nuisances is None else tuple(nuisances)
     for name in nuisances:
         if name not in NUISANCES:
             raise UsageError(f"'nuisances' must be among {', '.join(NUISANCES)}, got {name!r}")
-    if not free or any(name not in VIEW for name in free) or len(set(free)) < len(free):
-        raise UsageError(f"'free' must name some of {', '.join(VIEW)} once each, got {tuple(free)!r}")
+    _check_free(free)
     if (background is None or background.wall_m is None) and set(nuisances) & {"wall_m", "wall_albedo"}:
         raise UsageError("a wall can be a nuisance only where there is one: give 'background' a wall")
     one = None
@@ -187,6 +202,12 @@ def cramer_rao(
     if one is not None:
         use = one.layers(use).any(axis=-3)
     return Bound(tuple(free), information, use, common)
+
+
+def _check_free(free: Sequence[str]) -> None:
+    """Refuse parameters that are unknown or repeated."""
+    if not free or any(name not in VIEW for name in free) or len(set(free)) < len(free):
+        raise UsageError(f"'free' must name some of {', '.join(VIEW)} once each, got {tuple(free)!r}")
 
 
 def _image_and_slopes(

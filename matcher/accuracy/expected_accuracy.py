@@ -16,7 +16,7 @@ from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_
 from phasemark.matcher.accuracy.look_alikes import class_distances_squared
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.render import Background, Renderer, Views
+from phasemark.render import Background, Renderer, Views, predicted_range_std
 
 EDGES, FACES = "noise of edge pixels", "noise of face pixels"
 CALIBRATION, DECLARED = "calibration of the sensor", "systematic errors declared by the sensor"
@@ -29,7 +29,7 @@ _SIDES = 12
 
 @dataclass(frozen=True, eq=False)
 class AccuracyCard:
-    """What one measurement can tell at best, at n views.
+    """Best possible accuracy of one measurement at n views.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def accuracy_card(
 
     Standard deviations are the Cramér–Rao bound on ranges (PHYSICS section 7), what the calibration of the sensor
     leaves, and what the sensor declares. With P the covariance of the noise and I_e the information of the edge pixels,
-    P I_e P is what the noise of edge pixels contributes.
+    P I_e P is the contribution of the noise of edge pixels.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def accuracy_card(
     Raises
     ------
     UsageError
-        `n_frames` is below 1, or `free` lacks distance_m or delta_rad.
+        `n_frames` is below 1, `free` lacks distance_m or delta_rad, or the sensor has no noise.
 
     Examples
     --------
@@ -214,6 +214,8 @@ def accuracy_card(
         raise UsageError(f"'n_frames' must be at least 1, got {n_frames}")
     if not set(VIEW[:2]) <= set(free):
         raise UsageError(f"'free' must have {' and '.join(VIEW[:2])} among its names, got {tuple(free)!r}")
+    if not predicted_range_std(1.0, 1.0, renderer.sensor) > 0:
+        raise UsageError("the sensor has no noise, so that there is no bound: set its 'shot_noise'")
     others = dict(others or {})
 
     def bound(pixels: Any = "all", systematic: Sequence[str] = ()) -> Any:

@@ -1,4 +1,4 @@
-"""What the spacing of a bank's grid costs: random views without noise, matched, as banks of waveforms are tested.
+"""Accuracy lost to the spacing of a bank's grid: random views without noise, matched as banks of waveforms are tested.
 
 A view between the grid's points is rendered, weighed with the noise of 50 frames but given none of it, and matched:
 what the answer is off is due to the grid alone. Over the Cramér–Rao bound of those frames (PHYSICS section 7) it says
@@ -38,7 +38,7 @@ _BATCH = 256
 
 @dataclass(frozen=True)
 class SpacingLoss:
-    """What the grid cost one method of matching.
+    """Error that the grid adds to one method of matching.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class SpacingLoss:
 
 @dataclass(frozen=True)
 class GridLoss:
-    """What the spacing of a bank's grid costs, and what spacing would cost as much as the noise.
+    """Error that the spacing of a bank's grid adds, and the spacing at which it would equal the noise.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def grid_loss(bank: Bank, n: int, *, seed: int = 0, workers: int | None = None) 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """What some views of one class gave: errors (n, 2) by method, NaN for another class."""
+    """Errors and bounds (n, 2) by method at some views of one class; NaN where another class was found."""
 
     error: dict[str, NDArray[np.float64]]
     bound: dict[str, NDArray[np.float64]]

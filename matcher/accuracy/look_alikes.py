@@ -1,4 +1,4 @@
-"""How far a landmark's noise-free frame is from the best imitation by another class, over distance and side."""
+"""Distance from a landmark's noise-free frame to the most similar frame of another class, over distance and side."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far measured poses are from true ones, in the terms of ASTM E2919 (static pose in six degrees of freedom).
+"""Errors of measured poses in the terms of ASTM E2919 (static pose in six degrees of freedom).
 
 The standard compares the pose of an object that a system measures with a reference. *Position error* is the length of
 the difference of the two positions. *Orientation error* is the angle of the one rotation that takes the measured
@@ -32,7 +32,7 @@ _TAIL = 0.025
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """What the errors of some poses say.
+    """Statistics of the errors of some poses.
 
     Parameters
     ----------

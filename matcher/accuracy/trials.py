@@ -31,7 +31,7 @@ MatchFrames = Callable[[FilteredFrames], Matches]
 
 @dataclass(frozen=True)
 class TrialSetup:
-    """What is tried.
+    """Conditions of a Monte-Carlo trial.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class TrialSetup:
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """What n frames gave.
+    """Errors, bounds and covariances of n matched frames.
 
     Parameters
     ----------

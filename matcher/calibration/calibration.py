@@ -1,8 +1,8 @@
-"""How a camera is really mounted: calibration from frames of a landmark taken at known positions.
+"""Calibration of a camera's mounting from frames of a landmark taken at known positions.
 
 :func:`calibrate` finds the mounting (pitch, roll, height, bearing, field of view, range offset, from amplitudes the
 landmark's albedo, and from a moving camera the delay of its stamps) under which filtered frames are most likely, with
-its covariance, a test of the fit, and sentences on what these poses cannot tell.
+its covariance, a test of the fit, and sentences on numbers that these poses cannot determine.
 """
 
 from __future__ import annotations
@@ -402,7 +402,7 @@ def _leave_one_out(fit: Fit, place: Place, found: Calibration) -> tuple[float, f
 
 @dataclass(frozen=True)
 class _Job:
-    """What a recording is calibrated with."""
+    """Settings with which a recording is calibrated."""
 
     mesh: trimesh.Trimesh
     background: Background | None
@@ -537,8 +537,8 @@ def _from_recording(job: _Job, frames: FilteredFrames, poses: KnownPoses, moving
     std = np.sqrt(np.diag(found.covariance))
     if "delay" in job.names and std[job.names.index("delay")] > _DELAY_UNKNOWN_S:
         raise UsageError(
-            f"the delay cannot be told from this recording (± {1e3 * std[job.names.index('delay')]:.0f} ms): turn and"
-            " approach faster, or state it with Mounting(delay_s=…) and give fixed=delay"
+            f"the delay cannot be determined from this recording (± {1e3 * std[job.names.index('delay')]:.0f} ms): turn"
+            " and approach faster, or state it with Mounting(delay_s=…) and give fixed=delay"
         )
     untold = [
         name for name, one in zip(job.names, std, strict=True)
@@ -803,7 +803,7 @@ def _check_units(model: CalibrationModel, evidence: Evidence) -> None:
 
 
 def _returns_beside(model: CalibrationModel, evidence: Evidence, assumed: Mounting) -> bool:
-    """Whether much returns that is not near the landmark, though nothing is said to stand behind it."""
+    """Return True if many pixels see something behind the landmark although no background was given."""
     seen = evidence.seen
     away = np.abs(wrap_difference_m(seen.range_m - model.poses.distance_m[:, None], evidence.sensor))
     return bool((seen.returned & (away > model.reach_m + 0.3)).mean() > _FAR_RETURNS)
@@ -831,7 +831,7 @@ def _check_observable(information: NDArray[np.float64], fit: Fit, poses: KnownPo
         return
     weak = np.abs(vectors[:, -1])
     names = [name for name, share in zip(fit.free, weak, strict=True) if share > 0.3 * weak.max()]
-    together = "cannot be told apart" if len(names) > 1 else "cannot be told"
+    together = "cannot be distinguished" if len(names) > 1 else "cannot be determined"
     raise UsageError(
         f"{named(names)} {together} from these poses: {advice(names, poses)}; and do they belong to these"
         " frames (their order, angles in degrees, bearings counter-clockwise)?"
@@ -857,7 +857,7 @@ def _concluded(
     edges: bool,
     estimated: PoseStd | None,
 ) -> Calibration:
-    """Take stock; `estimated` is what the residuals said of the poses, if they were asked."""
+    """Return the calibration of a fit; `estimated` are the pose errors found from the residuals, if requested."""
     model, evidence = fit.model, fit.evidence
     poses, sensor = model.poses, frames.sensor
     pose_residuals = place.use.sum(axis=1) * evidence.per_pixel
@@ -975,7 +975,7 @@ def _calibrated(
 
 
 def _mounted(sensor: Sensor, mounting: Mounting, free: Sequence[str]) -> Sensor:
-    """Return a sensor with the fields that were estimated, or stated anew, to the digits of a sensor file."""
+    """Return a sensor with the fields that were estimated or restated, to the digits of a sensor file."""
     there, before = mounting.on(sensor), Mounting.of_sensor(sensor, mounting.albedo)
     changed = [
         name

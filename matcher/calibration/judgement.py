@@ -1,4 +1,4 @@
-"""Whether a calibration can be trusted: held-out residuals, ranges in which the model holds, and the likely cause."""
+"""Trust in a calibration: held-out residuals, ranges in which the model holds, and the likely cause of a misfit."""
 
 from __future__ import annotations
 

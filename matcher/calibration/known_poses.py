@@ -1,4 +1,4 @@
-"""Where a camera stood when it took the frames of a calibration: what a user measured, read from a CSV file."""
+"""Known poses of the camera for a calibration, measured by the user and read from a CSV file."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from phasemark import InputFileError, UsageError
 from phasemark.inputs import read_text
+from phasemark.inputs.table_cells import finite_number
 from phasemark.render import Frames
 from phasemark.render.view import wrap_delta_rad
 
@@ -45,7 +46,7 @@ class KnownPoses:
     wall_m : (K,) float64, optional
         Distance of a wall behind the landmark from the lens.
     frames : (K,) int64, optional
-        How many frames were taken at each, where the file says so.
+        Number of frames taken at each, where the file states it.
     place : tuple of str
         Where each stands in its file, for messages.
     time_s : (K,) float64, optional
@@ -136,7 +137,7 @@ class KnownPoses:
 
 @dataclass(frozen=True)
 class PoseStd:
-    """How well the poses are known: standard deviations, independent from pose to pose.
+    """Standard deviations of the stated poses, independent from pose to pose.
 
     Parameters
     ----------
@@ -222,7 +223,8 @@ def read_poses(
         if len(cells) != len(names):
             raise InputFileError(f"{path}, line {number}: {len(cells)} values, must have {len(names)}")
         for name, cell in zip(names, cells, strict=True):
-            columns[name].append(_number(path, number, name, cell if separator == "," else cell.replace(",", ".")))
+            text = cell if separator == "," else cell.replace(",", ".")
+            columns[name].append(finite_number(text, f"{path}, line {number}", name))
     place = tuple(f"{path}, line {number}" for number, _ in lines[1:])
     values = {name: np.array(column) for name, column in columns.items()}
     zero = np.zeros(len(place))
@@ -278,16 +280,6 @@ def _check_header(path: Path, names: list[str]) -> bool:
     if set(TIMES) <= set(names):
         raise InputFileError(f"{path}: columns 't_s' and 't_ms' state the same stamps twice: keep one of them")
     return own is POLAR
-
-
-def _number(path: Path, line: int, column: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise InputFileError(f"{path}, line {line}: '{column}' must be a number, got {text.strip()!r}") from None
-    if not math.isfinite(value):
-        raise InputFileError(f"{path}, line {line}: '{column}' must be a finite number, got {text.strip()}")
-    return value
 
 
 def frames_of_poses(frames: Sequence[Frames], poses: KnownPoses) -> list[Frames]:

@@ -93,7 +93,7 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Knowledge:
-    """What the frames tell of the free parameters at a place.
+    """Information of the frames on the free parameters at one place.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ class _Linear:
         return np.einsum("kpr,kr->kp", self.rows, residual) - eliminated, own
 
     def pose_information(self) -> NDArray[np.float64]:
-        """Return what each pose tells of the mounting, its own errors eliminated, (K, p, p)."""
+        """Return the information of each pose on the mounting, its own errors eliminated, (K, p, p)."""
         eliminated = np.linalg.solve(self.own, self.cross.transpose(0, 2, 1))
         return np.asarray(self.rows @ self.rows.transpose(0, 2, 1) - self.cross @ eliminated)
 
@@ -288,7 +288,7 @@ class Fit:
         return self._linearise_wide(place)
 
     def _with_its_pixels(self, place: Place) -> Place:
-        """Decide anew which pixels count, and descend from the place if others do."""
+        """Decide again which pixels count, and descend from the place if they changed."""
         use = self.pixels(place.theta, place.images)
         return place if (use == place.use).all() else self._descend(self._at(place.theta, place.u, use))
 
@@ -370,7 +370,7 @@ class Fit:
         return self._linearise(place, *(np.minimum(width * np.nan_to_num(std), 0.5 * scale) for width in widths))
 
     def _descend(self, place: Place) -> Place:
-        """Run Levenberg–Marquardt; slopes, which cost most, are taken anew when following them leads no farther."""
+        """Run Levenberg–Marquardt; slopes cost most, so they are computed again only when a step with them fails."""
         for _ in range(_MAX_ITERATIONS):
             before, expected = place.cost, float(np.count_nonzero(place.residual))
             settled = _SETTLED * max(1.0, place.cost / max(expected, 1.0))

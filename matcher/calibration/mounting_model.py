@@ -1,4 +1,4 @@
-"""What a camera would see from known positions, for any mounting: the model that a calibration moves.
+"""Model of a calibration: the frames that a camera with any mounting would see from known positions.
 
 The mounting is nine numbers, :class:`Mounting`. Four of them turn or widen the camera itself (pitch, roll and both
 half angles), two move the landmark in its image (height and bearing), one delays the light (range offset), one the time
@@ -98,7 +98,7 @@ POSE = ("distance_m", "delta_rad", "bearing_rad")
 
 @dataclass(frozen=True)
 class Mounting:
-    """How a camera is mounted, and the little of the camera itself that frames from known positions tell.
+    """Parameters of a mounting, and the few of the camera itself that frames from known positions determine.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def clipped(theta: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """What is seen from K poses; (K, pixels) arrays.
+    """Model images from K poses; (K, pixels) arrays.
 
     Parameters
     ----------

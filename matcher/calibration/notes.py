@@ -112,8 +112,8 @@ def observability_notes(
             names = [name for name in group if name in free]
             if len(names) > 1 and group[0] in names and not told & set(names):
                 notes.append(
-                    f"The {named(names)} are told apart only because the landmark's shape and brightness are taken to"
-                    f" be exact: {advice(names, poses)}."
+                    f"The {named(names)} are distinguished only because the landmark's shape and brightness are assumed"
+                    f" to be exact: {advice(names, poses)}."
                 )
     well = {name for name, s in zip(free, std / scale, strict=True) if s < _WELL}
     for a, b, rho in pairs:

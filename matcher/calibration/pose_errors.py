@@ -1,4 +1,4 @@
-"""How far off stated poses are, estimated from the residuals of a calibration: variance components.
+"""Errors of stated poses, estimated from the residuals of a calibration as variance components.
 
 Errors of the poses are independent from pose to pose, normal, and of three sizes: places of the lens, headings, sides
 δ. With the residuals r linear in the mounting (slopes A) and in those errors (slopes B, sizes s), r is normal with the

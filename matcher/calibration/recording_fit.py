@@ -183,7 +183,7 @@ def _shrunk(gram: _Float, size: _Float) -> tuple[_Float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """What a recording told.
+    """Result of fitting a recording.
 
     Parameters
     ----------

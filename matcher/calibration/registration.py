@@ -1,4 +1,4 @@
-"""Where a calibration starts: the mounting under which the landmark's outlines agree with which pixels returned."""
+"""Initial guess of a calibration: the mounting whose landmark outlines agree best with the pixels that returned."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def register(
     target = np.where(seen.returned & near, 1.0, 0.0)
     known = seen.returned | seen.not_returned
     if not (known & ~seen.returned).any() and (target[known] == 1).all():
-        known = np.ones_like(known)  # nothing was told apart: what is missing returned nothing
+        known = np.ones_like(known)  # nothing was distinguished: a missing pixel returned nothing
     enough = _PREVAILS_FROM if (seen.returned & ~near).mean() > _BESIDE else _RETURNS_FROM
     columns = np.array([ALL_NAMES.index(name) for name in free])
     scale = model.scale[columns]

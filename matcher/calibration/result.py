@@ -1,4 +1,4 @@
-"""What a calibration gives: the mounting with its covariance, as plain numbers and as a sensor file."""
+"""Result of a calibration: the mounting with its covariance, as plain numbers and as a sensor file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _COMMON = {
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """How a camera is mounted, and how well that is known.
+    """Mounting of a camera with its covariance.
 
     Parameters
     ----------

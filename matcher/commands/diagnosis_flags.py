@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Given:
-    """How a command was told to read frames and match them, as far as a diagnosis depends on it."""
+    """Options of a command on reading and matching frames that a diagnosis depends on."""
 
     reading: FrameReading
     nearest: bool

@@ -1,4 +1,4 @@
-"""What ``phasemark match`` is told: how to match, where the landmark stands, and what to print and write."""
+"""Options of ``phasemark match``: method, place of the landmark, and output."""
 
 # Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
 
@@ -32,7 +32,7 @@ _FREE = {"bearing": "bearing_rad", "height": "height_m", "pitch": "pitch_rad", "
 
 @dataclass(frozen=True)
 class Search:
-    """How frames are averaged and matched."""
+    """Options for averaging and matching frames."""
 
     filter_name: Annotated[
         Literal["kalman", "phasor-mean"], typer.Option("--filter", help="kalman or phasor-mean.")
@@ -249,7 +249,7 @@ def _one_landmark(xy: tuple[float, float], yaw_deg: float) -> LandmarkMap:
 
 @dataclass(frozen=True)
 class Results:
-    """What is printed and written."""
+    """Options for printed and written output."""
 
     estimates: Annotated[
         Path | None,

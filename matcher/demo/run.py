@@ -61,7 +61,7 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class CellResult:
-    """What the repetitions of a cell gave; arrays have one entry a repetition.
+    """Results of the repetitions of a cell; arrays have one entry a repetition.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class DemoResult:
     background : Background
     seed, n_frames, repetitions : int
     seconds : dict of str to float
-        Time spent in each stage, added up over the threads; "total" is what the clock showed.
+        Time spent in each stage, added up over the threads; "total" is the elapsed time.
     """
 
     cells: tuple[CellResult, ...]

@@ -1,4 +1,4 @@
-"""Which landmark to build: searched for a camera and a working range, drawn, and confirmed by simulated frames."""
+"""Design of landmarks for a camera and a working range: searched, drawn, and confirmed by simulated frames."""
 
 from typing import TYPE_CHECKING
 

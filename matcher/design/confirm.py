@@ -1,4 +1,4 @@
-"""Whether the bound keeps its word: simulated noisy frames, matched, for a design and for the catalogue.
+"""Confirmation of the bound: simulated noisy frames are matched, for a design and for the catalogue.
 
 Each set is seen at the distance of its worst bound from sides over half a period, the worst one among them; then, with
 fresh frames, from the side that turned out worst (three are looked at again before it is named); and at random places
@@ -86,7 +86,7 @@ def _position_statistics(error_m: NDArray[np.float64], bound_m: NDArray[np.float
 
 @dataclass(frozen=True, eq=False)
 class Confirmation:
-    """What a set of landmarks gave.
+    """Results of a set of landmarks.
 
     Parameters
     ----------

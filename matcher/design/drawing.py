@@ -1,7 +1,7 @@
 """A landmark as a drawing for the workshop: one page of SVG, front, side and top view to scale, with dimensions.
 
 Views in first-angle projection: what is seen from the left stands on the right, what is seen from above stands below.
-The front is what a camera sees at δ = 0, looking along x'.
+The front is the view of a camera at δ = 0, which looks along x'.
 """
 
 from __future__ import annotations

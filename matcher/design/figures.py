@@ -39,7 +39,7 @@ def pareto_figure(design: Design) -> Figure:
         _mark(left, design.result, design.result.class_distance, "chosen, its upper parts refined", _NEW)
         left.axhline(limits.least_class_distance, color=_GREY, lw=0.8, ls="--")
     else:
-        left.text(0.5, 0.5, "one class: nothing to be told apart", ha="center", transform=left.transAxes)
+        left.text(0.5, 0.5, "one class: nothing to distinguish", ha="center", transform=left.transAxes)
     left.set_ylabel("least d between two classes")
     finite = [c.turn_distance for c in design.candidates if np.isfinite(c.turn_distance)]
     top = _INFINITE * max([*finite, known.turn_distance, limits.least_turn_distance])

@@ -1,4 +1,4 @@
-"""What a design leaves behind: landmarks other commands take, tables, pictures, meshes and drawings."""
+"""Files of a design: landmarks for other commands, tables, pictures, meshes and drawings."""
 
 from __future__ import annotations
 

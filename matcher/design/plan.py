@@ -1,4 +1,4 @@
-"""What a landmark is designed for: camera, working range, limits and effort, as a TOML file or in code."""
+"""Plan of a design: camera, working range, limits and effort, as a TOML file or in code."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _AtLeastZero = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class LimitsPlan(PlanModel):
-    """What every landmark has to keep.
+    """Limits that every landmark has to keep.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class LimitsPlan(PlanModel):
 
 
 class SamplingPlan(PlanModel):
-    """Where bounds are taken.
+    """Views at which bounds are computed.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class SamplingPlan(PlanModel):
 
 
 class SearchPlan(PlanModel):
-    """How hard to look.
+    """Effort of the search.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class DesignPlan(PlanModel):
         return np.linspace(*self.distance_m, self.sampling.distances)
 
     def sampled_delta_rad(self, symmetry: int) -> NDArray[np.float64]:
-        """Sides at which bounds are taken, half a period of a box."""
+        """Return the sides at which bounds are computed, half a period of a box."""
         half = math.pi / symmetry
         return np.linspace(0.0, half, math.ceil(math.degrees(half) / self.sampling.delta_step_deg - 1e-9) + 1)
 

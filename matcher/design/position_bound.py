@@ -1,4 +1,4 @@
-"""How well a landmark places the robot over a working range: the Cramér–Rao bound of its lower pixels."""
+"""Position bound of a landmark over a working range: the Cramér–Rao bound of its lower pixels."""
 
 from __future__ import annotations
 

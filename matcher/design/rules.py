@@ -27,7 +27,7 @@ _ROUNDING_M = 1e-9
 
 @dataclass(frozen=True)
 class Check:
-    """One rule held against one landmark.
+    """Result of one rule for one landmark.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def upper_size(upper: Upper) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class AllowedDimensions:
-    """What the rules leave of a landmark's dimensions.
+    """Dimensions of a landmark that the rules allow.
 
     Parameters
     ----------

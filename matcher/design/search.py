@@ -2,7 +2,7 @@
 
 A view's distance and side come from the lower pixels, that is from the box alone; the class comes from the upper ones.
 So boxes are scored once, parts above them are compared once, and only then put together: each box with the set of parts
-that are told apart best on it.
+that are easiest to distinguish on it.
 """
 
 from __future__ import annotations
@@ -296,7 +296,7 @@ def _ordered(distances: NDArray[np.float64]) -> tuple[float, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """What came of a search.
+    """Result of a search.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How far landmarks look apart: noncentralities between classes, and between a box and itself turned.
+"""Distances between landmarks' frames: noncentralities between classes, and between a box and itself turned.
 
 The noncentrality d is the whitened distance between two noise-free frames, over everything that could make one imitate
 the other (PHYSICS section 7): two classes are confused with probability Q(d/2), see

@@ -1,4 +1,4 @@
-"""Why a frame is refused, and which change of a setting would make it fit."""
+"""Diagnosis of refused frames: the cause, and the change of a setting that would make the frame fit."""
 
 from typing import TYPE_CHECKING
 

@@ -92,7 +92,7 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Why a frame was refused, as far as a change of settings tells.
+    """Diagnosis of a refused frame: the changes of settings that make it fit.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def _remedy(change: Change) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Setup:
-    """How a matcher was built, as far as a matcher like it needs it."""
+    """Settings of a matcher that are needed to build another one like it."""
 
     nearest: bool
     free: tuple[str, ...]
@@ -221,7 +221,7 @@ class _Setup:
             "pixels": told["pixels"],
             "robust": told["robust"] or unknown,
         }
-        # a bearing with a prior is looked for anew without one
+        # a bearing with a prior is searched again without one
         free = VIEW if told["free"] is None else check_free(told["free"])
         return cls(False, free, None if unknown else told["background"], options)
 
@@ -252,7 +252,7 @@ def diagnose(
     index : int
         Which of them.
     background : Background, optional
-        What a matcher of method "nearest" was told of the background, which it does not keep.
+        Background of a matcher of method "nearest", which does not keep it.
     seconds : float
         No further change is tried when this much time has passed; the change that is being tried is finished.
 

@@ -267,7 +267,7 @@ _LONGEST = (np.array([-0.05, -0.15, -0.05, -0.05]), np.array([0.05, 0.15, 0.05, 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What one frame has at its pixels; (pixels,) arrays."""
+    """Values of one frame at its pixels; (pixels,) arrays."""
 
     range_m: NDArray[np.float64]
     root_weight: NDArray[np.float64]

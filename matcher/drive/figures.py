@@ -89,7 +89,7 @@ def drive_animation(drive: Drive) -> bytes:
     figure.set_layout_engine("none")  # nothing moves any more
     moving: list[Artist] = [*lines, robot]
     for artist in moving:
-        artist.set_animated(True)  # drawn over what stands still, which is drawn anew at stops alone
+        artist.set_animated(True)  # drawn over the still parts, which are redrawn at stops alone
     still = None
     images, durations = [], []
     for index, stop in _moments(drive):

@@ -16,7 +16,7 @@ STATE = ("x_m", "y_m", "heading_rad", "slip", "gyro_bias_rad_s")
 
 @dataclass(frozen=True)
 class Reading:
-    """What the odometry says about one step.
+    """Odometry of one step.
 
     Parameters
     ----------

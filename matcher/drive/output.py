@@ -1,4 +1,4 @@
-"""What a drive leaves behind: tables of the path and of the stops, a summary, a figure and an animation."""
+"""Files of a drive: tables of the path and of the stops, a summary, a figure and an animation."""
 
 from __future__ import annotations
 

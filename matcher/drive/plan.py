@@ -1,4 +1,4 @@
-"""What a drive is made of: map, path, odometry, camera and rules, as a TOML file or in code."""
+"""Plan of a drive: map, path, odometry, camera and rules, as a TOML file or in code."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from phasemark.render import Sensor, preset
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Share = Annotated[float, Field(gt=0, lt=1)]
 LEAST_CLEARANCE_M = 0.6
-"""A landmark nearer to a wall cannot be told from it."""
+"""A landmark nearer to a wall cannot be distinguished from it."""
 
 
 class PathPlan(PlanModel):
-    """Where to go.
+    """Path of the robot.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class PathPlan(PlanModel):
 
 
 class OdometryPlan(PlanModel):
-    """How wheels and gyro err; the filter knows these figures, never the errors themselves.
+    """Errors of wheels and gyro; the filter knows these figures, never the errors themselves.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ class CameraPlan(PlanModel):
 
 
 class StopPlan(PlanModel):
-    """When to stop for a landmark, and what to believe.
+    """Rules for stopping at a landmark and for accepting a match.
 
     Parameters
     ----------

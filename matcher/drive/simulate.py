@@ -86,7 +86,7 @@ class Stop:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """What a drive gave; poses are (x, y, heading) by row, metres and radians.
+    """Result of a drive; poses are (x, y, heading) by row, metres and radians.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def pose_error(estimate: NDArray[np.float64], truth: NDArray[np.float64]) -> NDA
 
 @dataclass(frozen=True, eq=False)
 class RobotEquipment:
-    """What a robot brings along: camera, bank, matcher, and a model of each class.
+    """Equipment of a robot: camera, bank, matcher, and a model of each class.
 
     One set serves any number of drives with the same classes and camera.
 

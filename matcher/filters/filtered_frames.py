@@ -37,7 +37,7 @@ _LEAST_POOLED = 1e-4
 
 
 class PixelState(IntEnum):
-    """What a filtered pixel is (PHYSICS section 7)."""
+    """State of a filtered pixel (PHYSICS section 7)."""
 
     RETURN = 0
     """At least half of the usable frames are valid: the range counts."""
@@ -440,7 +440,7 @@ def phasor_mean(frames: Frames) -> FilteredFrames:
     """Average the phasors amplitude_e · exp(iφ) of every pixel coherently (PHYSICS section 6).
 
     Better than a mean of ranges at low signal, where a weak frame's phase is worth less, and near the wrap. Frames
-    without amplitude average unit phasors. A frame below the validity threshold has no range, hence no phase: only
+    without amplitude average unit phasors. A frame below the validity threshold has no range and so no phase: only
     valid frames enter. To use every frame at low signal, capture with ``max_phase_std_rad=None``.
 
     The variance of the range is the noise law at the amplitude of the mean phasor and the mean intensity, over n_valid;

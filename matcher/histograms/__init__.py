@@ -1,4 +1,4 @@
-"""Where a known object stands, from histograms of a direct sensor at several poses (PHYSICS section 11)."""
+"""Pose of a known object from histograms of a direct sensor at several poses (PHYSICS section 11)."""
 
 from typing import TYPE_CHECKING
 

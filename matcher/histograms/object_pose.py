@@ -28,7 +28,7 @@ _WEAK = 1e-10  # eigenvalue of the scaled information below which a direction is
 
 
 class ModelError(NamedTuple):
-    """What the model of a sensor may be off.
+    """Errors of a sensor's model, as standard deviations of expected counts.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ POISSON = ModelError()
 
 @dataclass(frozen=True, eq=False)
 class ObjectPose:
-    """Where an object stands.
+    """Pose of an object with its covariance.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def solve_jointly(
     step : (p,) float64
         0 along directions that nothing tells.
     covariance : (p, p) float64
-        Infinite for parameters that such a direction involves.
+        Infinite for parameters that an undetermined direction involves.
     """
     p = evidence.gradient.shape[-1]
     parts, gradients = evidence.information.reshape(-1, p, p), evidence.gradient.reshape(-1, p)

@@ -1,4 +1,4 @@
-"""What a direct sensor expects to count of an object at a supposed pose, and how that changes with the pose."""
+"""Expected counts of a direct sensor for an object at an assumed pose, and their derivatives by the pose."""
 
 from __future__ import annotations
 

@@ -47,12 +47,12 @@ def rank(
     p_values = p_values_of(fits.tested / tolerated, fits.dof, frames, fits.frame)
     order = np.lexsort((fits.cost, fits.frame))
     first = np.searchsorted(fits.frame[order], np.arange(len(frames) + 1))
-    doubt = np.asarray(special.chdtri(np.maximum(fits.dof, 1), setup.false_alarm), np.float64)
+    chi2_at_edge = np.asarray(special.chdtri(np.maximum(fits.dof, 1), setup.false_alarm), np.float64)
     answers = []
     for k in range(len(frames)):
         own = order[first[k] : first[k + 1]]
         own = own[np.isfinite(fits.cost[own])]
-        answers.append(_answer(setup, fits, own, p_values, doubt, float(bare[k]), background))
+        answers.append(_answer(setup, fits, own, p_values, chi2_at_edge, float(bare[k]), background))
     return answers
 
 
@@ -73,7 +73,7 @@ def _answer(
     fits: Fits,
     own: NDArray[np.int64],
     p_values: NDArray[np.float64],
-    doubt: NDArray[np.float64],
+    chi2_at_edge: NDArray[np.float64],
     bare: float,
     background: Background | None,
 ) -> Match:
@@ -84,8 +84,9 @@ def _answer(
         return Match(class_name=None, accepted=False, free=setup.free, class_probability=nothing, reason="no landmark")
     kept = distinct(fits, own, setup.shapes.symmetry, setup.policy.same_m, setup.policy.same_rad)
     best = kept[0]
-    left = DISAGREEMENT * float(fits.unexplained[best])
-    weight = _weights(np.append(fits.cost[kept], min(bare, float(doubt[best]) + left)))
+    # "none" weighs as a fit that just fails the test, or as a scene without a landmark
+    cost_of_unknown = DISAGREEMENT * float(fits.unexplained[best])
+    weight = _weights(np.append(fits.cost[kept], min(bare, float(chi2_at_edge[best]) + cost_of_unknown)))
     reason = _reason(setup, fits, kept, weight[:-1], float(p_values[best]), bare)
     candidates = _candidates(setup, fits, kept, weight)
     condition, weak = weak_direction(setup.free, information=fits.information[best])

@@ -1,4 +1,4 @@
-"""What stands behind the landmark, estimated from the frame's own far pixels (PHYSICS section 7).
+"""Background behind the landmark, estimated from the frame's own far pixels (PHYSICS section 7).
 
 The landmark stands in front, so what is clearly farther than the nearest surface is background. Its pixels are
 explained by a wall, a plane across the line of sight, and below the horizon by a floor; on amplitudes their brightness
@@ -42,7 +42,7 @@ _USUAL_ALBEDO = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What one frame shows behind the landmark.
+    """Background that one frame shows behind the landmark.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ class BankModel:
         Its grid must be regular, with at least four distances and four angles.
     """
 
-    slopes_are_free = True
+    slopes_are_cheap = True
 
     def __init__(self, bank: Bank) -> None:
         self._sensor = bank.sensor
@@ -51,15 +51,14 @@ class BankModel:
         self._behind = _behind_arrays(None)
         self._distance, self._delta = bank.distance_m, bank.delta_rad
         self._period = closing_period(bank.delta_rad)
-        shape = (len(self._distance), len(self._delta), -1)
         if bank.full is not None:
-            self._lower = _stack(bank.full, (len(bank.classes), *shape))
+            self._lower = _stack(bank.full)
             self._upper = np.zeros((len(bank.classes), len(self._distance), 4, 0), np.float32)
         else:
             assert bank.lower is not None
             assert bank.upper is not None
-            self._lower = _stack(bank.lower, (1, *shape))
-            self._upper = _stack(bank.upper, (len(bank.classes), len(self._distance), -1))
+            self._lower = _stack(bank.lower)[None]
+            self._upper = _stack(bank.upper)
 
     def before(self, behind: PhasorImages | None) -> BankModel:
         """Return the same model before another background: one image of it is composed with the landmark's."""
@@ -77,8 +76,8 @@ class BankModel:
         return other
 
     @staticmethod
-    def fits(bank: Bank, step_m: float, step_rad: float) -> bool:
-        """Whether a bank's grid is regular, and no wider than some steps."""
+    def grid_is_fine_enough(bank: Bank, step_m: float, step_rad: float) -> bool:
+        """Return True if a bank's grid is regular and no wider than some steps."""
         return all(
             len(grid) >= 4
             and grid[-1] - grid[0] <= (len(grid) - 1) * step * (1 + 1e-6)
@@ -134,9 +133,9 @@ class BankModel:
         ]
         return np.stack([(one - other) / 2 for one, other in ends], axis=1)
 
-    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
-        """Interpolate anew."""
-        return replace(self.images(class_index, view, ()), slope=before.slope)
+    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
+        """Interpolate images at turned views, and keep the slopes of the views before."""
+        return replace(self.images(class_index, view, ()), slope=like.slope)
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels are smooth enough."""
@@ -158,12 +157,20 @@ class BankModel:
         return float(self._distance[0]), step_d, float(self._delta[0]), step_a, self._period is not None
 
 
-def _stack(group: BankGroup, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return real and imaginary part, intensity and coverage of a group's images, (class, D[, δ], 4, pixels)."""
-    phasor, intensity, coverage = (
-        np.asarray(images).reshape(shape) for images in (group.phasor, group.intensity, group.coverage)
-    )
-    return np.ascontiguousarray(np.stack([phasor.real, phasor.imag, intensity, coverage], axis=-2))
+def _stack(group: BankGroup) -> NDArray[np.float32]:
+    """Return real and imaginary part, intensity and coverage of a group's images, (class, D[, δ], 4, pixels).
+
+    The images are read some at a time: together with a second copy of a large bank they would not fit into memory.
+    """
+    stack = np.empty((0, 0), np.float32)
+    for which, some in group.parts():
+        planes = (some.phasor.real, some.phasor.imag, some.intensity, some.coverage)
+        shape = planes[0].shape[-2:]
+        if not stack.size:
+            stack = np.empty((*group.n_views, len(planes), *shape), np.float32)
+        for k, plane in enumerate(planes):
+            stack[which][..., k, :, :] = plane
+    return stack.reshape(*stack.shape[:-2], -1)
 
 
 def _behind_arrays(behind: PhasorImages | None) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:

@@ -1,4 +1,4 @@
-"""Steps 1 to 4 of the search: minima of the bank, refined on interpolated and rendered images; other classes."""
+"""Steps 2 to 4 of the search: descend from minima of the bank, let other classes explain, refine on final images."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from phasemark.matcher.likelihood.fits import Fits, best_of_frame, distinct, distinct_of_frames, least_of_frame
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
-from phasemark.matcher.likelihood.problem import Settings
+from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.refine import costs_at, refine
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.nearest.bank_minima import Starts
 
-__all__ = ["fit_modes", "fit_other_classes", "fit_starts", "fit_surroundings"]
+__all__ = ["fit_modes", "fit_neighbouring_views", "fit_other_classes", "fit_starts"]
 
 
 def fit_starts(
@@ -66,10 +66,13 @@ def fit_modes(
     frame: NDArray[np.int64],
     class_index: NDArray[np.int64],
     view: NDArray[np.float64],
-    settings: Settings,
+    settings: DescentSettings,
     margin: float,
 ) -> Fits:
-    """Refine the first candidate of every frame, the others while they can still win, and at last what is likely."""
+    """Refine the first candidate of every frame, the others while they can still win, and at last what is likely.
+
+    Of likely fits that end at one place the best is kept; unlikely ones keep their rough fit.
+    """
     n = len(evidence.weight)
     first = np.isin(np.arange(len(frame)), np.unique(frame, return_index=True)[1])
     fits = refine(model, evidence, frame[first], class_index[first], view[first], settings, roughly=True)
@@ -83,7 +86,9 @@ def fit_modes(
     return Fits.joined([refine(model, evidence, again.frame, again.class_index, again.view, settings), fits[~likely]])
 
 
-def fit_other_classes(setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits, settings: Settings) -> Fits:
+def fit_other_classes(
+    setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits, settings: DescentSettings
+) -> Fits:
     """Let every class but the best explain each frame, from the view of the best."""
     best = best_of_frame(fits)
     n_class = len(setup.shapes.names)
@@ -112,8 +117,10 @@ def _with_sides(
     )
 
 
-def fit_surroundings(setup: Setup, scene: Scene, evidence: Evidence, which: NDArray[np.int64], fits: Fits) -> Fits:
-    """Refine from around the best fits of some frames: where an edge has just left a pixel, nothing leads back.
+def fit_neighbouring_views(
+    setup: Setup, scene: Scene, evidence: Evidence, which: NDArray[np.int64], fits: Fits
+) -> Fits:
+    """Refine from around the best fits of some frames: no gradient leads back across an edge that has left a pixel.
 
     Parameters
     ----------
@@ -138,7 +145,7 @@ def fit_surroundings(setup: Setup, scene: Scene, evidence: Evidence, which: NDAr
     return refine(scene.final, evidence, again.frame, again.class_index, again.view, close, limit, rival)
 
 
-def _close_settings(setup: Setup, scene: Scene, evidence: Evidence) -> Settings:
+def _close_settings(setup: Setup, scene: Scene, evidence: Evidence) -> DescentSettings:
     """Return how a descent runs that starts near a minimum."""
     policy = setup.policy
     side_peaks = evidence.on == "phasors" or scene.behind is not None
@@ -152,7 +159,11 @@ def _close_settings(setup: Setup, scene: Scene, evidence: Evidence) -> Settings:
 
 
 def _polished(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
-    """Refine on the final images what is likely after the scout; the other fits keep their distance from the best."""
+    """Refine on the final images what is likely after the scout.
+
+    The other fits keep the scout's cost, shifted by the change of the best one of their frame. Likely fits beyond
+    `most_refined` are dropped.
+    """
     policy, n = setup.policy, len(evidence.weight)
     order = np.lexsort((fits.cost, fits.frame))
     least = least_of_frame(fits, n)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
+from phasemark.matcher.likelihood.residuals import range_residuals
 from phasemark.matcher.likelihood.uncertainty import capped_std
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, disagrees
 
@@ -42,9 +43,9 @@ def contradicted_pixels(
 
 def outlying_pixels(problem: Problem, state: State) -> NDArray[np.bool_]:
     """Return where the robust loss of a range has reached what a disagreement costs, (m, pixels)."""
-    sensor, huber = problem.evidence.sensor, problem.settings.huber or math.inf
+    huber = problem.settings.huber or math.inf
     phasor = state.images.phasor
-    residual = sensor.metres_per_radian * np.angle(problem.evidence.value[problem.frame] * phasor.conj())
+    residual = range_residuals(phasor, problem.evidence, problem.frame)
     size = np.abs(residual) * np.sqrt(problem.evidence.seen.weight[problem.frame])
     return np.asarray((phasor == 0) | (huber * (2 * size - huber) >= DISAGREEMENT))
 

@@ -10,15 +10,15 @@ from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State, 
 _FIRST_DAMPING = 1e-3
 _HOPELESS_DAMPING = 1e5
 _LAST_PROMISE = 100.0
-"""A step that was taken and promised less than this many times a settled cost was the last: the next would promise its
-square."""
+"""A descent ends after a successful step that promised a decrease below this many times `settled`: convergence is
+quadratic."""
 
 
 def descend(problem: Problem, state: State, settled: float) -> State:
     """Run Levenberg–Marquardt, each candidate with its own damping.
 
     Where a step promises little, slopes that were rendered before serve again; when a step with them fails, they are
-    rendered anew.
+    rendered again.
     """
     damping = np.full(len(state.theta), _FIRST_DAMPING)
     slopes_are_old = np.zeros(len(state.theta), np.bool_)
@@ -27,6 +27,7 @@ def descend(problem: Problem, state: State, settled: float) -> State:
     for _ in range(problem.policy.max_iterations):
         sums = state.sums
         step, limited = _steps(problem, sums.information[active], sums.gradient[active], damping[active], reach[active])
+        # the predicted decrease: stop where it is negligible, or where several times it stays above the limit
         promise = np.einsum("mp,mp->m", sums.gradient[active], step)
         worth = (promise > settled) & (sums.cost[active] - problem.policy.optimism * promise < problem.limit[active])
         active, step, promise, limited = active[worth], step[worth], promise[worth], limited[worth]

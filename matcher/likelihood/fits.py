@@ -27,7 +27,8 @@ class Fits:
     cost : float64
         Whitened squared residual of all pixels that count, and
         :data:`~phasemark.matcher.pixel_agreement.DISAGREEMENT` for each pixel whose return or lack of it no view
-        nearby explains.
+        nearby explains. Of a fit that was not refined on the final images it is an estimate: the best final cost of its
+        frame, and the difference that interpolated images gave between the two.
     capped : float64
         The same with no residual adding more than that: what to compare with a scene that explains nothing.
     dof : int64
@@ -46,8 +47,8 @@ class Fits:
     information : (m, p, p) float64
         Its inverse.
     std_without_one : (m, p) float64
-        Largest standard deviations that any single pixel's absence leaves: what a fit is sure of although one pixel at
-        an edge may claim to know more than it does. Infinite where that is not looked at.
+        Largest standard deviations after any one pixel is left out. One pixel at an edge may claim more than it knows,
+        so an answer is judged by these. Infinite where they were not computed.
     """
 
     frame: NDArray[np.int64]
@@ -119,6 +120,8 @@ def best_of_frame(fits: Fits) -> NDArray[np.int64]:
 
 def distinct(fits: Fits, own: NDArray[np.int64], symmetry: Sequence[int], same_m: float, same_rad: float) -> list[int]:
     """Return some fits of one frame, best first, without those that came to the same place.
+
+    The bearing is not compared: a flat landmark has one heading under many bearings, and they are one place.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a model of images gives the likelihood: images of views anywhere, and how they change with the view."""
+"""Interface of image models: images of views anywhere, and their derivatives by the view."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from phasemark.render.view import VIEW_FIELDS
 
 VIEW = VIEW_FIELDS
-"""What a view is made of; the columns of arrays of views."""
+"""What a view is made of; the columns of arrays of views: D, δ, bearing, height, pitch, roll."""
 LEVEL_VIEW = VIEW[:4]
 """What the view of a level camera is made of."""
 
@@ -36,15 +36,15 @@ class ModelImages:
 
 
 class ImageModel(Protocol):
-    """What the refinement asks of a model.
+    """Interface that the refinement needs of an image model.
 
     Parameters
     ----------
-    slopes_are_free : bool
-        Whether slopes cost no more than images.
+    slopes_are_cheap : bool
+        Whether slopes cost no more than images, as those of interpolated images do.
     """
 
-    slopes_are_free: bool
+    slopes_are_cheap: bool
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Return the images of views (m, 6), columns :data:`VIEW`, of a class each."""
@@ -54,8 +54,8 @@ class ImageModel(Protocol):
     ) -> ModelImages:
         """Return the same where a search starts, at views that other frames may start from too."""
 
-    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
-        """Return images of views that differ from those of `before` in δ alone, with the slopes of `before`."""
+    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
+        """Return images of views that differ from those of `like` in δ alone, with the slopes of `like`."""
 
     def reach(
         self,

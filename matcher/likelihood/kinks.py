@@ -23,7 +23,7 @@ def look_beside(problem: Problem, state: State) -> State:
     The other parameters follow by one Gauss–Newton step.
     """
     sides = np.array(problem.settings.look_beside_rad)
-    near = problem.near_best(state, 0.0)
+    near = problem.best_of_frames(state)
     if not near.size:
         return state
     source = np.repeat(near, len(sides))
@@ -37,14 +37,14 @@ def look_beside(problem: Problem, state: State) -> State:
     information = there.sums.information[:, others[:, None], others] * np.outer(unit, unit)
     gradient = there.sums.gradient[:, others] * unit
     step = np.einsum("mpq,mq->mp", np.linalg.pinv(information, hermitian=True), gradient)
-    excess_cost = (there.sums.cost - np.einsum("mp,mp->m", gradient, step)).reshape(len(near), -1)
-    excess_cost -= state.sums.cost[near, None]
-    # one minimum alone would cost so much more at the sides; what is far below that has another one near it
-    parabola_cost = sides**2 / np.einsum("mpp->mp", view_covariance(problem, state.sums))[near, d][:, None]
-    best = np.argmin(excess_cost - problem.policy.parabola_share * parabola_cost, axis=1)
-    parabola = np.take_along_axis(parabola_cost, best[:, None], axis=1)[:, 0]
+    rise = (there.sums.cost - np.einsum("mp,mp->m", gradient, step)).reshape(len(near), -1)
+    rise -= state.sums.cost[near, None]
+    # expected rise beside a single minimum: offset² / var(δ); a rise far below that shows another minimum
+    expected_rise = sides**2 / np.einsum("mpp->mp", view_covariance(problem, state.sums))[near, d][:, None]
+    best = np.argmin(rise - problem.policy.parabola_share * expected_rise, axis=1)
+    parabola = np.take_along_axis(expected_rise, best[:, None], axis=1)[:, 0]
     most = np.minimum(problem.policy.promising_cost, problem.policy.parabola_share * parabola)
-    chosen = np.flatnonzero(np.take_along_axis(excess_cost, best[:, None], axis=1)[:, 0] < most)
+    chosen = np.flatnonzero(np.take_along_axis(rise, best[:, None], axis=1)[:, 0] < most)
     if not chosen.size:
         return state
     which, at = near[chosen], chosen * len(sides) + best[chosen]

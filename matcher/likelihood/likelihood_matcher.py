@@ -33,11 +33,12 @@ from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
 from phasemark.matcher.nearest.bank_minima import Search, Upward
 from phasemark.matcher.nearest.templates import Observation
+from phasemark.matcher.nearest.thinned_bank import ThinnedBank
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
 from phasemark.render import Background, PhasorImages, Views
 from phasemark.render.phasor_images import wrap_difference_m
 
-__all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TILT_STD_RAD", "LikelihoodMatcher", "Pixels"]
+__all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TILT_STD_RAD", "LikelihoodMatcher", "Pixels", "usual_workers"]
 
 Pixels = Literal["all", "lower"]
 ROBUST_FROM = 3.0
@@ -69,24 +70,24 @@ class LikelihoodMatcher:
         workers: int | None = None,
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
-        near = free is None
+        has_prior = free is None  # the default frees the bearing, with a prior
         names = check_free((*VIEW[:2], "bearing_rad") if free is None else free)
-        _check_choices(bank, background, on, pixels, names)
+        _check_choices(bank, background, on, names)
         known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
-        if near:
+        if has_prior:
             known["bearing_rad"] = bearing_std_rad
         prior = tuple(known.get(name, math.inf) for name in names)
         unknown = background == "unknown"
         self._bank = bank
         self._systematic = systematic
-        self._workers = workers or _usual_workers()
+        self._workers = workers or usual_workers()
         self._stated = background if isinstance(background, Background) else None
         self._setup = Setup(
             bank=bank,
             shapes=Shapes.of_bank(bank),
             free=names,
-            prior_std=prior if near or min(prior) < math.inf else (),
-            bearing_has_prior=near,
+            prior_std=prior if has_prior or min(prior) < math.inf else (),
+            bearing_has_prior=has_prior,
             on=on,
             background_is_known=self._stated is not None,
             unknown=unknown,
@@ -94,15 +95,17 @@ class LikelihoodMatcher:
             huber=ROBUST_FROM if robust or unknown else None,
             false_alarm=false_alarm,
             tolerance={name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW},
-            widest_rad=policy.prior_sigma * bearing_std_rad if near else math.inf,
+            widest_rad=policy.prior_sigma * bearing_std_rad if has_prior else math.inf,
             policy=policy,
         )
         behind = None if self._stated is None else background_of(bank, self._stated)
         self._exact, self._scout = self._bank_models(behind)
-        self._stride = self._search_stride()
-        search = self._new_search(behind, 0.0 if near else self._setup.widest_rad)
-        wide = self._new_search(behind, self._setup.widest_rad) if near else search
         self._auto = background == "auto"
+        thinned = ThinnedBank(bank, self._search_stride())
+        self._thinned = thinned if self._auto else None  # backgrounds that are estimated ask for other templates
+        wide = self._new_search(thinned, behind)
+        # with a prior the first search takes the bearing for 0, and repeated ones shift the frame
+        search = wide.over(0.0) if has_prior else wide
         if self._auto or self._exact is None:
             self._check_distances()
         if self._stated is not None and self._stated.floor_m is not None and "height_m" not in self._setup.free:
@@ -163,8 +166,8 @@ class LikelihoodMatcher:
         setup, policy = self._setup, self._setup.policy
         fixed = setup.free == VIEW[:2]
         is_exact = fixed and setup.on == "ranges" and self._stated is None
-        is_exact = is_exact and BankModel.fits(self._bank, *policy.fine_grid)
-        scouts = (fixed or setup.bearing_has_prior) and BankModel.fits(self._bank, *policy.coarse_grid)
+        is_exact = is_exact and BankModel.grid_is_fine_enough(self._bank, *policy.fine_grid)
+        scouts = (fixed or setup.bearing_has_prior) and BankModel.grid_is_fine_enough(self._bank, *policy.coarse_grid)
         if not (is_exact or scouts):
             return None, None
         model = BankModel(self._bank)
@@ -198,13 +201,13 @@ class LikelihoodMatcher:
         )
         return along, around
 
-    def _new_search(self, behind: PhasorImages | None, widest_rad: float) -> Search:
-        """Return a search before some background, over bearings up to a widest where they are free."""
-        widest = widest_rad if self._setup.bearing_is_free else 0.0
+    def _new_search(self, thinned: ThinnedBank, behind: PhasorImages | None) -> Search:
+        """Return a search before some background, over all bearings that are looked for where they are free."""
         setup = self._setup
-        upward = Upward(setup.std_before("height_m"), setup.std_before("pitch_rad"), setup.policy.prior_sigma)
+        widest = setup.widest_rad if setup.bearing_is_free else 0.0
+        upward = Upward(setup.prior_std_of("height_m"), setup.prior_std_of("pitch_rad"), setup.policy.prior_sigma)
         capped = setup.unknown or not setup.is_upright  # edges between rows: no pixel may decide alone where it starts
-        return Search(self._bank, behind, self._stride, widest, upward, capped=capped)
+        return Search(thinned, behind, widest, upward, capped=capped)
 
     def _scene_before(self, background: Background | None, together: bool) -> Scene:
         """Return the scene of an estimated background; see :class:`AutoBackground`."""
@@ -218,9 +221,9 @@ class LikelihoodMatcher:
             final=self._rendered.with_background(background),
             scout=None if self._scout is None else self._scout.before(behind),
         )
-        if not together:
+        if not together or self._thinned is None:
             return scene
-        search = self._new_search(behind, self._setup.widest_rad)
+        search = self._new_search(self._thinned, behind)
         return replace(scene, search=search, wide_search=search)
 
     def _bare_wall_cost(self, evidence: Evidence) -> NDArray[np.float64]:
@@ -250,12 +253,8 @@ def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.floa
     return np.asarray(squared.sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
 
 
-def _check_choices(bank: Bank, background: object, on: str, pixels: str, free: tuple[str, ...]) -> None:
-    """Check the choices of a matcher."""
-    if on not in ("ranges", "phasors"):
-        raise UsageError(f"'on' must be ranges or phasors, got {on!r}")
-    if pixels not in ("all", "lower"):
-        raise UsageError(f"'pixels' must be all or lower, got {pixels!r}")
+def _check_choices(bank: Bank, background: object, on: str, free: tuple[str, ...]) -> None:
+    """Check that the choices of a matcher go together."""
     if bank.plan.model != "ray":
         raise UsageError(f"the bank's model is '{bank.plan.model}', which knows no mixed pixels: refine needs 'ray'")
     if background == "unknown" and on != "ranges":
@@ -275,5 +274,6 @@ def _check_choices(bank: Bank, background: object, on: str, pixels: str, free: t
         )
 
 
-def _usual_workers() -> int:
+def usual_workers() -> int:
+    """Return how many threads match where nobody says: one for each processor, at most eight."""
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8)

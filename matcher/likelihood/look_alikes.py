@@ -10,11 +10,18 @@ from numpy.typing import NDArray
 from phasemark.matcher.likelihood.fits import Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.refine import refine
-from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.likelihood.residuals import Evidence, range_residuals
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 
 __all__ = ["fit_look_alikes"]
+
+_BETTER = 1.0
+"""By how much a cost must be lower: below that both views remain, and the answer is ambiguous anyway."""
+_Views = tuple[NDArray[np.int64], NDArray[np.float64]]
+"""Indices of fits, and as many views to try instead of theirs."""
+_OfClasses = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
+"""The same, with the class of each view between them."""
 
 
 def fit_look_alikes(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
@@ -66,6 +73,7 @@ def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: 
 
 def _refined(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, kinds: list[_OfClasses]) -> Fits:
     """Refine the most promising views of each kind; `fits` are what they look like."""
+    only_distance_and_delta = len(setup.free) == 2  # with more free, a start that costs much may still be near
     chosen = [_most_promising(setup, scene.final, evidence, fits, *kind) for kind in kinds]
     source, class_index, view = (np.concatenate(part) for part in zip(*chosen, strict=True))
     frame = fits.frame[source]
@@ -78,7 +86,7 @@ def _refined(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, kinds: 
         scene.settings(setup),
         fits.cost[source] + setup.policy.likely_cost,
         fits.cost[source],
-        at_first_sight=len(setup.free) == 2,
+        at_first_sight=only_distance_and_delta,
     )
 
 
@@ -107,25 +115,17 @@ def _most_promising(
     view[:, 0] = np.clip(view[:, 0], *model.limits())
     frame = fits.frame[source]
     phasor = model.images(class_index, np.ascontiguousarray(view), ()).phasor
-    residual = evidence.sensor.metres_per_radian * np.angle(evidence.value[frame] * phasor.conj())
-    weight, dark = evidence.weight[frame], phasor == 0
+    residual = range_residuals(phasor, evidence, frame)
+    weight, dark = evidence.seen.weight[frame] * (evidence.weight[frame] > 0), phasor == 0
     residual[dark | (weight == 0)] = np.nan
     some = np.isfinite(residual).any(axis=1)
     residual[some] -= np.nanmedian(residual[some], axis=1, keepdims=True)
     squared = np.where(np.isnan(residual), DISAGREEMENT, weight * residual**2)
     cost = np.where(weight > 0, np.minimum(squared, DISAGREEMENT), 0.0).sum(axis=1)
     order = np.lexsort((cost, source))
-    rank = np.arange(len(order)) - np.searchsorted(source[order], source[order])
-    kept = np.sort(order[rank < most])
+    place = np.arange(len(order)) - np.searchsorted(source[order], source[order])
+    kept = np.sort(order[place < most])
     return source[kept], class_index[kept], view[kept]
-
-
-_BETTER = 1.0
-"""By how much a cost must be lower: below that both views remain, and the answer is ambiguous anyway."""
-_Views = tuple[NDArray[np.int64], NDArray[np.float64]]
-"""Indices of fits, and as many views to try instead of theirs."""
-_OfClasses = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
-"""The same, with the class of each view between them."""
 
 
 def _other_sides(setup: Setup, fits: Fits, best: NDArray[np.int64]) -> list[_Views]:
@@ -205,7 +205,7 @@ def _at_measured_distance(
     for _ in range(setup.policy.registrations):
         view[:, 0] = np.clip(view[:, 0], *model.limits())
         phasor = model.images(class_index, np.ascontiguousarray(view), ()).phasor
-        residual = evidence.sensor.metres_per_radian * np.angle(evidence.value[frame] * phasor.conj())
+        residual = range_residuals(phasor, evidence, frame)
         compared = (phasor != 0) & (evidence.weight[frame] > 0)
         residual[~compared] = np.nan
         some = compared.any(axis=1)

@@ -29,18 +29,18 @@ _STEEPEST_RAD = 1.2
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What is estimated, and from what.
+class DescentSettings:
+    """Free parameters and evidence of a descent.
 
     Parameters
     ----------
     free : tuple of str
         Parameters of the view.
-    pixels : (pixels,) bool
+    used : (pixels,) bool
         Which pixels place the landmark; all of them tell its class.
     huber : float, optional
-        Residual, in σ, from which the loss grows linearly, and soon no more.
-    background : PhasorImages' phasor (pixels,) complex128, optional
+        Residual, in σ, from which the loss grows linearly; it stays constant where it has reached 25.
+    phasor_behind : (pixels,) complex128, optional
         What stands behind, without the landmark; on phasors the albedo does not scale it.
     look_beside_rad : tuple of float
         How far to either side of a solution δ is tried once more; there may be a lower minimum behind a kink.
@@ -58,9 +58,9 @@ class Settings:
     """
 
     free: tuple[str, ...]
-    pixels: NDArray[np.bool_]
+    used: NDArray[np.bool_]
     huber: float | None = None
-    background: NDArray[np.complex128] | None = None
+    phasor_behind: NDArray[np.complex128] | None = None
     look_beside_rad: tuple[float, ...] = ()
     prior_std: tuple[float, ...] = ()
     returns_behind: NDArray[np.bool_] | None = None
@@ -71,7 +71,7 @@ class Settings:
 
 @dataclass(eq=False)
 class State:
-    """Where m candidates are: parameters (view and albedo, (m, 7)), pixels in use, images and sums there."""
+    """State of m candidates: parameters (view and albedo, (m, 7)), pixels in use, images and sums there."""
 
     theta: NDArray[np.float64]
     use: NDArray[np.bool_]
@@ -89,13 +89,25 @@ class State:
 class Problem:
     """m candidates with their frames.
 
+    Five methods return a :class:`State`:
+
+    ========== ======================= ==================== ===========================
+    method     pixels that count       images               slopes
+    ========== ======================= ==================== ===========================
+    `start`    decided by the images   new, or kept ones    new
+    `state`    those that are given    new                  new, or those that are given
+    `at`       decided by the images   new                  new on request, else 0
+    `turned`   as in the source        the rows δ changes   those of the source
+    `summed`   those that are given    those that are given those that are given
+    ========== ======================= ==================== ===========================
+
     Parameters
     ----------
     model : ImageModel
     evidence : Evidence
     frame, class_index : (m,) int64
         Which frame each candidate explains, and by which class.
-    settings : Settings
+    settings : DescentSettings
     limit : (m,) float64
         Cost above which a candidate is given up.
     rival : (m,) float64, optional
@@ -108,7 +120,7 @@ class Problem:
         evidence: Evidence,
         frame: NDArray[np.int64],
         class_index: NDArray[np.int64],
-        settings: Settings,
+        settings: DescentSettings,
         limit: NDArray[np.float64],
         rival: NDArray[np.float64] | None = None,
     ) -> None:
@@ -142,7 +154,7 @@ class Problem:
         """Look at the first views: which pixels count, and how bright the landmark is."""
         theta = np.column_stack([self.clipped(view.copy()), np.ones(len(view))])
         view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
-        if at_first_sight and not self.with_albedo and not self.model.slopes_are_free:
+        if at_first_sight and not self.with_albedo and not self.model.slopes_are_cheap:
             images = self._images_at_first_sight(theta)
         else:
             images = self.model.first_images(self.class_index, view, free)
@@ -182,18 +194,18 @@ class Problem:
 
     def turned(self, states: State, source: NDArray[np.integer], theta: NDArray[np.float64]) -> State:
         """Return states that differ from `source` in δ alone, with the slopes from there."""
-        before = ModelImages(**{name: values[source] for name, values in vars(states.images).items()})
-        if self.with_albedo:  # what the model makes is as bright as the bank has it
-            before = replace(before, phasor=before.phasor - (theta[:, ALBEDO_COLUMN:] - 1) * before.slope[:, -1])
-        images = self.model.turned(self.class_index, np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), before)
+        like = ModelImages(**{name: values[source] for name, values in vars(states.images).items()})
+        if self.with_albedo:  # a model returns images of the bank's albedo
+            like = replace(like, phasor=like.phasor - (theta[:, ALBEDO_COLUMN:] - 1) * like.slope[:, -1])
+        images = self.model.turned(self.class_index, np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), like)
         if self.with_albedo:
-            images = replace(self.scaled(replace(images, slope=images.slope[:, :-1]), theta), slope=before.slope)
+            images = replace(self.scaled(replace(images, slope=images.slope[:, :-1]), theta), slope=like.slope)
         return self.summed(theta, states.use[source], images)
 
     def summed(self, theta: NDArray[np.float64], use: NDArray[np.bool_], images: ModelImages) -> State:
         """Return the state of images that were rendered: compare them with the frames."""
         sums = gauss_newton_sums(
-            images.phasor, images.slope, self.evidence, self.frame, use & self.settings.pixels, self.settings.huber
+            images.phasor, images.slope, self.evidence, self.frame, use & self.settings.used, self.settings.huber
         )
         return State(theta, use, images, self.with_prior(sums, theta))
 
@@ -225,17 +237,25 @@ class Problem:
             phasor = phasor - (theta[:, ALBEDO_COLUMN:] - 1) * images.slope[:, -1]
         return counts(phasor, images.intensity, self.evidence.sensor) & trusted
 
-    def near_best(self, state: State, margin: float) -> NDArray[np.intp]:
-        """Return the candidates that may be their frame's best, up to some cost above it; at 0 the best alone."""
+    def best_of_frames(self, state: State) -> NDArray[np.intp]:
+        """Return the best candidate of each frame, in the order of the candidates, if its cost is within its limit."""
         cost = state.sums.cost
-        order = np.lexsort((cost, self.frame))
-        first = order[np.flatnonzero(np.diff(self.frame[order], prepend=-1))]
-        if margin == 0:
-            return np.sort(first[cost[first] <= self.limit[first]])
+        first = self._first_of_frames(cost)
+        return np.sort(first[cost[first] <= self.limit[first]])
+
+    def near_best(self, state: State, margin: float) -> NDArray[np.intp]:
+        """Return the candidates that cost at most `margin` more than their frame's best, and may beat their rival."""
+        cost = state.sums.cost
+        first = self._first_of_frames(cost)
         least = np.full(len(self.evidence.weight), np.inf)
         least[self.frame[first]] = cost[first]
         near = np.minimum(least[self.frame] + margin, self.rival + DISAGREEMENT)
         return np.flatnonzero((cost <= self.limit) & (cost <= near))
+
+    def _first_of_frames(self, cost: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Return the candidate of lowest cost of each frame."""
+        order = np.lexsort((cost, self.frame))
+        return order[np.flatnonzero(np.diff(self.frame[order], prepend=-1))]
 
     def scaled(self, images: ModelImages, theta: NDArray[np.float64]) -> ModelImages:
         """Make the landmark as bright as the parameters have it, and append the slope by that."""
@@ -247,7 +267,7 @@ class Problem:
         return replace(images, phasor=images.phasor + (factor - 1) * own, slope=slope)
 
     def _landmark_alone(self, images: ModelImages) -> NDArray[np.complex128]:
-        behind = self.settings.background
+        behind = self.settings.phasor_behind
         return images.phasor if behind is None else images.phasor - (1 - images.coverage) * behind
 
     def _brightness(self, images: ModelImages) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from phasemark.matcher.likelihood.descent import descend
 from phasemark.matcher.likelihood.fits import Fits
 from phasemark.matcher.likelihood.images import ImageModel, ModelImages
 from phasemark.matcher.likelihood.kinks import look_beside, settle
-from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, Settings, State, picked
+from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, DescentSettings, Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import (
     capped_std,
@@ -35,7 +35,7 @@ def refine(
     frame: NDArray[np.int64],
     class_index: NDArray[np.int64],
     view: NDArray[np.float64],
-    settings: Settings,
+    settings: DescentSettings,
     give_up_above: NDArray[np.float64] | None = None,
     rival: NDArray[np.float64] | None = None,
     *,
@@ -52,15 +52,17 @@ def refine(
         Which frame each candidate explains, and by which class.
     view : (m, 6) float64
         Where it starts, columns :data:`~phasemark.matcher.likelihood.images.VIEW`.
-    settings : Settings
+    settings : DescentSettings
     give_up_above : (m,) float64, optional
         Stop where the cost promises to stay above this.
     rival : (m,) float64, optional
-        Cost of the best explanation of each candidate's frame that is known; what is not near it is refined roughly.
+        Cost of the best known explanation of each candidate's frame; a candidate that costs more than it by 50
+        (`SearchPolicy.close_cost`) is refined roughly.
     roughly : bool
         Whether to stop within a fraction of a standard deviation, with the pixels that counted at the start.
     at_first_sight : bool
-        Whether to give up at the start already, where its cost is far above the limit: for starts that are good.
+        Whether to give up at the start already, where its cost is far above the limit. Use it only where starts are
+        close to a solution.
 
     Returns
     -------
@@ -77,7 +79,7 @@ def refine(
     if settings.look_beside_rad:
         state = look_beside(problem, state)
     state = _recounted(problem, state)
-    if not model.slopes_are_free:
+    if not model.slopes_are_cheap:  # interpolated coverages do not show the step in which an edge enters a pixel
         state = settle(problem, state)
     return conclude(problem, state)
 
@@ -88,7 +90,7 @@ def costs_at(
     frame: NDArray[np.int64],
     class_index: NDArray[np.int64],
     view: NDArray[np.float64],
-    settings: Settings,
+    settings: DescentSettings,
 ) -> NDArray[np.float64]:
     """Return what m candidates cost where they start, disagreements included; arguments as for :func:`refine`."""
     problem = Problem(model, evidence, frame, class_index, settings, np.full(len(frame), np.inf))
@@ -111,7 +113,7 @@ def _descend_near(problem: Problem, state: State) -> State:
 
 
 def _recounted(problem: Problem, state: State) -> State:
-    """Decide anew which pixels count, and descend again where others do."""
+    """Decide again which pixels count, and descend again where they changed."""
     policy = problem.policy
     use = problem.pixels_at(state.images, state.theta)
     changed = np.flatnonzero((use != state.use).any(axis=1) & (state.sums.cost <= problem.rival + policy.margin_cost))
@@ -135,16 +137,16 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     look_around : bool
         Whether to look at what is near solutions that may be the best of their frame.
     """
-    policy, settings = problem.policy, problem.settings
-    # before a background the cost is final here; otherwise pixels that nothing explains may still change it
-    margin = policy.close_cost if settings.background is None else 0.0
-    near = problem.near_best(state, margin) if look_around else np.empty(0, np.intp)
+    settings = problem.settings
+    # 1  count contradicted pixels within three standard deviations, by the covariance of the descent's own slopes
+    near = _near_solutions(problem, state) if look_around else np.empty(0, np.intp)
     sums, covariance = _sums_of_all_pixels(problem, state), view_covariance(problem, state.sums)
     pixels = _judged_pixels(problem, state, near, covariance)
-    # what costs more than another explanation by a pixel's disagreement decides nothing
-    close = near[(sums.cost + _further_cost(pixels))[near] <= problem.rival[near] + DISAGREEMENT]
-    covariance, without_one = _uncertainty(problem, state, close)
-    if pixels.wrong[close].any():
+    # 2  take the covariance of solutions that may still win from wide differences
+    competitive = near[(sums.cost + _further_cost(pixels))[near] <= problem.rival[near] + DISAGREEMENT]
+    covariance, without_one = _uncertainty(problem, state, competitive)
+    # 3  count contradicted pixels again, by that covariance
+    if pixels.wrong[competitive].any():
         pixels = _judged_pixels(problem, state, near, covariance)
     further = _further_cost(pixels)
     n_residuals = pixels.compared * problem.evidence.per_pixel + pixels.wrong + pixels.undecided
@@ -168,6 +170,17 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
         information=covariance_of(covariance / np.outer(scale, scale)) * np.outer(1 / scale, 1 / scale),
         std_without_one=without_one,
     )
+
+
+def _near_solutions(problem: Problem, state: State) -> NDArray[np.intp]:
+    """Return the solutions whose surroundings are looked at.
+
+    Before a background the cost is final already, so they are the best of each frame. Otherwise contradicted pixels may
+    still change the order of solutions whose costs are close.
+    """
+    if problem.settings.phasor_behind is not None:
+        return problem.best_of_frames(state)
+    return problem.near_best(state, problem.policy.close_cost)
 
 
 def _uncertainty(
@@ -201,7 +214,7 @@ def _uncertainty(
 def _sums_of_all_pixels(problem: Problem, state: State) -> Sums:
     """Return the sums of solutions over all pixels, also those that do not give the view."""
     settings = problem.settings
-    if settings.pixels.all():
+    if settings.used.all():
         return state.sums
     sums = gauss_newton_sums(
         state.images.phasor, state.images.slope, problem.evidence, problem.frame, state.use, settings.huber

@@ -35,7 +35,7 @@ class RenderedModel:
         Room for images that other frames may start from too.
     """
 
-    slopes_are_free = False
+    slopes_are_cheap = False
 
     def __init__(self, bank: Bank, background: Background | None = None, cache_bytes: int = 0) -> None:
         self.sensor: Sensor = bank.sensor
@@ -122,16 +122,16 @@ class RenderedModel:
             return new
         return ModelImages(*(np.stack([cast(Any, row[part]) for row in rows]) for part in range(4)))
 
-    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], before: ModelImages) -> ModelImages:
+    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
         """Render the rows that δ changes."""
-        phasor, intensity, coverage = before.phasor.copy(), before.intensity.copy(), before.coverage.copy()
+        phasor, intensity, coverage = like.phasor.copy(), like.intensity.copy(), like.coverage.copy()
         rows, first = self._changing_rows("delta_rad", view)
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
             image = self._render(c, view[of], rows)
             for values, new in ((phasor, image.phasor), (intensity, image.intensity), (coverage, image.coverage)):
                 values[of, first:] = new.reshape(len(of), -1)
-        return ModelImages(phasor, before.slope, intensity, coverage)
+        return ModelImages(phasor, like.slope, intensity, coverage)
 
     def wide_slopes(
         self,

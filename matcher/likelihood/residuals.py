@@ -1,4 +1,4 @@
-"""How well model images explain filtered frames, and how that changes with the view: Gauss–Newton's sums.
+"""Residuals between model images and filtered frames, and their derivatives by the view: Gauss–Newton's sums.
 
 On *ranges*, each pixel leaves the residual y − (c/4πf) arg S, wrapped, with the variance of the filter. On *phasors*
 it leaves two, real and imaginary part of z − S, where z is the filtered amplitude · exp(iφ) in units of |S|; both have
@@ -9,6 +9,7 @@ divided by the amplitude.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -40,7 +41,8 @@ class Evidence:
         Noise of a single frame's range; infinite where nothing returned.
     seen : Observation
         The same frames as the coarse search sees them. What one frame cannot measure to 0.1 rad is no return there,
-        whether or not the camera dropped it.
+        whether or not the camera dropped it. Such pixels keep their `weight`: where a model is bright enough, a fit
+        compares them.
     on : {"ranges", "phasors"}
     sensor : Sensor
     """
@@ -136,7 +138,7 @@ def gauss_newton_sums(
         ∂S/∂parameter.
     evidence : Evidence
     frame : (m,) int64
-        Which frame each model is held against.
+        Number of the frame that each model is compared with.
     use : (m, pixels) bool
         Which pixels count. On ranges, one of them that returns where the model has no light costs
         :data:`~phasemark.matcher.pixel_agreement.DISAGREEMENT`.
@@ -153,6 +155,21 @@ def gauss_newton_sums(
         np.inf if huber is None else huber, cost, capped, gradient, information, scatter,
     )  # fmt: skip
     return Sums(cost, capped, gradient, information, scatter)
+
+
+def range_residuals(
+    phasor: NDArray[np.complex128], evidence: Evidence, frame: NDArray[np.integer] | Sequence[int]
+) -> NDArray[np.float64]:
+    """Return the ranges of frames less those of model images, wrapped, in metres; 0 where either has no light.
+
+    Parameters
+    ----------
+    phasor : (m, pixels) complex128
+    evidence : Evidence
+    frame : (m,) int
+        Which frame each model is compared with.
+    """
+    return np.asarray(evidence.sensor.metres_per_radian * np.angle(evidence.value[frame] * phasor.conj()))
 
 
 def robust_weight(

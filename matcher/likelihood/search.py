@@ -1,4 +1,4 @@
-"""The search for the most likely views of a batch of frames before one background, in five steps."""
+"""The search for the most likely views of a batch of frames before one background: steps 1 to 6 of docs/matching.md."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from phasemark.matcher.likelihood.candidates import fit_modes, fit_other_classes, fit_starts, fit_surroundings
+from phasemark.matcher.likelihood.candidates import fit_modes, fit_neighbouring_views, fit_other_classes, fit_starts
 from phasemark.matcher.likelihood.fits import Fits, best_of_frame
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.look_alikes import fit_look_alikes
@@ -32,22 +32,24 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     evidence : Evidence
         n frames.
     seen : Observation
-        What the search in the bank sees of them.
+        What the search in the bank sees of them. It is `evidence.seen`, but for an estimated background, which hides
+        the pixels that see it.
     bare : (n,) float64
         Cost of a scene without a landmark.
     """
     which = _worth_a_search(setup, evidence, bare)
     policy = setup.policy
-    n_modes = setup.modes_before(scene.background)
+    n_modes = setup.n_modes_before(scene.background)
     sides = () if scene.background is None else policy.beside_rad
-    # 1  minima of the bank
+    # 1  start: minima of the bank
     starts = scene.search.starts(seen[which], n_modes, all_classes=_all_classes(setup, evidence))
-    # 2 to 4  refined on interpolated and on rendered images; other classes
+    # 2 to 4  descend on interpolated images, let other classes explain, refine on final images
     fits = fit_starts(setup, scene, evidence, which, starts, sides)
-    # 5  doubt: from elsewhere, without what fits worst, and from what looks alike
+    # 5  doubt: search more widely where nothing fits; a robust matcher also without what fits worst
     fits = _retry_unexplained(setup, scene, evidence, seen, bare, fits)
     if setup.huber is not None and not setup.unknown:
         fits = _retry_trimmed(setup, scene, evidence, seen, bare, fits)
+    # 6  look-alikes of every best fit
     return Fits.joined([fits, fit_look_alikes(setup, scene, evidence, fits)])
 
 
@@ -78,11 +80,12 @@ def _unexplained(
     p: float | None = None,
     among: NDArray[np.int64] | None = None,
 ) -> NDArray[np.int64]:
-    """Return the frames whose best fit is worse than good ones are, but not beyond hope.
+    """Return the frames whose best fit fails the χ² test at `p`, and that are searched again.
 
-    On ranges, that is where it costs more than returns that nothing explains; before a known background every fit may
-    be a side peak. `p` is the share of good frames whose fits are as bad, if not the policy's; `among` are the frames
-    that are asked about, if not all.
+    Not searched again are frames that a scene without a landmark explains more cheaply, on ranges without a stated
+    background. Elsewhere every fit may be a side peak, and that cost decides nothing; nor does it where
+    `even_beyond_bare` is set. Without `p` the policy's is taken: `doubtful_p` where the likelihood has side peaks,
+    `hopeless_p` where it is smooth. `among` restricts the frames.
     """
     best = best_of_frame(fits)
     side_peaks = evidence.on == "phasors" or scene.background is not None
@@ -155,15 +158,15 @@ def _retry_with_prior(
     fits: Fits,
     poor: NDArray[np.int64],
 ) -> list[Fits]:
-    """Search poor frames anew with the bearing free: turned, heading kept, then from shifted minima of the bank.
+    """Search poor frames again with the bearing free: turned, heading kept, then from shifted minima of the bank.
 
-    A scout knows no bearing.
+    Interpolated images have bearing 0, so these searches use rendered images from the start.
     """
     policy, direct = setup.policy, replace(scene, scout=None)
     found = [_fit_turned(setup, direct, evidence, poor, fits)]
     poor = _unexplained(setup, scene, evidence, bare, Fits.joined([fits, *found]))
     if poor.size:
-        n_modes = setup.modes_before(scene.background)
+        n_modes = setup.n_modes_before(scene.background)
         starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=_all_classes(setup, evidence))
         found.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
         poor = _unexplained(
@@ -192,7 +195,7 @@ def _retry_without_prior(
     fits: Fits,
     poor: NDArray[np.int64],
 ) -> list[Fits]:
-    """Search poor frames from more minima and angles; what would still be refused, around its best fits and anew."""
+    """Search poor frames from more minima and angles; what fails `refused_p` still, around its best fits and anew."""
     policy, all_classes = setup.policy, _all_classes(setup, evidence)
 
     def refused(found: list[Fits]) -> NDArray[np.int64]:
@@ -202,13 +205,13 @@ def _retry_without_prior(
     found = [fit_starts(setup, scene, evidence, poor, starts, policy.beside_again_rad, patient=True)]
     again = refused(found)
     if again.size and (scene.scout is not None or scene.background is not None):
-        found.append(fit_surroundings(setup, scene, evidence, again, Fits.joined([fits, *found])))
+        found.append(fit_neighbouring_views(setup, scene, evidence, again, Fits.joined([fits, *found])))
         again = refused(found)
     if not again.size:
         return found
     if scene.scout is not None:
         # too little may be smooth for the scout to see the way
-        n_modes = setup.modes_before(scene.background)
+        n_modes = setup.n_modes_before(scene.background)
         starts = scene.wide_search.starts(seen[again], n_modes, all_classes=all_classes)
     elif scene.background is not None:
         # edges between columns before a bright wall: no pixel may decide alone where the search starts
@@ -220,7 +223,7 @@ def _retry_without_prior(
 
 
 def _fit_turned(setup: Setup, scene: Scene, evidence: Evidence, which: NDArray[np.int64], fits: Fits) -> Fits:
-    """Fit some frames from their best views seen under several bearings, as far apart as their prior is wide.
+    """Fit some frames from their best views turned to four other bearings, to half the widest bearing or half a column.
 
     A frame tells the heading δ − b before it tells δ and b: a view fitted without a bearing has the right heading.
     """
@@ -243,7 +246,7 @@ def _retry_trimmed(
 ) -> Fits:
     """Search again without the returns that fit worst, as a robust matcher does where nothing fits."""
     policy = setup.policy
-    n_modes = setup.modes_before(scene.background)
+    n_modes = setup.n_modes_before(scene.background)
     sides = () if scene.background is None else policy.beside_rad
     for _ in range(policy.trimmings):
         poor = _unexplained(setup, scene, evidence, bare, fits, even_beyond_bare=True)

@@ -86,7 +86,7 @@ class SearchPolicy:
     close_cost : float
         A fit whose cost is above its frame's best by more will not become the best: its surroundings are not looked at.
     recount_cost : float
-        What a view may cost more, contradicted pixels included, after it was decided anew which pixels count.
+        Cost by which a view may grow, contradicted pixels included, after deciding again which pixels count.
     settling_rounds : int
         How often a view that contradicts some pixels is left for a better one nearby.
     settling_sigma : tuple of float
@@ -136,7 +136,7 @@ class SearchPolicy:
         Unexplained pixels that must stand against a far view of the same landmark among unknown things.
 
     walls_beyond_m : tuple of float
-        How far behind the landmark a wall is tried that no pixel sees alone.
+        Distances behind the landmark at which a wall is tried where no pixel sees the background alone.
     background_rounds : int
         How often background and views are fitted in turn.
     other_angles : int

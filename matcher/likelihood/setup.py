@@ -1,4 +1,4 @@
-"""What a likelihood matcher estimates, from what, and before which background; fixed while frames are matched."""
+"""Setup of a likelihood matcher: free parameters, evidence and background, fixed while frames are matched."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.landmarks.symmetry import mesh_symmetry
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
-from phasemark.matcher.likelihood.problem import Settings
+from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import SearchPolicy
 from phasemark.matcher.nearest.bank_minima import Search
@@ -42,7 +42,7 @@ def check_free(free: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """What the search knows of the landmarks of a bank, in the order of its classes.
+    """Landmarks of a bank as the search needs them, in the order of its classes.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class Shapes:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What is estimated, and by which rules.
+    """Free parameters of a matcher, and the rules of its search.
 
     Parameters
     ----------
@@ -125,14 +125,14 @@ class Setup:
         """Whether the camera is level and at the height that was stated."""
         return not set(self.free) & set(VIEW[3:])
 
-    def modes_before(self, background: Background | None) -> int:
+    def n_modes_before(self, background: Background | None) -> int:
         """Return how many minima of the bank each frame is first refined from before a background."""
         policy = self.policy
         if background is None:
             return policy.modes
         return policy.modes_before_background if self.is_upright else policy.modes_again
 
-    def std_before(self, name: str) -> float:
+    def prior_std_of(self, name: str) -> float:
         """Return the standard deviation of a parameter before a frame is seen; 0 of one that is not estimated."""
         if name not in self.free:
             return 0.0
@@ -146,7 +146,7 @@ class Setup:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stands behind the landmark, with the models and searches that know it.
+    """Background with the image models and searches that include it.
 
     Parameters
     ----------
@@ -168,10 +168,10 @@ class Scene:
     search: Search
     wide_search: Search
 
-    def settings(self, setup: Setup) -> Settings:
+    def settings(self, setup: Setup) -> DescentSettings:
         """Return how a descent runs before this background."""
         behind = self.behind
-        return Settings(
+        return DescentSettings(
             setup.free,
             setup.used,
             setup.huber,

@@ -14,7 +14,7 @@ from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.acceptance import is_determined
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
-from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.likelihood.residuals import Evidence, range_residuals
 from phasemark.matcher.likelihood.setup import Setup
 from phasemark.matcher.likelihood.systematic import (
     Systematic,
@@ -136,7 +136,7 @@ def _carried(
     weight = np.where(use, evidence.weight[which], 0.0)
     phasor = image.phasor.reshape(len(which), -1)
     if setup.unknown:
-        residual = sensor.metres_per_radian * np.angle(evidence.value[which] * phasor.conj())
+        residual = range_residuals(phasor, evidence, which)
         weight = np.where(weight * residual**2 > setup.policy.strange_sigma**2, 0.0, weight)
 
     def whitened(slopes: NDArray[np.complex128]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""How well a solution is known: its covariance, the slopes that make it, and what single pixels contribute."""
+"""Uncertainty of a solution: its covariance, the slopes behind it, and the contributions of single pixels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
-from phasemark.matcher.likelihood.residuals import Sums, robust_weight
+from phasemark.matcher.likelihood.residuals import Sums, range_residuals, robust_weight
 
 
 def view_covariance(problem: Problem, sums: Sums) -> NDArray[np.float64]:
@@ -88,12 +88,12 @@ def std_without_one_pixel(
     """
     p = covariance.shape[1]
     phasor, weight = state.images.phasor[which], problem.evidence.weight[problem.frame]
-    use = state.use[which] & problem.settings.pixels & (weight > 0) & (phasor != 0)
+    use = state.use[which] & problem.settings.used & (weight > 0) & (phasor != 0)
     turn = np.divide(1.0, phasor, out=np.zeros_like(phasor), where=use)
     value = problem.evidence.value[problem.frame]
     if problem.evidence.on == "ranges":
         rows = problem.evidence.sensor.metres_per_radian * (slope * turn[:, None]).imag[..., None]
-        residual = problem.evidence.sensor.metres_per_radian * np.angle(value * phasor.conj())[..., None]
+        residual = range_residuals(phasor, problem.evidence, problem.frame)[..., None]
     else:
         rows = np.stack([slope.real, slope.imag], axis=-1)
         residual = np.stack([(value - phasor).real, (value - phasor).imag], axis=-1)

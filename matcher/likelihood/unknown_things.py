@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.likelihood.fits import Fits, distinct_of_frames, least_of_frame
 from phasemark.matcher.likelihood.images import ImageModel
 from phasemark.matcher.likelihood.refine import refine
-from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.likelihood.residuals import Evidence, range_residuals
 from phasemark.matcher.likelihood.setup import Scene, Setup
 
 __all__ = ["fit_without_borders"]
@@ -35,7 +35,8 @@ def fit_without_borders(setup: Setup, scene: Scene, evidence: Evidence, fits: Fi
     again = refine(model, inside_evidence, some.frame, some.class_index, some.view, scene.settings(setup))
     again = again.with_scale(_scatter_of_columns(setup, model, inside_evidence, again))
     others = fits[np.setdiff1d(np.arange(len(fits)), modes)]
-    less = np.zeros(len(evidence.weight))  # what the pixels left out cost the best no longer
+    # fits that are not refined again cost less by as much as the best of their frame: its pixels were left out
+    less = np.zeros(len(evidence.weight))
     refitted = np.unique(some.frame)
     less[refitted] = least_of_frame(again, len(less))[refitted] - least[refitted]
     others.cost[:] += less[others.frame]
@@ -46,9 +47,7 @@ def _inside(setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits) -> 
     """Return which pixels are not beside one that sees something else than some views, (m, pixels)."""
     frame = fits.frame
     phasor = model.images(fits.class_index, np.ascontiguousarray(fits.view), ()).phasor
-    size = np.sqrt(evidence.weight[frame]) * np.abs(
-        evidence.sensor.metres_per_radian * np.angle(evidence.value[frame] * phasor.conj())
-    )
+    size = np.sqrt(evidence.weight[frame]) * np.abs(range_residuals(phasor, evidence, frame))
     returned = evidence.seen.returned[frame]
     other = returned & ((phasor == 0) | (size > setup.policy.strange_sigma))
     shape = (-1, evidence.sensor.rows, evidence.sensor.cols)
@@ -82,7 +81,7 @@ def _scatter_of_columns(setup: Setup, model: ImageModel, evidence: Evidence, fit
     image = model.images(fits.class_index, np.ascontiguousarray(fits.view), setup.free)
     turn = np.divide(1.0, image.phasor, out=np.zeros_like(image.phasor), where=image.phasor != 0)
     slope = evidence.sensor.metres_per_radian * (image.slope * turn[:, None]).imag
-    residual = evidence.sensor.metres_per_radian * np.angle(evidence.value[fits.frame] * image.phasor.conj())
+    residual = range_residuals(image.phasor, evidence, fits.frame)
     weight = np.where(image.phasor != 0, evidence.weight[fits.frame], 0.0)
     weight = np.where(weight * residual**2 > strange2, 0.0, weight)
     by_column = (m, p, rows, cols)

@@ -1,4 +1,4 @@
-"""Where to start: the best views of a thinned bank, several modes of the likelihood, any bearing.
+"""Initial guesses: the best views of a thinned bank, several modes of the likelihood, any bearing.
 
 A bearing moves the image sideways, a height or a pitch up and down. The rays of a turned camera meet the landmark at
 the same ranges, so a frame shifted by whole columns and rows is compared with the bank's images ahead; what is
@@ -16,12 +16,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from phasemark.data import Bank
-from phasemark.data.bank.bank_file import BankGroup
-from phasemark.data.plans.arrays import group_rows
-from phasemark.matcher.frequencies import phases_wrap
 from phasemark.matcher.nearest.grid import closing_period
-from phasemark.matcher.nearest.templates import Observation, Templates
+from phasemark.matcher.nearest.templates import Observation
+from phasemark.matcher.nearest.thinned_bank import ThinnedBank
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import PhasorImages
 from phasemark.render.view import VIEW_FIELDS, wrap_delta_difference_rad
@@ -65,7 +62,7 @@ class Starts:
 
 
 class Upward(NamedTuple):
-    """What is known before of what moves the landmark up and down in the image.
+    """Prior knowledge of the parameters that move the landmark up and down in the image.
 
     Parameters
     ----------
@@ -97,15 +94,13 @@ class Upward(NamedTuple):
 
 
 class Search:
-    """A bank thinned for a first look.
+    """A first look at a thinned bank.
 
     Parameters
     ----------
-    bank : Bank
+    bank : ThinnedBank
     behind : PhasorImages, optional
         What stands behind the landmark.
-    stride : (distance, delta)
-        Every how many steps of the bank's grid an image is compared.
     widest_rad : float
         How far the landmark may be off to a side; at most a quarter of the image.
     upward : Upward
@@ -116,23 +111,25 @@ class Search:
 
     def __init__(
         self,
-        bank: Bank,
+        bank: ThinnedBank,
         behind: PhasorImages | None,
-        stride: tuple[int, int],
         widest_rad: float,
         upward: Upward = Upward(),  # noqa: B008 - a constant
         *,
         capped: bool = False,
     ) -> None:
-        self._bank = bank
+        self._sensor, self._n_class = bank.sensor, bank.n_class
         self._capped = capped
-        self._distance = bank.distance_m[:: stride[0]]
-        self._delta = bank.delta_rad[:: stride[1]]
-        self._closes = closing_period(bank.delta_rad) is not None
-        sensor = bank.sensor
+        self._distance, self._delta, self._closes = bank.distance_m, bank.delta_rad, bank.closes
+        self._parts = bank.templates(behind)
+        self._upward = upward
+        self._look(widest_rad)
+
+    def _look(self, widest_rad: float) -> None:
+        """Say to which sides the landmark may be off."""
+        sensor, upward = self._sensor, self._upward
         self.column_rad = 2 * math.atan(sensor.tan_half_angles[0]) / sensor.cols
         most = min(sensor.cols // 4, math.ceil(min(widest_rad / self.column_rad, sensor.cols)))
-        self._upward = upward
         self._row_rad = 2 * math.atan(sensor.tan_half_angles[1]) / sensor.rows
         widest_up = upward.widest_rad(float(self._distance[0]))
         highest = min(sensor.rows // 4, math.ceil(min(widest_up / self._row_rad, sensor.rows)))
@@ -140,23 +137,12 @@ class Search:
         highest -= highest % stride_up
         self._n_side = 2 * most + 1
         self._shifts = [(up, side) for up in range(-highest, highest + 1, stride_up) for side in range(-most, most + 1)]
-        thin = slice(None, None, stride[0]), slice(None, None, stride[1])
-        self._parts: list[tuple[Templates, tuple[int, int], bool]] = []
-        if bank.full is not None:
-            self._add(bank.full, (slice(None), *thin), behind)
-        else:
-            assert bank.lower is not None
-            assert bank.upper is not None
-            self._add(bank.lower, thin, behind)
-            self._add(bank.upper, (slice(None), thin[0]), behind)
 
-    def _add(self, group: BankGroup, which: tuple[slice, ...], behind: PhasorImages | None) -> None:
-        rows = group_rows(group.name, self._bank.sensor)
-        templates = Templates.build(
-            group.phasor[which], group.intensity[which], group.coverage[which], self._bank.sensor, behind, rows,
-            wraps=phases_wrap(self._bank),
-        )  # fmt: skip
-        self._parts.append((templates, rows, group.name == "upper"))
+    def over(self, widest_rad: float) -> Search:
+        """Return the same search, with its templates, over other bearings."""
+        other = copy.copy(self)
+        other._look(widest_rad)
+        return other
 
     def capped(self) -> Search:
         """Return the same search, in which no pixel costs more than a disagreement."""
@@ -247,11 +233,11 @@ class Search:
         return self._shifts[index][0] * self._row_rad
 
     def _shifted(self, seen: Observation, shift: tuple[int, int]) -> Observation:
-        """Move frames so that what was so many rows above and columns right of the middle comes to the middle."""
+        """Move frames by a shift (rows up, columns right), so that the shifted point comes to the middle."""
         up, side = shift
         if up == 0 and side == 0:
             return seen
-        rows, cols = self._bank.sensor.rows, self._bank.sensor.cols
+        rows, cols = self._sensor.rows, self._sensor.cols
 
         def move(values: NDArray[_T]) -> NDArray[_T]:
             grid = values.reshape(-1, rows, cols)
@@ -268,8 +254,8 @@ class Search:
 
         The latter is (n, class, D, δ), or (n, class, D, 1) where it does not depend on δ.
         """
-        n, cols = len(moved.range_m), self._bank.sensor.cols
-        n_class, shape = len(self._bank.classes), (len(self._distance), len(self._delta))
+        n, cols = len(moved.range_m), self._sensor.cols
+        n_class, shape = self._n_class, (len(self._distance), len(self._delta))
         out = DISAGREEMENT * (seen.returned.sum(axis=1) - moved.returned.sum(axis=1)).astype(np.float32)
         pose: NDArray[np.float32] | None = None
         upper: NDArray[np.float32] | None = None

@@ -93,10 +93,7 @@ class NearestMatcher:
         return matches
 
     def _templates(self, group: BankGroup, rows: tuple[int, int]) -> Templates:
-        return Templates.build(
-            group.phasor, group.intensity, group.coverage, self._bank.sensor, self._behind, rows,
-            wraps=phases_wrap(self._bank),
-        )  # fmt: skip
+        return Templates.of_group(group, self._bank.sensor, self._behind, rows, wraps=phases_wrap(self._bank))
 
     def _match_some(self, frames: FilteredFrames) -> list[Match]:
         pose_seen = Observation.from_frames(frames, self._pose_rows)
@@ -153,7 +150,6 @@ class NearestMatcher:
         nothing = np.zeros(shape, np.float32)
         return Templates.build(
             np.zeros(shape, np.complex64),
-            nothing,
             nothing,
             self._bank.sensor,
             self._behind,

@@ -18,6 +18,7 @@ comes within its rounding error of the smallest is computed again in float64.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -25,12 +26,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from phasemark.data.bank.bank_file import BankGroup
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState, assumed_std_m
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, disagrees
 from phasemark.render import PhasorImages, Sensor, phasor_to_range_m, predicted_range_std
 from phasemark.render.phasor_images import wrap_difference_m
 
 _RECHECKED = 64
+_PIXELS_AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +108,6 @@ class Templates:
     def build(
         cls,
         phasor: NDArray[np.complexfloating],
-        intensity: NDArray[np.floating],
         coverage: NDArray[np.floating],
         sensor: Sensor,
         background: PhasorImages | None,
@@ -117,7 +119,7 @@ class Templates:
 
         Parameters
         ----------
-        phasor, intensity, coverage : (..., rows, cols)
+        phasor, coverage : (..., rows, cols)
             What the landmark alone returns.
         sensor : Sensor
         background : PhasorImages, optional
@@ -127,29 +129,55 @@ class Templates:
         wraps : bool
             As an attribute.
         """
-        pixels = math.prod(phasor.shape[-2:])
-        s = phasor.reshape(-1, pixels)
-        cover = np.asarray(coverage).reshape(-1, pixels)
-        may = cover >= MAY_RETURN_COVERAGE
-        must = cover > MUST_RETURN_COVERAGE
-        if background is not None:
-            picked = slice(*rows)
-            free = 1 - cover
-            behind = free * background.phasor[0, picked].reshape(1, pixels)
-            behind_intensity = free * background.intensity[0, picked].reshape(1, pixels)
-            s = s + behind.astype(np.complex64)
-            noise = predicted_range_std(np.abs(behind), behind_intensity, sensor) / sensor.metres_per_radian
-            limit = sensor.max_phase_std_rad or np.inf
-            may |= noise <= limit
-            must |= noise <= 0.5 * limit
-        may &= s != 0
-        ranges = np.where(may, phasor_to_range_m(s, sensor), 0.0)
+        seen = phasor.reshape(-1, *phasor.shape[-2:])
+        cover = np.asarray(coverage).reshape(-1, *seen.shape[1:])
+        at_once = max(_PIXELS_AT_ONCE // math.prod(seen.shape[1:]), 1)
+        some = [slice(first, first + at_once) for first in range(0, len(seen), at_once)]
+        return cls.of_parts(((seen[k], cover[k]) for k in some), sensor, background, rows, wraps=wraps)
+
+    @classmethod
+    def of_group(
+        cls,
+        group: BankGroup,
+        sensor: Sensor,
+        background: PhasorImages | None,
+        rows: tuple[int, int],
+        *,
+        wraps: bool = False,
+    ) -> Templates:
+        """Turn all images of a group of a bank into templates, reading some at a time; see :meth:`build`."""
+        parts = ((some.phasor, some.coverage) for _, some in group.parts())
+        return cls.of_parts(parts, sensor, background, rows, wraps=wraps)
+
+    @classmethod
+    def of_parts(
+        cls,
+        parts: Iterable[tuple[NDArray[np.complexfloating], NDArray[np.floating]]],
+        sensor: Sensor,
+        background: PhasorImages | None,
+        rows: tuple[int, int],
+        *,
+        wraps: bool = False,
+    ) -> Templates:
+        """Turn phasors and coverages that come some images at a time into templates; see :meth:`build`.
+
+        The answer does not depend on how many come together.
+        """
+        found = [_seen(*part, sensor, background, rows) for part in parts]
         # the circular mean, so that a pixel whose ranges straddle the wrap has its mean there
-        turn = np.exp(1j * ranges / sensor.metres_per_radian) * may
-        mean = phasor_to_range_m(turn.sum(axis=0), sensor)
+        total: NDArray[np.complex128] | None = None
+        for ranges, may, _ in found:
+            turn = np.exp(1j * ranges / sensor.metres_per_radian) * may
+            total = (turn if total is None else np.concatenate([total[None], turn])).sum(axis=0)
+        assert total is not None
+        mean = phasor_to_range_m(total, sensor)
         mean = np.where(np.isfinite(mean), mean, 0.0)
-        about = np.where(may, wrap_difference_m(ranges - mean, sensor), 0.0).astype(np.float32)
-        return cls(about, may, must, mean, sensor, wraps)
+        may_return, must_return = (np.concatenate([part[k] for part in found]) for k in (1, 2))
+        about, first = np.empty(may_return.shape, np.float32), 0
+        for ranges, may, _ in found:
+            about[first : first + len(ranges)] = np.where(may, wrap_difference_m(ranges - mean, sensor), 0.0)
+            first += len(ranges)
+        return cls(about, may_return, must_return, mean, sensor, wraps)
 
     def __len__(self) -> int:
         return len(self.range_m)
@@ -166,9 +194,11 @@ class Templates:
     @cached_property
     def matrix(self) -> NDArray[np.float32]:
         """[M, −2 M f, M f², C], what the matrix product needs; (t, 4 · pixels)."""
-        f = self.range_m
-        may, must = self.may_return.astype(np.float32), self.must_return.astype(np.float32)
-        return np.concatenate([may, -2 * f, f**2, must], axis=1)
+        matrix = np.empty((len(self), 4, self.range_m.shape[1]), np.float32)
+        matrix[:, 0], matrix[:, 3] = self.may_return, self.must_return
+        np.multiply(self.range_m, -2, out=matrix[:, 1])
+        np.square(self.range_m, out=matrix[:, 2])
+        return matrix.reshape(len(self), -1)
 
     def costs(self, seen: Observation, subset: slice | None = None) -> NDArray[np.float32]:
         """Return the distances of n frames from all templates (or a slice of them), (n, t), to float32's accuracy."""
@@ -256,6 +286,33 @@ class Templates:
     def about(self, seen: Observation) -> NDArray[np.float64]:
         """Return measured ranges less the bank's mean, wrapped to ± c/4f, 0 where nothing returned."""
         return np.where(seen.returned, wrap_difference_m(seen.range_m - self.mean_m, self.sensor), 0.0)
+
+
+def _seen(
+    phasor: NDArray[np.complexfloating],
+    coverage: NDArray[np.floating],
+    sensor: Sensor,
+    background: PhasorImages | None,
+    rows: tuple[int, int],
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return ranges of some images, 0 where they may not return, and which pixels may and must return."""
+    pixels = math.prod(phasor.shape[-2:])
+    s = phasor.reshape(-1, pixels)
+    cover = np.asarray(coverage).reshape(-1, pixels)
+    may = cover >= MAY_RETURN_COVERAGE
+    must = cover > MUST_RETURN_COVERAGE
+    if background is not None:
+        picked = slice(*rows)
+        free = 1 - cover
+        behind = free * background.phasor[0, picked].reshape(1, pixels)
+        behind_intensity = free * background.intensity[0, picked].reshape(1, pixels)
+        s = s + behind.astype(np.complex64)
+        noise = predicted_range_std(np.abs(behind), behind_intensity, sensor) / sensor.metres_per_radian
+        limit = sensor.max_phase_std_rad or np.inf
+        may |= noise <= limit
+        must |= noise <= 0.5 * limit
+    may &= s != 0
+    return np.where(may, phasor_to_range_m(s, sensor), 0.0), may, must
 
 
 @njit(cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""Where the robot is: its pose from matches and a map."""
+"""Pose of the robot from matches and a map."""
 
 from typing import TYPE_CHECKING
 

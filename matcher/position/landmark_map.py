@@ -1,4 +1,4 @@
-"""Where the landmarks stand: a map in TOML, and the robot poses that a match allows on it (PHYSICS section 8)."""
+"""Map of landmarks in TOML, and the robot poses that a match allows on it (PHYSICS section 8)."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ PRIOR_STD = (1.0, 1.0, 1.0)
 
 
 class ViewEstimate(Protocol):
-    """What a robot's position needs of a match; :class:`phasemark.matcher.Match` has it."""
+    """Interface that a robot's position needs of a match; :class:`phasemark.matcher.Match` has it."""
 
     @property
     def class_name(self) -> str | None:
@@ -133,7 +133,7 @@ def robot_poses(
     sin(δ + ψ)), the optical axis at heading κ = ψ + δ − b and the robot at heading α = κ − β. The robot's centre is
     lens − Rz(α) o_pan − Rz(κ) o_lens. An n-fold landmark allows δ + k · 2π/n, k = 0 … n − 1.
 
-    Covariances are propagated to first order, at each pose anew. Parameters of the view that the match did not
+    Covariances are propagated to first order, separately at each pose. Parameters of the view that the match did not
     estimate count as exact.
 
     Parameters

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from phasemark import InputFileError
 from phasemark.inputs import read_text
+from phasemark.inputs.table_cells import finite_number
 from phasemark.render import Views
 
 _SCALE = {
@@ -92,7 +93,8 @@ def read_pose_table(path: str | os.PathLike[str]) -> PoseTable:
         if name not in names:
             return None
         at = names.index(name)
-        return np.array([_number(path, line, name, row[at]) for line, row in zip(place, rows, strict=True)])
+        cells = ((f"{path}, line {line}", row[at]) for line, row in zip(place, rows, strict=True))
+        return np.array([finite_number(cell, where, name, empty_is_nan=True) for where, cell in cells])
 
     found = {name: column(prefix + name) for name in _SCALE}
     zero = np.zeros(len(rows))
@@ -109,16 +111,3 @@ def read_pose_table(path: str | os.PathLike[str]) -> PoseTable:
         accepted,
         time_s,
     )
-
-
-def _number(path: Path, line: int, name: str, cell: str) -> float:
-    """Return a cell as a number, NaN where it is empty."""
-    if not cell.strip():
-        return math.nan
-    try:
-        value = float(cell)
-    except ValueError:
-        raise InputFileError(f"{path}, line {line}: '{name}' must be a number, got {cell.strip()[:40]!r}") from None
-    if not math.isfinite(value):
-        raise InputFileError(f"{path}, line {line}: '{name}' must be a finite number, got {cell.strip()[:40]}")
-    return value

@@ -28,7 +28,7 @@ _VALUES_AT_ONCE = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class MotionTest:
-    """What the frames at n positions say on whether anything moved.
+    """Tests of the frames at n positions for motion.
 
     Parameters
     ----------

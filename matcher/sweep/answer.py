@@ -1,4 +1,4 @@
-"""What a sweep's page says first: how accurate the best method is in the middle of the design, and its bound."""
+"""Headline of a sweep's page: accuracy of the best method in the middle of the design, and its bound."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def answer_cells(cells: Sequence[Cell]) -> list[Cell]:
     Returns
     -------
     list of Cell
-        Empty if no method found distance and angle in such a cell.
+        Empty if no method found distance and angle in a cell of this kind.
     """
     if not cells:
         return []

@@ -1,4 +1,4 @@
-"""What a sweep tries: axes of the world, a design over them, and the methods that are judged on the same frames."""
+"""Plan of a sweep: axes of the world, a design over them, and the methods that are judged on the same frames."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def _place_of_axis(key: str) -> str | None:
 
 
 class Method(PlanModel):
-    """How frames are turned into views.
+    """Method that turns frames into views.
 
     Parameters
     ----------
@@ -392,7 +392,7 @@ def refuse_programs(plan: SweepPlan, trusted: Collection[str], where: str) -> No
         if method.is_program and method.method not in trusted:
             raise UsageError(
                 f"{where}: the method '{method.name}' would run the program '{method.method}': name it with"
-                f" trusted={method.method}, or leave refuse_programs() out if you trust whoever wrote the plan"
+                f" trusted={method.method}, or leave refuse_programs() out if you trust the author of the plan"
             )
 
 

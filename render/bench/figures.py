@@ -29,6 +29,11 @@ _LABELS = {
     "signal_e": "signal, both taps of a phase image (e-)",
     "flagged_share": "share of frames flagged",
     "no_return_share": "share of frames without return",
+    "counts": "mean counts of a bin in one frame",
+    "separation_m": "separation of two equal targets (m)",
+    "two_targets_share": "share of frames with two targets",
+    "ambient_photons": "ambient photons per cycle and bin",
+    "half_found_m": "distance at which half of the frames find it (m)",
 }
 _TITLES = {
     "photon_transfer": "Photon transfer",
@@ -36,9 +41,17 @@ _TITLES = {
     "linearity": "Linearity",
     "saturation": "Saturation",
     "threshold": "Where the return is lost",
+    "histogram": "Histogram against prediction",
+    "merging": "Where two targets merge",
+    "ambient": "Range against ambient light",
 }
 _LEAST_REACH = 1e-6  # of an axis: nothing below is anything but rounding
 _LOGARITHMIC = ("photon_transfer", "range_noise")
+NAMES = (
+    "photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold", "histogram", "merging",
+    "ambient",
+)  # fmt: skip
+"""The figures that a data sheet may have, in its order."""
 _MAPS = {
     "range_offset_m": ("range offset", "mm", 1e3),
     "response_percent": ("sensitivity, mean of both taps", "% of the mean", 1.0),
@@ -56,10 +69,10 @@ def characterisation_figures(found: Characterisation) -> dict[str, Figure]:
     Returns
     -------
     dict of str to matplotlib.figure.Figure
-        By name: ``photon_transfer``, ``range_noise``, ``linearity``, ``fixed_pattern``, ``saturation``, ``threshold``.
+        By name, those of `NAMES` that it has.
     """
     figures: dict[str, Figure] = {}
-    for name in ("photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold"):
+    for name in NAMES:
         if name == "fixed_pattern":
             if found.maps:
                 figures[name] = _pattern_figure(found)
@@ -89,6 +102,8 @@ def _curve_figure(name: str, series: tuple[Comparison, ...], found: Characterisa
         positive = np.concatenate([one.simulated[one.simulated > 0] for one in series])
         axes.set_ylim(positive.min() / 3, positive.max() * 3)
     else:
+        if name == "ambient":
+            axes.set_xscale("log")
         low, high = axes.get_ylim()
         axes.set_ylim(0.0 if name in _LOGARITHMIC else min(low, -_LEAST_REACH), max(high, _LEAST_REACH))
     _mark_limits(axes, name, found)

@@ -84,7 +84,7 @@ def board_image(sensor: Sensor, distance_m: float, albedo: float) -> PhasorImage
 
 @dataclass(frozen=True, eq=False)
 class ExpectedFlatField:
-    """What a camera with taps must report of a flat field, by closed forms (PHYSICS section 4).
+    """Predicted report of a camera with taps on a flat field, by closed forms (PHYSICS section 4).
 
     Parameters
     ----------

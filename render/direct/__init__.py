@@ -5,10 +5,16 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
-    from phasemark.render.direct.bin_counts import expected_counts, piled_up, without_pile_up
+    from phasemark.render.direct.bin_counts import detected_counts, expected_counts, piled_up, without_pile_up
     from phasemark.render.direct.fit_sensor import DirectFit, fit_direct_sensor, score_zone_orders
     from phasemark.render.direct.footprints import footprint_grid
-    from phasemark.render.direct.histogram_frames import HistogramFrames, capture_histograms, reference_centroid
+    from phasemark.render.direct.histogram_frames import (
+        HistogramFrames,
+        capture_histograms,
+        nearest_ranges,
+        reference_centroid,
+    )
+    from phasemark.render.direct.histogram_images import HistogramImages, HistogramRenderer
     from phasemark.render.direct.recordings import (
         ObjectRecording,
         PlaneRecording,
@@ -25,17 +31,21 @@ else:
 __all__ = [
     "DirectFit",
     "HistogramFrames",
+    "HistogramImages",
+    "HistogramRenderer",
     "ObjectRecording",
     "PlaneRecording",
     "SceneMesh",
     "Status",
     "Targets",
     "capture_histograms",
+    "detected_counts",
     "expected_counts",
     "find_targets",
     "fit_direct_sensor",
     "footprint_grid",
     "label_object",
+    "nearest_ranges",
     "piled_up",
     "plane_samples",
     "range_axis",

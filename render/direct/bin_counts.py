@@ -10,9 +10,13 @@ from scipy.special import ndtr
 
 from phasemark import UsageError
 from phasemark.render.direct.footprints import histogram_of
-from phasemark.render.direct.transients import PARTS, RangeAxis
+from phasemark.render.direct.transients import RangeAxis
+from phasemark.render.kernel import kernel
 from phasemark.render.sensor.histogram_fields import Histogram
 from phasemark.render.sensor.sensor import Sensor
+
+_LEAST_SHARE = 1e-15
+"""Of the light from one range: a bin that gets less is not reached by it."""
 
 
 def response_share(delay_m: ArrayLike, histogram: Histogram, zone: int = 0) -> NDArray[np.float64]:
@@ -84,19 +88,56 @@ def signal_counts(
     -------
     (n, zones, bins) float64
     """
+    albedos = np.broadcast_to(np.asarray(albedo, dtype=np.float64), transients.shape[1:2])
+    return counts_of_light(np.einsum("npzr,p->nzr", transients, albedos), sensor, axis)
+
+
+def counts_of_light(light: NDArray[np.float64], sensor: Sensor, axis: RangeAxis) -> NDArray[np.float64]:
+    """Return the expected signal counts of light that is spread over ranges, without pile-up.
+
+    Parameters
+    ----------
+    light : (n, zones, nodes) float64
+        Transients of all parts of a scene, times their albedos.
+    sensor : Sensor
+    axis : RangeAxis
+
+    Returns
+    -------
+    (n, zones, bins) float64
+    """
     histogram = histogram_of(sensor)
-    albedos = np.broadcast_to(np.asarray(albedo, dtype=np.float64), (PARTS,))
-    light = np.einsum("npzr,p->nzr", transients, albedos)
     response = bin_response(sensor, axis)
     gain = np.array(histogram.zone_gain or ((1.0,) * sensor.cols,) * sensor.rows).ravel()
     light = light * gain[:, None]
     if histogram.stray > 0:
         light = light + histogram.stray * light.mean(axis=1, keepdims=True)
-    if len(response) == 1:
-        counts = light @ response[0]
-    else:
-        counts = np.einsum("nzr,zrb->nzb", light, response, optimize=True)
-    return np.asarray(histogram.cycles * histogram.photons * counts)
+    counts = np.zeros((*light.shape[:2], histogram.bins))
+    _respond(light, response, _reached_bins(sensor, axis), counts)
+    counts *= histogram.cycles * histogram.photons
+    return counts
+
+
+@lru_cache(maxsize=16)
+def _reached_bins(sensor: Sensor, axis: RangeAxis) -> NDArray[np.int64]:
+    """Return the first bin that light from each node reaches, and the one behind the last: (zones or 1, nodes, 2)."""
+    reached = bin_response(sensor, axis) > _LEAST_SHARE
+    first, last = reached.argmax(axis=2), reached.shape[2] - reached[..., ::-1].argmax(axis=2)
+    return np.stack([first, np.where(reached.any(axis=2), last, first)], axis=-1)
+
+
+@kernel
+def _respond(light, response, reached, counts):  # type: ignore[no-untyped-def]
+    """Add to the bins what arrives in them; most nodes are dark, and light from a node reaches few bins."""
+    for view in range(light.shape[0]):
+        for zone in range(light.shape[1]):
+            row, own = counts[view, zone], min(zone, len(response) - 1)
+            for node in range(light.shape[2]):
+                amount = light[view, zone, node]
+                if amount == 0.0:
+                    continue
+                for k in range(reached[own, node, 0], reached[own, node, 1]):
+                    row[k] += amount * response[own, node, k]
 
 
 def expected_counts(
@@ -113,9 +154,27 @@ def expected_counts(
     -------
     (n, zones, bins) float64
     """
+    return detected_counts(signal_counts(transients, sensor, axis, albedo), sensor)
+
+
+def detected_counts(signal: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
+    """Return expected counts λ, pile-up included, from expected signal counts.
+
+    Ambient light, dark counts and the crosstalk of a cover glass are added, then pile-up takes what the first photon of
+    a cycle leaves (PHYSICS section 11).
+
+    Parameters
+    ----------
+    signal : (..., zones, bins) float64
+        From :func:`signal_counts`, or their sum over parts of a scene.
+    sensor : Sensor
+
+    Returns
+    -------
+    (..., zones, bins) float64
+    """
     histogram = histogram_of(sensor)
-    counts = signal_counts(transients, sensor, axis, albedo)
-    counts += histogram.cycles * (histogram.ambient + histogram.dark)
+    counts = signal + histogram.cycles * (histogram.ambient + histogram.dark)
     if histogram.crosstalk > 0:
         edges = histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1)
         counts += histogram.crosstalk * np.diff(response_share(edges - histogram.crosstalk_range_m, histogram))

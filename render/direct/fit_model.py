@@ -124,7 +124,7 @@ class FitModel:
     """Predicts histograms of recordings from parameters and responses.
 
     The brightness of every histogram and its ambient level are taken from the histogram itself: reflectance is not
-    known, and shape is what tells geometry.
+    known, and only the shape tells the geometry.
 
     Parameters
     ----------

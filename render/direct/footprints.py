@@ -1,4 +1,4 @@
-"""Which directions a zone of a direct sensor sees, and how strongly (PHYSICS section 11).
+"""Footprints of the zones of a direct sensor: directions and their weights (PHYSICS section 11).
 
 A zone is a rectangle of tangents with soft borders, times the light's distribution. It may be larger than its share
 of the image and overlap its neighbours. Footprints are scaled so that each zone's weight adds up to one.

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Self
+from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,8 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.photon_counts import draw_counts
+from phasemark.render.direct.targets import Targets, find_targets
 from phasemark.render.exposure.random_streams import draw_key
+from phasemark.render.frames import Flag, Frames
+from phasemark.render.sensor.camera_unit import camera_unit
 from phasemark.render.sensor.sensor import Sensor
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _LEAST_CENTROID_COUNTS = 1.0
 _REFERENCE_WINDOW = (4, 8)
@@ -38,6 +46,9 @@ class HistogramFrames:
     UsageError
         The shapes do not agree, or a count is negative, not finite or beyond what pile-up leaves.
     """
+
+    figure: ClassVar[Callable[..., Figure]]
+    """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
 
     def __init__(
         self,
@@ -93,6 +104,28 @@ class HistogramFrames:
         )
 
     @property
+    def n_frames(self) -> int:
+        """Frames of each position."""
+        return int(self.counts.shape[1])
+
+    @cached_property
+    def targets(self) -> Targets:
+        """What the chip makes of the histograms: distance, sigma, signal and status, nearest first."""
+        return find_targets(self)
+
+    @property
+    def ranges(self) -> Frames:
+        """The nearest target of every zone as frames of ranges along the ray, which matchers of ranges take.
+
+        A zone without a target has the flag `NO_RETURN`, one whose range is negative `MISSING`, a dead one `DEAD`.
+        """
+        return nearest_ranges(self.targets, self.sensor)
+
+    def plot(self, index: int = 0, frame: int = 0) -> Figure:
+        """Draw the histograms of all zones of one frame, and the range of the nearest target."""
+        return type(self).figure(self, index, frame)
+
+    @property
     def zone_counts(self) -> NDArray[np.float64]:
         """Counts summed over the frames of each position, (n, zones, bins), zones in image order."""
         n, _, rows, cols, bins = self.counts.shape
@@ -110,6 +143,29 @@ class HistogramFrames:
     def drift_bins(self) -> NDArray[np.float64]:
         """How far histograms are shifted by the drift that the reference histogram shows, bins, (n,)."""
         return histogram_of(self.sensor).reference_gain * self.reference_shift_bins
+
+
+def nearest_ranges(targets: Targets, sensor: Sensor) -> Frames:
+    """Return the nearest target of every zone as frames of ranges; see :attr:`HistogramFrames.ranges`.
+
+    Parameters
+    ----------
+    targets : Targets
+        As the sensor's chip reports them, as ranges or z.
+    sensor : Sensor
+        With a [histogram] table.
+
+    Returns
+    -------
+    Frames
+        (n, frames, rows, cols).
+    """
+    cosine = sensor.axis_cosine() if histogram_of(sensor).reports == "z" else 1.0
+    range_m = np.asarray(targets.distance_m[..., 0] / cosine)
+    flags = np.where(np.isnan(range_m), int(Flag.NO_RETURN), 0).astype(np.uint8)
+    flags[range_m < 0] = int(Flag.MISSING)
+    flags[..., camera_unit(sensor).dead] = int(Flag.DEAD | Flag.MISSING)
+    return Frames(np.where(flags == 0, range_m, np.nan), flags=flags, sensor=sensor)
 
 
 def reference_centroid(reference: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -157,7 +213,8 @@ def capture_histograms(
     Returns
     -------
     HistogramFrames
-        Counts are Poisson, above a mean of 500 a normal of the same mean and variance, rounded.
+        Counts are Poisson, above a mean of 500 a normal of the same mean and variance, rounded. Dead zones count
+        nothing.
     """
     means = np.ascontiguousarray(expected, dtype=np.float64)
     histogram = histogram_of(sensor)
@@ -170,6 +227,9 @@ def capture_histograms(
     for name, (value, least) in {**least_of, "workers": (workers, 1)}.items():
         if value < least:
             raise UsageError(f"'{name}' must be at least {least}, got {value!r}")
+    dead = camera_unit(sensor).dead.ravel()
+    if dead.any():
+        means = np.where(dead[:, None], 0.0, means)
     key = draw_key(rng)
     flat = means.reshape(len(means), -1)
     total = len(means) * n_frames

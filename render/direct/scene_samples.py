@@ -1,11 +1,13 @@
-"""What a direct sensor's zones can see: samples with direction, range and amplitude, from the exact integral.
+"""Scene samples of a direct sensor: direction, range and amplitude, from the exact integral.
 
 The integral of section 3 cuts every cell of a grid along the edges of the mesh and places a few points in each smooth
-piece. Here these points keep their path lengths instead of being added to phasors.
+piece. Here these points keep their path lengths instead of being added to phasors. A wall and a floor fill what the
+landmark leaves free, cell by cell.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import NamedTuple
 
@@ -13,20 +15,28 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from phasemark.render.integral.arguments import Camera, Motion, Poses
+from phasemark.render.background import Background, background_hit
+from phasemark.render.integral.arguments import Camera, Motion, Poses, towards_level
+from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.light import landmark_hit
 from phasemark.render.integral.mesh_topology import MeshTopology
-from phasemark.render.integral.quadrature_rules import gauss_legendre
-from phasemark.render.integral.ray_plan import plan_rays
-from phasemark.render.integral.shells import unite_shells
+from phasemark.render.integral.quadrature_rules import G2W, G2X, gauss_legendre
+from phasemark.render.integral.ray_plan import SKIPPED, plan_rays
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.kernel import kernel
-from phasemark.render.renderer import _Buffers
+from phasemark.render.renderer import _Buffers, _poses, _topology
 from phasemark.render.rigid import rigid_transforms
+from phasemark.render.view import Views
+
+LOWER, UPPER, BACKGROUND = 0, 1, 2
+"""Parts of a scene: the landmark's lower and upper part, and what stands behind it."""
 
 _NO_BACKGROUND = np.zeros(4)
 _SAMPLES = 1 << 15
+_MOST_BOXES = 32
+_RADIANS_PER_SCALE = 1.5
+"""What the rule for split cells takes as the turn of a phase, for each `finest_m` of range."""
 _PLANE_POINTS = 2  # Gauss points a side of a cell: the integrand of a plane is smooth
 
 
@@ -41,9 +51,10 @@ class SceneSamples(NamedTuple):
     range_m : (m,) float64
         Path length along the ray.
     amplitude : (m,) float64
-        cos θ / r² for albedo 1, times the area of tangents that the point stands for.
+        cos θ / r² for albedo 1, times the area of tangents that the point stands for; of the background times its
+        albedo.
     part : (m,) int8
-        0 for the lower part of the mesh, 1 for the upper one.
+        `LOWER` or `UPPER` part of the mesh, or `BACKGROUND`.
     """
 
     start: NDArray[np.int64]
@@ -63,16 +74,23 @@ class SceneMesh:
 
     Parameters
     ----------
-    mesh : trimesh.Trimesh
-        Metres. A face attribute "part" names faces 0 or 1 for two albedos; without it the sign of z does.
+    mesh : trimesh.Trimesh or None
+        Metres. A face attribute "part" names faces 0 or 1 for two albedos; without it the sign of z does. None: there
+        is nothing but what stands behind.
     intersector : {"auto", "embree", "float64"}
         As for :class:`~phasemark.render.Renderer`.
     """
 
-    def __init__(self, mesh: trimesh.Trimesh, *, intersector: str = "auto") -> None:
-        self.topology = MeshTopology.from_mesh(unite_shells(mesh))
+    def __init__(self, mesh: trimesh.Trimesh | None, *, intersector: str = "auto") -> None:
+        self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
         self._room: tuple[tuple[int, int], _Buffers] | None = None
+
+    def for_thread(self) -> SceneMesh:
+        """Return the same scene with scratch of its own, for another thread."""
+        other = copy.copy(self)
+        other._room = None
+        return other
 
     def samples(self, landmark2cam: ArrayLike, grid: Camera) -> SceneSamples:
         """Sample what a grid of cells sees.
@@ -102,21 +120,61 @@ class SceneMesh:
             np.zeros(len(transforms)),
             np.repeat(grid.level[None], len(transforms), axis=0),
         )
-        found = [self._of_pose(poses._replace(**_only(poses, k)), grid) for k in range(len(transforms))]
+        return self._of_poses(poses, grid, _NO_BACKGROUND, (1.0, 1.0))
+
+    def samples_of_views(
+        self,
+        views: Views,
+        grid: Camera,
+        *,
+        background: Background | None = None,
+        finest_m: float = 0.01,
+        farthest_m: float = 20.0,
+    ) -> SceneSamples:
+        """Sample what a grid of cells sees of a landmark at views, and of what stands behind it.
+
+        Parameters
+        ----------
+        views : Views
+            As the camera itself has them, :meth:`~phasemark.render.Views.in_camera`.
+        grid : Camera
+        background : Background, optional
+        finest_m : float
+            Cells along which the background's range changes by more than this are cut finely enough to resolve it.
+        farthest_m : float
+            Beyond this the background's range need not be resolved.
+
+        Returns
+        -------
+        SceneSamples
+        """
+        behind = (background or Background()).parameters()
+        return self._of_poses(_poses(views, grid), grid, behind, (finest_m, farthest_m))
+
+    def _of_poses(
+        self, poses: Poses, grid: Camera, background: NDArray[np.float64], scale: tuple[float, float]
+    ) -> SceneSamples:
+        found = [
+            self._of_pose(poses._replace(**_only(poses, k)), grid, background, scale) for k in range(len(poses.lens))
+        ]
         counts = [len(one[1]) for one in found]
         start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         columns = [np.concatenate([one[k] for one in found]) for k in range(4)]
         return SceneSamples(start, *columns)
 
-    def _of_pose(self, pose: Poses, grid: Camera) -> tuple[NDArray[np.float64], ...]:
+    def _of_pose(
+        self, pose: Poses, grid: Camera, background: NDArray[np.float64], scale: tuple[float, float]
+    ) -> tuple[NDArray[np.float64], ...]:
         mesh = self.topology
         rows, cols = grid.stop_row - grid.first_row, grid.cols
         state = np.zeros((1, rows, cols), np.uint8)
         buffers = self._buffers(rows, cols)
         still = Motion(pose, np.empty(0), np.empty((1, 4)))  # no slopes are asked for
+        behind = bool(background[:2].any())
+        fastest = _RADIANS_PER_SCALE / scale[0] if behind else 0.0
         while True:
             reached, n = plan_rays(
-                0, mesh, pose, grid, 1, _NO_BACKGROUND, 0.0, buffers.edges, buffers.scratch, buffers.samples, state,
+                0, mesh, pose, grid, 1, background, fastest, buffers.edges, buffers.scratch, buffers.samples, state,
                 still, buffers.borders,
             )  # fmt: skip
             if reached == 1:
@@ -131,8 +189,12 @@ class SceneMesh:
         scouts = cast(pick_scouts(n, samples))
         rest = share_faces(n, mesh, mesh.closed, scouts, samples, pose, grid, state)
         samples.face[samples.chosen[:rest]] = cast(rest)
-        tangents, range_m, amplitude, part = np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n, np.int8)
-        kept = _hits(n, samples, mesh, pose, grid, tangents, range_m, amplitude, part)
+        more = _count_free(state[0], pose, grid, background, scale) if behind else 0
+        tangents, range_m = np.empty((n + more, 2)), np.empty(n + more)
+        amplitude, part = np.empty(n + more), np.empty(n + more, np.int8)
+        kept = _hits(n, samples, mesh, pose, grid, background, tangents, range_m, amplitude, part)
+        if more:
+            kept = _fill_free(kept, state[0], pose, grid, background, scale, tangents, range_m, amplitude, part)
         return tangents[:kept], range_m[:kept], amplitude[:kept], part[:kept]
 
     def _buffers(self, rows: int, cols: int) -> _Buffers:
@@ -187,22 +249,96 @@ def _only(poses: Poses, k: int) -> dict[str, NDArray[np.float64]]:
 
 
 @kernel
-def _hits(n, samples, mesh, poses, camera, tangents, range_m, amplitude, part):  # type: ignore[no-untyped-def]
-    """Fill path length and amplitude of the samples that meet the mesh; returns how many there are."""
+def _hits(n, samples, mesh, poses, camera, background, tangents, range_m, amplitude, part):  # type: ignore[no-untyped-def]
+    """Fill path length and amplitude of the samples that meet something; returns how many there are."""
     kept = 0
     area = 1.0 / (camera.scale_u * camera.scale_v)
+    behind = background[0] > 0.0 or background[1] > 0.0
+    cos_b, sin_b = math.cos(poses.bearing[0]), math.sin(poses.bearing[0])
     for k in range(n):
         face = samples.face[k]
-        if face < 0:
+        if face < 0 and not behind:
             continue
         y, z = samples.rays[k, 0], samples.rays[k, 1]
         length = math.sqrt(1.0 + y * y + z * z)
-        t, cos_theta = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], y, z)
+        if face >= 0:
+            t, reflected = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], y, z)
+            seen = mesh.part[face]
+        else:
+            dx, dy, dz = towards_level(poses.level[0], y, z)
+            t, rho, facing = background_hit(background, cos_b, sin_b, dx, dy, dz)
+            reflected, seen = rho * facing, BACKGROUND
         if not t > 0.0:
             continue
         tangents[kept, 0], tangents[kept, 1] = y, z
         range_m[kept] = t * length
-        amplitude[kept] = cos_theta / length / (t * length * t * length) * samples.weights[k] * area
-        part[kept] = mesh.part[face]
+        amplitude[kept] = reflected / length / (t * length * t * length) * samples.weights[k] * area
+        part[kept] = seen
         kept += 1
+    return kept
+
+
+@kernel
+def _clipped_range(u, v, cos_b, sin_b, level, camera, background, farthest_m):  # type: ignore[no-untyped-def]
+    """Return the range of what stands behind a point of the grid, `farthest_m` where nothing nearer does."""
+    y, z = ray_of(camera, u, v)
+    dx, dy, dz = towards_level(level, y, z)
+    t, _, _ = background_hit(background, cos_b, sin_b, dx, dy, dz)
+    return min(t * math.sqrt(1.0 + y * y + z * z), farthest_m) if t > 0.0 else farthest_m
+
+
+@kernel
+def _boxes(c, r, cos_b, sin_b, level, camera, background, scale):  # type: ignore[no-untyped-def]
+    """Return into how many boxes along u and v a cell is cut so that its points resolve the background's ranges."""
+    finest_m, farthest_m = scale
+    left = _clipped_range(c, r + 0.5, cos_b, sin_b, level, camera, background, farthest_m)
+    right = _clipped_range(c + 1.0, r + 0.5, cos_b, sin_b, level, camera, background, farthest_m)
+    top = _clipped_range(c + 0.5, r, cos_b, sin_b, level, camera, background, farthest_m)
+    bottom = _clipped_range(c + 0.5, r + 1.0, cos_b, sin_b, level, camera, background, farthest_m)
+    n_u = int(min(math.ceil(abs(right - left) / finest_m), _MOST_BOXES))
+    n_v = int(min(math.ceil(abs(bottom - top) / finest_m), _MOST_BOXES))
+    return max(n_u, 1), max(n_v, 1)
+
+
+@kernel
+def _count_free(state, poses, camera, background, scale):  # type: ignore[no-untyped-def]
+    """Return how many points :func:`_fill_free` places at most."""
+    cos_b, sin_b = math.cos(poses.bearing[0]), math.sin(poses.bearing[0])
+    n = 0
+    for r in range(state.shape[0]):
+        for c in range(state.shape[1]):
+            if state[r, c] == SKIPPED:
+                n_u, n_v = _boxes(c, r, cos_b, sin_b, poses.level[0], camera, background, scale)
+                n += 4 * n_u * n_v
+    return n
+
+
+@kernel
+def _fill_free(kept, state, poses, camera, background, scale, tangents, range_m, amplitude, part):  # type: ignore[no-untyped-def]
+    """Append the background's points in cells that the landmark does not touch; returns how many points there are.
+
+    Two Gauss points a side of a box.
+    """
+    cos_b, sin_b, level = math.cos(poses.bearing[0]), math.sin(poses.bearing[0]), poses.level[0]
+    area = 1.0 / (camera.scale_u * camera.scale_v)
+    for r in range(state.shape[0]):
+        for c in range(state.shape[1]):
+            if state[r, c] != SKIPPED:
+                continue
+            n_u, n_v = _boxes(c, r, cos_b, sin_b, level, camera, background, scale)
+            for i in range(2 * n_v):
+                v = r + (i // 2 + G2X[i % 2]) / n_v
+                for j in range(2 * n_u):
+                    y, z = ray_of(camera, c + (j // 2 + G2X[j % 2]) / n_u, v)
+                    dx, dy, dz = towards_level(level, y, z)
+                    t, rho, facing = background_hit(background, cos_b, sin_b, dx, dy, dz)
+                    if not t > 0.0:
+                        continue
+                    length = math.sqrt(1.0 + y * y + z * z)
+                    weight = G2W[i % 2] * G2W[j % 2] / (n_u * n_v) * area
+                    tangents[kept, 0], tangents[kept, 1] = y, z
+                    range_m[kept] = t * length
+                    amplitude[kept] = rho * facing / length / (t * length * t * length) * weight
+                    part[kept] = BACKGROUND
+                    kept += 1
     return kept

@@ -1,24 +1,21 @@
-"""What the chip makes of its histograms: targets with range, sigma, signal and status (PHYSICS section 11)."""
+"""Targets that the chip computes from its histograms: range, sigma, signal and status (PHYSICS section 11)."""
 
 from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.render.direct.footprints import histogram_of
-from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.kernel import kernel
 from phasemark.render.sensor.sensor import Sensor
 
-_AMBIENT_SHARE = 0.5  # the ambient level is this quantile of a histogram's bins: peaks take fewer
-
 
 class Status(IntEnum):
-    """Why a target is or is not there."""
+    """Status of a target: valid, or the reason why it is missing."""
 
     VALID = 0
     """A target."""
@@ -47,7 +44,14 @@ class Targets(NamedTuple):
     status: NDArray[np.uint8]
 
 
-def find_targets(frames: HistogramFrames) -> Targets:
+class Counted(Protocol):
+    """What has histograms: :class:`~phasemark.render.direct.HistogramFrames`."""
+
+    counts: NDArray[np.float64]
+    sensor: Sensor
+
+
+def find_targets(frames: Counted) -> Targets:
     """Run the chip's estimator on histograms.
 
     The ambient level is the median bin. Peaks are local maxima that rise above it by `threshold` standard deviations
@@ -67,10 +71,9 @@ def find_targets(frames: HistogramFrames) -> Targets:
     flat = np.ascontiguousarray(frames.counts.reshape(-1, shape[-1]))
     n, most = len(flat), histogram.max_targets
     place, sigma, signal = np.full((n, most), np.nan), np.full((n, most), np.nan), np.zeros((n, most))
-    ambient = np.quantile(flat, _AMBIENT_SHARE, axis=1)
     _find_peaks(
-        flat, ambient, histogram.estimator == "centroid", histogram.estimator_bins, histogram.threshold,
-        histogram.min_separation_m / histogram.bin_width_m, place, sigma, signal,
+        flat, histogram.estimator == "centroid", histogram.estimator_bins, histogram.threshold,
+        histogram.min_separation_m / histogram.bin_width_m, place, sigma, signal, np.empty(shape[-1]),
     )  # fmt: skip
     out = (*shape[:-1], most)
     range_m, slope = place_to_range(place.reshape(out), sensor)
@@ -108,11 +111,42 @@ def response_means(sensor: Sensor) -> list[float]:
 
 
 @kernel
-def _find_peaks(counts, ambient, centroid, reach, threshold, separation, place, sigma, signal):  # type: ignore[no-untyped-def]
+def _median(row, scratch):  # type: ignore[no-untyped-def]
+    """Return the median of a histogram by Hoare's selection; `scratch` has its length and is overwritten."""
+    n = len(row)
+    for k in range(n):
+        scratch[k] = row[k]
+    middle, low, high = n // 2, 0, n - 1
+    while low < high:
+        pivot, i, j = scratch[(low + high) // 2], low, high
+        while i <= j:
+            while scratch[i] < pivot:
+                i += 1
+            while pivot < scratch[j]:
+                j -= 1
+            if i <= j:
+                scratch[i], scratch[j] = scratch[j], scratch[i]
+                i += 1
+                j -= 1
+        if j < middle:
+            low = i
+        if middle < i:
+            high = j
+    if n % 2 == 1:
+        return scratch[middle]
+    below = scratch[0]
+    for k in range(1, middle):
+        below = max(below, scratch[k])
+    return 0.5 * (below + scratch[middle])
+
+
+@kernel
+def _find_peaks(counts, centroid, reach, threshold, separation, place, sigma, signal, scratch):  # type: ignore[no-untyped-def]
     """Fill the targets of each histogram, nearest first."""
     n_bins, most = counts.shape[1], place.shape[1]
     for i in range(counts.shape[0]):
-        row, level = counts[i], ambient[i]
+        row = counts[i]
+        level = _median(row, scratch)  # peaks take fewer than half of the bins
         least = level + threshold * math.sqrt(max(level, 1.0))
         found = 0
         while found < most:

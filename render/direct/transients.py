@@ -81,8 +81,11 @@ def zone_transients(
     """
     zones = footprints_of(sensor) if footprints is None else footprints
     out = np.zeros((samples.n_views, PARTS, len(zones.centre), axis.n))
+    amplitude = samples.amplitude
+    if sensor.vignetting:
+        amplitude = amplitude / (1 + (samples.tangents**2).sum(axis=1)) ** 2
     _add_samples(
-        samples.start, samples.tangents, samples.range_m, samples.amplitude, samples.part, zones,
+        samples.start, samples.tangents, samples.range_m, amplitude, samples.part, zones,
         1 / footprint_areas(zones), axis.first_m, axis.step_m, out,
     )  # fmt: skip
     return out

@@ -12,7 +12,7 @@ The chain is a row of functions in the order in which the camera does things::
     demodulate            phasor and intensity of the four phase images     taps.py
     validity_flags        why a pixel is not valid                          here
 
-At every modulation frequency of the camera this is done anew; unwrapped_frames.py then makes one range of several.
+This is repeated at every modulation frequency of the camera; unwrapped_frames.py then makes one range of several.
 :func:`capture` runs it over as many frames as are wanted. Arrays of taps are (..., 4, 2, rows, cols): phase images
 τ = 0, π/2, π, 3π/2, then taps a and b.
 """
@@ -142,7 +142,7 @@ def capture(
 
 
 class _Counters(NamedTuple):
-    """Where some frames stand in the random streams: key, and numbers of first view, frame and phase image."""
+    """Place of frames in the random streams: key, and numbers of first view, frame and phase image."""
 
     key: NDArray[np.uint64]
     first_view: int

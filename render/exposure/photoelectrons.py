@@ -24,7 +24,7 @@ _SHOT, _READ = int(Term.SHOT), int(Term.READ)
 
 
 class ReadOut(NamedTuple):
-    """What a sensor does to the electrons of a tap, in the form the kernel wants."""
+    """Read-out parameters of a tap in the form that the kernel takes."""
 
     shot_noise: bool
     full_well_e: float

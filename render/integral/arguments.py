@@ -1,4 +1,4 @@
-"""What the kernels of the integral are told: camera, poses, light, and the buffers they fill."""
+"""Arguments of the integral's kernels: camera, poses, light, and the buffers they fill."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Camera(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Where the landmark stands in each of n views.
+    """Poses of the landmark in n views.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class Poses(NamedTuple):
 
 
 class Light(NamedTuple):
-    """What turns a hit into a phasor.
+    """Light: the numbers that turn a hit into a phasor.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ class Borders(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How the view of a batch is moved, to tell how fast its edges move.
+    """Motion of a batch's views, from which the speed of their edges follows.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ class Motion(NamedTuple):
 
 
 class Returns(NamedTuple):
-    """What comes back to some samples that follow one another; room for m.
+    """Returned light of consecutive samples; room for m.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ class Samples(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What the pixels of a batch add up to.
+    """Sums over the samples of each pixel of a batch.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ _SHORT = math.sqrt(0.5)
 
 
 class Plane(NamedTuple):
-    """What :func:`~phasemark.render.integral.edge_projection.project` asks of a camera."""
+    """Camera as :func:`~phasemark.render.integral.edge_projection.project` needs it."""
 
     centre_u: float
     centre_v: float

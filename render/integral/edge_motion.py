@@ -1,4 +1,4 @@
-"""How fast edges move through the image while a parameter of the view changes.
+"""Speed of edges in the image while a parameter of the view changes.
 
 An edge is one of the mesh, held: at a limb, the fold that makes it does not change. Its speed is that of its place x
 on a line of fixed s, not along its normal. Behind a lens with distortion the edge is followed in tangents, where it

@@ -1,4 +1,4 @@
-"""Where the integrand is not smooth: creases and silhouettes of a mesh, projected into the image.
+"""Projected edges: creases and silhouettes of a mesh, at which the integrand is not smooth.
 
 Inside a pixel the light a surface returns is a smooth function of (u, v) except across the images of creases (faces
 that meet at more than 30°, borders of open meshes) and of silhouettes (an edge between a face seen from its front and

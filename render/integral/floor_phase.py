@@ -1,4 +1,4 @@
-"""How far the phase of the background turns within a pixel: a floor seen at a slant needs more points than a rule has.
+"""Phase of the background within a pixel: a floor seen at a slant needs more points than a rule has.
 
 At a single slow frequency behind an ideal lens the rules are left as they are.
 """

@@ -1,7 +1,7 @@
 """The first face a ray meets: Embree where it is installed, and a float64 intersector of our own.
 
 Both answer the same question, *which face*, and nothing else; where the ray meets the face's plane is computed in
-float64 by whoever asked.
+float64 by the caller.
 """
 
 from __future__ import annotations

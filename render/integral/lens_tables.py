@@ -1,4 +1,4 @@
-"""What the kernels need of a lens with distortion: rays of every pixel, and how far out edges matter."""
+"""Tables of a lens with distortion for the kernels: rays of every pixel, and the radius within which edges matter."""
 
 from __future__ import annotations
 

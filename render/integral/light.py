@@ -1,4 +1,4 @@
-"""What comes back: the hit of each sample in float64, its amplitude and phase, added to its pixel."""
+"""Returned light: the hit of each sample in float64, its amplitude and phase, added to its pixel."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ _HOLLOW = 1e-9
 
 
 class MeshTopology(NamedTuple):
-    """What the renderer needs to know of a mesh, in float64 and contiguous.
+    """Mesh in the form that the renderer needs, float64 and contiguous.
 
     Parameters
     ----------
@@ -360,29 +360,35 @@ def _corner_normals(
 
 @njit(cache=True)
 def _average_corners(vertices, faces, normals, patch, corner_of, start, cos_limit):  # type: ignore[no-untyped-def]
+    # numbers one by one: arrays of three would be allocated, and multiplied by a library, a million times a mesh
     n_faces = len(faces)
     weight = np.empty((n_faces, 3))
     for f in range(n_faces):
         for k in range(3):
-            p = vertices[faces[f, k]]
-            a = vertices[faces[f, (k + 1) % 3]] - p
-            b = vertices[faces[f, (k + 2) % 3]] - p
-            cross = np.cross(a, b)
-            weight[f, k] = math.sqrt(np.dot(cross, cross)) / (np.dot(a, a) * np.dot(b, b))
+            p, q, r = vertices[faces[f, k]], vertices[faces[f, (k + 1) % 3]], vertices[faces[f, (k + 2) % 3]]
+            ax, ay, az = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+            bx, by, bz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
+            cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            squares = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz)
+            weight[f, k] = math.sqrt(cx * cx + cy * cy + cz * cz) / squares
     out = np.zeros((n_faces, 3, 3))
     for f in range(n_faces):
+        nx, ny, nz = normals[f]
         for k in range(3):
             vertex = faces[f, k]
-            total = np.zeros(3)
+            tx, ty, tz = 0.0, 0.0, 0.0
             apex = False
             for j in range(start[vertex], start[vertex + 1]):
                 g, corner = corner_of[j] // 3, corner_of[j] % 3
-                if np.dot(normals[f], normals[g]) >= cos_limit:
-                    total += weight[g, corner] * normals[g]
+                gx, gy, gz = normals[g]
+                if nx * gx + ny * gy + nz * gz >= cos_limit:
+                    share = weight[g, corner]
+                    tx, ty, tz = tx + share * gx, ty + share * gy, tz + share * gz
                 else:
                     apex = apex or patch[g] == patch[f]
             if not apex:
-                out[f, k] = total / math.sqrt(np.dot(total, total))
+                length = math.sqrt(tx * tx + ty * ty + tz * tz)
+                out[f, k, 0], out[f, k, 1], out[f, k, 2] = tx / length, ty / length, tz / length
         if not out[f].any():
             out[f] = normals[f]
     return out

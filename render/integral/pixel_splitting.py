@@ -1,4 +1,4 @@
-"""Which rays a pixel needs: its active area split along the projected edges, with Gauss points in every smooth piece.
+"""Rays of a pixel: its active area is split along the projected edges, with Gauss points in every smooth piece.
 
 Edges cut a pixel into pieces inside which the integrand is smooth. Along one image axis (the *sweep*) the pixel is cut
 into slabs wherever an edge begins, ends, crosses another, enters or leaves; within a slab the edges do not cross, so

@@ -1,4 +1,4 @@
-"""Which rays a batch of views needs: the samples of as many views as fit into the buffers."""
+"""Rays of a batch of views: the samples of as many views as fit into the buffers."""
 
 from __future__ import annotations
 

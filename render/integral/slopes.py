@@ -1,4 +1,4 @@
-"""How the phasors of a batch change with the view, from the samples and edges that its images are made of.
+"""Derivatives of a batch's phasors by the view, from the samples and edges that its images are made of.
 
 ∂S/∂p = Σ weights · ∂f/∂p at the samples, the faces they see held, + ∫ (f_left − f_right) ẋ ds along the edges. ∂f/∂p is
 taken at fixed points of the image. Both ẋ and ∂f/∂p are differences over a step of 3e-8 that no edge and no sample

@@ -1,4 +1,4 @@
-"""How the light of pixels changes because edges move: ∫ (f_left − f_right) ẋ ds along each (Leibniz's rule)."""
+"""Change of pixels' light by moving edges: ∫ (f_left − f_right) ẋ ds along each edge (Leibniz's rule)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which face each sample sees: one ray an interval scouts, the other samples are found on its patch or cast.
+"""Visible face of each sample: one ray an interval is cast, the others are found on its patch or cast too.
 
 One ray an interval scouts what is seen there (:func:`pick_scouts`). On a plane patch that is all there is to know. On a
 curved one each of the other samples has a face of its own (:func:`share_faces`). On a patch that bulges everywhere, or

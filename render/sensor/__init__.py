@@ -1,4 +1,4 @@
-"""What the camera is: its parameters, presets, files, correlation and range noise."""
+"""Sensors: parameters, presets, files, correlation and range noise."""
 
 from typing import TYPE_CHECKING
 

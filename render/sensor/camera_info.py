@@ -26,7 +26,7 @@ _SPELLINGS = {
 
 
 class CameraInfo(NamedTuple):
-    """What a camera_info states of a camera.
+    """Camera as a camera_info file states it.
 
     Parameters
     ----------

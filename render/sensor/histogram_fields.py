@@ -1,4 +1,4 @@
-"""How a direct sensor measures: bins, response, zones, pile-up and the on-chip estimator (PHYSICS section 11)."""
+"""Histogram fields of a direct sensor: bins, response, zones, pile-up and the on-chip estimator (PHYSICS 11)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LEAST_IRF_SAMPLES = 3
 
 
 class Histogram(BaseModel):
-    """What a direct sensor counts in each zone, and what it makes of it on the chip (PHYSICS section 11).
+    """Histograms of a direct sensor's zones, and the estimator of its chip (PHYSICS section 11).
 
     The expected counts of bin j are cycles · [photons · h ∗ p + ambient + dark] + crosstalk, where h is the zone's
     transient and p the instrument response; pile-up then takes what the first photon of a cycle leaves. Tangents are

@@ -1,4 +1,4 @@
-"""Where a lens images a ray, and which ray meets an image point (PHYSICS section 9).
+"""Map of a lens: from a ray to its image point, and back (PHYSICS section 9).
 
 Normalised coordinates are OpenCV's: a ray (1, y, z) of the camera has x = −y to the right and −z downwards. The lens
 moves them to (x_d, y_d), and the image point is u = fx · x_d + cx + ½, v = fy · y_d + cy + ½: OpenCV counts pixels from

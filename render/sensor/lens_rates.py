@@ -1,4 +1,4 @@
-"""How far each number of a lens moves an image."""
+"""Image motion by each number of a lens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the fields of a sensor agree with each other; each check raises ValueError with one line."""
+"""Checks that the fields of a sensor agree with each other; each raises ValueError with one line."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
     ----------
     sensor : Sensor
     comments : mapping of str to str
-        What stands behind a field; such a field is written even where it has its default.
+        Comment behind a field; a field with a comment is written even where it has its default.
     header : sequence of str
         Lines of comment at the top.
     otherwise : str

@@ -1,4 +1,4 @@
-"""What follows from the fields of a sensor: rays, timing, harmonics, saturation and the scale of ranges."""
+"""Quantities derived from the fields of a sensor: rays, timing, harmonics, saturation and the scale of ranges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where each number of a sensor comes from: the table ``[source]`` of a sensor file.
+"""Origin of each number of a sensor: the table ``[source]`` of a sensor file.
 
 The table says of a field whether it was measured, is published or is assumed, and in words from what. It changes
 nothing that the sensor does, and is no part of it: two files that differ in it alone give the same sensor.

@@ -1,4 +1,4 @@
-"""What a sweep's figures have in common: colours that differ for the colour-blind, marks that differ without colour."""
+"""Style of a sweep's figures: colours that differ for the colour-blind, marks that differ without colour."""
 
 from __future__ import annotations
 

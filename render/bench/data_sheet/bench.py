@@ -9,6 +9,7 @@ import numpy as np
 from phasemark import UsageError
 from phasemark.render.bench.data_sheet.results import Comparison, Floats, SheetQuantity
 from phasemark.render.bench.flat_field import expected_flat_field, flat_field
+from phasemark.render.direct.histogram_frames import HistogramFrames, capture_histograms
 from phasemark.render.exposure.capture import capture
 from phasemark.render.frames import Frames
 from phasemark.render.phasor_images import wrap_difference_m
@@ -22,7 +23,7 @@ NEAREST_M, FURTHEST_M = 0.2, 100.0
 
 @dataclass(frozen=True)
 class Part:
-    """What one measurement adds to the whole."""
+    """Contribution of one measurement to the data sheet."""
 
     comparisons: tuple[Comparison, ...] = ()
     quantities: tuple[SheetQuantity, ...] = ()
@@ -51,6 +52,10 @@ class Bench:
         """Take the frames of one flat field, thresholds off unless a sensor is given."""
         sensor = sensor or self.open
         return capture(flat_field(sensor, range_m, amplitude), sensor, rng=self._rng, n_frames=self.n_frames)
+
+    def histograms(self, expected: Floats, n_frames: int, sensor: Sensor | None = None) -> HistogramFrames:
+        """Take the histograms of a direct sensor from their expected counts, (views, zones, bins)."""
+        return capture_histograms(expected, sensor or self.sensor, rng=self._rng, n_frames=n_frames)
 
     def steady_taps(self, amplitude: float, sensor: Sensor) -> Floats:
         """Take frames of steady light and return the taps' electrons, (frames, 4, 2, working pixels)."""

@@ -1,4 +1,4 @@
-"""The data sheet of a direct time-of-flight sensor: noise and mean error of its range, and where it drops out."""
+"""The data sheet of a direct time-of-flight sensor: its range, where it drops out, and its histograms."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from phasemark.render.bench.data_sheet.bench import ALBEDOS, NEAREST_M, Bench, Part
 from phasemark.render.bench.data_sheet.flagged_shares import found_beside
+from phasemark.render.bench.data_sheet.histograms import histogram_parts
 from phasemark.render.bench.data_sheet.results import Comparison, SheetQuantity
 from phasemark.render.frames import Flag
 from phasemark.render.sensor.range_noise import direct_range_std
@@ -20,7 +21,8 @@ def direct_parts(bench: Bench) -> list[Part]:
         "It is a direct time-of-flight sensor: photon transfer, saturation, wiggling and amplitude thresholds belong "
         "to taps and phases, which it does not have."
     )
-    return [_direct_range(bench), *(_dropout(bench, albedo) for albedo in ALBEDOS), Part(notes=(note,))]
+    counted = histogram_parts(bench) if bench.sensor.histogram is not None else []
+    return [_direct_range(bench), *(_dropout(bench, albedo) for albedo in ALBEDOS), *counted, Part(notes=(note,))]
 
 
 def _direct_range(bench: Bench) -> Part:

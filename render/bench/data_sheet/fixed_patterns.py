@@ -1,4 +1,4 @@
-"""What stays from frame to frame: range offset, sensitivity and dark signal of every pixel."""
+"""Fixed patterns of a camera: range offset, sensitivity and dark signal of every pixel."""
 
 from __future__ import annotations
 

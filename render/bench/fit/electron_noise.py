@@ -37,7 +37,7 @@ def fit_noise(
         step = _DISTANCE_STEP * float(distance)
         sides = [_refitted(data.shifted(board, side), base, amplitude_unit) for side in (step, -step)] if std else []
         for name, one in found.items():
-            # a side on which other numbers can be told apart says nothing of the slope
+            # a side on which other numbers can be distinguished tells nothing about the slope
             slopes = [
                 (side[name].value - one.value) / (sign * step)
                 for sign, side in zip((1, -1), sides, strict=False)
@@ -178,7 +178,7 @@ def _noise_of_electrons(
         signal = mean - (constant / float(law.light.mean()) if intensity_e is not None else 0.0)
         signal_error = mean_error
         notes.append(
-            "Signal and ambient light cannot be told apart from one level of light: ambient light is the assumed one. "
+            "Signal and ambient light cannot be distinguished by one level of light: ambient light is the assumed one. "
             f"That takes distances or albedos whose light differs by {NOISE_LEVELS_RATIO:g} times and more."
         )
     if signal <= 2 * signal_error:

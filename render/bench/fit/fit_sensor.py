@@ -1,4 +1,4 @@
-"""FittedField a sensor from measured flat-field frames: a board, square to the camera, at known distances.
+"""Fit of a sensor to measured flat-field frames of a board, square to the camera, at known distances.
 
 What can be told depends on what was measured. Ranges alone at one distance show one number of noise; several
 distances or albedos tell shot noise, which follows the light, from noise that does not; amplitude and intensity add the
@@ -48,7 +48,7 @@ def fit_sensor(
     4), the board's light follows from distance and albedo, S = ρ cos θ / r² averaged over each pixel:
 
     - the offset is the mean error; with distances enough, wiggling is fitted beside it;
-    - the pattern is what is left of each pixel, its spread less the spread that noise leaves;
+    - the pattern is the remaining error of each pixel, its spread less the spread that noise leaves;
     - from ranges alone, σ_φ² = a/S + b/S² with a = 1 / 2K²N₀ and b = (all noise that does not follow the light) /
       2K²N₀²; K is assumed;
     - from amplitude in electrons, K N₀ = A/S and 2σ_φ²A² = N₀S + (N_amb + N_dark + V); from intensity as well,
@@ -110,7 +110,7 @@ def fit_sensor(
     distance_std = known_distance_std(distance_m, distance_std_m)
     data = BoardData.of(frames, distance_m, distance_std, albedos, base).of_usable_boards(distance_m, notes)
     if assumed_albedo and base.kind == "phase":
-        notes.append("The board's albedo was assumed to be 0.8: signal_e times albedo is what was measured.")
+        notes.append("The board's albedo was assumed to be 0.8: only signal_e times albedo was measured.")
     if not (data.variance_m2[:, data.good] > 0).any():
         raise UsageError("the frames have no noise: every range is the same in all of them; is one frame repeated?")
     notes.append(say_of_distances(distance_std, assumed=distance_std_m is None))

@@ -1,4 +1,4 @@
-"""What a fit returns: every field of the camera with its standard error and its origin."""
+"""Result of a sensor fit: every field of the camera with its standard error and its origin."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class FittedField:
 
 @dataclass(frozen=True, eq=False)
 class SensorFit:
-    """What measured flat fields say about a camera.
+    """Camera fitted to measured flat fields.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class SensorFit:
     estimates : dict of str to FittedField
         By the name of the sensor's field, in the order of its fields.
     notes : tuple of str
-        Sentences on what could not be told apart, and on what is odd.
+        Sentences on numbers that could not be distinguished, and on odd findings.
     pixel_offset_m : (rows, cols) float64
         Range offset of each pixel beside the global one; NaN for pixels left out.
     pixel_offset_std_error_m : (rows, cols) float64

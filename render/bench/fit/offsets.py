@@ -69,7 +69,7 @@ def fit_offsets(
         needed = 2 + 2 * len(_WIGGLING_ORDERS[-1])
         period = base.unambiguous_range_m / 4
         notes.append(
-            f"Offset and wiggling cannot be told apart from {where}: that takes at least {needed}, spread over "
+            f"Offset and wiggling cannot be distinguished from {where}: that takes at least {needed}, spread over "
             f"{period:.3g} m, one period of the wiggling. The modulation is the assumed one."
         )
     return changes

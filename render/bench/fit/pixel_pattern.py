@@ -1,4 +1,4 @@
-"""What differs from pixel to pixel: range offsets, and pixels that are dead, stuck, noisy or far off."""
+"""Differences between pixels: range offsets, and pixels that are dead, stuck, noisy or far off."""
 
 from __future__ import annotations
 

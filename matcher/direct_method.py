@@ -1,0 +1,108 @@
+"""How a matcher matches what a direct sensor counted or reported, and which of its options go with that."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from phasemark import UsageError
+from phasemark.data import Bank
+from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher, check_histogram_sensor, refuse_other_sensor
+from phasemark.matcher.histograms.target_matcher import TargetMatcher
+from phasemark.matcher.histograms.view_answers import Rules
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.likelihood_matcher import usual_workers
+from phasemark.matcher.likelihood.setup import check_free
+from phasemark.matcher.likelihood.systematic import declared_covariance
+from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.direct.targets import Targets
+
+Measured = Literal["ranges", "phasors", "histograms", "targets"]
+"""What is matched on."""
+DIRECT_KINDS = ("histograms", "targets")
+"""What of it a direct sensor alone measures."""
+
+
+def refuse_direct_options(method: str, on: str, background: object, pixels: str, robust: bool) -> None:
+    """Refuse options that do not go with histograms and targets.
+
+    Raises
+    ------
+    UsageError
+        Naming the option.
+    """
+    wrong = {
+        "'method' must be refine": method != "refine",
+        "'background' must be None, for nothing but the landmark is expected to return": background is not None,
+        "'pixels' must be all": pixels != "all",
+        "'robust' must be False": robust,
+    }
+    for problem, is_wrong in wrong.items():
+        if is_wrong:
+            raise UsageError(f'on="{on}": {problem}')
+
+
+def direct_method(
+    bank: Bank,
+    on: str,
+    *,
+    free: Sequence[str] | None,
+    known: Mapping[str, float],
+    false_alarm: float,
+    tolerance_m: float,
+    tolerance_rad: float,
+    declared: bool,
+    workers: int | None,
+) -> HistogramMatcher | TargetMatcher:
+    """Return what matches histograms or targets against a bank.
+
+    Parameters
+    ----------
+    bank : Bank
+    on : {"histograms", "targets"}
+    free : sequence of str, optional
+        None: distance, δ and the bearing.
+    known : mapping of str to float
+        Standard deviations of parameters before a frame is seen; nothing is known of the others.
+    false_alarm, tolerance_m, tolerance_rad, workers
+        As for :class:`~phasemark.matcher.Matcher`.
+    declared : bool
+        Whether what the sensor declares of a pose is added to covariances.
+
+    Raises
+    ------
+    UsageError
+        The bank's sensor has no histograms, or `free` is wrong.
+    """
+    check_histogram_sensor(bank)
+    names = check_free(VIEW[:3] if free is None else free)
+    rules = Rules(
+        names=tuple(bank.classes),
+        symmetry=tuple(int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes),
+        false_alarm=false_alarm,
+        tolerance={name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW},
+        systematic=declared_covariance(bank.camera, names) if declared else np.zeros((len(names), len(names))),
+    )
+    prior_std = [known.get(name, math.inf) for name in names]
+    kind = HistogramMatcher if on == "histograms" else TargetMatcher
+    return kind(bank, free=names, prior_std=prior_std, rules=rules, workers=workers or usual_workers())
+
+
+def direct_frames(bank: Bank, on: str, frames: object) -> HistogramFrames | Targets:
+    """Return frames as a method takes them.
+
+    Raises
+    ------
+    UsageError
+        They are not what is matched on.
+    """
+    if isinstance(frames, HistogramFrames):
+        refuse_other_sensor(bank.camera, frames.sensor)
+        return frames.targets if on == "targets" else frames
+    if on == "targets" and isinstance(frames, Targets):
+        return frames
+    takes = "HistogramFrames" if on == "histograms" else "Targets, or HistogramFrames"
+    raise UsageError(f'on="{on}" takes {takes}, got {type(frames).__name__}')

@@ -1,0 +1,214 @@
+"""Class and view of a landmark from histograms: a table's hills, exact scenes on them, and an answer with its test."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data import Bank
+from phasemark.matcher.histograms.exact_fit import Counted, Fit, fit_view
+from phasemark.matcher.histograms.histogram_table import Table, TableGrid, build_table, plan_table
+from phasemark.matcher.histograms.poisson_fit import bare_deviance, deviance_test, doubtful_deviance, moments_of
+from phasemark.matcher.histograms.table_search import DESCENT_MARGIN, ambient_light, find_hills
+from phasemark.matcher.histograms.view_answers import Explanation, FitTest, Rules, answer_of, no_answer
+from phasemark.matcher.histograms.view_signals import ViewSignals
+from phasemark.matcher.match import Match
+from phasemark.render import Sensor
+from phasemark.render.direct.bin_counts import response_share
+from phasemark.render.direct.fit_model import undo_pile_up
+from phasemark.render.direct.footprints import histogram_of
+from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.view import VIEW_FIELDS
+
+_SURE_COST = 40.0
+"""A hill of the table this much worse than the best one cannot be the answer, nor make it ambiguous …"""
+_TABLE_ERROR = 4.0
+"""… beside this multiple of how far the deviance of the table was off for the best one."""
+_MOST_FITS = 8
+_SCENES = 8
+_WIDEST_BEARING_RAD = math.radians(4.0)
+_BEARING_SIGMA = 2.0
+"""A free bearing has two further tables, as far aside as these say."""
+_STEEPEST_RAD = math.radians(20.0)
+
+
+class HistogramMatcher:
+    """Estimates class and view from histograms of a direct sensor.
+
+    Parameters
+    ----------
+    bank : Bank
+        Its meshes and the span of its grid are used. Its images are not: histograms are rendered when the first frames
+        come, which takes some seconds and :attr:`table_bytes` of memory.
+    free : tuple of str
+        Parameters of the view, in its order; distance_m and delta_rad among them.
+    prior_std : sequence of float
+        Standard deviation of each before a frame is seen, about 0; infinite where nothing is known.
+    rules : Rules
+        When an answer is accepted.
+    workers : int
+        Threads; the answers do not depend on their number.
+    """
+
+    def __init__(
+        self, bank: Bank, *, free: tuple[str, ...], prior_std: Sequence[float], rules: Rules, workers: int = 1
+    ) -> None:
+        self.sensor = bank.camera
+        check_histogram_sensor(bank)
+        self._free, self._rules, self._workers = free, rules, workers
+        self._prior = np.array(prior_std, dtype=np.float64)
+        meshes = [bank.mesh(name) for name in bank.classes]
+        self.signals = [ViewSignals(mesh, self.sensor, float(mesh.metadata["albedo"])) for mesh in meshes]
+        self.grid = plan_table(self.signals, bank.distance_m, bank.delta_rad, math.gcd(*rules.symmetry))
+        self._limits = view_limits(self.grid)
+
+    @property
+    def bearings_rad(self) -> tuple[float, ...]:
+        """Bearings at which a table is made."""
+        if "bearing_rad" not in self._free:
+            return (0.0,)
+        side = min(_BEARING_SIGMA * float(self._prior[self._free.index("bearing_rad")]), _WIDEST_BEARING_RAD)
+        return (0.0, -side, side)
+
+    @property
+    def table_bytes(self) -> int:
+        """How large the tables of histograms are in memory."""
+        return len(self.bearings_rad) * self.grid.n_bytes(self.sensor, len(self.signals))
+
+    @cached_property
+    def tables(self) -> list[Table]:
+        """Histograms on a grid, one table for each bearing; rendered when they are first needed."""
+        return [build_table(self.signals, self.grid, b, self._workers) for b in self.bearings_rad]
+
+    def match(self, frames: HistogramFrames) -> list[Match]:
+        """Return an answer for every position of the bank's sensor, whose frames are added up."""
+        counted, _ = counted_frames(frames), self.tables
+        if self._workers == 1 or len(counted) < 2:
+            return [self._match(one) for one in counted]
+        with ThreadPoolExecutor(self._workers) as pool:
+            return list(pool.map(self._match, counted))
+
+    def _match(self, frame: Counted) -> Match:
+        bare_level, bare_ambient = np.empty(frame.counts.shape), np.empty(len(frame.counts))
+        bare = bare_deviance(frame.counts, frame.extra, frame.cycles, bare_level, bare_ambient)
+        counts = shifted_back(
+            undo_pile_up(frame.counts, frame.cycles) if math.isfinite(frame.cycles) else frame.counts,
+            frame.drift_bins,
+        )
+        ambient = ambient_light(counts, frame.extra)
+        starts = self._starts(frame, counts, ambient)
+        if not starts:
+            return no_answer(self._rules, self._free)
+        least = starts[0][2]
+        fits: list[Fit] = []
+        classes: list[int] = []
+        offset, margin = 0.0, _SURE_COST
+        for c, view, cost, bright in starts[:_MOST_FITS]:
+            if fits and cost > least + margin:
+                break
+            fit = fit_view(
+                self.signals[c], frame, view, bright, ambient, self._free, self._prior, self._limits, _SCENES
+            )
+            if not fits:
+                offset = fit.cost - least  # of the exact deviance over that of the table
+                margin += _TABLE_ERROR * abs(offset)
+            fits.append(fit)
+            classes.append(c)
+        found = [Explanation(c, fit.view, fit.cost, fit.information) for c, fit in zip(classes, fits, strict=True)]
+        found += [Explanation(c, view, cost + offset, None) for c, view, cost, _ in starts[len(fits) :]]
+        best = min(fits, key=lambda fit: fit.cost)
+        mean, variance = moments_of(best.level)
+        free = len(self._free) + 1 + len(ambient)
+        test = FitTest(*deviance_test(best.deviance, mean, variance, free))
+        doubt = best.cost - best.deviance + doubtful_deviance(mean, variance, free, self._rules.false_alarm)
+        return answer_of(self._rules, self._free, found, test, bare, doubt)
+
+    def _starts(
+        self, frame: Counted, counts: NDArray[np.float64], ambient: NDArray[np.float64]
+    ) -> list[tuple[int, NDArray[np.float64], float, float]]:
+        """Return class, view, cost and brightness of the hills of all tables, best first."""
+        starts = []
+        limit = math.inf
+        for bearing, table in zip(self.bearings_rad, self.tables, strict=True):
+            hills = find_hills(table, counts, ambient, frame.extra, frame.n_frames, limit=limit)
+            prior = 0.0 if bearing == 0 else (bearing / self._prior[self._free.index("bearing_rad")]) ** 2
+            for c, place, bright, cost in zip(*hills, strict=True):
+                view = np.zeros(len(VIEW_FIELDS))
+                view[:2], view[2] = place, bearing
+                starts.append((int(c), view, float(cost) + prior, float(bright)))
+                limit = min(limit, float(cost) + DESCENT_MARGIN)
+        return sorted(starts, key=lambda start: start[2])
+
+
+def check_histogram_sensor(bank: Bank) -> None:
+    """Refuse a bank whose sensor counts no histograms.
+
+    Raises
+    ------
+    UsageError
+    """
+    if bank.camera.kind != "direct" or bank.camera.histogram is None:
+        lacks = "without a [histogram] table" if bank.camera.kind == "direct" else "a phase camera"
+        raise UsageError(
+            f"histograms and targets take a bank of a direct sensor with a [histogram] table: '{bank.plan.sensor}' is"
+            f" {'one ' if bank.camera.kind == 'direct' else ''}{lacks}"
+        )
+
+
+def refuse_other_sensor(own: Sensor, other: Sensor) -> None:
+    """Refuse frames that were taken with another sensor.
+
+    Raises
+    ------
+    UsageError
+    """
+    difference = other.optics_difference(own)
+    if difference is None and other.histogram != own.histogram:
+        ours, theirs = histogram_of(own).model_dump(), histogram_of(other).model_dump()
+        name = next(name for name in ours if ours[name] != theirs[name])
+        difference = f"'histogram.{name}' is {theirs[name]} here and {ours[name]} there"
+    if difference is not None:
+        raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
+
+
+def view_limits(grid: TableGrid) -> NDArray[np.float64]:
+    """Return least and greatest values of a view that is looked for, (2, 6)."""
+    low, high = np.full(len(VIEW_FIELDS), -math.inf), np.full(len(VIEW_FIELDS), math.inf)
+    low[0], high[0] = grid.distance_m[0], grid.distance_m[-1]
+    if not grid.cyclic:
+        low[1], high[1] = grid.delta_rad[0], grid.delta_rad[-1]
+    low[4:], high[4:] = -_STEEPEST_RAD, _STEEPEST_RAD
+    return np.stack([low, high])
+
+
+def counted_frames(frames: HistogramFrames) -> list[Counted]:
+    """Return what was counted at each position, its frames added up."""
+    histogram = histogram_of(frames.sensor)
+    n_frames = float(frames.counts.shape[1])
+    cycles = histogram.cycles * n_frames if histogram.pile_up else math.inf
+    extra = n_frames * glass_counts(frames.sensor)
+    return [
+        Counted(np.ascontiguousarray(counts), n_frames, cycles, extra, float(drift))
+        for counts, drift in zip(frames.zone_counts, frames.drift_bins, strict=True)
+    ]
+
+
+def glass_counts(sensor: Sensor) -> NDArray[np.float64]:
+    """Return the expected counts of the cover glass in one frame, (bins,)."""
+    histogram = histogram_of(sensor)
+    edges = histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1)
+    return np.asarray(histogram.crosstalk * np.diff(response_share(edges - histogram.crosstalk_range_m, histogram)))
+
+
+def shifted_back(counts: NDArray[np.float64], bins: float) -> NDArray[np.float64]:
+    """Return histograms shifted to earlier bins, linear between bins; (zones, bins)."""
+    if bins == 0:
+        return counts
+    at = np.arange(counts.shape[1]) + bins
+    return np.stack([np.interp(at, np.arange(counts.shape[1]), row) for row in counts])

@@ -1,0 +1,170 @@
+"""Signal counts straight from the samples of a scene: each is shared among its bins, without a transient between.
+
+A scene of a thousand samples lights some ten bins a sample; a transient convolved with the response multiplies two
+thousand nodes by all bins of every zone. Both give the same counts to 1e-5 of the peak (PHYSICS section 11).
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from phasemark.render.direct.bin_counts import response_share
+from phasemark.render.direct.footprints import (
+    _REACH,
+    Footprints,
+    footprint_areas,
+    footprint_weight,
+    footprints_of,
+    histogram_of,
+)
+from phasemark.render.direct.scene_samples import SceneSamples
+from phasemark.render.direct.transients import PARTS
+from phasemark.render.kernel import kernel
+from phasemark.render.sensor.sensor import Sensor
+
+_STEPS_PER_STD = 64
+_STEPS_PER_SAMPLE = 32
+
+
+class _Response(NamedTuple):
+    """The cumulative response of each zone on a fine axis of delays, and where bins begin.
+
+    Parameters
+    ----------
+    share : (zones or 1, m) float64
+        0 … 1 along the delays.
+    first_m, steps_per_m : float
+        First delay and density of the axis.
+    start_m, width_m : (zones,) float64
+        Range of the lower edge of bin 0, delays of the zone taken off, and width of the bins.
+    """
+
+    share: NDArray[np.float64]
+    first_m: float
+    steps_per_m: float
+    start_m: NDArray[np.float64]
+    width_m: NDArray[np.float64]
+
+
+class _Optics(NamedTuple):
+    zones: Footprints
+    scale: NDArray[np.float64]
+    response: _Response
+
+
+def signal_of_samples(samples: SceneSamples, sensor: Sensor, albedo: ArrayLike = 1.0) -> NDArray[np.float64]:
+    """Return the expected signal counts without pile-up, stray light between zones included.
+
+    Parameters
+    ----------
+    samples : SceneSamples
+        n poses.
+    sensor : Sensor
+        With a [histogram] table.
+    albedo : float or (parts,)
+        Of each part.
+
+    Returns
+    -------
+    (n, zones, bins) float64
+        What :func:`~phasemark.render.direct.bin_counts.signal_counts` returns of the samples' transients.
+    """
+    histogram, optics = histogram_of(sensor), _optics_of(sensor)
+    albedos = np.ascontiguousarray(np.broadcast_to(np.asarray(albedo, dtype=np.float64), (PARTS,)))
+    n_zones = sensor.rows * sensor.cols
+    out = np.zeros((samples.n_views, n_zones, histogram.bins))
+    response = optics.response
+    # zones of one response are lit alike by stray light, which is then added to their counts in the end
+    alike = len(response.share) == 1 and np.ptp(response.start_m) == 0 and np.ptp(response.width_m) == 0
+    _add_samples(
+        samples.start, samples.tangents, samples.range_m, samples.amplitude, samples.part, albedos, optics.zones,
+        sensor.cols, optics.scale, response.share, response.first_m, response.steps_per_m, response.start_m,
+        response.width_m, 0.0 if alike else histogram.stray, out,
+    )  # fmt: skip
+    if alike and histogram.stray > 0:
+        out += histogram.stray * out.mean(axis=1, keepdims=True)
+    out *= histogram.cycles * histogram.photons
+    return out
+
+
+@lru_cache(maxsize=16)
+def _optics_of(sensor: Sensor) -> _Optics:
+    """Return footprints and responses of a sensor as the kernel takes them."""
+    histogram, zones = histogram_of(sensor), footprints_of(sensor)
+    n_zones = sensor.rows * sensor.cols
+    low, high = histogram.irf_reach_m
+    if histogram.irf_std_m is not None:
+        step = histogram.irf_std_m / _STEPS_PER_STD
+    else:
+        step = (high - low) / ((len(histogram.irf[0]) - 1) * _STEPS_PER_SAMPLE)
+    delay = low + step * np.arange(int(np.ceil((high - low) / step)) + 1)
+    alike = len(histogram.irf) <= 1
+    share = np.stack([response_share(delay, histogram, zone) for zone in range(1 if alike else n_zones)])
+    gain = np.array(histogram.zone_gain or ((1.0,) * sensor.cols,) * sensor.rows).ravel()
+    bin_scale = np.array(histogram.zone_bin_scale or ((1.0,) * sensor.cols,) * sensor.rows).ravel()
+    offset = np.broadcast_to(sensor.zone_offsets + sensor.range_offset_m, (sensor.rows, sensor.cols)).ravel()
+    response = _Response(share, float(low), 1 / step, histogram.start_m - offset, histogram.bin_width_m * bin_scale)
+    return _Optics(zones, gain / footprint_areas(zones), response)
+
+
+@kernel
+def _share(table, x):  # type: ignore[no-untyped-def]
+    """Return the cumulative response at a place along its axis, linear between two steps."""
+    if x <= 0.0:
+        return 0.0
+    i = int(x)
+    if i >= len(table) - 1:
+        return 1.0
+    return table[i] + (x - i) * (table[i + 1] - table[i])
+
+
+@kernel
+def _add_to_bins(light, range_m, table, first, density, start_m, width_m, out):  # type: ignore[no-untyped-def]
+    """Share light from one range among the bins of a zone."""
+    nearest = range_m - start_m
+    j = max(math.floor((nearest + first) / width_m), 0)
+    stop = min(math.ceil((nearest + first + (len(table) - 1) / density) / width_m), len(out))
+    x = (j * width_m - nearest - first) * density
+    step = width_m * density
+    below = _share(table, x)
+    while j < stop:
+        x += step
+        above = _share(table, x)
+        out[j] += light * (above - below)
+        below = above
+        j += 1
+
+
+@kernel
+def _add_samples(  # type: ignore[no-untyped-def]
+    start, tangents, range_m, amplitude, part, albedo, zones, cols, scale, share, first, density, start_m, width_m,
+    stray, out,
+):  # fmt: skip
+    """Add every sample to the bins of the zones that count its light."""
+    n_zones = out.shape[1]
+    own = share.shape[0] > 1
+    for view in range(len(start) - 1):
+        for k in range(start[view], start[view + 1]):
+            y, z = tangents[k, 0], tangents[k, 1]
+            light = amplitude[k] * albedo[part[k]]
+            total = 0.0
+            for row in range(0, n_zones, cols):
+                if abs(z - zones.centre[row, 1]) > zones.half[row, 1] + _REACH * zones.blur[1]:
+                    continue
+                for q in range(row, row + cols):
+                    w = footprint_weight(zones, q, y, z)
+                    if w != 0.0:
+                        w *= scale[q] * light
+                        total += w
+                        table = share[q if own else 0]
+                        _add_to_bins(w, range_m[k], table, first, density, start_m[q], width_m[q], out[view, q])
+            if stray > 0.0 and total > 0.0:
+                total *= stray / n_zones
+                for q in range(n_zones):
+                    table = share[q if own else 0]
+                    _add_to_bins(total, range_m[k], table, first, density, start_m[q], width_m[q], out[view, q])

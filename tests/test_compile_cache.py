@@ -1,0 +1,115 @@
+"""Compiled code that is kept is used only while all source files it was made from are the same."""
+
+import ast
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from phasemark.render.compiled_sources import COMPILED_SOURCES, ROOT, compiled_sources_hash
+
+_COMPILERS = ("njit", "kernel", "inlined", "_compiled", "_vectorised")
+
+
+def compiled_functions(tree: ast.Module) -> list[ast.FunctionDef]:
+    """Return the functions of a module that numba compiles."""
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    passed = {
+        argument.id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and "njit" in ast.unparse(node.func)
+        for argument in node.args
+        if isinstance(argument, ast.Name)
+    }
+    return [
+        one
+        for one in functions
+        if one.name in passed
+        or any(word in ast.unparse(by).replace("(", ".").split(".") for by in one.decorator_list for word in _COMPILERS)
+    ]
+
+
+def imported_names(tree: ast.Module) -> dict[str, str]:
+    """Return the module of this package that each name of a module is imported from."""
+    found = {}
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("phasemark."):
+            found |= {name.asname or name.name: node.module for name in node.names}
+    return found
+
+
+def test_every_file_that_compiled_code_is_made_from_is_listed():
+    files = [
+        path
+        for folder in ("inputs", "landmarks", "render", "data", "matcher")
+        for path in ROOT.glob(f"{folder}/**/*.py")
+    ]
+    needed = {"render/kernel.py"}
+    for path in files:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        compiled = compiled_functions(tree)
+        if not compiled:
+            continue
+        needed.add(path.relative_to(ROOT).as_posix())
+        imported = imported_names(tree)
+        used = {node.id for one in compiled for node in ast.walk(one) if isinstance(node, ast.Name)}
+        for name in used & set(imported):
+            needed.add(imported[name].removeprefix("phasemark.").replace(".", "/") + ".py")
+    assert sorted(COMPILED_SOURCES) == sorted(needed)
+
+
+def test_the_hash_of_the_sources_is_quick():
+    seconds = []
+    for _ in range(20):
+        compiled_sources_hash.cache_clear()
+        start = time.perf_counter()
+        compiled_sources_hash()
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 5e-3  # once a process
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from phasemark.render.compile_cache import stamp_with_all_sources
+folder = Path(sys.argv[1]).resolve()
+stamp_with_all_sources(folder, ("inner_part.py", "outer_part.py"))
+sys.path.insert(0, str(folder))
+import outer_part
+print(outer_part.outer(), sum(outer_part.outer.stats.cache_hits.values()))
+"""
+OUTER = """
+from numba import njit
+from inner_part import inner
+@njit(cache=True)
+def outer():
+    return inner() + 1
+"""
+INNER = """
+from numba import njit
+@njit(inline="always")
+def inner():
+    return {}
+"""
+
+
+def outer_result(folder: Path) -> str:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-c", PROGRAM, str(folder)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_a_changed_function_of_another_module_is_compiled_again(tmp_path):
+    (tmp_path / "outer_part.py").write_text(OUTER)
+    (tmp_path / "inner_part.py").write_text(INNER.format(10))
+    assert outer_result(tmp_path) == "11 0"
+    assert outer_result(tmp_path) == "11 1"  # kept
+    (tmp_path / "inner_part.py").write_text(INNER.format(20))
+    assert outer_result(tmp_path) == "21 0"
+    assert outer_result(tmp_path) == "21 1"
+
+
+def test_sources_that_cannot_be_read_count_as_empty(tmp_path):
+    (tmp_path / "one.py").write_text("")
+    assert compiled_sources_hash(tmp_path, ("one.py",)) == compiled_sources_hash(tmp_path / "none", ("one.py",))
