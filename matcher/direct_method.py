@@ -1,4 +1,4 @@
-"""How a matcher matches what a direct sensor counted or reported, and which of its options go with that."""
+"""Matching of histograms and targets of a direct sensor, and the options of a matcher that go with them."""
 
 from __future__ import annotations
 

@@ -46,7 +46,11 @@ class MatchMethod(Protocol):
 
 
 class DirectMethod(Protocol):
-    """What matches the histograms or the targets of a direct sensor."""
+    """Interface of a method that matches the histograms or the targets of a direct sensor."""
+
+    @property
+    def table_bytes(self) -> int:
+        """How much memory the table takes that is rendered when frames come first."""
 
     def match(self, frames: Any) -> list[Match]:
         """Return one answer for each of n positions."""
@@ -75,12 +79,13 @@ class Matcher:
     false_alarm : float
         Share of good frames that the test of the fit may refuse.
     on : {"ranges", "phasors", "histograms", "targets"}
-        What "refine" explains: of a direct sensor with a [histogram] table the counts of every bin, Poisson, with the
-        landmark's brightness and the ambient light of every zone estimated too; or the targets that its chip reports.
-        Both take a scene that holds the landmark alone. Otherwise ranges, or amplitude · exp(iφ) with the landmark's albedo estimated too. Phasors need
+        What "refine" explains: ranges, or amplitude · exp(iφ) with the landmark's albedo estimated too. Phasors need
         frames with amplitudes, best from :func:`~phasemark.matcher.phasor_mean`. Of several modulation frequencies
         ranges are the unwrapped ones with their combined variance; phasors, and the phases that "nearest" compares, are
-        those of every frequency, each wrapped by itself: nothing is unwrapped, and mixed pixels count.
+        those of every frequency, each wrapped by itself: nothing is unwrapped, and mixed pixels count. Of a direct
+        sensor with a [histogram] table also the counts of every bin, Poisson, with the landmark's brightness and the
+        ambient light of every zone estimated, or the targets that its chip reports; both take a scene that holds the
+        landmark alone.
     pixels : {"all", "lower"}
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool
@@ -126,7 +131,7 @@ class Matcher:
     """
 
     def __repr__(self) -> str:
-        """Say in one line how frames are matched, and against what."""
+        """Describe in one line the method and the bank."""
         usual = (None, False, "all", "ranges")
         stated = [f"{name}={value!r}" for name, value in self.options.items() if value not in usual]
         return f"Matcher({', '.join([self.method, *stated])}, {self.bank!r})"
@@ -234,6 +239,11 @@ class Matcher:
             tolerance_m=tolerance_m,
             tolerance_rad=tolerance_rad,
         )
+
+    @property
+    def table_bytes(self) -> int:
+        """How much memory a table of histograms takes, which is rendered when frames come first; 0 on ranges."""
+        return 0 if self._direct is None else self._direct.table_bytes
 
     def match(self, frames: FilteredFrames | HistogramFrames | Targets) -> Matches:
         """Match a batch of filtered frames, or of what a direct sensor counted or reported.

@@ -1,4 +1,4 @@
-"""What histograms of a direct sensor can tell at best: the Poisson information in a view (PHYSICS section 11)."""
+"""Best possible accuracy from histograms of a direct sensor: the Poisson information in a view (PHYSICS section 11)."""
 
 from __future__ import annotations
 

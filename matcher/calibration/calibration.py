@@ -640,7 +640,7 @@ def _check_ranges(recording: Recording, assumed: Mounting) -> None:
 def _delay_doubts(
     job: _Job, frames: FilteredFrames, poses: KnownPoses, fixed: Recording, track: PoseTrack | None
 ) -> list[str]:
-    """Say if another delay than the one stated fits much better."""
+    """Warn if another delay than the stated one fits much better."""
     freed = _recording(replace(job, names=(*job.names, "delay")), frames, poses, track, fixed.edges)
     start = job.assumed.vector
     with_it, without = freed.approach(start)[0], fixed.approach(start)[0]
@@ -657,7 +657,7 @@ def _of_pose_errors(recording: Recording, found: Recorded) -> NDArray[np.float64
 
 
 def _recording_notes(found: Recorded, left_out: float) -> list[str]:
-    """Say how many pixels disagreed, and what errors noise does not explain."""
+    """Note how many pixels disagreed, and which errors noise does not explain."""
     frames = int((found.use.sum(axis=1) > 0).sum())
     notes = [
         f"{int(found.use.sum())} pixels of {frames} frames counted; {100 * left_out:.1f} % of those that should see the"
@@ -702,7 +702,7 @@ def _with_zones(sensor: Sensor, found: Recorded, shape: tuple[int, int]) -> Sens
 
 
 def _cause(job: _Job, frames: FilteredFrames, poses: KnownPoses, edges: bool, track: PoseTrack | None = None) -> str:
-    """Say what is likely wrong, by what fits much better than what was stated."""
+    """Name the likely cause of a misfit: the change of a stated value that fits much better."""
 
     def misfit(job: _Job, frames: FilteredFrames, poses: KnownPoses, track: PoseTrack | None) -> tuple[float, float]:
         recording = _recording(job, frames, poses, track, edges)

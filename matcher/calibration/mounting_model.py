@@ -132,7 +132,7 @@ class Mounting:
 
     @classmethod
     def of_sensor(cls, sensor: Sensor, albedo: float) -> Mounting:
-        """Take what a sensor states."""
+        """Read the mounting that a sensor states."""
         return cls(
             math.radians(sensor.pitch_deg),
             math.radians(sensor.roll_deg),

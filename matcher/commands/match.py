@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from phasemark import UsageError
 from phasemark.data.commands.console import LongWork, Table, echo_json, tell
 from phasemark.data.commands.inputs import note_too_far, open_any_bank
 from phasemark.data.commands.options import (
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from phasemark.data import Bank
     from phasemark.matcher import FilteredFrames, Match, Matcher
     from phasemark.matcher.position.landmark_map import LandmarkMap
+    from phasemark.matcher.recordings.direct_positions import DirectBatch, DirectPositions
     from phasemark.matcher.recordings.estimates_table import MatchedBatch
     from phasemark.render import Background, Frames
 
@@ -53,6 +55,8 @@ def match_frames(
     All frames of a file are averaged: the camera stands still. A file of shape (n, frames, rows, cols) has n positions.
     With --moving every frame is a position of its own. A CSV file may have a header that names its columns: t_ms or
     t_s, mm_0 ... (or range_0 ..., z_0 ...), status_0 ...; for a VL53L5CX or VL53L8CX give --valid-status 5.
+    With --on histograms or --on targets FRAMES is a log of a direct sensor: histograms in NPZ or lines of JSON, or
+    targets in CSV with columns mm_ZONE_TARGET.
     """
     from phasemark.data.files.atomic_write import write_atomically
 
@@ -60,6 +64,9 @@ def match_frames(
     landmarks = place.landmarks()
     results.check()
     search.check()
+    if search.is_direct:
+        _match_directly(bank, frames, reading, search, place, landmarks, moving, results)
+        return
     with open_any_bank(bank) as opened:
         measured = reading.read(frames, opened.camera)
         note_too_far(opened.camera, {"--wall": search.wall})
@@ -82,6 +89,55 @@ def match_frames(
         for path in results.files(plots):
             typer.echo(path)
         _note_plots(plots, results.plot_index, len(positions))
+
+
+def _match_directly(
+    bank: Path,
+    frames: Path,
+    reading: FrameReading,
+    search: Search,
+    place: Place,
+    landmarks: LandmarkMap | None,
+    moving: bool,
+    results: Results,
+) -> None:
+    """Match a log of histograms or targets."""
+    from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.data.plans.size import format_size
+    from phasemark.matcher.recordings.direct_positions import read_positions
+
+    _refuse_turned(reading)
+    if results.plot is not None:
+        raise UsageError(f"--plot draws ranges: leave it out with --on {search.on}")
+    with open_any_bank(bank) as opened:
+        matcher = search.matcher(opened)
+        positions = read_positions(frames, opened.camera, search.on, moving=moving, valid_status=reading.valid_status)
+        refuse_unwritable_files(results.files({}), results.force)
+        tell(f"note: histograms are rendered first, a table of {format_size(matcher.table_bytes)}")
+        printed = _Answers(search, place, results, landmarks, {}, moving)
+        printed.match_all(matcher, positions)
+        if results.as_json:
+            echo_json({"bank": str(bank), "frames": str(frames), "matches": printed.answers})
+        if results.estimates is not None:
+            write_atomically(results.estimates, printed.estimated.to_csv().encode(), force=results.force)
+    if not (results.as_json or results.as_jsonl):
+        for path in results.files({}):
+            typer.echo(path)
+
+
+def _refuse_turned(reading: FrameReading) -> None:
+    """Refuse what is said of images of ranges."""
+    stated = {
+        "--unit": reading.unit is not None, "--quantity": reading.quantity is not None,
+        "--invalid-means": reading.invalid_means != "missing", "--flip-h": reading.flip_h,
+        "--flip-v": reading.flip_v, "--rotate": reading.rotate != 0,
+    }  # fmt: skip
+    for option, is_stated in stated.items():
+        if is_stated:
+            raise UsageError(
+                f"{option} goes with images of ranges: zones of a direct sensor's log are turned by 'zone_order' in its"
+                " [histogram] table, and its units are fixed"
+            )
 
 
 class _Answers:
@@ -107,14 +163,19 @@ class _Answers:
         self._refused: tuple[int, FilteredFrames] | None = None
         self._n_accepted = 0
 
-    def match_all(self, matcher: Matcher, positions: Frames) -> None:
+    def match_all(self, matcher: Matcher, positions: Frames | DirectPositions) -> None:
         """Match all positions, and print each batch as soon as it is known."""
+        from phasemark.matcher.recordings.direct_positions import DirectPositions, match_directly
         from phasemark.matcher.recordings.estimates_table import match_in_batches
 
         n, averaged = len(positions), self._search.filter()
         at_once = NEAREST_AT_ONCE if self._search.method == "nearest" else REFINED_AT_ONCE
         with LongWork("matching") if n > at_once else nullcontext() as progress:
-            for batch in match_in_batches(matcher, positions, averaged, at_once=at_once):
+            if isinstance(positions, DirectPositions):
+                batches: Iterator[MatchedBatch | DirectBatch] = match_directly(matcher, positions, at_once=at_once)
+            else:
+                batches = match_in_batches(matcher, positions, averaged, at_once=at_once)
+            for batch in batches:
                 self._print([self._answer(batch, k) for k in range(len(batch.matches))], batch.start)
                 if self._results.estimates is not None:
                     self.estimated.add(batch)
@@ -122,17 +183,21 @@ class _Answers:
                 if progress is not None:
                     progress(batch.start + len(batch.matches), n)
 
-    def _answer(self, batch: MatchedBatch, k: int) -> dict[str, Any]:
+    def _answer(self, batch: MatchedBatch | DirectBatch, k: int) -> dict[str, Any]:
         """Return a match of a batch as plain numbers, and note what is needed of it later."""
+        from phasemark.matcher.recordings.direct_positions import DirectBatch
+
         match, index = batch.matches[k], batch.start + k
         answer = match.as_dict()
         if batch.filtered.time_s is not None:
             answer["time_s"] = float(batch.filtered.time_s[k])
         if self._landmarks is not None:
             answer["poses"] = self._place.poses(match, self._landmarks)
+        self._n_accepted += match.accepted
+        if isinstance(batch, DirectBatch):
+            return answer
         if index in self._plots:
             self.drawn[index] = batch.filtered[k : k + 1], match
-        self._n_accepted += match.accepted
         if self._refused is None and not match.accepted:
             self._refused = index, batch.filtered[k : k + 1]
         return answer
@@ -149,7 +214,7 @@ class _Answers:
             self._table.echo([list(row.values()) for row in rows])
 
     def diagnose(self, matcher: Matcher, reading: FrameReading) -> None:
-        """Say which setting would make the first refused position fit."""
+        """Name the setting that would make the first refused position fit."""
         from phasemark.matcher import diagnose
 
         search = self._search
@@ -166,7 +231,7 @@ class _Answers:
 
 
 def _note_plots(plots: Mapping[int, Path], chosen: str | None, n: int) -> None:
-    """Say how to have more positions drawn than the first."""
+    """Note how to draw more positions than the first."""
     if plots and chosen is None and len(plots) < n:
         tell(
             f"note: drew the first of {n} positions; --plot-index 0,{n // 2}:{min(n // 2 + 9, n - 1)} draws others"
@@ -175,7 +240,7 @@ def _note_plots(plots: Mapping[int, Path], chosen: str | None, n: int) -> None:
 
 
 def _note_motion(measured: Frames, file: Path) -> None:
-    """Say that frames which are about to be averaged were not taken at rest."""
+    """Warn that frames to be averaged were not taken at rest."""
     import numpy as np
 
     from phasemark.matcher.recordings.stillness import motion_test

@@ -78,10 +78,10 @@ class Search:
         ),
     ] = None
     on: Annotated[
-        Literal["ranges", "phasors"],
+        Literal["ranges", "phasors", "histograms", "targets"],
         typer.Option(
             "--on",
-            help="With refine: ranges, or phasors with the albedo free.",
+            help="With refine: ranges, or phasors with the albedo free; of a direct sensor also histograms or targets.",
         ),
     ] = "ranges"
     pixels: Annotated[
@@ -106,6 +106,11 @@ class Search:
     def background(self) -> Background | None:
         """What stands behind the landmark, as far as it is stated."""
         return background_of(self.wall, self.floor)
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether histograms or targets of a direct sensor are matched."""
+        return self.on in ("histograms", "targets")
 
     @property
     def near_the_axis(self) -> bool:
@@ -148,6 +153,8 @@ class Search:
         for name, std in self._stated_std.items():
             if std is not None and name not in (self.free or ()):
                 raise UsageError(f"--{name}-std goes with --free {name}: what is not free is 0")
+        if self.is_direct:
+            self._check_direct()
         refined = (
             ("--free", bool(self.free)), ("--on", self.on != "ranges"), ("--pixels", self.pixels != "all"),
             ("--robust", self.robust), ("--auto-background", self.auto_background),
@@ -157,6 +164,17 @@ class Search:
         for option, used in refined:
             if used and self.method == "nearest":
                 raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
+
+    def _check_direct(self) -> None:
+        """Refuse options that belong to images of ranges."""
+        foreign = (
+            ("--pixels", self.pixels != "all"), ("--robust", self.robust), ("--auto-background", self.auto_background),
+            ("--unknown-background", self.unknown_background), ("--wall", self.wall is not None),
+            ("--floor", self.floor is not None), ("--filter", self.filter_name != "kalman"),
+        )  # fmt: skip
+        for option, used in foreign:
+            if used:
+                raise UsageError(f"{option} goes with images of ranges: leave it out with --on {self.on}")
 
     def matcher(self, bank: Bank) -> Matcher:
         """Return the matcher."""

@@ -184,12 +184,12 @@ class AllowedDimensions:
                 )
 
     def checks(self, spec: LandmarkSpec) -> list[Check]:
-        """Hold the rules that are plain geometry and light against a landmark."""
+        """Check a landmark by the rules of geometry and light."""
         upper = [] if spec.upper is None else self.upper_checks(spec.box, spec.upper)
         return [*self._box(spec.box), *upper, *self._light()]
 
     def upper_checks(self, box: Box, upper: Upper) -> list[Check]:
-        """Hold the rules for an upper part on a box against it."""
+        """Check an upper part on a box by its rules."""
         return list(self._upper(box, upper))
 
     def _box(self, box: Box) -> Iterator[Check]:

@@ -70,7 +70,7 @@ def _rank(candidate: Candidate) -> tuple[float, float]:
 
 
 def _what_fails(plan: DesignPlan, found: list[Candidate]) -> str:
-    """Say which rule no candidate keeps, or which ones the best of them breaks."""
+    """Name the rule that no candidate keeps, or the rules that the best one breaks."""
     near, far = plan.distance_m
     start = f"no landmark can serve {near:g} … {far:g} m"
     if not found:

@@ -211,7 +211,7 @@ class _Setup:
 
     @classmethod
     def of(cls, matcher: Matcher, background: Background | None) -> _Setup:
-        """Take what a matcher was told: the one place that knows its options."""
+        """Copy the options of a matcher; only this function knows them all."""
         told = matcher.options
         if matcher.method == "nearest":
             return cls(True, VIEW, background, {"false_alarm": matcher.false_alarm})

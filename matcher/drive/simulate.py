@@ -21,7 +21,6 @@ from phasemark.matcher.drive.odometry import OdometryModel, World, moved
 from phasemark.matcher.drive.plan import DrivePlan
 from phasemark.matcher.drive.pose_filter import PoseFilter
 from phasemark.matcher.filters.filtered_frames import kalman_filter
-from phasemark.matcher.likelihood.likelihood_matcher import TILT_STD_RAD
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.position.landmark_map import MappedLandmark
@@ -191,15 +190,8 @@ class RobotEquipment:
                 raise UsageError(f"'map.landmark.class' must be one of {', '.join(specs)}, got {name!r}")
         bank = _bank(plan, names, workers)
         tilts = plan.camera.tilt_std_rad
-        matcher = Matcher(
-            bank,
-            "refine",
-            free=(*FREE, *tilts),
-            background="auto",
-            pitch_std_rad=tilts.get("pitch_rad", TILT_STD_RAD),
-            roll_std_rad=tilts.get("roll_rad", TILT_STD_RAD),
-            workers=workers,
-        )
+        known: dict[str, Any] = {f"{name.removesuffix('_rad')}_std_rad": std for name, std in tilts.items()}
+        matcher = Matcher(bank, "refine", free=(*FREE, *tilts), background="auto", workers=workers, **known)
         return cls(sensor, matcher, {name: _renderer(specs[name], sensor) for name in names})
 
 
@@ -366,12 +358,8 @@ class _Driver:
         view = view_of(lens, xy, yaw)
         renderer = self.equipment.renderers[landmark.class_name]
         tilt = {name: std * self.rng.standard_normal() for name, std in camera.tilt_std_rad.items()}
-        image = renderer.render(
-            *view,
-            pitch_rad=tilt.get("pitch_rad", 0.0),
-            roll_rad=tilt.get("roll_rad", 0.0),
-            background=self._wall(lens[:2], xy),
-        )
+        pitch_rad, roll_rad = (tilt.get(name, 0.0) for name in ("pitch_rad", "roll_rad"))
+        image = renderer.render(*view, pitch_rad=pitch_rad, roll_rad=roll_rad, background=self._wall(lens[:2], xy))
         filtered = kalman_filter(capture(image, sensor, rng=self.rng, n_frames=camera.n_frames))
         standing_s = camera.n_frames / sensor.frame_rate_hz
         self.world.stand(standing_s)

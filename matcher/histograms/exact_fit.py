@@ -24,6 +24,8 @@ _NEAR_ENOUGH = 0.7
 _SHRINK, _LEAST_SHRINK = 0.3, 0.05
 _WORSE = 0.5
 """A scene may be so much worse than the linear one that led to it: less than what a test can see."""
+_SAME = np.array([0.005, *[math.radians(1.0)] * 2, 0.005, *[math.radians(1.0)] * 2])
+"""A fit this near to another one, on its way, ends where that one did."""
 _LONGEST = {"m": 0.04, "rad": math.radians(4.0)}
 
 
@@ -77,8 +79,9 @@ class Fit(NamedTuple):
 
 def fit_view(
     signals: ViewSignals, frame: Counted, view: NDArray[np.float64], bright: float, ambient: NDArray[np.float64],
-    free: Sequence[str], prior_std: NDArray[np.float64], limits: NDArray[np.float64], most: int,
-) -> Fit:  # fmt: skip
+    free: Sequence[str], prior_std: NDArray[np.float64], limits: NDArray[np.float64], most: int, hopeless: float,
+    known: Sequence[NDArray[np.float64]] = (),
+) -> Fit | None:  # fmt: skip
     """Refine a view until a scene rendered there explains the frame best.
 
     Parameters
@@ -97,6 +100,15 @@ def fit_view(
         Least and greatest values of the view.
     most : int
         Scenes with slopes that are rendered at most.
+    hopeless : float
+        A fit that will cost more than this is given up.
+    known : sequence of (6,) float64
+        Views that are fitted already: a fit that comes to one of them is given up.
+
+    Returns
+    -------
+    Fit or None
+        None of a fit that was given up.
     """
     columns = [VIEW_FIELDS.index(name) for name in free]
     longest = np.array([_LONGEST[name.rpartition("_")[2]] for name in free])
@@ -123,7 +135,8 @@ def fit_view(
         view = np.clip(view, *limits)
         if float(offset @ there.information @ offset) < _NEAR_ENOUGH**2:
             return Fit(view, bright, ambient, there.deviance, there.cost, there.level, there.information)
-    assert best is not None
+        if there.cost > hopeless or any((np.abs(view - other) < _SAME).all() for other in known):
+            return None
     return best
 
 

@@ -106,23 +106,27 @@ class HistogramMatcher:
         if not starts:
             return no_answer(self._rules, self._free)
         least = starts[0][2]
-        fits: list[Fit] = []
-        classes: list[int] = []
-        offset, margin = 0.0, _SURE_COST
+        fits: list[tuple[int, Fit]] = []
+        offset, margin, n_tried = 0.0, _SURE_COST, 0
         for c, view, cost, bright in starts[:_MOST_FITS]:
             if fits and cost > least + margin:
                 break
+            n_tried += 1
+            hopeless = min((fit.cost for _, fit in fits), default=math.inf) + _SURE_COST
+            known = [fit.view for other, fit in fits if other == c]
             fit = fit_view(
-                self.signals[c], frame, view, bright, ambient, self._free, self._prior, self._limits, _SCENES
-            )
+                self.signals[c], frame, view, bright, ambient, self._free, self._prior, self._limits, _SCENES, hopeless,
+                known,
+            )  # fmt: skip
+            if fit is None:
+                continue
             if not fits:
                 offset = fit.cost - least  # of the exact deviance over that of the table
                 margin += _TABLE_ERROR * abs(offset)
-            fits.append(fit)
-            classes.append(c)
-        found = [Explanation(c, fit.view, fit.cost, fit.information) for c, fit in zip(classes, fits, strict=True)]
-        found += [Explanation(c, view, cost + offset, None) for c, view, cost, _ in starts[len(fits) :]]
-        best = min(fits, key=lambda fit: fit.cost)
+            fits.append((c, fit))
+        found = [Explanation(c, fit.view, fit.cost, fit.information) for c, fit in fits]
+        found += [Explanation(c, view, cost + offset, None) for c, view, cost, _ in starts[n_tried:]]
+        best = min((fit for _, fit in fits), key=lambda fit: fit.cost)
         mean, variance = moments_of(best.level)
         free = len(self._free) + 1 + len(ambient)
         test = FitTest(*deviance_test(best.deviance, mean, variance, free))

@@ -63,7 +63,7 @@ class Table(NamedTuple):
 
 
 class TableGrid(NamedTuple):
-    """Where a table has its nodes, and which bins it holds: known before anything is rendered.
+    """Nodes and bins of a table of histograms, known before anything is rendered.
 
     Parameters
     ----------
@@ -116,15 +116,17 @@ def plan_table(
     step = _STEP_OF_RESPONSE * response_width_m(sensor)
     low = max(float(distance_m[0]) - step, radius + _NEAREST_TO_SURFACE_M)
     n = max(math.ceil((float(distance_m[-1]) + step - low) / step) + 1, _FEWEST_NODES)
-    distances = low + step * np.arange(n)
+    distances = np.asarray(low + step * np.arange(n), dtype=np.float64)
     first, window = _window(sensor, distances, radius, float(np.abs(corners[:, 2]).max()))
     period = delta_period_rad(symmetry)
     span = float(np.ptp(delta_rad))
     if span + (float(np.diff(delta_rad).max()) if len(delta_rad) > 1 else 0.0) > period - _SAME_RAD:
         n = max(math.ceil(period / _STEP_RAD), 2 * _FEWEST_NODES)
-        return TableGrid(distances, period / n * np.arange(n), True, first, window)
+        angles = np.asarray(period / n * np.arange(n), dtype=np.float64)
+        return TableGrid(distances, angles, True, first, window)
     n = max(math.ceil(span / _STEP_RAD) + 3, _FEWEST_NODES)
-    return TableGrid(distances, float(delta_rad[0]) + _STEP_RAD * (np.arange(n) - 1), False, first, window)
+    angles = np.asarray(float(delta_rad[0]) + _STEP_RAD * (np.arange(n) - 1), dtype=np.float64)
+    return TableGrid(distances, angles, False, first, window)
 
 
 def build_table(signals: Sequence[ViewSignals], grid: TableGrid, bearing_rad: float = 0.0, workers: int = 1) -> Table:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 from scipy.stats import chi2
 
 from phasemark import UsageError
@@ -128,6 +129,15 @@ class Evidence:
         """Return the evidence of some sensor poses."""
         return Evidence(self.information[poses], self.gradient[poses], self.chi2[poses], self.dof[poses])
 
+    @classmethod
+    def joined(cls, parts: Sequence[Evidence]) -> Evidence:
+        """Return the evidence of several sensors, each histogram as a pose of one zone; (n · zones, 1, …)."""
+        flat = [
+            [values.reshape(-1, 1, *values.shape[2:]) for values in (one.information, one.gradient, one.chi2, one.dof)]
+            for one in parts
+        ]
+        return cls(*(np.concatenate(columns) for columns in zip(*flat, strict=True)))
+
 
 def evidence_of(linear: Linearised, measured: NDArray[np.float64], model_error: ModelError = POISSON) -> Evidence:
     """Return what histograms tell about an object pose, brightness and ambient light of each projected out.
@@ -166,7 +176,8 @@ def solve_jointly(
         Size of a step of each parameter; None: 1.
     robust : bool
         Whether the covariance is taken from how far the histograms' gradients scatter (H⁻¹ Σ g gᵀ H⁻¹, each histogram
-        for itself) rather than from the information alone: for models that are off by more than noise.
+        for itself) rather than from the information alone: for models that are off by more than noise. For few
+        histograms it is so much larger that its 95 % ellipsoid is that of Hotelling's T².
 
     Returns
     -------
@@ -188,7 +199,7 @@ def solve_jointly(
         left = gradients - parts @ step
         n = int((evidence.chi2 > 0).sum())
         scatter = left.T @ left * (n / max(n - p, 1))
-        covariance = covariance @ scatter @ covariance
+        covariance = covariance @ scatter @ covariance * _small_sample(n, p)
     if weak.any():
         blind = (vectors[:, weak] ** 2).sum(axis=1) > 1e-6
         covariance[blind, blind] = np.inf
@@ -196,9 +207,9 @@ def solve_jointly(
 
 
 def match_jointly(
-    frames: HistogramFrames,
-    sensor2world: ArrayLike,
-    scene: ObjectScene,
+    frames: HistogramFrames | Sequence[HistogramFrames],
+    sensor2world: ArrayLike | Sequence[ArrayLike],
+    scene: ObjectScene | Sequence[ObjectScene],
     *,
     start: ArrayLike = (0.0,) * 6,
     free: Sequence[str] = (*POSE_PARAMETERS, "support"),
@@ -207,15 +218,16 @@ def match_jointly(
     systematic: tuple[float, float] = (0.0, 0.0),
     false_alarm: float = 0.01,
 ) -> ObjectPose:
-    """Estimate the pose of an object from histograms of several sensor poses together.
+    """Estimate the pose of an object from histograms of several sensor poses together, of one sensor or of several.
 
     Parameters
     ----------
-    frames : HistogramFrames
-        n positions of one sensor.
-    sensor2world : (n, 4, 4) array_like
-        Pose of the optical frame at each.
-    scene : ObjectScene
+    frames : HistogramFrames, or a sequence of them
+        n positions of one sensor; or of each sensor.
+    sensor2world : (n, 4, 4) array_like, or a sequence of them
+        Pose of the optical frame at each position. Sensors on one mount have its pose times that of the sensor on it.
+    scene : ObjectScene, or a sequence of them
+        The same object, for each sensor.
     start : (6,) array_like
         Initial guess of the displacement; within about a bin and ten degrees.
     free : sequence of str
@@ -238,20 +250,25 @@ def match_jointly(
     Raises
     ------
     UsageError
-        Numbers of poses differ, or an unknown parameter is named.
+        Numbers of poses or of sensors differ, the objects are turned about different points, or an unknown parameter
+        is named.
     """
+    sensors = _by_sensor(frames, sensor2world, scene)
     if not 0 < false_alarm < 1:
         raise UsageError(f"'false_alarm' must lie between 0 and 1, got {false_alarm!r}")
     move = np.array(start, dtype=np.float64)
     if move.shape != (6,):
         raise UsageError(f"'start' must have 6 numbers, got {move.shape}")
-    poses, measured = np.asarray(sensor2world, dtype=np.float64), frames.zone_counts
     limits = np.array(
         [_LARGEST_STEP["m" if name.endswith("_m") else "rad"] if name != "support" else 1.0 for name in free]
     )
 
     def look(values: NDArray[np.float64], ratio: float) -> Evidence:
-        return evidence_of(scene.linearise(frames, poses, values, ratio, free), measured, model_error)
+        parts = [
+            evidence_of(one.linearise(seen, poses, values, ratio, free), seen.zone_counts, model_error)
+            for seen, poses, one in sensors
+        ]
+        return parts[0] if len(parts) == 1 else Evidence.joined(parts)
 
     def stepped(step: NDArray[np.float64], shrink: float) -> tuple[NDArray[np.float64], float]:
         values, ratio = move.copy(), support
@@ -287,6 +304,36 @@ def match_jointly(
     covariance = covariance + np.diag([common.get(name.rpartition("_")[2], 0.0) ** 2 for name in free])
     total, dof = float(here.chi2.sum()), int(here.dof.sum()) - len(free)
     return ObjectPose(
-        move, scene.moved(move), tuple(free), covariance, support, total, dof,
+        move, sensors[0][2].moved(move), tuple(free), covariance, support, total, dof,
         bool(chi2.sf(total, dof) > false_alarm), steps,
     )  # fmt: skip
+
+
+def _by_sensor(
+    frames: HistogramFrames | Sequence[HistogramFrames],
+    sensor2world: ArrayLike | Sequence[ArrayLike],
+    scene: ObjectScene | Sequence[ObjectScene],
+) -> list[tuple[HistogramFrames, NDArray[np.float64], ObjectScene]]:
+    """Return frames, poses and scene of each sensor."""
+    if isinstance(frames, HistogramFrames) and isinstance(scene, ObjectScene):
+        return [(frames, np.asarray(sensor2world, dtype=np.float64), scene)]
+    if isinstance(frames, HistogramFrames) or isinstance(scene, ObjectScene):
+        raise UsageError("'frames' and 'scene' must both be of one sensor, or both be lists of the same sensors")
+    poses = [np.asarray(one, dtype=np.float64) for one in sensor2world]  # type: ignore[union-attr]
+    if not (len(frames) == len(poses) == len(scene) > 0):
+        raise UsageError(
+            "'frames', 'sensor2world' and 'scene' must name the same sensors, got"
+            f" {len(frames)}, {len(poses)} and {len(scene)}"
+        )
+    for k, one in enumerate(scene):
+        if not np.allclose(one.centre_m, scene[0].centre_m, rtol=0, atol=1e-9):
+            raise UsageError(f"'scene' must hold one object: that of sensor {k} is turned about another point")
+    return list(zip(frames, poses, scene, strict=True))
+
+
+def _small_sample(n: int, p: int) -> float:
+    """Return by what a covariance grows that n values tell, so that its 95 % ellipsoid is that of Hotelling's T²."""
+    nu = max(n - p, 1)
+    left = max(nu - p + 1, 1)
+    limit = p * nu / left * special.fdtri(p, left, 0.95)
+    return float(limit / special.chdtri(p, 0.05))

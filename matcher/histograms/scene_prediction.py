@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from phasemark import UsageError
-from phasemark.render.direct.bin_counts import bin_response, piled_up, signal_counts
+from phasemark.render.direct.bin_counts import piled_up
 from phasemark.render.direct.fit_model import undo_pile_up
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.recordings import object_centre, world2cam
+from phasemark.render.direct.sample_counts import signal_of_samples
 from phasemark.render.direct.scene_samples import SceneMesh
-from phasemark.render.direct.transients import range_axis, zone_transients
 from phasemark.render.rigid import rigid_transforms
 from phasemark.render.sensor.sensor import Sensor
 
@@ -26,7 +26,6 @@ POSE_PARAMETERS = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
 
 _STEPS = {"x_m": 5e-4, "y_m": 5e-4, "z_m": 5e-4, "roll_rad": 2e-3, "pitch_rad": 2e-3, "yaw_rad": 2e-3, "support": 0.05}
 _AMBIENT_BINS = slice(2, 9)
-_LONGEST_M = 2.0
 
 
 class Linearised(NamedTuple):
@@ -65,8 +64,6 @@ class ObjectScene:
         self.sensor, self.histogram = sensor, histogram_of(sensor)
         self._scene = SceneMesh(mesh)
         self._grid = footprint_grid(sensor)
-        self._axis = range_axis(sensor, longest_m=_LONGEST_M)
-        bin_response(sensor, self._axis)
         if centre_m is None:
             centre_m = object_centre(mesh)
         self.centre_m = np.asarray(centre_m, dtype=np.float64)
@@ -88,9 +85,7 @@ class ObjectScene:
     def signal(self, sensor2world: NDArray[np.float64], displacement: ArrayLike, support: float) -> NDArray[np.float64]:
         """Return expected signal counts for albedo 1 of the object and `support` of the support, (n, zones, bins)."""
         landmark2cam = world2cam(sensor2world) @ self.moved(displacement)
-        samples = self._scene.samples(landmark2cam, self._grid)
-        seen = zone_transients(samples, self.sensor, self._axis)
-        return signal_counts(seen, self.sensor, self._axis, (support, 1.0))
+        return signal_of_samples(self._scene.samples(landmark2cam, self._grid), self.sensor, (support, 1.0))
 
     def linearise(
         self,

@@ -1,4 +1,4 @@
-"""Where in a table of histograms a frame may lie: the grid by moments of every zone, then a descent between its nodes.
+"""Initial guesses from a table of histograms: its grid by moments of every zone, then a descent between its nodes.
 
 Pile-up is taken off the counts first, and ambient light is that of the bins without a peak; both are good enough for
 where a likelihood has its hills. What is found is refined with exact scenes afterwards.
@@ -25,11 +25,11 @@ _TRIM_SIGMA = 3.0
 _STEPS = 8
 _HALVINGS = 3
 _DONE = 0.05  # of a standard deviation
-_HOPE = 4.0  # times what a step promises is what is still to be gained at most
+_HOPE = 4.0  # the most that can still be gained, over the gain that a step promises
 
 
 class Hills(NamedTuple):
-    """Where the likelihood of one frame has hills, best first.
+    """Local maxima of the likelihood of one frame, best first.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def ambient_light(counts: NDArray[np.float64], extra: NDArray[np.float64]) -> ND
     for _ in range(_TRIMS):
         use = net <= (level + _TRIM_SIGMA * np.sqrt(np.maximum(level, 1.0)))[:, None]
         level = np.where(use, net, 0.0).sum(axis=1) / np.maximum(use.sum(axis=1), 1)
-    return np.maximum(level, LEAST_COUNT)
+    return np.asarray(np.maximum(level, LEAST_COUNT), dtype=np.float64)
 
 
 def find_hills(

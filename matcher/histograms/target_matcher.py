@@ -1,9 +1,9 @@
 """Class and view of a landmark from the targets that a direct sensor's chip reports (PHYSICS sections 7 and 11).
 
-What the chip makes of expected counts is what it is expected to report: merged peaks and estimates drawn to one side
-follow by themselves. A target is compared with the nearest one expected in its zone, with the sigma that came with it.
-A target that must be seen and is missing, and one that nothing explains, cost a disagreement. Chips report peaks
-of the noise too: how many of these are expected follows from the ambient light and the threshold.
+The expected report is computed from the expected counts by the chip's own estimator: merged peaks and estimates drawn
+to one side follow by themselves. A target is compared with the nearest one expected in its zone, with the sigma that
+came with it. A target that must be seen and is missing, and one that nothing explains, cost a disagreement. Chips
+report peaks of the noise too: how many of these are expected follows from the ambient light and the threshold.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ _STEPS = 6
 _DONE = 0.1
 _LEAST_STD_M = 1e-5
 _WIDER = 6.0
-"""Slopes of targets are taken over this multiple of the steps of counts: estimates jump where the highest bin changes."""
+"""Slopes of targets span this multiple of the steps of counts: estimates jump where the highest bin changes."""
 _LONGEST = {"m": 0.04, "rad": math.radians(4.0)}
 
 
 class Reported(NamedTuple):
-    """What the chip reported at one position; k targets of all frames.
+    """Targets that the chip reported at one position; k of all frames.
 
     Parameters
     ----------
@@ -99,6 +99,11 @@ class TargetMatcher:
         self.grid = plan_table(self.signals, bank.distance_m, bank.delta_rad, math.gcd(*rules.symmetry))
         self._limits = view_limits(self.grid)
         self._faint, self._sure = (_with_threshold(self.sensor, share) for share in (_FAINT, _SURE))
+
+    @property
+    def table_bytes(self) -> int:
+        """How large the histograms are that the table of targets is made of; they are not kept."""
+        return self.grid.n_bytes(self.sensor, len(self.signals))
 
     @cached_property
     def table(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

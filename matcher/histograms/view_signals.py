@@ -30,7 +30,7 @@ _VIEWS_AT_ONCE = 16
 
 
 class ViewSignals:
-    """What a direct sensor counts of one landmark, without pile-up and ambient light.
+    """Counts of a direct sensor from one landmark, without pile-up and ambient light.
 
     Parameters
     ----------

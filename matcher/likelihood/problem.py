@@ -152,7 +152,7 @@ class Problem:
         )
 
     def start(self, view: NDArray[np.float64], at_first_sight: bool) -> State:
-        """Look at the first views: which pixels count, and how bright the landmark is."""
+        """Evaluate the first views: the pixels that count, and the brightness of the landmark."""
         theta = np.column_stack([self.clipped(view.copy()), np.ones(len(view))])
         view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
         if at_first_sight and not self.with_albedo and not self.model.slopes_are_cheap:

@@ -127,7 +127,7 @@ class Search:
         self._look(widest_rad)
 
     def _look(self, widest_rad: float) -> None:
-        """Say to which sides the landmark may be off."""
+        """Set the shifts to each side by which the landmark may be off."""
         sensor, upward = self._sensor, self._upward
         self.column_rad = 2 * math.atan(sensor.tan_half_angles[0]) / sensor.cols
         most = min(sensor.cols // 4, math.ceil(min(widest_rad / self.column_rad, sensor.cols)))

@@ -15,6 +15,7 @@ from phasemark.data.files.csv_cell import as_cell
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
+from phasemark.matcher.recordings.direct_positions import DirectBatch
 from phasemark.render import Frames
 
 POSITIONS_AT_ONCE = 256
@@ -100,12 +101,12 @@ class EstimateTable:
         header += [f"corr_{_COLUMNS[a][0]}_{_COLUMNS[b][0]}" for a, b in combinations(self._free, 2)]
         self._writer.writerow([*header, "chi2", "dof", "p_value", "reason"])
 
-    def add(self, batch: MatchedBatch) -> None:
+    def add(self, batch: MatchedBatch | DirectBatch) -> None:
         """Add the answers of a batch.
 
         Parameters
         ----------
-        batch : MatchedBatch
+        batch : MatchedBatch or DirectBatch
         """
         times = batch.filtered.time_s
         for k, match in enumerate(batch.matches):

@@ -423,7 +423,7 @@ class Sensor(SensorQuantities):
             raise UsageError(f"{path}: {error}") from None
 
     def __repr__(self) -> str:
-        """Say in one line what kind of camera it is: pixels, field of view and modulation."""
+        """Describe the camera in one line: pixels, field of view and modulation."""
         view = f"{2 * self.half_angle_v_deg:.4g}° × {2 * self.half_angle_h_deg:.4g}°"
         parts = [f"{self.rows} × {self.cols} pixels", view]
         if self.kind == "direct":
@@ -439,7 +439,7 @@ class Sensor(SensorQuantities):
         return repr(self)
 
     def optics_difference(self, other: Sensor) -> str | None:
-        """Say in what the noise-free images of two cameras differ, e.g. ``'rows' is 16 here and 8 there``.
+        """Describe why the noise-free images of two cameras differ, e.g. ``'rows' is 16 here and 8 there``.
 
         Returns
         -------

@@ -1,0 +1,130 @@
+"""Logs of direct sensors as positions to be matched: histograms and targets, from their files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data.measured.histogram_logs import read_histograms, read_targets
+from phasemark.matcher.match import Matches
+from phasemark.matcher.matcher import Matcher
+from phasemark.render import Sensor
+from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.direct.targets import Targets
+
+_VALID_STATUS = (5, 9)
+
+
+@dataclass(frozen=True, eq=False)
+class DirectPositions:
+    """Positions of a direct sensor.
+
+    Parameters
+    ----------
+    frames : HistogramFrames or Targets
+    time_s : (n,) float64, optional
+    """
+
+    frames: HistogramFrames | Targets
+    time_s: NDArray[np.float64] | None = None
+
+    def __len__(self) -> int:
+        return len(self.frames.counts if isinstance(self.frames, HistogramFrames) else self.frames.distance_m)
+
+    def __getitem__(self, positions: slice) -> Self:
+        """Return some positions."""
+        frames = self.frames
+        some = (
+            frames[positions]
+            if isinstance(frames, HistogramFrames)
+            else _each(frames, lambda values: values[positions])
+        )
+        return type(self)(some, None if self.time_s is None else self.time_s[positions])
+
+
+@dataclass(frozen=True, eq=False)
+class DirectBatch:
+    """The answers to some positions; as :class:`~phasemark.matcher.recordings.estimates_table.MatchedBatch`."""
+
+    start: int
+    filtered: DirectPositions
+    matches: Matches
+
+
+def read_positions(
+    path: Path, sensor: Sensor, on: str, *, moving: bool, valid_status: Collection[int] | None = None
+) -> DirectPositions:
+    """Read a log of histograms or of targets.
+
+    Parameters
+    ----------
+    path : Path
+        NPZ or lines of JSON with histograms, or CSV with targets.
+    sensor : Sensor
+        The bank's, with a [histogram] table.
+    on : {"histograms", "targets"}
+        On targets histograms serve too: the chip's estimator makes targets of them.
+    moving : bool
+        Whether every frame is a position of its own; otherwise all are frames of one.
+    valid_status : collection of int, optional
+        Which codes of a CSV file's status columns mark a target; None: 5 and 9.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, or holds something else.
+    UsageError
+        Histograms are asked of a CSV file, or a status of a file that has none.
+    """
+    if path.suffix.lower() == ".csv":
+        if on == "histograms":
+            raise UsageError(f"{path}: CSV holds targets, not histograms: match it --on targets")
+        targets = read_targets(path, sensor=sensor, valid_status=valid_status or _VALID_STATUS)
+        return DirectPositions(_each(targets, lambda values: np.swapaxes(values, 0, 1)) if moving else targets)
+    if valid_status is not None:
+        raise UsageError(f"--valid-status goes with targets from CSV: {path} has histograms")
+    log = read_histograms(path, sensor=sensor).frames
+    if moving:
+        return DirectPositions(log, None if log.time_s is None else log.time_s[:, 0])
+    return DirectPositions(_added(log), None if log.time_s is None else np.array([log.time_s.mean()]))
+
+
+def match_directly(matcher: Matcher, positions: DirectPositions, *, at_once: int) -> Iterator[DirectBatch]:
+    """Match positions in batches; the answers do not depend on the size of a batch.
+
+    Parameters
+    ----------
+    matcher : Matcher
+        On histograms or on targets.
+    positions : DirectPositions
+    at_once : int
+        Positions in a batch.
+
+    Yields
+    ------
+    DirectBatch
+    """
+    for start in range(0, len(positions), at_once):
+        some = positions[start : start + at_once]
+        yield DirectBatch(start, some, matcher.match(some.frames))
+
+
+def _each(targets: Targets, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Targets:
+    """Return targets whose arrays were all changed."""
+    return Targets(change(targets.distance_m), change(targets.sigma_m), change(targets.signal), change(targets.status))
+
+
+def _added(log: HistogramFrames) -> HistogramFrames:
+    """Return all frames of a log as those of one position."""
+    return HistogramFrames(
+        np.swapaxes(log.counts, 0, 1),
+        sensor=log.sensor,
+        reference=None if log.reference is None else np.swapaxes(log.reference, 0, 1),
+        time_s=None if log.time_s is None else log.time_s.T,
+    )

@@ -1,0 +1,329 @@
+"""Matching histograms and targets of direct sensors: bound, honest covariance, classes, and what must be refused."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.stats import binom, kstest, norm
+
+from phasemark import UsageError
+from phasemark.data import Bank, BankPlan, build_bank
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.matcher import Matcher, Matches, cramer_rao, kalman_filter
+from phasemark.matcher.direct_method import Measured
+from phasemark.matcher.histograms.poisson_fit import deviance_moments, deviance_test, frame_sums, moments_of
+from phasemark.matcher.statistics import nees, view_errors
+from phasemark.render import Background, Frames, Sensor, Views, preset
+from phasemark.render.direct import HistogramFrames, HistogramRenderer, Targets, capture_histograms
+from phasemark.render.direct.bin_counts import detected_counts, piled_up, signal_counts
+from phasemark.render.direct.footprints import footprint_grid
+from phasemark.render.direct.sample_counts import signal_of_samples
+from phasemark.render.direct.scene_samples import SceneMesh
+from phasemark.render.direct.transients import range_axis, zone_transients
+
+SENSOR = "vl53l5cx-8x8"
+CLASSES = ("cylinder", "cone", "sphere")
+FREE = ("distance_m", "delta_rad")
+
+
+@lru_cache(maxsize=4)
+def bank_of(sensor: str = SENSOR, span: str = "0.95:1.25:0.1", classes: tuple[str, ...] = CLASSES) -> Bank:
+    return build_bank(
+        BankPlan(sensor=sensor, classes=classes, distance_m=span, delta_deg="0:170:10", layout="full"), workers=1
+    )
+
+
+@lru_cache(maxsize=8)
+def renderer_of(name: str, sensor: Sensor) -> HistogramRenderer:
+    return HistogramRenderer(build_mesh(catalog()[name]), sensor, albedo=catalog()[name].albedo)
+
+
+@lru_cache(maxsize=4)
+def matcher_of(free: tuple[str, ...] | None = FREE, on: Measured = "histograms", sensor: str = SENSOR) -> Matcher:
+    return Matcher(bank_of(sensor), "refine", free=free, on=on, workers=1)
+
+
+def random_views(n: int, rng: np.random.Generator) -> Views:
+    return Views.broadcast(rng.uniform(1.0, 1.2, n), rng.uniform(0, np.pi, n))
+
+
+def frames_of(name: str, views: Views, rng: np.random.Generator, n_frames: int = 1) -> HistogramFrames:
+    sensor = bank_of().camera
+    return capture_histograms(renderer_of(name, sensor).expected(views), sensor, rng=rng, n_frames=n_frames)
+
+
+@pytest.mark.parametrize("name", ["vl53l5cx-8x8", "tmf8820-3x3"])
+def test_counts_of_samples_are_those_of_their_transients(name: str) -> None:
+    sensor = preset(name)
+    histogram = sensor.histogram.model_dump()
+    if name == "tmf8820-3x3":  # each zone has a response, a bin width and a gain of its own
+        x = np.arange(-20, 41) * 0.002
+        rows = [tuple(np.exp(-0.5 * (x / (0.012 + 0.001 * k)) ** 2).tolist()) for k in range(9)]
+        scale = ((1.0, 1.02, 0.98),) * 3
+        gain = ((1.0, 0.9, 1.1),) * 3
+        histogram |= {
+            "irf_std_m": None, "irf": rows, "irf_start_m": float(x[0]), "irf_step_m": 0.002, "zone_bin_scale": scale,
+            "zone_gain": gain,
+        }  # fmt: skip
+        sensor = sensor.with_(histogram=histogram)
+    axis = range_axis(sensor)
+    views = Views.broadcast([0.7, 1.0], [0.3, 1.0])
+    samples = SceneMesh(build_mesh(catalog()["cone"])).samples_of_views(views, footprint_grid(sensor))
+    want = signal_counts(zone_transients(samples, sensor, axis), sensor, axis, 0.5)
+    got = signal_of_samples(samples, sensor, 0.5)
+    assert np.abs(got - want).max() < 5e-5 * want.max()  # linear steps of the response, 1/64 of its width
+
+
+def test_deviance_of_a_poisson_count_has_its_closed_forms() -> None:
+    means = 10.0 ** np.linspace(-3, 4, deviance_moments().shape[1])
+    table = deviance_moments()
+    faint = means[0]  # none or one: 2λ, or 2 (λ − 1 − ln λ)
+    none, one = 2 * faint, 2 * (faint - 1 - math.log(faint))
+    assert table[0, 0] == pytest.approx(math.exp(-faint) * (none + faint * one), rel=1e-3)
+    # to first order in 1/λ the mean is 1 + 1/6λ, and the variance 2 + 1/λ · 2/3
+    assert table[0, -1] == pytest.approx(1 + 1 / (6 * means[-1]), abs=1e-6)
+    assert table[1, -1] == pytest.approx(2, rel=1e-3)
+
+
+def test_chi2_of_a_deviance_is_uniform_where_bins_are_nearly_empty() -> None:
+    rng = np.random.default_rng(5)
+    level = np.full((8, 64), 0.4)
+    mean, variance = moments_of(level)
+    p = []
+    for _ in range(2000):
+        n = rng.poisson(level)
+        deviance = float((2 * (level - n + np.where(n > 0, n * np.log(np.maximum(n, 1) / level), 0.0))).sum())
+        p.append(deviance_test(deviance, mean, variance, 0)[2])
+    assert kstest(p, "uniform").pvalue > 1e-3  # false alarm of this test
+
+
+def test_gradient_and_information_are_those_of_the_piled_up_likelihood() -> None:
+    rng = np.random.default_rng(2)
+    zones, bins, cycles = 2, 12, 300.0
+    signal, slope = rng.uniform(0, 20, (zones, bins)), rng.normal(size=(1, zones, bins))
+    ambient, extra = np.array([2.0, 3.0]), rng.uniform(0, 1, bins)
+    counts = rng.poisson(10, (zones, bins)).astype(float)
+
+    def level_at(theta: float, log_bright: float, light: np.ndarray) -> np.ndarray:
+        return piled_up(math.exp(log_bright) * (signal + theta * slope[0]) + light[:, None] + extra, cycles)
+
+    def log_likelihood(x: np.ndarray) -> float:
+        level = level_at(x[0], x[1], ambient + x[2:])
+        return float((counts * np.log(level) - level).sum())
+
+    level, whole, gradient = np.empty((zones, bins)), np.empty((2, 2)), np.empty(2)
+    own = np.empty((zones, 4))
+    frame_sums(counts, signal, slope, 1.0, ambient, extra, cycles, level, whole, gradient, own, np.empty((2, 3)))
+    np.testing.assert_allclose(level, level_at(0, 0, ambient), rtol=1e-9)
+    h = 1e-5 * np.eye(4)
+    want = np.array([(log_likelihood(h[k]) - log_likelihood(-h[k])) / 2e-5 for k in range(4)])
+    by = [
+        (level_at(h[k, 0], h[k, 1], ambient + h[k, 2:]) - level_at(-h[k, 0], -h[k, 1], ambient - h[k, 2:])) / 2e-5
+        for k in range(4)
+    ]
+    full = np.array([[(a * b / level).sum() for a in by] for b in by])
+    cross, inner = full[:2, 2:], np.linalg.inv(full[2:, 2:])
+    np.testing.assert_allclose(whole, full[:2, :2] - cross @ inner @ cross.T, rtol=1e-6)
+    np.testing.assert_allclose(gradient, want[:2] - cross @ inner @ want[2:], rtol=1e-5)
+
+
+def errors_over_bound(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return RMSE over bound, NEES of each right answer, p-values, and the share that is right."""
+    rng = np.random.default_rng(seed)
+    scaled, squares, p_values, right = [], [], [], 0
+    for name in CLASSES:
+        views = random_views(n // len(CLASSES), rng)
+        found = matcher_of().match(frames_of(name, views, rng))
+        error = view_errors(found, views, FREE, np.pi)
+        ok = (found.class_name == name) & (np.abs(error) < [0.03, math.radians(6)]).all(axis=1)
+        wrong = found.accepted & ~ok
+        assert not wrong.any(), (name, views[np.flatnonzero(wrong)])
+        bound = cramer_rao(renderer_of(name, bank_of().camera), views, n_frames=1).covariance
+        scaled.append((error / np.sqrt(np.einsum("npp->np", bound)))[ok])
+        squares.append(nees(error[ok], found.covariance[ok]))
+        p_values.append(found.p_value[ok])
+        right += int(ok.sum())
+    ratio = np.sqrt((np.concatenate(scaled) ** 2).mean(axis=0))
+    return ratio, np.concatenate(squares), np.concatenate(p_values), right / (n // len(CLASSES) * len(CLASSES))
+
+
+def test_error_is_at_the_poisson_bound_and_the_covariance_is_honest() -> None:
+    n = 150
+    ratio, squares, p_values, right = errors_over_bound(n, seed=3)
+    assert right > 0.97
+    half = norm.isf(0.0005 / 4) / math.sqrt(2 * n)  # of a root mean square
+    assert (np.abs(ratio - 1) < half + 0.02).all()  # 0.02: slopes change over a standard deviation
+    assert abs(squares.mean() / 2 - 1) < norm.isf(0.0005 / 4) / math.sqrt(n) + 0.03
+    assert (p_values < 0.01).sum() <= binom.isf(1e-4, len(p_values), 0.01)
+
+
+@pytest.mark.soak
+def test_error_over_bound_and_nees_hold_their_bars_in_5000_trials_of_histograms() -> None:
+    ratio, squares, p_values, right = errors_over_bound(5000, seed=4)
+    assert ((ratio > 0.97) & (ratio < 1.05)).all(), ratio
+    assert 0.97 < squares.mean() / 2 < 1.05
+    assert (p_values < 0.01).mean() < 0.015
+    assert right > 0.97
+
+
+def test_brightness_and_ambient_light_that_the_sensor_file_does_not_know_cost_nothing() -> None:
+    rng = np.random.default_rng(6)
+    views = random_views(12, rng)
+    sensor = bank_of().camera
+    h = sensor.histogram.model_dump()
+    other = sensor.with_(histogram={**h, "photons": 0.4 * h["photons"], "ambient": 4 * h["ambient"]})
+    drawn = capture_histograms(renderer_of("cone", other).expected(views), other, rng=rng, n_frames=3)
+    frames = HistogramFrames(drawn.counts, sensor=sensor)
+    found = matcher_of().match(frames)
+    error = view_errors(found, views, FREE, np.pi)
+    assert (found.class_name == "cone").sum() >= 11
+    assert (np.abs(error) < 5 * np.sqrt(np.einsum("npp->np", found.covariance))).all()
+
+
+def test_the_bearing_is_estimated_unless_the_matcher_is_told_and_lies_within_its_errors() -> None:
+    rng = np.random.default_rng(7)
+    views = Views.broadcast(1.1, rng.uniform(0, np.pi, 9), np.radians(rng.normal(0, 1.5, 9)))
+    found = matcher_of(None).match(frames_of("cylinder", views, rng))
+    assert found.free == ("distance_m", "delta_rad", "bearing_rad")
+    error = view_errors(found, views, found.free, np.pi)
+    assert (found.class_name == "cylinder").sum() >= 8
+    assert (np.abs(error) < 5 * np.sqrt(np.einsum("npp->np", found.covariance))).all()
+    assert found.accepted.sum() >= 6
+
+
+def test_height_and_pitch_are_estimated_on_request_and_a_wrong_hill_is_refused() -> None:
+    rng, n = np.random.default_rng(8), 6
+    height, pitch = rng.normal(0, 0.015, n), np.radians(rng.normal(0, 1.5, n))
+    views = Views.broadcast(1.1, rng.uniform(0, np.pi, n), 0.0, height, pitch)
+    free = (*FREE, "height_m", "pitch_rad")
+    matcher = Matcher(bank_of(), "refine", free=free, on="histograms", height_std_m=0.03, workers=1)
+    found = matcher.match(frames_of("cone", views, rng, n_frames=20))
+    error = view_errors(found, views, free, np.pi)
+    inside = (np.abs(error) < 5 * np.sqrt(np.einsum("npp->np", found.covariance))).all(axis=1)
+    assert inside[found.accepted].all()
+    assert found.accepted.sum() >= n - 1
+
+
+def test_nothing_a_wall_and_another_thing_are_not_accepted() -> None:
+    rng = np.random.default_rng(9)
+    sensor = bank_of().camera
+    empty = np.tile(detected_counts(np.zeros((1, 64, sensor.histogram.bins)), sensor), (20, 1, 1))
+    nothing = matcher_of().match(capture_histograms(empty, sensor, rng=rng))
+    assert all(name is None for name in nothing.class_name)
+    assert not nothing.accepted.any()
+    assert (nothing.class_probability["none"] > 0.9).all()
+    views = Views.broadcast([1.0, 1.1, 1.2])
+    plain = HistogramRenderer(None, sensor).expected(views, background=Background(wall_m=1.3))
+    ball = HistogramRenderer(trimesh.creation.icosphere(3, 0.12), sensor).expected(views)
+    for mean in (plain, ball):
+        assert not matcher_of().match(capture_histograms(mean, sensor, rng=rng)).accepted.any()
+
+
+def test_a_drift_that_the_reference_histogram_shows_is_taken_off() -> None:
+    rng = np.random.default_rng(10)
+    sensor = bank_of().camera
+    h = {**sensor.histogram.model_dump(), "reference_peak": 10.0, "reference_gain": 1.0}
+    bank = build_bank(
+        BankPlan(
+            sensor=SENSOR, sensor_overrides={"histogram": h}, classes=("cone",), distance_m="1.0:1.2:0.1",
+            delta_deg="0:170:10", layout="full",
+        )
+    )  # fmt: skip
+    views = Views.broadcast(1.1, 0.7)
+    signal = 0.8 * renderer_of("cone", sensor).signal(views)[:, 0]
+    late = detected_counts(np.fft.irfft(np.fft.rfft(signal) * np.exp(-2j * np.pi * np.arange(65) / 128 * 0.6)), sensor)
+    counts = rng.poisson(np.maximum(late, 1e-3)).reshape(1, 1, 8, 8, 128)
+    reference = np.exp(-0.5 * ((np.arange(32) - 10.6) / 1.5) ** 2).reshape(1, 1, 32) * 1e4
+    found = Matcher(bank, "refine", free=FREE, on="histograms", workers=1).match(
+        HistogramFrames(counts, sensor=bank.camera, reference=reference)
+    )
+    assert abs(found.distance_m[0] - 1.1) < 5 * math.sqrt(found.covariance[0, 0, 0])
+
+
+def test_the_answers_do_not_depend_on_threads_or_on_what_else_is_matched() -> None:
+    rng = np.random.default_rng(11)
+    frames = frames_of("sphere", random_views(6, rng), rng)
+    alone = Matches(matcher_of().match(frames[k : k + 1])[0] for k in range(6))
+    together = Matcher(bank_of(), "refine", free=FREE, on="histograms", workers=2).match(frames)
+    np.testing.assert_array_equal(alone.distance_m, together.distance_m)
+    np.testing.assert_array_equal(alone.covariance, together.covariance)
+
+
+def test_targets_give_class_and_view_within_their_errors() -> None:
+    rng = np.random.default_rng(12)
+    matcher = matcher_of(on="targets")
+    squares, n_right = [], 0
+    for name in CLASSES:
+        views = random_views(20, rng)
+        found = matcher.match(frames_of(name, views, rng).targets)
+        error = view_errors(found, views, FREE, np.pi)
+        right = (found.class_name == name) & (np.abs(error) < [0.03, math.radians(10)]).all(axis=1)
+        assert right[found.accepted].all()
+        squares.append(nees(error[right], found.covariance[right]))
+        n_right += int(right.sum())
+    assert n_right >= 54
+    inside = np.concatenate(squares) < 5.99  # the 95 % ellipse
+    assert inside.sum() >= binom.ppf(1e-4, n_right, 0.88)  # estimates jump from bin to bin: tails are heavier
+
+
+def test_targets_that_are_z_alone_are_matched_as_z_and_missing_ones_count() -> None:
+    rng = np.random.default_rng(13)
+    views = Views.broadcast([1.05, 1.15], [0.5, 1.2])
+    found = frames_of("cylinder", views, rng, n_frames=10).targets
+    first = found.distance_m[..., :1]
+    bare = Targets(first, np.full(first.shape, np.nan), np.zeros(first.shape), found.status[..., :1])
+    panel = matcher_of(on="targets").match(bare)
+    assert (panel.class_name == "cylinder").all()
+    assert np.abs(view_errors(panel, views, FREE, np.pi)[:, 0]).max() < 0.01
+    status = bare.status.copy()
+    status[:, :, 2:6, 3:5] = 1  # what stands in the middle of the image is gone
+    left = Targets(np.where(status == 0, first, np.nan), bare.sigma_m, bare.signal, status)
+    blind = matcher_of(on="targets").match(left)
+    assert not blind.accepted.any()
+
+
+def test_no_target_at_all_is_no_landmark() -> None:
+    none = np.full((1, 1, 8, 8, 1), np.nan)
+    found = matcher_of(on="targets").match(Targets(none, none, np.zeros(none.shape), np.ones(none.shape, np.uint8)))
+    assert found[0].reason == "no landmark"
+    assert found[0].class_name is None
+
+
+def test_what_does_not_go_with_histograms_is_refused_in_one_line() -> None:
+    bank, phase = bank_of(), bank_of("pmd-16x16", "1.0:1.1:0.1", ("cone",))
+    with pytest.raises(
+        UsageError, match=r"^histograms and targets take a bank of a direct sensor.*'pmd-16x16' is a phase"
+    ):
+        Matcher(phase, "refine", on="histograms")
+    with pytest.raises(UsageError, match=r"^on=\"histograms\": 'method' must be refine"):
+        Matcher(bank, on="histograms")
+    with pytest.raises(UsageError, match=r"^on=\"targets\": 'background' must be None"):
+        Matcher(bank, "refine", on="targets", background="auto")
+    with pytest.raises(UsageError, match=r"^on=\"histograms\": 'robust'"):
+        Matcher(bank, "refine", on="histograms", robust=True)
+    frames = HistogramFrames(np.ones((1, 1, 8, 8, 128)), sensor=bank.camera)
+    with pytest.raises(UsageError, match=r"^on=\"ranges\" takes filtered frames"):
+        Matcher(bank, "refine", free=FREE).match(frames)
+    filtered = kalman_filter(Frames(np.ones((1, 1, 8, 8)), sensor=bank.camera))
+    with pytest.raises(UsageError, match=r"^on=\"histograms\" takes HistogramFrames, got FilteredFrames"):
+        matcher_of().match(filtered)
+    other = bank.camera.with_(histogram={**bank.camera.histogram.model_dump(), "photons": 0.5})
+    with pytest.raises(UsageError, match=r"another sensor than the bank's: 'histogram.photons' is 0.5 here"):
+        matcher_of().match(HistogramFrames(np.ones((1, 1, 8, 8, 128)), sensor=other))
+    none = np.full((1, 1, 4, 4, 1), np.nan)
+    with pytest.raises(UsageError, match=r"^the targets are of 4 × 4 zones"):
+        matcher_of(on="targets").match(Targets(none, none, none, none))
+    with pytest.raises(UsageError, match="of histograms all zones count"):
+        cramer_rao(renderer_of("cone", bank.camera), Views.broadcast(1.0), pixels="lower")
+
+
+def test_the_table_states_its_size_before_it_is_made() -> None:
+    from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
+
+    direct = matcher_of()._direct
+    assert isinstance(direct, HistogramMatcher)
+    assert matcher_of().table_bytes == sum(table.n_bytes for table in direct.tables)

@@ -1,0 +1,96 @@
+"""``phasemark match`` on logs of direct sensors: histograms, targets, and what does not go with them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phasemark.cli import main
+from phasemark.data import BankPlan, build_bank
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.render import Views, preset
+from phasemark.render.direct import HistogramRenderer, capture_histograms
+
+VIEWS = Views.broadcast([1.0, 1.1], [0.4, 1.2])
+FIXED = ("--method", "refine", "--fix", "bearing")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a bank, and a log of histograms and one of targets of the cone."""
+    place = tmp_path_factory.mktemp("direct")
+    grid = {"classes": ("cone", "sphere"), "distance_m": "0.95:1.15:0.1", "delta_deg": "0:170:10"}
+    build_bank(BankPlan(sensor="vl53l5cx-8x8", **grid), place / "bank.h5").close()
+    build_bank(BankPlan(classes=("cone",), distance_m="1.0", delta_deg="0"), place / "phase.h5").close()
+    sensor = preset("vl53l5cx-8x8")
+    renderer = HistogramRenderer(build_mesh(catalog()["cone"]), sensor)
+    frames = capture_histograms(renderer.expected(VIEWS), sensor, rng=np.random.default_rng(1))
+    counts = frames.zone_counts.astype(int)
+    np.savez(place / "log.npz", histogram=counts, t_s=np.array([0.0, 0.1]))
+    lines = [json.dumps({"histogram": one.tolist(), "t_s": 0.1 * k}) for k, one in enumerate(counts)]
+    (place / "log.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    mm = 1000 * frames.targets.distance_m[:, 0, :, :, 0].reshape(2, 64)
+    sigma = 1000 * frames.targets.sigma_m[:, 0, :, :, 0].reshape(2, 64)
+    header = [f"mm_{z}_0" for z in range(64)] + [f"sigma_mm_{z}_0" for z in range(64)]
+    rows = [["" if np.isnan(v) else f"{v:.2f}" for v in row] for row in np.hstack([mm, sigma])]
+    (place / "targets.csv").write_text("\n".join(",".join(row) for row in [header, *rows]) + "\n", encoding="utf-8")
+    return place
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
+    code = main([str(word) for word in words])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+LOGS = [("log.npz", "histograms"), ("log.jsonl", "histograms"), ("log.npz", "targets"), ("targets.csv", "targets")]
+
+
+@pytest.mark.parametrize(("name", "on"), LOGS)
+def test_a_log_is_matched_frame_by_frame(folder: Path, capsys: pytest.CaptureFixture[str], name: str, on: str) -> None:
+    code, out, _ = run(
+        capsys, "match", folder / "bank.h5", folder / name, *FIXED, "--on", on, "--moving", "--json",
+        "--estimates", folder / f"{name}-{on}.csv",
+    )  # fmt: skip
+    assert code == 0
+    found = json.loads(out)["matches"]
+    assert [one["class"] for one in found] == ["cone", "cone"]
+    assert [one["distance_m"] for one in found] == pytest.approx(VIEWS.distance_m.tolist(), abs=0.01)
+    if name == "log.npz":
+        assert [one["time_s"] for one in found] == [0.0, 0.1]
+    assert len((folder / f"{name}-{on}.csv").read_text().splitlines()) == 3
+
+
+def test_frames_of_a_sensor_at_rest_are_added_up(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = np.load(folder / "log.npz")["histogram"][:1]
+    np.savez(folder / "rest.npz", histogram=np.repeat(one, 3, axis=0))
+    code, out, _ = run(capsys, "match", folder / "bank.h5", folder / "rest.npz", *FIXED, "--on", "histograms")
+    assert code == 0
+    assert out.count("cone") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (("bank.h5", "log.npz", "--on", "histograms"), "--on goes with --method refine"),
+        (("phase.h5", "log.npz", *FIXED, "--on", "histograms"), "take a bank of a direct sensor"),
+        (("bank.h5", "targets.csv", *FIXED, "--on", "histograms"), "match it --on targets"),
+        (("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--wall", "3"), "--wall goes with images of ranges"),
+        (("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--unit", "mm"), "--unit goes with images of ranges"),
+        (("bank.h5", "log.npz", *FIXED, "--on", "targets", "--robust"), "--robust goes with images of ranges"),
+        (("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--plot", "a.png"), "--plot draws ranges"),
+        (("bank.h5", "log.npz", *FIXED, "--on", "targets", "--valid-status", "5"), "--valid-status goes with targets"),
+        (("bank.h5", "log.npz", *FIXED), "--on histograms"),
+    ],
+)
+def test_what_does_not_go_together_is_refused_in_one_line(
+    folder: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], problem: str
+) -> None:
+    bank, log, *rest = words
+    code, _, err = run(capsys, "match", folder / bank, folder / log, *rest)
+    assert code in (2, 3)
+    assert problem in err
+    assert len(err.strip().splitlines()) == 1
