@@ -233,7 +233,6 @@ def test_half_angles_and_principal_point_follow_from_the_lens():
         ),
         ({"lens": {"fx": 60, "fy": 60, "cx": 16, "cy": 12, "k1": 0}}, r"'k1' is no key of \[lens\]"),
         ({"lens": {"fx": 60, "fy": 60, "cx": 16}}, "'lens.cy' is missing"),
-        ({"lens": {"fx": 60, "fy": 60, "cx": 90, "cy": 12}}, "another image size"),
     ],
 )
 def test_what_contradicts_a_lens_is_refused(fields, message):
@@ -241,6 +240,16 @@ def test_what_contradicts_a_lens_is_refused(fields, message):
     with pytest.raises(UsageError, match=message) as refused:
         Sensor(**{**stated, **fields})
     assert "\n" not in str(refused.value)
+
+
+def test_intrinsics_of_another_image_size_are_refused(tmp_path):
+    matrix = [[60, 0, 90], [0, 60, 12], [0, 0, 1]]
+    with pytest.raises(UsageError, match="'lens.cx' must lie near the middle of an image of 32 columns, got 90"):
+        Sensor.from_opencv(matrix, size=(32, 24))
+    file = tmp_path / "my.toml"
+    file.write_text("rows = 24\ncols = 32\n[lens]\nfx = 60\nfy = 60\ncx = 90\ncy = 12\n")
+    with pytest.raises(UsageError, match="my.toml: 'lens.cx' must lie near the middle"):
+        Sensor.from_toml(file)
 
 
 def test_a_lens_that_folds_inside_the_image_is_refused_with_the_radius():

@@ -22,8 +22,6 @@ SPLIT = 1
 """Pixel state: sampled, split exactly."""
 UNTRUSTED = 2
 """Pixel state: sampled, but too many edges for an exact split."""
-_TURN_RAD = 0.1
-"""Turn of the fastest phase over the width of a pixel at the landmark above which slanted faces take more points."""
 SHORT_LINKS = -1
 """Next view that says that ``edges.link`` is too short."""
 SHORT_SEGMENTS = -2
@@ -79,7 +77,6 @@ def plan_rays(  # type: ignore[no-untyped-def]
             return SHORT_SEGMENTS, n
         if bin_segments(n_edges, camera, edges) < 0:
             return SHORT_LINKS, n
-        fine = fastest * camera.slope_u * _distance(poses.lens[view]) > _TURN_RAD
         start, first_border = n, n_borders
         for row in range(rows):
             r = camera.first_row + row
@@ -100,7 +97,6 @@ def plan_rays(  # type: ignore[no-untyped-def]
                     continue
                 before = n
                 bent = left < bent_high_u and right > bent_low_u and top < bent_high_v and bottom > bent_low_v
-                bent = bent or fine
                 parts_u, parts_v = parts_of_pixel(r, c, background, fastest, cos_b, sin_b, poses.level[view], camera)
                 parts_u, parts_v = max(splits, parts_u), max(splits, parts_v)
                 n, region, trusted = sample_pixel(
@@ -143,12 +139,6 @@ def _add_background(background, cos_b, sin_b, level, camera, edges, n):  # type:
     else:
         return n
     return add_bent_edge(ya, za, yb, zb, -1, -1, 0, camera, edges, n)
-
-
-@kernel
-def _distance(lens):  # type: ignore[no-untyped-def]
-    """Return how far the lens is from the landmark's origin."""
-    return math.sqrt(lens[0] * lens[0] + lens[1] * lens[1] + lens[2] * lens[2])
 
 
 @kernel
