@@ -131,7 +131,7 @@ def _visible_edges(mesh: trimesh.Trimesh, towards: NDArray[np.float64], closed: 
 def _hidden(
     points: NDArray[np.float64], triangles: NDArray[np.float64], towards: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Tell which points have a triangle between them and a viewer far away, (n,)."""
+    """Return True for points that a triangle hides from a distant viewer, (n,)."""
     across = np.cross(towards, [0.0, 0.0, 1.0] if abs(towards[2]) < 0.9 else [1.0, 0.0, 0.0])
     across /= np.linalg.norm(across)
     frame = np.stack([across, np.cross(towards, across), towards])

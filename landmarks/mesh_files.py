@@ -167,7 +167,7 @@ def read_mesh(
 
 
 def check_mesh(mesh: trimesh.Trimesh) -> MeshReport:
-    """Say what a mesh holds and what may be wrong with it.
+    """Report size, extent and defects of a mesh.
 
     Parameters
     ----------

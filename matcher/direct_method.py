@@ -1,4 +1,4 @@
-"""Matching of what a direct sensor counted or reported, and the options that go with it."""
+"""Matching of histograms and targets of a direct sensor, and the options of a matcher that go with them."""
 
 from __future__ import annotations
 

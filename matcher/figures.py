@@ -110,7 +110,7 @@ def match_figure(
 
 
 def describe(match: Match) -> str:
-    """Say in one line what a match found."""
+    """Describe a match in one line."""
     if match.class_name is None:
         return "no landmark"
     verdict = "accepted" if match.accepted else "doubtful"

@@ -29,6 +29,7 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.pixel_agreement import pixel_mask
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, unwrap_ranges
 from phasemark.render.sensor.frequencies import common_divisor_hz
+from phasemark.render.sensor.lens_fields import DERIVED
 
 _UNMIXED_RAD = 0.01
 """How far the phases of the frequencies may disagree, as a standard deviation, for a pixel to count as unmixed."""
@@ -98,6 +99,23 @@ class OneFrequency:
     def _more_electrons(self) -> float:
         hz = common_divisor_hz(self.camera.frequencies_hz)
         return math.fsum((own / hz) ** 2 for own in self.camera.frequencies_hz)
+
+    def camera_like(self, sensor: Sensor) -> Sensor:
+        """Return the camera with the fields in which a sensor differs from the one that stands for the camera.
+
+        Parameters
+        ----------
+        sensor : Sensor
+            Of one frequency, with other optics or another calibration.
+        """
+        changes = {
+            name: getattr(sensor, name)
+            for name in type(sensor).model_fields
+            if getattr(sensor, name) != getattr(self.sensor, name)
+        }
+        if "lens" in changes:  # the others follow from it
+            changes = {name: value for name, value in changes.items() if name not in DERIVED}
+        return self.camera.with_(**changes)
 
     def stack(self, layers: NDArray[Any]) -> NDArray[Any]:
         """Put images (…, m, rows, cols) above one another, (…, m · rows, cols): first upper halves, then lower ones.
@@ -200,7 +218,7 @@ class OneFrequency:
         if not parts:
             raise UsageError(
                 "the frames hold unwrapped ranges alone, and phases are compared at every modulation frequency: give"
-                ' frames with what each of them measured, or match with method="refine" on="ranges"'
+                ' frames with what each of them measured, or match with method="refine" on="ranges" and no background'
             )
 
         def stacked(name: str, scale: ArrayLike = 1.0) -> NDArray[Any] | None:
@@ -252,12 +270,7 @@ class OneFrequencyRenderer(Renderer):
 
     def seen_by(self, sensor: Sensor) -> Renderer:
         """Return a renderer for a camera that differs in optics from the one that stands for the camera."""
-        changes = {
-            name: getattr(sensor, name)
-            for name in type(sensor).model_fields
-            if getattr(sensor, name) != getattr(self.sensor, name)
-        }
-        camera = self._one.camera.with_(**changes)
+        camera = self._one.camera_like(sensor)
         return OneFrequencyRenderer(self._renderer.seen_by(camera), OneFrequency(camera, self._one.way))
 
     def render_views(self, views: Views, *, rows: tuple[int, int] | None = None, **options: Any) -> PhasorImages:
@@ -382,6 +395,11 @@ def pixels_of(bank: Bank, pixels: str) -> NDArray[np.bool_]:
     return bank.one.same_for_all(pixel_mask(pixels, bank.one.camera))
 
 
+def layers_of(bank: Bank) -> OneFrequency | None:
+    """Return how a bank's images of several frequencies lie above one another; None where they do not."""
+    return bank.one if isinstance(bank, OneFrequencyBank) and bank.one.stacked else None
+
+
 def phases_wrap(bank: Bank) -> bool:
     """Return whether phases of one pixel may differ by more than half a turn from view to view of a bank."""
-    return isinstance(bank, OneFrequencyBank) and bank.one.stacked
+    return layers_of(bank) is not None

@@ -46,7 +46,7 @@ class MatchMethod(Protocol):
 
 
 class DirectMethod(Protocol):
-    """A method that matches the histograms or the targets of a direct sensor."""
+    """Interface of a method that matches the histograms or the targets of a direct sensor."""
 
     @property
     def table_bytes(self) -> int:
@@ -79,13 +79,13 @@ class Matcher:
     false_alarm : float
         Share of good frames that the test of the fit may refuse.
     on : {"ranges", "phasors", "histograms", "targets"}
-        What "refine" explains: ranges, or amplitude · exp(iφ) with the landmark's albedo estimated too. Phasors need
-        frames with amplitudes, best from :func:`~phasemark.matcher.phasor_mean`. Of several modulation frequencies
-        ranges are the unwrapped ones with their combined variance; phasors, and the phases that "nearest" compares, are
-        those of every frequency, each wrapped by itself: nothing is unwrapped, and mixed pixels count. Of a direct
-        sensor with a [histogram] table also the counts of every bin, Poisson, with the landmark's brightness and the
-        ambient light of every zone estimated, or the targets that its chip reports; both take a scene that holds the
-        landmark alone.
+        What "refine" explains: of a direct sensor with a [histogram] table the counts of every bin, Poisson, with the
+        landmark's brightness and the ambient light of every zone estimated too; or the targets that its chip reports.
+        Both take a scene that holds the landmark alone. Otherwise ranges, or amplitude · exp(iφ) with the landmark's
+        albedo estimated too. Phasors need frames with amplitudes, best from :func:`~phasemark.matcher.phasor_mean`.
+        Of several modulation frequencies ranges are the unwrapped ones with their combined variance; phasors, and the
+        phases that "nearest" compares, are those of every frequency, each wrapped by itself: nothing is unwrapped, and
+        mixed pixels count.
     pixels : {"all", "lower"}
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool
@@ -131,7 +131,7 @@ class Matcher:
     """
 
     def __repr__(self) -> str:
-        """Say in one line how frames are matched, and against what."""
+        """Describe in one line the method and the bank."""
         usual = (None, False, "all", "ranges")
         stated = [f"{name}={value!r}" for name, value in self.options.items() if value not in usual]
         return f"Matcher({', '.join([self.method, *stated])}, {self.bank!r})"
@@ -202,7 +202,9 @@ class Matcher:
             )
             return
         if len(bank.sensor.frequencies_hz) > 1:
-            bank = OneFrequencyBank(bank, "combined" if method == "refine" and on == "ranges" else "stacked")
+            # mixed pixels have no range that the frequencies agree on, and before a background they are at every edge
+            unwraps = method == "refine" and on == "ranges" and not isinstance(background, Background)
+            bank = OneFrequencyBank(bank, "combined" if unwraps else "stacked")
             self._one = bank.one
         self._method: MatchMethod
         if method == "refine":

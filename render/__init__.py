@@ -7,7 +7,7 @@ from phasemark.render import compile_cache  # noqa: F401 - first, for the module
 from phasemark.render.background import Background
 from phasemark.render.direct.capture import capture
 from phasemark.render.direct.histogram_frames import HistogramFrames
-from phasemark.render.direct.histogram_images import HistogramImages
+from phasemark.render.direct.histogram_images import HistogramImages, HistogramRenderer
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m
 from phasemark.render.renderer import Renderer, background_image
@@ -32,6 +32,9 @@ __all__ = [
     "Background",
     "Flag",
     "Frames",
+    "HistogramFrames",
+    "HistogramImages",
+    "HistogramRenderer",
     "PhasorImages",
     "Renderer",
     "Sensor",

@@ -48,6 +48,8 @@ _VIEWS_PER_TASK = 64
 _MAX_SPLITS = 4
 _TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
 """Parameters that turn what stands behind the landmark."""
+_SLOW_HZ = 10e6
+"""Frequency up to which the phase of a floor turns so little within a pixel that none is cut."""
 _LARGE = 1 << 13
 """Faces above which a mesh is more than the processor's cache holds."""
 
@@ -171,7 +173,7 @@ class Renderer:
     """
 
     def __repr__(self) -> str:
-        """Say in one line what is rendered, and with which camera."""
+        """Describe in one line the landmark and the camera."""
         faces = self.topology.faces
         size = " × ".join(f"{100 * side:.3g}" for side in np.ptp(self.topology.vertices, axis=0)) if len(faces) else ""
         landmark = f"{size} cm, {len(faces)} faces, albedo {self.albedo:g}" if size else "no landmark"
@@ -626,8 +628,9 @@ class Renderer:
 
 
 def _fastest(sensor: Sensor) -> float:
-    """Return the radians per metre of the highest modulation frequency, 0 of a single one behind an ideal lens."""
-    if len(sensor.frequencies_hz) == 1 and not sensor.bends_rays:
+    """Return the radians per metre of the highest modulation frequency, 0 of a single slow one behind an ideal lens."""
+    highest = max(sensor.frequencies_hz)
+    if len(sensor.frequencies_hz) == 1 and not sensor.bends_rays and highest <= _SLOW_HZ:
         return 0.0
     return max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
 

@@ -113,7 +113,7 @@ class Views:
                 object.__setattr__(self, name, np.zeros(len(self.distance_m)))
 
     def __repr__(self) -> str:
-        """Say in one line how many views there are, and over what; what is 0 in all of them is left out."""
+        """Describe in one line the number and the extent of the views, without parameters that are 0 in all of them."""
         spans = []
         for name, label, unit in _SHOWN:
             values = getattr(self, name)

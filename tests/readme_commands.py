@@ -291,6 +291,21 @@ def _write_large_sensor(path: Path) -> None:
     path.write_text("".join(f"{name} = {value}\n" for name, value in fields.items()), encoding="utf-8")
 
 
+def _write_zones(path: Path) -> None:
+    """Write the plan of a frame set of a direct sensor."""
+    path.write_text(
+        """classes = ["cylinder", "cone"]
+sensor = "vl53l5cx-8x8"
+views = 100
+frames_per_view = 2
+distance_m = { uniform = [0.6, 1.2] }
+wall_m = 1.8
+floor_m = 0.5
+""",
+        encoding="utf-8",
+    )
+
+
 def _copy_example(path: Path) -> None:
     """Copy a file of the examples of that name."""
     path.write_bytes((Path(__file__).parent.parent / "examples" / path.name).read_bytes())
@@ -318,4 +333,5 @@ GIVEN: dict[str, Callable[[Path], None]] = {
     "own_matcher.toml": _copy_example,
     "poses.csv": _write_poses,
     "workshop.npz": _write_workshop,
+    "zones.toml": _write_zones,
 }

@@ -194,7 +194,10 @@ def test_a_camera_without_noise_has_a_data_sheet_without_chi2():
 def test_a_direct_sensor_says_what_it_does_not_have():
     sensor = preset("vl53l5cx-8x8").with_(range_offset_m=0.01)
     found = characterise(sensor, rng=np.random.default_rng(3), n_frames=200)
-    assert {one.figure for one in found.comparisons} == {"range_noise", "linearity", "threshold"}
+    of_histograms = {"histogram", "merging", "ambient"}
+    assert {one.figure for one in found.comparisons} == {"range_noise", "linearity", "threshold"} | of_histograms
+    plain = characterise(sensor.with_(histogram=None), rng=np.random.default_rng(3), n_frames=20)
+    assert not {one.figure for one in plain.comparisons} & of_histograms
     assert any("direct time-of-flight" in note for note in found.notes)
     assert found.quantity("threshold_distance_albedo_0.8_m").simulated == pytest.approx(4.0, rel=0.002)
     assert not found.disagreements

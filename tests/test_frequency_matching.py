@@ -1,19 +1,25 @@
 """Filters, bounds and matching of cameras with several modulation frequencies (PHYSICS section 10)."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from builders import wrapped
 from scipy import stats
+from test_calibrate import MESH, filtered, nees, some_mounting, some_poses
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Matcher, PixelKalman, kalman_filter, phasor_mean
+from phasemark.landmarks.spec import Box
+from phasemark.matcher import Matcher, PixelKalman, calibrate, diagnose, kalman_filter, phasor_mean
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
+from phasemark.matcher.accuracy.grid_spacing import grid_loss
 from phasemark.matcher.accuracy.look_alikes import class_distances_squared
+from phasemark.matcher.design import DesignPlan, turn_distance
 from phasemark.matcher.filters.filtered_frames import PixelState, noise_free
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.render import (
     Background,
     Frames,
@@ -171,6 +177,51 @@ def test_matching_on_unwrapped_ranges_reaches_the_bound(bank):
     assert low < np.sum(nees) < high
 
 
+def test_ranges_before_a_wall_count_mixed_pixels_and_their_covariance_is_honest(bank):
+    """Each frequency's wrapped range counts by itself: mixed pixels have no range that the frequencies agree on."""
+    wall = Background(wall_m=3.0)
+    renderer, image = scene(bank, wall)
+    frames = kalman_filter(take(image, TWO, 50))
+    matches = Matcher(bank, "refine", background=wall).match(frames)
+    accepted = matches.accepted
+    assert accepted.mean() > 0.8
+    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted).tolist())
+    error = errors_of(matches, image.views)
+    bound = cramer_rao(renderer, image.views, free=VIEW[:3], background=wall)
+    for k, name in enumerate(bound.free):
+        ratio = error[accepted, k] / bound.std(name)[accepted]
+        low, high = stats.chi2.interval(1 - 0.001 / 8, accepted.sum())  # 99.9 %, eight cells
+        assert low < np.sum(ratio**2) < 1.3 * high  # the bound is local: slopes jump where edges cross pixel borders
+    nees = [error[k] @ np.linalg.solve(matches[k].covariance, error[k]) for k in np.flatnonzero(accepted).tolist()]
+    low, high = stats.chi2.interval(1 - 0.001 / 8, 3 * accepted.sum())
+    assert low < np.sum(nees) < 1.3 * high
+    alone = replace(frames, by_frequency=())
+    with pytest.raises(UsageError, match=r'unwrapped ranges alone, .* on="ranges" and no background'):
+        Matcher(bank, "refine", background=wall).match(alone)
+
+
+@pytest.mark.parametrize("background", [None, Background(wall_m=3.0)], ids=["alone", "wall"])
+def test_all_six_numbers_are_found_on_phasors_of_two_frequencies(bank, background):
+    rng, n = np.random.default_rng(12), 8
+    tilts = [rng.normal(0, width, n) for width in (0.03, 0.03, 0.04, 0.06)]
+    views = Views.broadcast(rng.uniform(0.95, 1.2, n), rng.uniform(0, math.pi, n), *tilts)
+    renderer = Renderer(bank.mesh("cone"), TWO.with_(max_phase_std_rad=None))
+    frames = phasor_mean(take(renderer.render_views(views, background=background), renderer.sensor, 50))
+    matcher = Matcher(
+        bank, "refine", free=VIEW, on="phasors", background=background, height_std_m=0.05, pitch_std_rad=0.06,
+        roll_std_rad=0.1,
+    )  # fmt: skip
+    matches = matcher.match(frames)
+    assert set(matches.class_name) == {"cone"}
+    assert matches.accepted.sum() >= n - 1
+    error = np.column_stack([getattr(matches, name) - getattr(views, name) for name in VIEW])
+    error[:, 1] -= math.pi * np.round(error[:, 1] / math.pi)
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(matches.covariance), error)
+    # covariances are local beside edges before a wall: no error may be far beyond them; 99.9 % of the median of 8
+    assert np.median(nees) < 2.3 * stats.chi2.median(6)
+    assert nees.max() < 60
+
+
 @pytest.mark.parametrize("background", [None, Background(wall_m=3.0)])
 def test_the_nearest_image_is_found_by_phases_of_every_frequency(bank, background):
     _, image = scene(bank, background, bearing_std_deg=0.0)
@@ -238,8 +289,6 @@ def test_what_is_not_understood_of_several_frequencies_is_refused_in_one_line(ba
         Matcher(bank).match(kalman_filter(alone))
     with pytest.raises(UsageError, match='background="auto" takes on="ranges"'):
         Matcher(bank, "refine", on="phasors", background="auto")
-    with pytest.raises(UsageError, match="with several modulation frequencies takes height_m on"):
-        Matcher(bank, "refine", on="phasors", free=("distance_m", "delta_rad", "height_m"))
     with pytest.raises(UsageError, match="a data sheet takes a sensor of one modulation frequency, got"):
         characterise(TWO, rng=np.random.default_rng(1))
     with pytest.raises(UsageError, match="a fit takes a sensor of one modulation frequency"):
@@ -276,3 +325,67 @@ def test_a_camera_is_characterised_and_fitted_at_each_frequency():
         assert fit.sensor.signal_e * fit.sensor.contrast == pytest.approx(TWO.signal_e * 0.5, rel=0.02)
     sheet = characterise(TWO.by_frequency[1], rng=np.random.default_rng(1), n_frames=20)
     assert sheet.sensor.modulation_hz == 60e6
+
+
+# What is made from matching and bounds
+
+
+def test_a_camera_of_two_frequencies_is_calibrated_on_unwrapped_ranges():
+    found = []
+    for seed in range(2):
+        rng = np.random.default_rng([7, seed])
+        truth, poses = some_mounting(rng, 0.8), some_poses(rng, 8)
+        there = truth.on(TWO)
+        views = Views.broadcast(poses.distance_m, poses.delta_rad, poses.bearing_rad, poses.height_m)
+        seen = capture(Renderer(MESH, there, albedo=0.8).render_views(views), there, rng=rng, n_frames=50)
+        frames = Frames(
+            seen.range_m, seen.amplitude_e, seen.intensity_e, flags=seen.flags, sensor=TWO,
+            by_frequency=seen.by_frequency,
+        )  # fmt: skip
+        one = calibrate(MESH, filtered(frames), poses)
+        found.append(nees(one, truth))
+        assert one.sensor.modulation_hz == one.base.modulation_hz == (20e6, 60e6)
+        assert one.sensor.pitch_deg == pytest.approx(math.degrees(truth.pitch_rad), abs=0.05)
+        assert not one.doubts
+    # the sum of 2 NEES of 7 numbers is χ²(14), 99.9 %
+    assert stats.chi2.ppf(5e-4, 14) < sum(found) < stats.chi2.ppf(1 - 5e-4, 14)
+    with pytest.raises(UsageError, match="a calibration with several modulation frequencies takes 'on' = ranges"):
+        calibrate(MESH, filtered(frames), poses, on="phasors")
+
+
+def test_the_spacing_that_costs_as_much_as_the_noise_follows_from_information_that_adds_up():
+    """Fisher information of the frequencies adds up, so that reciprocal squares of the steps do too."""
+    steps, mismatch = {}, {}
+    for hz in (20e6, 60e6, [20e6, 60e6]):
+        plan = BankPlan(
+            classes=["cone"], distance_m="0.9:1.1:0.02", delta_deg="0:176:4", sensor_overrides={"modulation_hz": hz}
+        )
+        with build_bank(plan, workers=1) as bank:
+            loss = grid_loss(bank, 60, workers=1)
+        key = hz if isinstance(hz, float) else "both"
+        steps[key] = np.array([loss.suggested_distance_m, loss.suggested_delta_deg]) ** -2
+        mismatch[key] = loss.mismatch_median
+        assert loss.refined.class_errors == 0
+    # medians over 60 views, of a sum and of its parts
+    np.testing.assert_allclose(steps["both"], steps[20e6] + steps[60e6], rtol=0.05)
+    assert 0 < mismatch["both"] < mismatch[60e6]  # a weighted mean: phases at 60 MHz turn faster
+
+
+def test_boxes_turned_are_farther_apart_in_two_frequencies():
+    """One view has to imitate a box at both: the least of a sum is no less than the sum of the least."""
+    box = Box(length_m=0.3, width_m=0.2, height_m=0.3)
+    alone = [turn_distance(box, PMD.with_(modulation_hz=hz), DesignPlan()) for hz in (20e6, 60e6)]
+    both = turn_distance(box, TWO, DesignPlan())
+    assert both**2 > 0.99 * sum(one**2 for one in alone)
+
+
+def test_a_refused_frame_of_two_frequencies_is_diagnosed(bank):
+    renderer = Renderer(bank.mesh("cone"), TWO)
+    image = renderer.render(1.1, 0.6, math.radians(6))
+    frames = kalman_filter(take(image, TWO, 50))
+    for on in ("ranges", "phasors"):
+        matcher = Matcher(bank, "refine", free=VIEW[:2], on=on)
+        found = diagnose(matcher, frames, seconds=30)
+        assert [change.parameter for change in found.changes] == ["bearing_offset_deg"]
+        assert found.changes[0].value == pytest.approx(6.0, abs=0.2)
+        assert found.match.class_name == "cone"

@@ -363,8 +363,8 @@ def test_a_match_tells_weights_condition_and_weak_direction(bank, renderers):
     [
         ({"free": ("distance_m", "yaw")}, "'free' must be among"),
         ({"free": ("distance_m",)}, "must name distance_m and delta_rad"),
-        ({"on": "volts"}, "'on' must be 'ranges' or 'phasors', got 'volts'$"),
-        ({"on": np.ones((16, 16))}, "'on' must be 'ranges' or 'phasors', got ndarray$"),
+        ({"on": "volts"}, "'on' must be 'ranges' or 'phasors' or .*, got 'volts'$"),
+        ({"on": np.ones((16, 16))}, "'on' must be 'ranges' or 'phasors' or .*, got ndarray$"),
         ({"pixels": "upper"}, "'pixels' must be 'all' or 'lower', got 'upper'$"),
         ({"pixels": np.ones((16, 16), bool)}, "'pixels' must be 'all' or 'lower', got ndarray$"),
         ({"background": "wall"}, "'background' must be a Background, None, 'auto' or 'unknown', got 'wall'$"),

@@ -11,7 +11,7 @@ from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, cramer_rao, phasor_mean
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.matcher.filters.region import read_region
-from phasemark.render import Frames, Renderer, Sensor, Views, capture, predicted_range_std, preset
+from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, predicted_range_std, preset
 from phasemark.render.sensor.region import Region
 
 LARGE = Sensor(rows=84, cols=112, half_angle_h_deg=31, half_angle_v_deg=24, signal_e=5000, max_phase_std_rad=0.25)
@@ -69,6 +69,33 @@ def test_an_image_of_the_region_is_the_mean_of_its_blocks(geometry):
     brightest = np.abs(binned.phasor).max()
     assert np.abs(region.blocks(whole.phasor).mean(axis=-1) - binned.phasor).max() < 1e-4 * brightest
     assert np.abs(region.blocks(whole.coverage).mean(axis=-1) - binned.coverage).max() < 2e-4
+
+
+@pytest.mark.parametrize("geometry", [{}, {"lens": LENS}])
+def test_a_small_region_in_a_corner_of_the_image_is_a_camera_too(geometry):
+    """Its principal point lies five and more image sizes away."""
+    sensor, region = LARGE.with_(**geometry), Region(4, 12, 6, 18, 2)
+    camera = region.camera(sensor)
+    u, v = np.meshgrid(np.linspace(0, camera.cols, 5), np.linspace(0, camera.rows, 5))
+    there = sensor.ray_directions(6 + 2 * u, 4 + 2 * v)
+    np.testing.assert_allclose(camera.ray_directions(u, v), there, atol=1e-12)
+    assert Sensor(**camera.model_dump(mode="json")) == camera  # as a bank holds it
+    renderer = Renderer(build_mesh(catalog()["cone"]), sensor)
+    views = Views.broadcast(0.9, 0.4, [0.42, 0.45], [0.25, 0.22])
+    background = Background(wall_m=2.5, floor_m=1.0)
+    whole = renderer.render_views(views, background=background)
+    seen = renderer.seen_by(camera).render_views(views, background=background)
+    assert seen.coverage.max() > 0.9
+    error = np.abs(region.blocks(whole.phasor).mean(axis=-1) - seen.phasor).max()
+    assert error < 1e-4 * np.abs(whole.phasor).max()  # both are exact to that
+
+
+def test_a_principal_point_far_outside_is_still_refused_in_a_file(tmp_path):
+    path = tmp_path / "camera.toml"
+    text = "rows = 16\ncols = 16\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\nprincipal_point_px = [90, 3]\n"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(UsageError, match=r"camera.toml: 'principal_point_px' must lie within one image width"):
+        Sensor.from_toml(path)
 
 
 def test_blocks_add_up_phasors():

@@ -135,7 +135,7 @@ def bank_info(
     bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank.")],
     as_json: Json = False,
 ) -> None:
-    """Say what a bank holds."""
+    """Print the content of a bank."""
     with open_any_bank(bank) as opened:
         info = opened.info()
     if as_json:

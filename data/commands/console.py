@@ -182,7 +182,7 @@ def tell(message: str) -> None:
 
 @contextmanager
 def _messages_may_be_lost() -> Iterator[None]:
-    """Let messages to a stderr that takes none be lost: they change neither the work nor its exit code."""
+    """Ignore errors of writing messages to a closed stderr: they change neither the work nor its exit code."""
     try:
         yield
     except (OSError, ValueError):

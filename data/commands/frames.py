@@ -72,7 +72,7 @@ def frames_info(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
     as_json: Json = False,
 ) -> None:
-    """Say what a frame set holds."""
+    """Print the content of a frame set."""
     with open_frame_set(frames) as opened:
         info = opened.info()
     echo_json(info) if as_json else echo_facts(info)

@@ -40,7 +40,7 @@ def open_frame_set(path: Path) -> FrameSet:
 
 
 def _refuse_mesh(path: Path) -> None:
-    """Say of a mesh how a bank is made of it."""
+    """Refuse a mesh where a bank is expected, with the command that makes a bank of it."""
     from phasemark.landmarks.mesh_files import FORMATS
 
     if path.exists() and path.suffix.lower().removeprefix(".") in FORMATS:

@@ -42,7 +42,7 @@ def output_folder(
     *,
     also: Sequence[str] = (),
 ) -> Iterator[None]:
-    """Hold a folder while a command writes files into it; a file that another program wrote is not replaced.
+    """Lock a folder while a command writes files into it; a file that another program wrote is not replaced.
 
     `names` must not exist unless they are ours and `force` is set; `also` are ours too, and looked at by their writer.
     """

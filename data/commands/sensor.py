@@ -130,7 +130,7 @@ def sensor_show(
 
 
 def _sources_counted(sources: Mapping[str, str]) -> str:
-    """Say how many numbers are measured, published and assumed."""
+    """Count the numbers that are measured, published and assumed."""
     from phasemark.render.sensor.sources import SOURCE_KINDS, kind_of_source
 
     if not sources:

@@ -156,7 +156,7 @@ class OwnedFiles:
 
 @contextmanager
 def adding_to_folder(folder: Path, content: str, adopted: Iterable[str] = ()) -> Iterator[OwnedFiles]:
-    """Hold a folder against other runs while the block adds files to it.
+    """Lock a folder against other runs while the block adds files to it.
 
     A block that fails before it has added one leaves nothing: no marker, and no folder that was made for it.
 

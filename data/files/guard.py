@@ -172,7 +172,7 @@ def _read_blocks(dataset: h5py.Dataset) -> None:
 
 
 def first_reading(path: str | os.PathLike[str]) -> str | None:
-    """Have a child process read a file from one end to the other; return what is wrong with it, or None.
+    """Read a file whole in a child process; return what is wrong with it, or None.
 
     The child has a limit on its memory and time, and can neither write nor start anything. It is an ordinary program,
     not a copy of this process, so that notebooks can call this.

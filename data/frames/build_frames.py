@@ -386,7 +386,7 @@ _TRUTH = (
 
 
 class _Group(NamedTuple):
-    """What views that are rendered together have in common."""
+    """Properties that views rendered together have in common."""
 
     class_index: int
     albedo: float

@@ -64,7 +64,7 @@ def is_histogram_log(path: str | os.PathLike[str]) -> bool:
         False also if the file cannot be read.
     """
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):  # what is read of a pipe is gone for whoever reads it next
+        if not stat.S_ISREG(os.stat(path).st_mode):  # bytes read from a pipe are gone for the next reader
             return False
         with open(path, "rb") as file:
             if file.read(4) != b"PK\x03\x04":

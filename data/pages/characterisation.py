@@ -98,7 +98,7 @@ def write_characterisation(
 
 
 def summary_sentences(found: Characterisation, name: str) -> list[str]:
-    """Say in three sentences what was found: how well it measures, what is systematic, and whether theory agrees.
+    """Summarise a data sheet in three sentences: noise, systematic errors, and agreement with the prediction.
 
     Parameters
     ----------

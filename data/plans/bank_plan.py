@@ -497,7 +497,7 @@ def _as_usage_error(error: ValidationError, model: type[PlanModel]) -> UsageErro
 
 
 def _unknown_key(key: str, model: type[PlanModel]) -> UsageError:
-    """Say of an unknown key where it belongs, which known one it resembles, or which there are."""
+    """Describe for an unknown key where it belongs, which known key it resembles, or which keys exist."""
     keys = list(model.model_fields)
     similar = difflib.get_close_matches(key, keys, n=1)
     place = model.place_of_key(key)

@@ -87,9 +87,9 @@ def cramer_rao(
     """Return the Cramér–Rao bound at some views (PHYSICS section 7).
 
     Pixels count where one frame measures the range to 0.1 rad or better (0.24 m at 10 MHz). Of several modulation
-    frequencies the information is the sum of that of each. With a
-    :class:`~phasemark.render.direct.HistogramRenderer` the bound is that of histograms: the Poisson information, the
-    landmark's brightness and the ambient light of every zone unknown.
+    frequencies the information is the sum of that of each. A :class:`~phasemark.render.direct.HistogramRenderer` has
+    the bound of histograms: the Poisson information, with the landmark's brightness and the ambient light of every
+    zone unknown.
 
     Parameters
     ----------

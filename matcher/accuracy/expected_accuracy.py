@@ -90,7 +90,7 @@ class AccuracyCard:
         return np.asarray(covariance[:, along, along] + self.views.distance_m**2 * covariance[:, across, across])
 
     def line(self) -> str:
-        """Say it in one line: medians over the views, the worst position, the class error and what dominates."""
+        """Summarise it in one line: medians over the views, the worst position, class error, dominant source."""
         shares, n = self.shares(), len(self.views)
         if not shares:
             return f"{self._where()}: the view is not observed: too few pixels are measured to 0.1 rad"

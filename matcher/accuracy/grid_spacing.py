@@ -125,7 +125,6 @@ def grid_loss(bank: Bank, n: int, *, seed: int = 0, workers: int | None = None) 
         raise UsageError(f"n=… must be at least 1, got {n}")
     if len(bank.distance_m) < 2 or len(bank.delta_rad) < 2:
         raise UsageError(f"{bank.path}: has one distance or one angle only: there is no spacing to test")
-    bank.sensor.refuse_several_frequencies("the test of a bank's spacing")
     methods = {"nearest": Matcher(bank, "nearest")}
     if bank.plan.model == "ray":
         methods["refined"] = Matcher(bank, "refine", free=VIEW[:2], workers=workers)
@@ -188,21 +187,33 @@ def _errors(matches: Matches, name: str, views: Views, period: float) -> NDArray
 def _mismatches(bank: Bank, matches: Matches, images: PhasorImages) -> NDArray[np.float64]:
     """Return the mismatch of each view with the image on the grid that it was matched to; NaN where there is none.
 
-    Pixels weigh by 1/σ² of a component of S, and count where one frame tells their phase at all.
+    Pixels weigh by 1/σ² of a component of S, and count where one frame tells their phase at all; of several modulation
+    frequencies the pixels of each count.
     """
-    sensor = bank.sensor
-    used = counts(images.phasor, images.intensity, sensor)
-    arrived_e = sensor.signal_e * images.intensity + sensor.ambient_e + sensor.dark_e
-    weight = used / np.maximum(phase_image_variance(arrived_e, sensor), 1e-30)
+    by_hz = dict(zip(bank.sensor.frequencies_hz, images.by_frequency, strict=True))
+    weights = {hz: _weights(seen) for hz, seen in by_hz.items()}
     out = np.full(len(matches), np.nan)
     for k, match in enumerate(matches):
         if match.class_name is not None:
             i = int(np.argmin(np.abs(bank.distance_m - match.distance_m)))
             j = int(np.argmin(np.abs(bank.delta_rad - match.delta_rad)))
-            model, seen = bank.phasor(match.class_name, i, j).astype(np.complex128), images.phasor[k]
-            size = np.sum(weight[k] * np.abs(model) ** 2) * np.sum(weight[k] * np.abs(seen) ** 2)
-            out[k] = 1 - np.sum(weight[k] * (model * seen.conj()).real) / math.sqrt(size)
+            along = power = model_power = 0.0
+            for hz, seen in by_hz.items():
+                model, own, weight = bank.phasor(match.class_name, i, j, hz), seen.phasor[k], weights[hz][k]
+                model = model.astype(np.complex128)
+                model_power += np.sum(weight * np.abs(model) ** 2)
+                power += np.sum(weight * np.abs(own) ** 2)
+                along += np.sum(weight * (model * own.conj()).real)
+            out[k] = 1 - along / math.sqrt(model_power * power)
     return out
+
+
+def _weights(images: PhasorImages) -> NDArray[np.float64]:
+    """Return 1/σ² of a component of S at one frequency, 0 where a pixel does not count."""
+    sensor = images.sensor
+    used = counts(images.phasor, images.intensity, sensor)
+    arrived_e = sensor.signal_e * images.intensity + sensor.ambient_e + sensor.dark_e
+    return np.asarray(used / np.maximum(phase_image_variance(arrived_e, sensor), 1e-30))
 
 
 def _summary(parts: list[_Part]) -> GridLoss:

@@ -1,4 +1,4 @@
-"""The bound of histograms of a direct sensor: the Poisson information in a view (PHYSICS section 11)."""
+"""Best possible accuracy from histograms of a direct sensor: the Poisson information in a view (PHYSICS section 11)."""
 
 from __future__ import annotations
 

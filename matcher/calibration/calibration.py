@@ -45,6 +45,7 @@ from phasemark.matcher.filters.filtered_frames import (
     phasor_mean,
 )
 from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
+from phasemark.matcher.frequencies import OneFrequency
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.pixel_agreement import MIN_RETURNS
@@ -187,7 +188,8 @@ def filter_poses(frames: Sequence[Frames], on: ResidualKind | Literal["auto"] = 
         As many positions.
     """
     lit = all(one.amplitude_e is not None and one.intensity_e is not None for one in frames)
-    coherent = on == "phasors" or (on == "auto" and lit and frames[0].sensor.kind == "phase")
+    several = len(frames[0].sensor.frequencies_hz) > 1
+    coherent = on == "phasors" or (on == "auto" and lit and frames[0].sensor.kind == "phase" and not several)
     parts = [phasor_mean(one) if coherent else kalman_filter(one) for one in frames]
     parts = [
         _with_known_noise(part) if one.n_frames < _FRAMES_FOR_SCATTER else part
@@ -266,7 +268,8 @@ def calibrate(
     albedo : float
         Of the landmark, as assumed.
     on : {"auto", "ranges", "phasors"}
-        "auto": phasors where the frames have amplitude and intensity.
+        "auto": phasors where the frames have amplitude and intensity. Of several modulation frequencies the unwrapped
+        ranges.
     background : Background, optional
         What stands behind; a pose's own `wall_m` replaces its wall. Without one, where more than a few pixels return
         beside the landmark, only those that see nothing else count.
@@ -297,6 +300,14 @@ def calibrate(
         With one line: names or numbers are wrong, frames and poses do not go together, or the poses do not tell what is
         free.
     """
+    one = OneFrequency(frames.sensor, "combined") if len(frames.sensor.frequencies_hz) > 1 else None
+    if one is not None:
+        if on == "phasors":
+            raise UsageError(
+                "a calibration with several modulation frequencies takes 'on' = ranges: phasors of the frequencies wrap"
+                " apart, and one range offset turns each by another angle"
+            )
+        on, frames = "ranges", one.frames(frames)
     sensor = frames.sensor
     has_light = frames.amplitude_e is not None and frames.intensity_e is not None and sensor.kind == "phase"
     if on not in ("auto", "ranges", "phasors"):
@@ -322,7 +333,6 @@ def calibrate(
     lit = quantity == "phasors" or background is not None or poses.wall_m is not None
     if free is None and not lit:
         names = tuple(name for name in names if name != "albedo")
-    sensor.refuse_several_frequencies("a calibration")
     kept = check_names(fixed, "'fixed'", lens)
     names = tuple(name for name in names if name not in kept)
     assumed = _assumed(start, sensor, albedo)
@@ -330,8 +340,8 @@ def calibrate(
     rendered = counter(progress, _USUAL_RENDERINGS)
     if recorded:
         with_zones = zones is not False and sensor.kind == "direct"
-        whole = _Job(mesh, background, assumed, names, z, with_zones, workers, rendered)
-        return _from_recording(whole, frames, poses, moving)
+        whole = _Job(mesh, background, assumed, names, z, with_zones, workers, rendered, one)
+        return _of_camera(_from_recording(whole, frames, poses, moving), one)
     frames = _without_zones(frames)
     _check(frames, poses, names, lit)
     evidence = Evidence.from_frames(frames, quantity)
@@ -344,6 +354,7 @@ def calibrate(
         reports_z=z,
         workers=workers,
         rendered=rendered,
+        one=one,
     )
     _check_view(model, evidence, assumed)
     edges = model.has_background or not _returns_beside(model, evidence, assumed)
@@ -372,9 +383,18 @@ def calibrate(
     doubts = doubts_about(place.theta, assumed.vector, names, held_out, scale=model.scale)
     cause = ""
     if doubts:
-        job = _Job(mesh, background, assumed, tuple(n for n in names if n != "albedo"), z, False, workers, rendered)
+        job = _Job(
+            mesh, background, assumed, tuple(n for n in names if n != "albedo"), z, False, workers, rendered, one
+        )
         cause = _cause(job, frames, poses, edges)
-    return replace(found, doubts=tuple(doubts), cause=cause, held_out_m=held_out)
+    return _of_camera(replace(found, doubts=tuple(doubts), cause=cause, held_out_m=held_out), one)
+
+
+def _of_camera(found: Calibration, one: OneFrequency | None) -> Calibration:
+    """Return a calibration of the camera of several frequencies that a camera of one frequency stood for."""
+    if one is None:
+        return found
+    return replace(found, sensor=one.camera_like(found.sensor), base=one.camera)
 
 
 def _leave_one_out(fit: Fit, place: Place, found: Calibration) -> tuple[float, float]:
@@ -413,6 +433,7 @@ class _Job:
     workers: int
     rendered: Callable[[], None]
     """Called each time all poses have been rendered."""
+    one: OneFrequency | None = None
 
 
 def _without_zones(frames: FilteredFrames) -> FilteredFrames:
@@ -494,6 +515,7 @@ def _recording(
         rendered=job.rendered,
         track=track,
         stamp_s=stamps if moving else None,
+        one=job.one,
     )
     evidence = Evidence.from_frames(frames, "ranges")
     if edges is None:
@@ -618,7 +640,7 @@ def _check_ranges(recording: Recording, assumed: Mounting) -> None:
 def _delay_doubts(
     job: _Job, frames: FilteredFrames, poses: KnownPoses, fixed: Recording, track: PoseTrack | None
 ) -> list[str]:
-    """Say if another delay than the one stated fits much better."""
+    """Warn if another delay than the stated one fits much better."""
     freed = _recording(replace(job, names=(*job.names, "delay")), frames, poses, track, fixed.edges)
     start = job.assumed.vector
     with_it, without = freed.approach(start)[0], fixed.approach(start)[0]
@@ -635,7 +657,7 @@ def _of_pose_errors(recording: Recording, found: Recorded) -> NDArray[np.float64
 
 
 def _recording_notes(found: Recorded, left_out: float) -> list[str]:
-    """Say how many pixels disagreed, and what errors noise does not explain."""
+    """Note how many pixels disagreed, and which errors noise does not explain."""
     frames = int((found.use.sum(axis=1) > 0).sum())
     notes = [
         f"{int(found.use.sum())} pixels of {frames} frames counted; {100 * left_out:.1f} % of those that should see the"
@@ -680,7 +702,7 @@ def _with_zones(sensor: Sensor, found: Recorded, shape: tuple[int, int]) -> Sens
 
 
 def _cause(job: _Job, frames: FilteredFrames, poses: KnownPoses, edges: bool, track: PoseTrack | None = None) -> str:
-    """Say what is likely wrong, by what fits much better than what was stated."""
+    """Name the likely cause of a misfit: the change of a stated value that fits much better."""
 
     def misfit(job: _Job, frames: FilteredFrames, poses: KnownPoses, track: PoseTrack | None) -> tuple[float, float]:
         recording = _recording(job, frames, poses, track, edges)

@@ -31,7 +31,7 @@ def doubts_about(
     *,
     scale: NDArray[np.float64] = SCALE,
 ) -> list[str]:
-    """Say why a calibration cannot be trusted.
+    """List the reasons why a calibration cannot be trusted.
 
     Parameters
     ----------

@@ -283,7 +283,7 @@ def _check_header(path: Path, names: list[str]) -> bool:
 
 
 def frames_of_poses(frames: Sequence[Frames], poses: KnownPoses) -> list[Frames]:
-    """Give each pose its frames.
+    """Assign frames to each pose.
 
     Parameters
     ----------

@@ -260,7 +260,7 @@ class Fit:
         return place
 
     def search(self, place: Place) -> Place:
-        """Leave small minima for lower ones nearby, as long as that saves anything to speak of.
+        """Move from small minima to lower ones nearby, as long as the cost falls noticeably.
 
         On ranges with exact poses: phasors have none, and errors of poses blur what a pixel tells by more than small
         minima are wide.
@@ -274,7 +274,7 @@ class Fit:
         return self._with_its_pixels(place)
 
     def knowledge(self, place: Place) -> Knowledge:
-        """Tell how well a place is known, with slopes that neither a corner nor a faint pixel at one end has spoilt."""
+        """Return the uncertainty of a place, from slopes that no corner and no faint pixel distort."""
         linear = self._linearise_wide(place, _WIDTHS)
         by_pose, _ = linear.gradients(self._pull(place), place.u)
         return Knowledge(linear.information, by_pose.T @ by_pose)

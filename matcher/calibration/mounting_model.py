@@ -21,6 +21,7 @@ from phasemark import UsageError
 from phasemark.matcher.calibration.known_poses import KnownPoses
 from phasemark.matcher.calibration.lens_terms import farthest_lens, lens_of, natural_units, numbers_of
 from phasemark.matcher.calibration.pose_track import PoseTrack
+from phasemark.matcher.frequencies import OneFrequency, OneFrequencyRenderer
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 from phasemark.render.sensor.lens_fields import LENS_FIELD, TERMS, Lens
@@ -131,7 +132,7 @@ class Mounting:
 
     @classmethod
     def of_sensor(cls, sensor: Sensor, albedo: float) -> Mounting:
-        """Take what a sensor states."""
+        """Read the mounting that a sensor states."""
         return cls(
             math.radians(sensor.pitch_deg),
             math.radians(sensor.roll_deg),
@@ -252,6 +253,8 @@ class CalibrationModel:
         Poses by time, for a moving camera; the poses of the frames then follow from the delay of the mounting.
     stamp_s : (K,) float64, optional
         Time stamps of the frames, with `track`.
+    one : OneFrequency, optional
+        How a camera of several modulation frequencies becomes `sensor`; None: it has one frequency.
     """
 
     def __init__(
@@ -267,6 +270,7 @@ class CalibrationModel:
         rendered: Callable[[], None] = lambda: None,
         track: PoseTrack | None = None,
         stamp_s: NDArray[np.float64] | None = None,
+        one: OneFrequency | None = None,
     ) -> None:
         self._track, self._stamp_s = track, stamp_s
         self.scale = np.concatenate([SCALE[: len(MOUNTING_NAMES)], natural_units(sensor)])
@@ -276,7 +280,9 @@ class CalibrationModel:
         self.sensor, self.poses, self.workers, self._rendered = sensor, poses, workers, rendered
         self._axis_cosine = sensor.axis_cosine() if reports_z else None
         self._albedo = albedo
-        self._renderer = Renderer(mesh, sensor, albedo=albedo, harmonics=())
+        self._renderer = Renderer(mesh, sensor if one is None else one.camera, albedo=albedo, harmonics=())
+        if one is not None:
+            self._renderer = OneFrequencyRenderer(self._renderer, one)
         self._background = background
         walls = poses.wall_m
         if walls is None:

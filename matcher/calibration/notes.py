@@ -54,7 +54,7 @@ def named(names: Sequence[str]) -> str:
 
 
 def advice(names: Sequence[str], poses: KnownPoses) -> str:
-    """Say what would make some parameters observable."""
+    """Suggest poses that would make some parameters observable."""
     hints = []
     near, far = float(poses.distance_m.min()), float(poses.distance_m.max())
     if set(names) & _BY_DISTANCE and far < _ALIKE * near:
@@ -78,7 +78,7 @@ def advice(names: Sequence[str], poses: KnownPoses) -> str:
 def observability_notes(
     free: Sequence[str], covariance: NDArray[np.float64], scale: NDArray[np.float64], poses: KnownPoses
 ) -> list[str]:
-    """Say which numbers are poorly known, and which pairs trade for one another.
+    """Note which numbers are poorly known, and which pairs are correlated.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ def accuracy_line(
     n_frames: Annotated[int, typer.Option("--frames", min=1, help="Frames averaged for one measurement.")] = 50,
     as_json: Json = False,
 ) -> None:
-    """Say in one line how accurate a measurement can be, from the Cramér–Rao bound.
+    """Print in one line how accurate a measurement can be, from the Cramér–Rao bound.
 
     1 σ of distance, angle and position with the bearing free, what limits it, and how often another class of the
     catalogue explains a frame better.

@@ -214,7 +214,7 @@ class _Answers:
             self._table.echo([list(row.values()) for row in rows])
 
     def diagnose(self, matcher: Matcher, reading: FrameReading) -> None:
-        """Say which setting would make the first refused position fit."""
+        """Name the setting that would make the first refused position fit."""
         from phasemark.matcher import diagnose
 
         search = self._search
@@ -231,7 +231,7 @@ class _Answers:
 
 
 def _note_plots(plots: Mapping[int, Path], chosen: str | None, n: int) -> None:
-    """Say how to have more positions drawn than the first."""
+    """Note how to draw more positions than the first."""
     if plots and chosen is None and len(plots) < n:
         tell(
             f"note: drew the first of {n} positions; --plot-index 0,{n // 2}:{min(n // 2 + 9, n - 1)} draws others"
@@ -240,7 +240,7 @@ def _note_plots(plots: Mapping[int, Path], chosen: str | None, n: int) -> None:
 
 
 def _note_motion(measured: Frames, file: Path) -> None:
-    """Say that frames which are about to be averaged were not taken at rest."""
+    """Warn that frames to be averaged were not taken at rest."""
     import numpy as np
 
     from phasemark.matcher.recordings.stillness import motion_test

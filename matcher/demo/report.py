@@ -148,7 +148,7 @@ def _page(result: DemoResult, figures: dict[str, list[Figure]]) -> str:
 
 
 def on_grid(result: DemoResult) -> str:
-    """Say in one sentence how often the nearest image named the very grid point that was shown.
+    """State in one sentence how often the nearest image was that of the true grid point.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def _middle(result: DemoResult) -> list[CellResult]:
 
 
 def answer(result: DemoResult) -> str:
-    """Say in one sentence how accurate maximum likelihood is at the middle distance, between grid points.
+    """State in one sentence the accuracy of maximum likelihood at the middle distance, between grid points.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def answer(result: DemoResult) -> str:
 
 
 def _card(result: DemoResult) -> str:
-    """Say in one line what the bound is at the middle distance, for the first class."""
+    """State in one line the bound at the middle distance, for the first class."""
     specs, sensor = catalog(), result.bank.sensor
     first, *others = (
         (name, Renderer(build_mesh(specs[name]), sensor, albedo=specs[name].albedo)) for name in result.bank.classes
@@ -216,7 +216,7 @@ def _card(result: DemoResult) -> str:
 
 
 def _summary(result: DemoResult) -> list[str]:
-    """Say in a few sentences what was found."""
+    """Summarise the results in a few sentences."""
     sentences = []
     for shifted, method, title in HALVES:
         if not shifted:

@@ -184,12 +184,12 @@ class AllowedDimensions:
                 )
 
     def checks(self, spec: LandmarkSpec) -> list[Check]:
-        """Hold the rules that are plain geometry and light against a landmark."""
+        """Check a landmark by the rules of geometry and light."""
         upper = [] if spec.upper is None else self.upper_checks(spec.box, spec.upper)
         return [*self._box(spec.box), *upper, *self._light()]
 
     def upper_checks(self, box: Box, upper: Upper) -> list[Check]:
-        """Hold the rules for an upper part on a box against it."""
+        """Check an upper part on a box by its rules."""
         return list(self._upper(box, upper))
 
     def _box(self, box: Box) -> Iterator[Check]:
@@ -218,7 +218,10 @@ class AllowedDimensions:
     def _light(self) -> Iterator[Check]:
         far = self.plan.distance_m[1]
         amplitude = self.plan.albedo * _SLANT_COSINE / far**2
-        std = float(predicted_range_std(amplitude, amplitude, self.sensor)) / self.sensor.metres_per_radian
+        std = max(
+            float(predicted_range_std(amplitude, amplitude, camera)) / camera.metres_per_radian
+            for camera in self.sensor.by_frequency
+        )
         yield Check("reflecting enough, far end", std, self.plan.limits.most_phase_std_rad, "rad", True)
 
     def _unambiguous(self, radius_m: float) -> Iterator[Check]:

@@ -38,7 +38,6 @@ def run_design(plan: DesignPlan, *, workers: int | None = None, progress: Progre
     InputFileError
         The sensor file cannot be read.
     """
-    plan.build_sensor().refuse_several_frequencies("the search for a set of landmarks")
     search = Search(plan, workers or os.cpu_count() or 1)
     step = counter(progress, plan.search.boxes + plan.search.uppers + _USUAL_REFINEMENT)
     search.look_at_uppers(step)
@@ -71,7 +70,7 @@ def _rank(candidate: Candidate) -> tuple[float, float]:
 
 
 def _what_fails(plan: DesignPlan, found: list[Candidate]) -> str:
-    """Say which rule no candidate keeps, or which ones the best of them breaks."""
+    """Name the rule that no candidate keeps, or the rules that the best one breaks."""
     near, far = plan.distance_m
     start = f"no landmark can serve {near:g} … {far:g} m"
     if not found:

@@ -20,6 +20,7 @@ from phasemark.landmarks.spec import Box, Upper
 from phasemark.matcher.accuracy.appearance import Appearance
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.position_bound import SEARCH_TOLERANCE_M, box_alone
+from phasemark.matcher.frequencies import phases_of
 from phasemark.render import Renderer, Sensor, Views
 
 _TURN_BIAS_RAD = np.radians(np.arange(-30.0, 31.0, 6.0))
@@ -34,9 +35,9 @@ def upper_appearance(upper: Upper, sensor: Sensor, plan: DesignPlan) -> Appearan
     stand = Box(length_m=side, width_m=side, height_m=side)  # below the upper rows: not built, not seen
     spec = LandmarkSpec(name="upper", box=stand, upper=upper, albedo=plan.albedo)
     mesh = build_mesh(spec, part="upper", tolerance_m=SEARCH_TOLERANCE_M)
-    renderer = Renderer(mesh, sensor, albedo=plan.albedo)
+    renderer = phases_of(Renderer(mesh, sensor, albedo=plan.albedo))
     views = Views.broadcast(plan.sampled_distance_m)
-    return Appearance.of(renderer, views, ("distance_m",), sensor.upper_rows, plan.n_frames)
+    return Appearance.of(renderer, views, ("distance_m",), renderer.sensor.upper_rows, plan.n_frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +142,8 @@ def turn_distance(box: Box, sensor: Sensor, plan: DesignPlan) -> float:
     """
     if box.length_m == box.width_m:
         return math.inf
-    renderer = Renderer(build_mesh(box_alone(box, plan)), sensor, albedo=plan.albedo)
-    rows = sensor.lower_rows
+    renderer = phases_of(Renderer(build_mesh(box_alone(box, plan)), sensor, albedo=plan.albedo))
+    rows = renderer.sensor.lower_rows
     far = plan.distance_m[1]
     sides = np.linspace(0.0, math.pi / 2, _TURN_SIDES)
     truth = Appearance.of(renderer, Views.broadcast(far, sides), (), rows, plan.n_frames)

@@ -21,6 +21,7 @@ from phasemark.data import Bank
 from phasemark.data.bank.build_bank import rebuild_bank
 from phasemark.matcher.diagnosis.search import SIZES, Fit, Search, fitted_wall, wider
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
+from phasemark.matcher.frequencies import OneFrequencyBank
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
 from phasemark.matcher.likelihood.setup import check_free
 from phasemark.matcher.match import Match
@@ -210,14 +211,14 @@ class _Setup:
 
     @classmethod
     def of(cls, matcher: Matcher, background: Background | None) -> _Setup:
-        """Take what a matcher was told: the one place that knows its options."""
+        """Copy the options of a matcher; only this function knows them all."""
         told = matcher.options
         if matcher.method == "nearest":
             return cls(True, VIEW, background, {"false_alarm": matcher.false_alarm})
         unknown = told["background"] == "unknown"
         options = {
             "false_alarm": matcher.false_alarm,
-            "on": told["on"],
+            "on": told["on"] if len(matcher.bank.sensor.frequencies_hz) == 1 else "ranges",
             "pixels": told["pixels"],
             "robust": told["robust"] or unknown,
         }
@@ -264,17 +265,17 @@ def diagnose(
     Raises
     ------
     UsageError
-        The frame is accepted, there is no such frame, or the frames come from another camera than the bank, or from
-        one of several modulation frequencies.
+        The frame is accepted, there is no such frame, or the frames come from another camera than the bank.
 
     Notes
     -----
     A change counts if its match is accepted, has at least three degrees of freedom and a chi2 that is lower than
     before by a factor of 1.5 and by 40.
+
+    Of several modulation frequencies unwrapped ranges are compared, whatever the matcher compares.
     """
     if not -len(frames) <= index < len(frames):
         raise UsageError(f"'index' must be in 0 … {len(frames) - 1}, got {index}")
-    frames.sensor.refuse_several_frequencies("the diagnosis of a refused frame")
     index %= len(frames)
     frame = frames[index]
     refused = matcher.match(frame)[0]
@@ -285,8 +286,12 @@ def diagnose(
     end = time.monotonic() + seconds
     if n_returned < FEWEST_RETURNS or matcher.bank.plan.model != "ray":
         return nothing
+    bank, frame = matcher.bank, frame.without_offset()
+    if len(frames.sensor.frequencies_hz) > 1:
+        bank = OneFrequencyBank(bank, "combined")
+        frame = bank.one.frames(frame)
     with ExitStack() as stack:
-        trials = _Trials(matcher.bank, _Setup.of(matcher, background), frame.without_offset(), refused, stack)
+        trials = _Trials(bank, _Setup.of(matcher, background), frame, refused, stack)
         for found in trials.in_order():
             if found:
                 (changes, match), *others = found

@@ -178,5 +178,5 @@ class World:
         return Reading(wheels_m, read, time_s)
 
     def stand(self, time_s: float) -> None:
-        """Let time pass at rest: nothing moves, only the bias wanders on."""
+        """Advance time at rest: only the bias changes."""
         self.state[4] += self._model.bias_walk * math.sqrt(time_s) * self._rng.standard_normal()

@@ -109,6 +109,9 @@ class CameraPlan(PlanModel):
     pan_offset_m, lens_offset_m : (x, y)
         Where the pan axis is on the robot, and the lens on the pan unit (PHYSICS section 8).
     wall_albedo : float
+    pitch_std_deg, roll_std_deg : float
+        How far an uneven floor tilts the camera at a stop. Where one is above 0, tilts are drawn with it, and the
+        matcher estimates them with it as the prior.
     """
 
     sensor: str = "pmd-16x16"
@@ -118,6 +121,14 @@ class CameraPlan(PlanModel):
     pan_offset_m: Point = (0.10, 0.0)
     lens_offset_m: Point = (0.04, 0.0)
     wall_albedo: Annotated[float, Field(gt=0, le=1)] = 0.5
+    pitch_std_deg: Std = 0.0
+    roll_std_deg: Std = 0.0
+
+    @property
+    def tilt_std_rad(self) -> dict[str, float]:
+        """Standard deviations of the tilts that a stop may have, by their names; empty on an even floor."""
+        stated = {"pitch_rad": self.pitch_std_deg, "roll_rad": self.roll_std_deg}
+        return {name: math.radians(std) for name, std in stated.items() if std > 0}
 
 
 class StopPlan(PlanModel):

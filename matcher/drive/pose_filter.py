@@ -63,7 +63,7 @@ class PoseFilter:
         self.state = moved(self.state, reading)
 
     def stand(self, time_s: float) -> None:
-        """Let time pass at rest: the pose stays, the bias wanders."""
+        """Advance time at rest: the pose stays, the variance of the bias grows."""
         self.covariance[4, 4] += self._model.bias_walk**2 * time_s
 
     def correct(self, placements: Sequence[Placement]) -> tuple[Placement | None, float]:

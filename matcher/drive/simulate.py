@@ -189,7 +189,9 @@ class RobotEquipment:
             if name not in specs:
                 raise UsageError(f"'map.landmark.class' must be one of {', '.join(specs)}, got {name!r}")
         bank = _bank(plan, names, workers)
-        matcher = Matcher(bank, "refine", free=FREE, background="auto", workers=workers)
+        tilts = plan.camera.tilt_std_rad
+        known = {f"{name.removesuffix('_rad')}_std_rad": std for name, std in tilts.items()}
+        matcher = Matcher(bank, "refine", free=(*FREE, *tilts), background="auto", workers=workers, **known)
         return cls(sensor, matcher, {name: _renderer(specs[name], sensor) for name in names})
 
 
@@ -223,7 +225,8 @@ def run_drive(
     landmark, takes its frames, rendered at the true pose before the room's wall, matches them with distance, side and
     bearing free, and corrects the pose by the filter. The wall that a frame shows is the plane across the line of sight
     at the distance of the room's wall behind the landmark (PHYSICS section 3). A landmark with another one in the
-    camera's field is passed by.
+    camera's field is passed by. Where the plan says that the floor is uneven, pitch and roll of each stop are drawn,
+    and matched too.
 
     Parameters
     ----------
@@ -338,7 +341,7 @@ class _Driver:
         bound = cramer_rao(
             self.equipment.renderers[landmark.class_name],
             Views.broadcast(distance, delta),
-            free=FREE,
+            free=(*FREE, *plan.camera.tilt_std_rad),
             n_frames=plan.camera.n_frames,
             background=self._wall(lens[:2], landmark.xy_m),
         )
@@ -354,7 +357,8 @@ class _Driver:
         lens = self._lens(self.world.state[:3], pan + math.radians(camera.pan_std_deg) * self.rng.standard_normal())
         view = view_of(lens, xy, yaw)
         renderer = self.equipment.renderers[landmark.class_name]
-        image = renderer.render(*view, background=self._wall(lens[:2], xy))
+        tilt = {name: std * self.rng.standard_normal() for name, std in camera.tilt_std_rad.items()}
+        image = renderer.render(*view, **tilt, background=self._wall(lens[:2], xy))
         filtered = kalman_filter(capture(image, sensor, rng=self.rng, n_frames=camera.n_frames))
         standing_s = camera.n_frames / sensor.frame_rate_hz
         self.world.stand(standing_s)

@@ -63,7 +63,7 @@ class Table(NamedTuple):
 
 
 class TableGrid(NamedTuple):
-    """The nodes of a table and the bins it holds, known before anything is rendered.
+    """Nodes and bins of a table of histograms, known before anything is rendered.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The search of a frame in a table of histograms: the grid by moments of every zone, then a descent between its nodes.
+"""Initial guesses from a table of histograms: its grid by moments of every zone, then a descent between its nodes.
 
 Pile-up is taken off the counts first, and ambient light is that of the bins without a peak; both are good enough for
 where a likelihood has its hills. What is found is refined with exact scenes afterwards.
@@ -25,11 +25,11 @@ _TRIM_SIGMA = 3.0
 _STEPS = 8
 _HALVINGS = 3
 _DONE = 0.05  # of a standard deviation
-_HOPE = 4.0  # a descent gains at most this multiple of what its next step promises
+_HOPE = 4.0  # the most that can still be gained, over the gain that a step promises
 
 
 class Hills(NamedTuple):
-    """Hills of the likelihood of one frame, best first.
+    """Local maxima of the likelihood of one frame, best first.
 
     Parameters
     ----------

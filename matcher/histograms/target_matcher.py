@@ -1,6 +1,6 @@
 """Class and view of a landmark from the targets that a direct sensor's chip reports (PHYSICS sections 7 and 11).
 
-The chip is expected to report the targets that its estimator finds in expected counts: merged peaks and estimates drawn
+The expected report is computed from the expected counts by the chip's own estimator: merged peaks and estimates drawn
 to one side follow by themselves. A target is compared with the nearest one expected in its zone, with the sigma that
 came with it. A target that must be seen and is missing, and one that nothing explains, cost a disagreement. Chips
 report peaks of the noise too: how many of these are expected follows from the ambient light and the threshold.
@@ -44,12 +44,12 @@ _STEPS = 6
 _DONE = 0.1
 _LEAST_STD_M = 1e-5
 _WIDER = 6.0
-"""Slopes of targets are taken over this multiple of the steps of counts: estimates jump as the highest bin changes."""
+"""Slopes of targets span this multiple of the steps of counts: estimates jump where the highest bin changes."""
 _LONGEST = {"m": 0.04, "rad": math.radians(4.0)}
 
 
 class Reported(NamedTuple):
-    """The targets that the chip reported at one position; k in all frames.
+    """Targets that the chip reported at one position; k of all frames.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ class FitTest(NamedTuple):
 
 @dataclass(frozen=True)
 class Rules:
-    """The rules by which an answer is accepted.
+    """Rules by which an answer is accepted.
 
     Parameters
     ----------

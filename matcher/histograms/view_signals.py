@@ -30,7 +30,7 @@ _VIEWS_AT_ONCE = 16
 
 
 class ViewSignals:
-    """Signal counts of one landmark by one direct sensor, without pile-up and ambient light.
+    """Counts of a direct sensor from one landmark, without pile-up and ambient light.
 
     Parameters
     ----------

@@ -15,6 +15,7 @@ from phasemark.matcher.likelihood.background_estimate import (
 )
 from phasemark.matcher.likelihood.candidates import fit_other_classes
 from phasemark.matcher.likelihood.fits import Fits
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.look_alikes import fit_look_alikes
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
@@ -58,12 +59,15 @@ class AutoBackground:
         """
         setup = self._setup
         known = not setup.bearing_is_free or setup.bearing_has_prior
-        around = estimate_surroundings(one, bearing_known=known)
+        tilted = bool(set(setup.free) & set(VIEW[4:]))
+        around = estimate_surroundings(one, bearing_known=known, tilt_known=not tilted)
         background, seen = around.background, evidence.seen
         if background is not None:
             seen = without_background(seen, around)
         fits = search_views(setup, self._scene(background, False), evidence, seen, bare)
-        if is_doubtful(setup, fits):
+        # the height of a floor, and tilts, are told by pixels that see some of the landmark too
+        entangled = background is not None and (background.floor_m is not None or tilted)
+        if entangled or is_doubtful(setup, fits):
             background, fits = self._with_better_background(background, evidence, fits)
         if background is not None and is_doubtful(setup, fits):
             again = search_views(setup, self._scene(background, True), evidence, evidence.seen, bare)

@@ -27,11 +27,12 @@ from phasemark.render import Background, Sensor
 CLEARLY_BEHIND_M = 0.4
 """Farther than the nearest surface by more than a landmark is deep."""
 NEAREST_WALL_M = 0.05
-"""Nothing nearer is taken for a wall."""
+"""Nothing nearer is taken for a wall or a floor."""
 _FEWEST = 6
 _BACKGROUND_STEP_M = 1e-3
 """Width of a difference between two places of a wall or floor."""
 _BACKGROUND_STEPS = 30
+_PLANE_ROUNDS = 5
 _BACKGROUND_SETTLED = 0.1
 """A step that promises to lower the whitened squared residual by less than this is not taken."""
 _LONGEST_STEP = 3.0
@@ -60,7 +61,12 @@ class Surroundings:
 
 
 def estimate_surroundings(
-    frames: FilteredFrames, index: int = 0, landmark_scale: float = 1.0, *, bearing_known: bool = True
+    frames: FilteredFrames,
+    index: int = 0,
+    landmark_scale: float = 1.0,
+    *,
+    bearing_known: bool = True,
+    tilt_known: bool = True,
 ) -> Surroundings:
     """Estimate wall and floor behind the landmark of one frame.
 
@@ -74,6 +80,9 @@ def estimate_surroundings(
     bearing_known : bool
         Whether the mount points at the landmark. Otherwise the azimuth of what is near takes its place: the wall is
         perpendicular to the line of sight, and a bearing of 4° ignored would move its two ends by 3 %.
+    tilt_known : bool
+        Whether pitch and roll are those of the mount. Otherwise a floor is a plane of any slope: at 2 m a pitch of 3°
+        ignored would raise it by 10 cm.
 
     Returns
     -------
@@ -107,8 +116,10 @@ def estimate_surroundings(
     floor_m = None
     if short.sum() >= _FEWEST:
         height = drop[short]
+        if not tilt_known:
+            height = height - _slope_of(height, (ray * ranges)[:2, short])
         middle = float(np.median(height))
-        if np.median(np.abs(height - middle)) < 0.02 * middle:
+        if middle > NEAREST_WALL_M and np.median(np.abs(height - middle)) < 0.02 * middle:
             floor_m = middle
     albedo = _USUAL_ALBEDO
     if frames.amplitude_e is not None:
@@ -120,6 +131,18 @@ def estimate_surroundings(
             albedo = float(np.clip(np.median(bright[lit]) / landmark_scale, 1e-3, 1.0))
     background = Background(wall_m=wall_m, floor_m=floor_m, wall_albedo=albedo, floor_albedo=albedo)
     return Surroundings(background, (far | ~_inner(~far) & returned).ravel(), pure.ravel())
+
+
+def _slope_of(height: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what a plane through heights at places (2, n) rises from below the lens to each of them."""
+    columns = np.column_stack([np.ones(len(height)), *place])
+    weight = np.ones(len(height))
+    for _ in range(_PLANE_ROUNDS):  # towards the least sum of absolute residuals: pixels that are mixed are few
+        root = np.sqrt(weight)
+        found = np.linalg.lstsq(columns * root[:, None], height * root, rcond=None)[0]
+        away = np.abs(height - columns @ found)
+        weight = 1 / np.maximum(away, np.median(away) + 1e-9)
+    return np.asarray(columns[:, 1:] @ found[1:])
 
 
 def fit_background(

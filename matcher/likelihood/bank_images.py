@@ -44,6 +44,7 @@ class BankModel:
     """
 
     slopes_are_cheap = True
+    alone = None
 
     def __init__(self, bank: Bank) -> None:
         self._sensor = bank.sensor

@@ -89,7 +89,7 @@ def fit_modes(
 def fit_other_classes(
     setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits, settings: DescentSettings
 ) -> Fits:
-    """Let every class but the best explain each frame, from the view of the best."""
+    """Fit every other class to each frame, from the view of the best class."""
     best = best_of_frame(fits)
     n_class = len(setup.shapes.names)
     others = np.array([(k, c) for k in best for c in range(n_class) if c != fits.class_index[k]], np.int64)

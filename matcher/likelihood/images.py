@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
@@ -27,12 +27,32 @@ class ModelImages:
     slope : (m, p, pixels) complex128
         ∂S by each of the parameters asked for.
     intensity, coverage : float64
+    behind : complex128, optional
+        The share of the phasor that comes from the background of each view; None where it is not known apart.
+    behind_slope : (m, p, pixels) complex128, optional
+        Of that share.
     """
 
     phasor: NDArray[np.complex128]
     slope: NDArray[np.complex128]
     intensity: NDArray[np.float64]
     coverage: NDArray[np.float64]
+    behind: NDArray[np.complex128] | None = None
+    behind_slope: NDArray[np.complex128] | None = None
+
+    def __getitem__(self, which: NDArray[np.integer]) -> ModelImages:
+        """Return the images of some of the views."""
+        return ModelImages(*(None if values is None else values[which] for values in self.arrays()))
+
+    def arrays(self) -> tuple[NDArray[np.complex128] | NDArray[np.float64] | None, ...]:
+        """Return the fields in their order."""
+        return tuple(getattr(self, field.name) for field in fields(self))
+
+    def update(self, where: NDArray[np.integer], news: ModelImages) -> None:
+        """Replace some views by others, in place."""
+        for own, new in zip(self.arrays(), news.arrays(), strict=True):
+            if own is not None and new is not None:
+                own[where] = new
 
 
 class ImageModel(Protocol):
@@ -42,9 +62,16 @@ class ImageModel(Protocol):
     ----------
     slopes_are_cheap : bool
         Whether slopes cost no more than images, as those of interpolated images do.
+    alone : ImageModel, optional
+        The same without a background, where what the background returns depends on the view and the landmark's
+        brightness is estimated: images then have `behind`. None elsewhere.
     """
 
     slopes_are_cheap: bool
+
+    @property
+    def alone(self) -> ImageModel | None:
+        """As an attribute."""
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Return the images of views (m, 6), columns :data:`VIEW`, of a class each."""

@@ -59,7 +59,7 @@ def look_beside(problem: Problem, state: State) -> State:
 
 
 def settle(problem: Problem, state: State) -> State:
-    """Leave views that contradict some pixels for better ones nearby.
+    """Move from views that contradict some pixels to better ones nearby.
 
     Whether a pixel returns changes in a step where an edge enters it, which no slope shows. So views up to five
     standard deviations away along the axes of the covariance are tried, with the whole cost of PHYSICS section 7.

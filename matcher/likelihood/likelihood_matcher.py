@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
-from phasemark.matcher.frequencies import OneFrequencyBank, background_of, pixels_of
+from phasemark.matcher.frequencies import background_of, layers_of, pixels_of
 from phasemark.matcher.likelihood.acceptance import rank
 from phasemark.matcher.likelihood.auto_background import AutoBackground
 from phasemark.matcher.likelihood.background_estimate import NEAREST_WALL_M
@@ -72,7 +72,7 @@ class LikelihoodMatcher:
     ) -> None:
         has_prior = free is None  # the default frees the bearing, with a prior
         names = check_free((*VIEW[:2], "bearing_rad") if free is None else free)
-        _check_choices(bank, background, on, names)
+        _check_choices(bank, background, on)
         known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
         if has_prior:
             known["bearing_rad"] = bearing_std_rad
@@ -82,6 +82,7 @@ class LikelihoodMatcher:
         self._systematic = systematic
         self._workers = workers or usual_workers()
         self._stated = background if isinstance(background, Background) else None
+        self._auto = background == "auto"
         self._setup = Setup(
             bank=bank,
             shapes=Shapes.of_bank(bank),
@@ -100,7 +101,6 @@ class LikelihoodMatcher:
         )
         behind = None if self._stated is None else background_of(bank, self._stated)
         self._exact, self._scout = self._bank_models(behind)
-        self._auto = background == "auto"
         thinned = ThinnedBank(bank, self._search_stride())
         self._thinned = thinned if self._auto else None  # backgrounds that are estimated ask for other templates
         wide = self._new_search(thinned, behind)
@@ -159,7 +159,9 @@ class LikelihoodMatcher:
     @cached_property
     def _rendered(self) -> RenderedModel:
         """What renders the landmarks of the bank, made when it is first needed."""
-        return RenderedModel(self._bank, self._stated, self._setup.policy.cache_bytes)
+        moves = set(self._setup.free) & {"bearing_rad", "pitch_rad", "roll_rad"}
+        splits = self._setup.on == "phasors" and (self._auto or self._stated is not None) and bool(moves)
+        return RenderedModel(self._bank, self._stated, self._setup.policy.cache_bytes, splits_light=splits)
 
     def _bank_models(self, behind: PhasorImages | None) -> tuple[BankModel | None, BankModel | None]:
         """Return the interpolated images that the answer is taken from, and those of a scout; None where unfit."""
@@ -253,25 +255,14 @@ def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.floa
     return np.asarray(squared.sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
 
 
-def _check_choices(bank: Bank, background: object, on: str, free: tuple[str, ...]) -> None:
+def _check_choices(bank: Bank, background: object, on: str) -> None:
     """Check that the choices of a matcher go together."""
     if bank.plan.model != "ray":
         raise UsageError(f"the bank's model is '{bank.plan.model}', which knows no mixed pixels: refine needs 'ray'")
     if background == "unknown" and on != "ranges":
         raise UsageError('background="unknown" takes on="ranges": the brightness of unknown things tells nothing')
-    if isinstance(bank, OneFrequencyBank) and bank.one.stacked:
-        if background == "auto":
-            raise UsageError('background="auto" takes on="ranges" with several modulation frequencies')
-        if tilted := [name for name in VIEW[3:] if name in free]:
-            raise UsageError(
-                f"'free' with several modulation frequencies takes {tilted[0]} on=\"ranges\" alone: leave it out on"
-                " phasors"
-            )
-    if on == "phasors" and background is not None and set(free) & set(VIEW[4:]):
-        raise UsageError(
-            "on=\"phasors\" before a background takes a level camera: leave pitch_rad and roll_rad out of 'free', or"
-            ' match on="ranges"'
-        )
+    if background == "auto" and layers_of(bank) is not None:
+        raise UsageError('background="auto" takes on="ranges" with several modulation frequencies')
 
 
 def usual_workers() -> int:

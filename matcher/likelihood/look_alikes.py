@@ -25,7 +25,7 @@ _OfClasses = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
 
 
 def fit_look_alikes(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
-    """Let views that look like the best one explain each frame.
+    """Fit views that look like the best one to each frame.
 
     A mesh with a symmetry that its bank does not have looks the same from several sides. A thin landmark looks
     nearly the same from the front and from the back, its middle seen at the same place, and something like a box from

@@ -6,6 +6,7 @@ start (PHYSICS section 7) and held while a view moves, so that the sum stays com
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -80,9 +81,9 @@ class State:
 
     def update(self, where: NDArray[np.integer], news: State) -> None:
         """Replace some candidates by others, in place."""
-        for own, new in ((self.images, news.images), (self.sums, news.sums)):
-            for name, values in vars(own).items():
-                values[where] = getattr(new, name)
+        self.images.update(where, news.images)
+        for name, values in vars(self.sums).items():
+            values[where] = getattr(news.sums, name)
         self.theta[where], self.use[where] = news.theta, news.use
 
 
@@ -151,7 +152,7 @@ class Problem:
         )
 
     def start(self, view: NDArray[np.float64], at_first_sight: bool) -> State:
-        """Look at the first views: which pixels count, and how bright the landmark is."""
+        """Evaluate the first views: the pixels that count, and the brightness of the landmark."""
         theta = np.column_stack([self.clipped(view.copy()), np.ones(len(view))])
         view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
         if at_first_sight and not self.with_albedo and not self.model.slopes_are_cheap:
@@ -194,7 +195,7 @@ class Problem:
 
     def turned(self, states: State, source: NDArray[np.integer], theta: NDArray[np.float64]) -> State:
         """Return states that differ from `source` in δ alone, with the slopes from there."""
-        like = ModelImages(**{name: values[source] for name, values in vars(states.images).items()})
+        like = states.images[source]
         if self.with_albedo:  # a model returns images of the bank's albedo
             like = replace(like, phasor=like.phasor - (theta[:, ALBEDO_COLUMN:] - 1) * like.slope[:, -1])
         images = self.model.turned(self.class_index, np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), like)
@@ -263,10 +264,33 @@ class Problem:
             return images
         own = self._landmark_alone(images)
         factor = theta[:, ALBEDO_COLUMN:]
-        slope = np.concatenate([images.slope * factor[:, :, None], own[:, None]], axis=1)
-        return replace(images, phasor=images.phasor + (factor - 1) * own, slope=slope)
+        slope = images.slope * factor[:, :, None]
+        if images.behind_slope is not None and images.behind_slope.shape == slope.shape:
+            slope -= (factor[:, :, None] - 1) * images.behind_slope
+        slope = np.concatenate([slope, own[:, None]], axis=1)
+        return replace(images, phasor=images.phasor + (factor - 1) * own, slope=slope, behind_slope=None)
+
+    def at_brightness(
+        self, factor: NDArray[np.float64], change: Callable[[ImageModel], NDArray[np.complex128] | None]
+    ) -> NDArray[np.complex128] | None:
+        """Return a change of images (m, k, pixels) with landmarks as bright as some factors (m,) have them.
+
+        Parameters
+        ----------
+        factor : (m,) float64
+        change : callable
+            Returns the change of a model's images, whose landmarks are as bright as the bank has them; None of a model
+            that is smooth, which is then returned.
+        """
+        whole = change(self.model)
+        if whole is None:
+            return None
+        alone = None if self.model.alone is None else change(self.model.alone)
+        return whole * factor[:, None, None] if alone is None else whole + (factor[:, None, None] - 1) * alone
 
     def _landmark_alone(self, images: ModelImages) -> NDArray[np.complex128]:
+        if images.behind is not None:
+            return images.phasor - images.behind
         behind = self.settings.phasor_behind
         return images.phasor if behind is None else images.phasor - (1 - images.coverage) * behind
 
@@ -290,6 +314,5 @@ class Problem:
 
 def picked(state: State, which: NDArray[np.integer]) -> State:
     """Return the state of some of the candidates."""
-    images = ModelImages(**{name: values[which] for name, values in vars(state.images).items()})
     sums = Sums(**{name: values[which] for name, values in vars(state.sums).items()})
-    return State(state.theta[which], state.use[which], images, sums)
+    return State(state.theta[which], state.use[which], state.images[which], sums)

@@ -6,6 +6,7 @@ count, it is decided again there, once, and the view moves again. Then lower min
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels, whole_cost
 from phasemark.matcher.likelihood.descent import descend
 from phasemark.matcher.likelihood.fits import Fits
-from phasemark.matcher.likelihood.images import ImageModel, ModelImages
+from phasemark.matcher.likelihood.images import ImageModel
 from phasemark.matcher.likelihood.kinks import look_beside, settle
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, DescentSettings, Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
@@ -201,9 +202,7 @@ def _uncertainty(
             else:
                 wide = slopes_around(there, state, near, capped_std(problem, covariance[near]))
             slope = state.images.slope[near] if wide is None else wide
-            images = ModelImages(
-                **{name: values[near] for name, values in vars(state.images).items() if name != "slope"}, slope=slope
-            )
+            images = replace(state.images[near], slope=slope)
             sums = there.summed(state.theta[near], state.use[near], images).sums
             if wide is not None:
                 covariance[near] = view_covariance(problem, sums)

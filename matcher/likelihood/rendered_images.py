@@ -33,11 +33,17 @@ class RenderedModel:
         What stands behind the landmark.
     cache_bytes : int
         Room for images that other frames may start from too.
+    splits_light : bool
+        Whether images know what of their phasors comes from the background, which takes a second rendering of each:
+        it depends on the bearing and the tilt of the view.
     """
 
     slopes_are_cheap = False
 
-    def __init__(self, bank: Bank, background: Background | None = None, cache_bytes: int = 0) -> None:
+    def __init__(
+        self, bank: Bank, background: Background | None = None, cache_bytes: int = 0, *, splits_light: bool = False
+    ) -> None:
+        self._splits_light = splits_light
         self.sensor: Sensor = bank.sensor
         self.background = background
         self.cache = ViewCache(cache_bytes)
@@ -67,6 +73,15 @@ class RenderedModel:
         other.__dict__.update(self.__dict__)
         other.background = background
         other._limits = self._limits_before(background)
+        return other
+
+    @property
+    def alone(self) -> RenderedModel | None:
+        """The same model without a background, over the same distances, where the light is split; None elsewhere."""
+        if not self._splits_light or self.background is None:
+            return None
+        other = self.with_background(None)
+        other._limits = self._limits
         return other
 
     def limits(self) -> tuple[float, float]:
@@ -102,7 +117,11 @@ class RenderedModel:
         if self._factored and "delta_rad" in free:  # a body of revolution looks the same from every side
             level, first = ~view[:, 3:].any(axis=1), self.sensor.lower_rows[0] * self.sensor.cols
             slope[level, list(free).index("delta_rad"), :first] = 0
-        return ModelImages(phasor, slope, intensity, coverage)
+        alone = self.alone
+        if alone is None:
+            return ModelImages(phasor, slope, intensity, coverage)
+        landmark = alone.images(class_index, view, free)
+        return ModelImages(phasor, slope, intensity, coverage, phasor - landmark.phasor, slope - landmark.slope)
 
     def first_images(
         self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
@@ -113,14 +132,15 @@ class RenderedModel:
         found = {key: self.cache.get(key) for key in place}
         missing = [k for key, k in place.items() if found[key] is None]
         new = self.images(class_index[missing], np.ascontiguousarray(view[missing]), free)
-        for k, *arrays in zip(missing, new.phasor, new.slope, new.intensity, new.coverage, strict=True):
+        held = [values for values in new.arrays() if values is not None]
+        for k, *arrays in zip(missing, *held, strict=True):
             own = tuple(values.copy() for values in arrays)  # no view of the whole batch, which would stay too
             found[keys[k]] = own
             self.cache.put(keys[k], own)
         rows = [row for row in map(found.get, keys) if row is not None]
         if not rows:
             return new
-        return ModelImages(*(np.stack([cast(Any, row[part]) for row in rows]) for part in range(4)))
+        return ModelImages(*(np.stack([cast(Any, row[part]) for row in rows]) for part in range(len(rows[0]))))
 
     def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
         """Render the rows that δ changes."""
@@ -131,7 +151,11 @@ class RenderedModel:
             image = self._render(c, view[of], rows)
             for values, new in ((phasor, image.phasor), (intensity, image.intensity), (coverage, image.coverage)):
                 values[of, first:] = new.reshape(len(of), -1)
-        return ModelImages(phasor, like.slope, intensity, coverage)
+        alone = self.alone
+        if alone is None or like.behind is None:
+            return ModelImages(phasor, like.slope, intensity, coverage)
+        landmark = alone.turned(class_index, view, replace(like, phasor=like.phasor - like.behind)).phasor
+        return ModelImages(phasor, like.slope, intensity, coverage, phasor - landmark, like.behind_slope)
 
     def wide_slopes(
         self,

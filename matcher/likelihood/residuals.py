@@ -41,7 +41,7 @@ class Evidence:
         Noise of a single frame's range; infinite where nothing returned.
     seen : Observation
         The same frames as the coarse search sees them. What one frame cannot measure to 0.1 rad is no return there,
-        whether or not the camera dropped it. Such pixels keep their `weight`: where a model is bright enough, a fit
+        whether or not the camera dropped it. Those pixels keep their `weight`: where a model is bright enough, a fit
         compares them.
     on : {"ranges", "phasors"}
     sensor : Sensor

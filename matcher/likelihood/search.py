@@ -195,7 +195,7 @@ def _retry_without_prior(
     fits: Fits,
     poor: NDArray[np.int64],
 ) -> list[Fits]:
-    """Search poor frames from more minima and angles; what fails `refused_p` still, around its best fits and anew."""
+    """Search poor frames from more minima and angles; what fails `refused_p` still, around its best fits and afresh."""
     policy, all_classes = setup.policy, _all_classes(setup, evidence)
 
     def refused(found: list[Fits]) -> NDArray[np.int64]:

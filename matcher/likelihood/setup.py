@@ -62,7 +62,7 @@ class Shapes:
 
     @classmethod
     def of_bank(cls, bank: Bank) -> Shapes:
-        """Look at the meshes of a bank."""
+        """Collect symmetry and centre of the meshes of a bank."""
         meshes = [bank.mesh(name) for name in bank.classes]
         symmetry = tuple(int(mesh.metadata["symmetry"]) for mesh in meshes)
         own = tuple(mesh_symmetry(mesh) if n == 1 else n for mesh, n in zip(meshes, symmetry, strict=True))

@@ -37,14 +37,18 @@ def slopes_around(
     """
     view = np.ascontiguousarray(state.theta[which, :ALBEDO_COLUMN])
     step = np.maximum(0.5 * std, problem.policy.slope_width * problem.scale[: std.shape[1]])
-    slope = problem.model.wide_slopes(problem.class_index, view, problem.settings.free, step)
-    if slope is None:
-        return None
     if not problem.with_albedo:
+        slope = problem.model.wide_slopes(problem.class_index, view, problem.settings.free, step)
+        if slope is None:
+            return None
         # light that comes and goes within the step has no phase whose slope could tell anything
         phasor = np.abs(state.images.phasor[which])[:, None]
         return np.where(np.abs(slope) * step[:, :, None] > phasor, 0.0, slope)
-    return np.concatenate([slope * state.theta[which, ALBEDO_COLUMN:, None], state.images.slope[which, -1:]], axis=1)
+    by_view = problem.at_brightness(
+        state.theta[which, ALBEDO_COLUMN],
+        lambda model: model.wide_slopes(problem.class_index, view, problem.settings.free, step),
+    )
+    return None if by_view is None else np.concatenate([by_view, state.images.slope[which, -1:]], axis=1)
 
 
 def slopes_along_axes(
@@ -64,14 +68,16 @@ def slopes_along_axes(
     moves = np.zeros((len(which), p, len(VIEW)))
     moves[:, :, problem.columns[:p]] = (vectors * length[:, None]).transpose(0, 2, 1) * scale
     view = np.ascontiguousarray(state.theta[which, :ALBEDO_COLUMN])
-    change = problem.model.differences(problem.class_index, view, moves)
+    factor = state.theta[which, ALBEDO_COLUMN]
+    change = problem.at_brightness(factor, lambda model: model.differences(problem.class_index, view, moves))
+    assert change is not None
     if not problem.with_albedo:
         change = np.where(np.abs(change) > np.abs(state.images.phasor[which])[:, None], 0.0, change)
     # along the axes: slope · axis = change
     slope = np.asarray(np.einsum("mik,mkq->miq", vectors / length[:, None], change) / scale[:, None])
     if not problem.with_albedo:
         return slope
-    return np.concatenate([slope * state.theta[which, ALBEDO_COLUMN:, None], state.images.slope[which, -1:]], axis=1)
+    return np.concatenate([slope, state.images.slope[which, -1:]], axis=1)
 
 
 def std_without_one_pixel(

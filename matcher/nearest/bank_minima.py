@@ -118,7 +118,8 @@ class Search:
         *,
         capped: bool = False,
     ) -> None:
-        self._sensor, self._n_class = bank.sensor, bank.n_class
+        self._layers, self._n_class = bank.layers, bank.n_class
+        self._sensor = bank.sensor if bank.layers is None else bank.layers.camera
         self._capped = capped
         self._distance, self._delta, self._closes = bank.distance_m, bank.delta_rad, bank.closes
         self._parts = bank.templates(behind)
@@ -126,7 +127,7 @@ class Search:
         self._look(widest_rad)
 
     def _look(self, widest_rad: float) -> None:
-        """Say to which sides the landmark may be off."""
+        """Set the shifts to each side by which the landmark may be off."""
         sensor, upward = self._sensor, self._upward
         self.column_rad = 2 * math.atan(sensor.tan_half_angles[0]) / sensor.cols
         most = min(sensor.cols // 4, math.ceil(min(widest_rad / self.column_rad, sensor.cols)))
@@ -237,15 +238,17 @@ class Search:
         up, side = shift
         if up == 0 and side == 0:
             return seen
-        rows, cols = self._sensor.rows, self._sensor.cols
+        rows, cols, layers = self._sensor.rows, self._sensor.cols, self._layers
 
         def move(values: NDArray[_T]) -> NDArray[_T]:
-            grid = values.reshape(-1, rows, cols)
+            grid = values.reshape(len(values), -1, cols)
+            if layers is not None:
+                grid = layers.layers(grid)
             out = np.zeros_like(grid)
             to_rows, from_rows = slice(max(up, 0), rows + min(up, 0)), slice(max(-up, 0), rows + min(-up, 0))
             to_cols, from_cols = slice(max(-side, 0), cols + min(-side, 0)), slice(max(side, 0), cols + min(side, 0))
-            out[:, to_rows, to_cols] = grid[:, from_rows, from_cols]
-            return out.reshape(values.shape)
+            out[..., to_rows, to_cols] = grid[..., from_rows, from_cols]
+            return (out if layers is None else layers.stack(out)).reshape(values.shape)
 
         return Observation(move(seen.range_m), move(seen.weight), move(seen.returned), move(seen.not_returned))
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
 from phasemark.data.plans.arrays import GroupName, group_rows
-from phasemark.matcher.frequencies import phases_wrap
+from phasemark.matcher.frequencies import layers_of, phases_wrap
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Templates
 from phasemark.render import PhasorImages
@@ -38,6 +38,8 @@ class ThinnedBank:
     Attributes
     ----------
     sensor : Sensor
+    layers : OneFrequency or None
+        How the images of several frequencies lie above one another; None where there is one image.
     n_class : int
     distance_m, delta_rad : float64
         The thinned grid.
@@ -47,6 +49,7 @@ class ThinnedBank:
 
     def __init__(self, bank: Bank, stride: tuple[int, int]) -> None:
         self.sensor = bank.sensor
+        self.layers = layers_of(bank)
         self.n_class = len(bank.classes)
         self.distance_m = bank.distance_m[:: stride[0]]
         self.delta_rad = bank.delta_rad[:: stride[1]]

@@ -88,7 +88,7 @@ class RobotPose:
     mahalanobis: float = math.nan
 
     def __repr__(self) -> str:
-        """Say in one line where the robot stands, with standard deviations if there are any."""
+        """Describe the robot's pose in one line, with standard deviations if there are any."""
         std = ["", "", ""]
         if self.covariance is not None:
             x, y, heading = (math.sqrt(max(float(self.covariance[k, k]), 0.0)) for k in range(3))

@@ -57,7 +57,7 @@ def answer_cells(cells: Sequence[Cell]) -> list[Cell]:
 
 
 def answer(cells: Sequence[Cell]) -> str:
-    """Say in one sentence how accurate the best method is in the middle of the design.
+    """State in one sentence the accuracy of the best method in the middle of the design.
 
     Parameters
     ----------

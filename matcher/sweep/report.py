@@ -116,7 +116,7 @@ def _write_report(ours: OwnedFiles) -> Path:
 
 
 def summary(trials: SweepTrials, cells: Sequence[Cell]) -> list[str]:
-    """Say in three sentences what was found: how accurate each method is, where it fails, which classes it finds."""
+    """Summarise a sweep in three sentences: accuracy of each method, where it fails, and the classes it finds."""
     landmarks = [cell for cell in cells if not cell.stranger]
     methods = trials.methods
     accurate = "; ".join(f"{method} {_accuracy([c for c in landmarks if c.method == method])}" for method in methods)
@@ -148,7 +148,7 @@ def _accuracy(cells: Sequence[Cell]) -> str:
 
 
 def _classes(trials: SweepTrials, m: int) -> str:
-    """Say what the confusion matrix of method m shows: right among the answers, and what was refused."""
+    """State from the confusion matrix of method m the share of right answers, and the share refused."""
     refused, strange = trials.refused[:, m], trials.true_class < 0
     answers = ~refused & ~strange
     right = int((trials.found[answers, m] == trials.true_class[answers]).sum())

@@ -193,7 +193,7 @@ def _stored_plan(folder: Path) -> SweepPlan | None:
 
 @contextmanager
 def sweep_folder(folder: Path) -> Iterator[OwnedFiles]:
-    """Hold a sweep's folder against other runs, and know which of its files are the sweep's.
+    """Lock a sweep's folder against other runs, and list the files in it that belong to the sweep.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a direct sensor counts and finds, by other arithmetic than the simulation's (PHYSICS section 11).
+"""Predicted counts and targets of a direct sensor, by other arithmetic than the simulation (PHYSICS section 11).
 
 A zone is integrated by midpoints, pile-up is the recursion over bins, and a target is found where a bin exceeds the
 threshold about the median.
@@ -35,7 +35,7 @@ def cumulative_response(delay_m: Floats, sensor: Sensor, zone: int) -> Floats:
     x = np.linspace(0.0, len(row) - 1.0, _FINER * (len(row) - 1) + 1)
     density = np.interp(x, np.arange(len(row)), row)
     whole = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
-    return np.interp(delay_m, histogram.irf_start_m + step * x, whole / whole[-1])
+    return np.asarray(np.interp(delay_m, histogram.irf_start_m + step * x, whole / whole[-1]), np.float64)
 
 
 def response_std_m(sensor: Sensor) -> float:
@@ -57,7 +57,7 @@ def bin_edges_m(sensor: Sensor, zone: int) -> Floats:
     scale = histogram.zone_bin_scale[row][col] if histogram.zone_bin_scale else 1.0
     offset_m = sensor.range_offset_m + float(sensor.zone_offsets.reshape(sensor.rows, -1)[row, col])
     edges = histogram.start_m + histogram.bin_width_m * scale * np.arange(histogram.bins + 1)
-    return np.asarray(edges - offset_m)
+    return np.asarray(edges - offset_m, np.float64)
 
 
 def plane_counts(sensor: Sensor, distance_m: float, albedo: float) -> Floats:
@@ -109,10 +109,9 @@ def detected(signal: Floats, sensor: Sensor) -> Floats:
     histogram = histogram_of(sensor)
     counts = signal + histogram.cycles * (histogram.ambient + histogram.dark)
     if histogram.crosstalk > 0:
-        edges = histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1)
-        counts = counts + histogram.crosstalk * np.diff(
-            cumulative_response(edges - histogram.crosstalk_range_m, sensor, 0)
-        )
+        edges = np.asarray(histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1), np.float64)
+        share = np.diff(cumulative_response(edges - histogram.crosstalk_range_m, sensor, 0))
+        counts = np.asarray(counts + histogram.crosstalk * share)
     if not histogram.pile_up:
         return np.asarray(counts)
     free, out = 1.0, np.empty(len(counts))
@@ -185,4 +184,5 @@ def _plane_light(sensor: Sensor, distance_m: float, zone: int) -> Floats:
     cell_m = histogram.bin_width_m / _CELLS_PER_BIN
     furthest = distance_m * math.sqrt(1 + (tan_h * 4) ** 2 + (tan_v * 4) ** 2)
     cells = np.minimum((distance_m * length / cell_m).astype(np.int64), int(furthest / cell_m))
-    return np.bincount(cells.ravel(), amplitude.ravel(), minlength=int(furthest / cell_m) + 1)
+    light = np.bincount(cells.ravel(), amplitude.ravel(), minlength=int(furthest / cell_m) + 1)
+    return np.asarray(light, np.float64)

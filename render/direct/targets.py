@@ -45,7 +45,7 @@ class Targets(NamedTuple):
 
 
 class Counted(Protocol):
-    """What has histograms: :class:`~phasemark.render.direct.HistogramFrames`."""
+    """Interface of objects with histograms: :class:`~phasemark.render.direct.HistogramFrames`."""
 
     counts: NDArray[np.float64]
     sensor: Sensor

@@ -67,7 +67,7 @@ def follow_borders(view, first, mesh, motion, background, camera, edges, borders
 
 @kernel
 def _follow_bent_borders(view, first, mesh, motion, background, camera, edges, borders):  # type: ignore[no-untyped-def]
-    """Do the same behind a lens with distortion.
+    """Follow the borders of edges behind a lens with distortion.
 
     With φ the distance of a fixed ray from the edge, in tangents, the edge is where φ = 0. Along the normal m of a link
     it moves by −φ̇ / (∇φ · m), and the link along x by that over m_x: weights are lengths along the link, not the curve.

@@ -226,7 +226,7 @@ def _in_lines(rows: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def _part_by_height(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int8]:
-    """Tell the parts of an unlabelled mesh apart by the side of the interface plane their centre lies on."""
+    """Label the parts of an unlabelled mesh by the side of the interface plane on which each face's centre lies."""
     return np.asarray(vertices[faces].mean(axis=1)[:, 2] > 0, dtype=np.int8)
 
 

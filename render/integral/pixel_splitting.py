@@ -100,7 +100,7 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, borders, n, region):  # type: ignore[no-untyped-def]
+def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples, borders, n, region):  # type: ignore[no-untyped-def]
     """Place the samples of one pixel.
 
     Parameters
@@ -109,8 +109,8 @@ def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, borders, n
         Row and column.
     bent : bool
         Whether the pixel may see the inside of a curved surface, which takes more points than a flat one.
-    splits : int
-        Boxes a side that the active area is cut into before anything else.
+    splits_u, splits_v : int
+        Boxes along u and along v that the active area is cut into before anything else.
     camera : Camera
     edges : Edges
         As :func:`project_edges` and :func:`bin_segments` left them.
@@ -137,20 +137,20 @@ def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, borders, n
     upright = lists_limb(head[i - 1, j], edges) or lists_limb(head[i + 1, j], edges)
     if head[i, j] < 0 and not sideways and not upright:
         count = 3 if bent else 2
-        if n + (splits * count) ** 2 > len(weights):
+        if n + splits_u * splits_v * count * count > len(weights):
             return -1, region, True
-        for part in range(splits * splits):
-            row, col = divmod(part, splits)
+        for part in range(splits_u * splits_v):
+            row, col = divmod(part, splits_u)
             for a in range(count):
                 for b in range(count):
-                    points[n, 0] = u0 + width / splits * (col + (G3X[b] if bent else G2X[b]))
-                    points[n, 1] = v0 + height / splits * (row + (G3X[a] if bent else G2X[a]))
-                    weights[n] = (G3W[a] * G3W[b] if bent else 0.25) / (splits * splits)
+                    points[n, 0] = u0 + width / splits_u * (col + (G3X[b] if bent else G2X[b]))
+                    points[n, 1] = v0 + height / splits_v * (row + (G3X[a] if bent else G2X[a]))
+                    weights[n] = (G3W[a] * G3W[b] if bent else 0.25) / (splits_u * splits_v)
                     regions[n] = region
                     n += 1
             region += 1
         return n, region, True
-    # sweep along the limb if there is one, else along where one is near, else along most of the edges
+    # sweep along the limb if there is one, else along those that are near, else along most of the edges
     crease_u, crease_v, limb_u, limb_v = 0.0, 0.0, 0.0, 0.0
     entry = head[i, j]
     while entry >= 0:
@@ -166,8 +166,11 @@ def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, borders, n
     has_limb = limb_u > 0.0 or limb_v > 0.0
     if has_limb:
         sweep_v = limb_v >= limb_u
-    elif sideways != upright:
-        sweep_v = sideways
+    elif sideways or upright:
+        for near in (head[i, j - 1], head[i, j + 1], head[i - 1, j], head[i + 1, j]):
+            du, dv = _extent_of_limbs(near, edges, c - 1, r - 1, c + 2, r + 2)
+            limb_u, limb_v = limb_u + du, limb_v + dv
+        sweep_v = limb_v >= limb_u
     else:
         sweep_v = crease_v >= crease_u
     curved = sideways or upright or has_limb
@@ -179,14 +182,14 @@ def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, borders, n
             collect_limbs(near, edges, sweep_v, scratch)
     stack = scratch.boxes
     part, depth, trusted = 0, 0, True
-    while depth > 0 or part < splits * splits:
+    while depth > 0 or part < splits_u * splits_v:
         if depth == 0:
-            row, col = divmod(part, splits)
+            row, col = divmod(part, splits_u)
             stack[0] = (
-                u0 + width * col / splits,
-                v0 + height * row / splits,
-                u0 + width * (col + 1) / splits,
-                v0 + height * (row + 1) / splits,
+                u0 + width * col / splits_u,
+                v0 + height * row / splits_v,
+                u0 + width * (col + 1) / splits_u,
+                v0 + height * (row + 1) / splits_v,
                 0.0,
             )
             part, depth = part + 1, 1
@@ -213,3 +216,18 @@ def sample_pixel(r, c, bent, splits, camera, edges, scratch, samples, borders, n
         if n < 0:
             return -1, region, trusted
     return n, region, trusted
+
+
+@kernel
+def _extent_of_limbs(entry, edges, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
+    """Return how far the limbs listed from `entry` on run along u and along v inside a box."""
+    segments, along_u, along_v = edges.segments, 0.0, 0.0
+    while entry >= 0:
+        k = edges.owner[entry]
+        entry = edges.link[entry]
+        if edges.limb[k]:
+            ua, va, ub, vb = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
+            lo, hi = clip(ua, va, ub, vb, u0, v0, u1, v1)
+            along_u += max(hi - lo, 0.0) * abs(ub - ua)
+            along_v += max(hi - lo, 0.0) * abs(vb - va)
+    return along_u, along_v

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from phasemark.render.kernel import kernel
 
 _THIN = 0.15
-"""Intervals narrower than this (pixels) get one Gauss point."""
+"""Intervals narrower than this share of their box get one Gauss point."""
 _WIDE = 0.3
-"""Intervals wider than this (pixels) get three Gauss points on a curved surface, the others two."""
+"""Intervals wider than this share of their box get three Gauss points on a curved surface, the others two."""
 _BESIDE_LIMB = (0.1, 0.6)
 """Intervals beside a limb get two Gauss points, or three, or four where they are wider than this (pixels)."""
 FELT = 1.5
@@ -37,9 +37,10 @@ G5X, G5W = gauss_legendre(5)
 
 
 @kernel
-def place_points(a, b, left, right, bent, points, weights):  # type: ignore[no-untyped-def]
+def place_points(a, b, left, right, side, bent, points, weights):  # type: ignore[no-untyped-def]
     """Place Gauss points on one interval [a, b], with limbs at `left` and `right` (∓inf: none).
 
+    `side` is the width of the box in which the interval lies.
     Column 0 of `points` gets the places, `weights` weights that add up to one; returns their number.
     """
     near_left, near_right = a - left < FELT, right - b < FELT
@@ -55,7 +56,7 @@ def place_points(a, b, left, right, bent, points, weights):  # type: ignore[no-u
     elif near_right:
         t0, t1 = math.sqrt(max(right - a, 0.0)), math.sqrt(max(right - b, 0.0))
     else:
-        count = 1 if b - a < _THIN else (3 if bent and b - a > _WIDE else 2)
+        count = 1 if b - a < _THIN * side else (3 if bent and b - a > _WIDE * side else 2)
         t0, t1 = a, b
     total = 0.0
     for g in range(count):

@@ -13,7 +13,6 @@ from phasemark.render.integral.edge_projection import project_edges
 from phasemark.render.integral.edges_in_pixels import bin_segments
 from phasemark.render.integral.floor_phase import parts_of_pixel
 from phasemark.render.integral.image_rays import trace
-from phasemark.render.integral.limbs import lists_limb
 from phasemark.render.integral.pixel_splitting import sample_pixel
 from phasemark.render.kernel import kernel
 
@@ -23,6 +22,8 @@ SPLIT = 1
 """Pixel state: sampled, split exactly."""
 UNTRUSTED = 2
 """Pixel state: sampled, but too many edges for an exact split."""
+_TURN_RAD = 0.1
+"""Turn of the fastest phase over the width of a pixel at the landmark above which slanted faces take more points."""
 SHORT_LINKS = -1
 """Next view that says that ``edges.link`` is too short."""
 SHORT_SEGMENTS = -2
@@ -78,6 +79,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
             return SHORT_SEGMENTS, n
         if bin_segments(n_edges, camera, edges) < 0:
             return SHORT_LINKS, n
+        fine = fastest * camera.slope_u * _distance(poses.lens[view]) > _TURN_RAD
         start, first_border = n, n_borders
         for row in range(rows):
             r = camera.first_row + row
@@ -98,10 +100,11 @@ def plan_rays(  # type: ignore[no-untyped-def]
                     continue
                 before = n
                 bent = left < bent_high_u and right > bent_low_u and top < bent_high_v and bottom > bent_low_v
-                parts = parts_of_pixel(r, c, background, fastest, cos_b, sin_b, poses.level[view], camera)
-                parts = max(splits, parts if parts > 1 and not _near_limb(r + 1, c + 1, edges) else 1)
+                bent = bent or fine
+                parts_u, parts_v = parts_of_pixel(r, c, background, fastest, cos_b, sin_b, poses.level[view], camera)
+                parts_u, parts_v = max(splits, parts_u), max(splits, parts_v)
                 n, region, trusted = sample_pixel(
-                    r, c, bent, parts, camera, edges, scratch, samples, borders, n, region
+                    r, c, bent, parts_u, parts_v, camera, edges, scratch, samples, borders, n, region
                 )
                 if n < 0 or borders.placed[0] > room:
                     borders.placed[0] = first_border
@@ -143,13 +146,9 @@ def _add_background(background, cos_b, sin_b, level, camera, edges, n):  # type:
 
 
 @kernel
-def _near_limb(i, j, edges):  # type: ignore[no-untyped-def]
-    """Return whether a limb runs through a pixel or one beside it; the rules beside a limb belong to whole pixels."""
-    head = edges.head
-    for entry in (head[i, j], head[i, j - 1], head[i, j + 1], head[i - 1, j], head[i + 1, j]):
-        if lists_limb(entry, edges):
-            return True
-    return False
+def _distance(lens):  # type: ignore[no-untyped-def]
+    """Return how far the lens is from the landmark's origin."""
+    return math.sqrt(lens[0] * lens[0] + lens[1] * lens[1] + lens[2] * lens[2])
 
 
 @kernel

@@ -53,7 +53,7 @@ def unite_shells(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _shells(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
-    """Take a mesh apart where no edge joins its faces; holes stay holes."""
+    """Split a mesh where no edge joins its faces; holes stay holes."""
     n, (first, second) = len(mesh.faces), np.asarray(mesh.face_adjacency).reshape(-1, 2).T
     label = connected_components(coo_array((np.ones(len(first), bool), (first, second)), shape=(n, n)))[1]
     order = np.argsort(label, kind="stable")
@@ -65,7 +65,7 @@ def _shells(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
 
 
 def _may_intersect(bounds: np.ndarray) -> bool:
-    """Tell whether any two of (n, 2, 3) bounding boxes overlap by more than rounding."""
+    """Return True if any two of (n, 2, 3) bounding boxes overlap by more than rounding."""
     margin = 1e-9 * np.ptp(bounds, axis=(0, 1)).max()
     overlap = (bounds[:, None, 0] < bounds[None, :, 1] - margin).all(axis=-1)
     both = overlap & overlap.T

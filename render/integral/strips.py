@@ -96,7 +96,7 @@ def _activate(lo, hi, m, started, n_active, scratch):  # type: ignore[no-untyped
 
 @inlined
 def _continues(m, last, n, stop, lo, scratch):  # type: ignore[no-untyped-def]
-    """Tell whether the edges of two neighbouring slabs are the same, or links of the same smooth curves.
+    """Return True if the edges of two neighbouring slabs are the same, or links of the same smooth curves.
 
     Not so where edges cross, begin or end alone, where one lies along the border between the slabs, where a link stands
     at a noticeable angle to the one before, or where the curve has turned far since the strip's first slab. The last

@@ -10,7 +10,7 @@ from __future__ import annotations
 from phasemark.render.integral.arguments import towards_landmark
 from phasemark.render.integral.face_search import find_face, look_about, plane_hit, turns_smoothly
 from phasemark.render.integral.ray_plan import SPLIT
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inlined, kernel
 
 _LOOKS = 2
 """Into the grid, for each sample, before its face is searched for step by step."""
@@ -18,24 +18,37 @@ _LOOKS = 2
 
 @kernel
 def pick_scouts(n, samples):  # type: ignore[no-untyped-def]
-    """Choose the middle sample of every interval.
+    """Choose one sample of every interval; return how many indices were written to ``samples.chosen``.
 
-    Samples of an interval lie one behind the other, and all see one smooth patch of the surface: the one in the middle
-    tells which. Returns how many indices were written to ``samples.chosen``.
+    Samples of an interval all see one smooth patch of the surface: one tells which.
     """
     regions, chosen = samples.regions, samples.chosen
     count, start = 0, 0
     for k in range(1, n + 1):
         if k == n or regions[k] != regions[start]:
-            chosen[count] = (start + k - 1) // 2
+            chosen[count] = _scout(start, k, samples.weights)
             count += 1
             start = k
     return count
 
 
+@inlined
+def _scout(start, stop, weights):  # type: ignore[no-untyped-def]
+    """Return the sample with the largest weight, the middle one if it is among those.
+
+    A sample beside an edge may see what lies beyond: a chain of links leaves its curve by a little, and an edge in
+    float64 leaves a ray in float32. Where an interval is widest, and far from limbs, weights are largest.
+    """
+    best = (start + stop - 1) // 2
+    for k in range(start, stop):
+        if weights[k] > weights[best]:
+            best = k
+    return best
+
+
 @kernel
 def share_faces(n, mesh, share, scout_face, samples, poses, camera, state):  # type: ignore[no-untyped-def]
-    """Hand the face a scout met to its interval where that is all there is to know, and list the samples left to cast.
+    """Assign the face of a scout ray to its interval where no other face can be seen, and list the samples left to cast.
 
     On a plain patch the plane is the same for all samples, and where the scout met nothing nothing is met. On a
     searched patch each sample's face is looked for from the scout's, and on any other curved patch it is cast.
@@ -49,7 +62,7 @@ def share_faces(n, mesh, share, scout_face, samples, poses, camera, state):  # t
     for k in range(1, n + 1):
         if k < n and regions[k] == regions[start]:
             continue
-        scout, found = (start + k - 1) // 2, scout_face[region]
+        scout, found = _scout(start, k, samples.weights), scout_face[region]
         known = share and states[pixel[start]] == SPLIT
         face[scout] = found
         if known and (found < 0 or mesh.plain[found]):

@@ -29,9 +29,9 @@ TERMS = (*_INTRINSICS, *_NAMES["opencv"])
 LENS_FIELD = "lens."
 """What stands before a term where it is named among the fields of a sensor, as in `calibration_fields`."""
 
-_MOST_PIXELS = 4096  # along a side of an image
+MOST_PIXELS = 4096
+"""Pixels along a side of an image."""
 _OFF_CENTRE = 0.4  # of the image's size, how far from its centre the principal point of a whole image may lie
-_PARTS_OFF = 1.0  # the same of a camera that reads a part of an image
 _SOLVED = 1e-13  # relative difference of tangents up to which focal lengths are solved for
 _MOST_STEPS = 30
 _SAME = 1e-5  # relative difference up to which a stated field agrees with the lens
@@ -165,7 +165,7 @@ def with_geometry_of_lens(data: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(lens, Lens) or rows is None or cols is None:
         return fields  # what is wrong about them is found where fields are checked
     centre = (lens.cx + 0.5, lens.cy + 0.5)
-    check_image_size(lens, rows, cols, _PARTS_OFF)
+    check_image_size(lens, rows, cols, MOST_PIXELS / min(rows, cols))
     try:
         tan_h, tan_v = lens.before(rows, cols).tan_half_angles
     except ValueError as error:
@@ -226,7 +226,7 @@ def changed_lens(lens: Lens, rows: int, cols: int, changes: Mapping[str, Any]) -
 
 def _pixels(value: Any) -> int | None:
     """Return a side of an image as a whole number, None where it is none."""
-    if not isinstance(value, int | float | np.integer) or not 1 <= value <= _MOST_PIXELS or value != int(value):
+    if not isinstance(value, int | float | np.integer) or not 1 <= value <= MOST_PIXELS or value != int(value):
         return None
     return int(value)
 

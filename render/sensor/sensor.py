@@ -16,7 +16,7 @@ from phasemark import UsageError
 from phasemark.inputs.numbers import in_words
 from phasemark.inputs.toml_file import read_toml
 from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD, Lens, changed_lens, check_image_size
-from phasemark.render.sensor.sensor_checks import check_fields
+from phasemark.render.sensor.sensor_checks import check_fields, check_principal_point_of_file
 from phasemark.render.sensor.sensor_fields import CALIBRATION, OPTICS
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
 from phasemark.render.sensor.sources import without_sources
@@ -417,12 +417,13 @@ class Sensor(SensorQuantities):
             sensor = cls(**without_sources(table)[0])
             if sensor.lens is not None:
                 check_image_size(sensor.lens, sensor.rows, sensor.cols)
+            check_principal_point_of_file(sensor)
             return sensor
         except UsageError as error:
             raise UsageError(f"{path}: {error}") from None
 
     def __repr__(self) -> str:
-        """Say in one line what kind of camera it is: pixels, field of view and modulation."""
+        """Describe the camera in one line: pixels, field of view and modulation."""
         view = f"{2 * self.half_angle_v_deg:.4g}° × {2 * self.half_angle_h_deg:.4g}°"
         parts = [f"{self.rows} × {self.cols} pixels", view]
         if self.kind == "direct":
@@ -438,7 +439,7 @@ class Sensor(SensorQuantities):
         return repr(self)
 
     def optics_difference(self, other: Sensor) -> str | None:
-        """Say in what the noise-free images of two cameras differ, e.g. ``'rows' is 16 here and 8 there``.
+        """Describe why the noise-free images of two cameras differ, e.g. ``'rows' is 16 here and 8 there``.
 
         Returns
         -------

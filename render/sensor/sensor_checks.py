@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 
+from phasemark import UsageError
 from phasemark.inputs.numbers import in_words
 from phasemark.render.sensor.correlation import SQUARE_PEAK, correlation_peak, pulse_harmonics
 from phasemark.render.sensor.frequencies import check_frequencies
-from phasemark.render.sensor.lens_fields import LENS_FIELD
+from phasemark.render.sensor.lens_fields import LENS_FIELD, MOST_PIXELS
 from phasemark.render.sensor.sensor_fields import CALIBRATION, DIRECT_ONLY, PHASE_ONLY, SensorFields
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
 
@@ -28,11 +29,27 @@ _ROUNDING = 1e-9  # of a limit that files state in decimals
 
 
 def check_principal_point(sensor: SensorQuantities) -> None:
-    """Refuse a principal point far from the image."""
+    """Refuse a principal point farther off than that of any camera that reads a region of the largest image."""
+    if sensor.principal_point_px is not None:
+        u0, v0 = sensor.principal_point_px
+        if not (abs(u0 - sensor.cols / 2) <= MOST_PIXELS and abs(v0 - sensor.rows / 2) <= MOST_PIXELS):
+            raise ValueError(
+                f"'principal_point_px' must lie within {MOST_PIXELS} pixels of the image's centre, got "
+                f"{sensor.principal_point_px}"
+            )
+
+
+def check_principal_point_of_file(sensor: SensorQuantities) -> None:
+    """Refuse a principal point that does not belong to a whole image, where a person stated it.
+
+    Raises
+    ------
+    UsageError
+    """
     if sensor.principal_point_px is not None:
         u0, v0 = sensor.principal_point_px
         if not (abs(u0 - sensor.cols / 2) <= sensor.cols and abs(v0 - sensor.rows / 2) <= sensor.rows):
-            raise ValueError(
+            raise UsageError(
                 "'principal_point_px' must lie within one image width and height of the image's centre, got "
                 f"{sensor.principal_point_px}"
             )

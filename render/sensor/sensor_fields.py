@@ -139,7 +139,7 @@ CALIBRATION = (
 
 
 class SensorFields(BaseModel):
-    """Hold what can be stated of a camera; :class:`~phasemark.render.Sensor` documents every field."""
+    """Define the fields of a camera; :class:`~phasemark.render.Sensor` documents each."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
 

@@ -64,7 +64,7 @@ def _counts(bench: Bench) -> Part:
     simulated = total / bench.n_frames
     predicted = plane_counts(sensor, distance_m, ALBEDOS[-1])
     histogram = histogram_of(sensor)
-    edges = histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1)
+    edges = np.asarray(histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1), np.float64)
     shown = int(np.searchsorted(edges, _SHOWN * distance_m))
     alive = np.flatnonzero(bench.alive.ravel())
     middle = (sensor.rows // 2) * sensor.cols + sensor.cols // 2
@@ -99,7 +99,7 @@ def _seen_ranges(sensor: Sensor, ranges_m: Floats, intensities: Floats) -> Float
     (views, zones, bins) float64
     """
     axis, grid = range_axis(sensor), footprint_grid(sensor)
-    light = 0.0
+    light = np.zeros((len(ranges_m), sensor.rows * sensor.cols, axis.n))
     for surface in range(ranges_m.shape[1]):
         flat = plane_samples(ranges_m[:, surface], grid)
         own = np.repeat(np.arange(flat.n_views), np.diff(flat.start))
@@ -108,8 +108,8 @@ def _seen_ranges(sensor: Sensor, ranges_m: Floats, intensities: Floats) -> Float
         spread = flat._replace(range_m=ranges_m[own, surface], amplitude=even)
         plain = zone_transients(spread, sensor.with_(vignetting=False), axis)[:, 0]
         plain /= plain.sum(axis=-1, keepdims=True)
-        light = light + plain * intensities[:, surface, None, None]
-    return detected_counts(counts_of_light(np.asarray(light), sensor, axis), sensor)
+        light += plain * intensities[:, surface, None, None]
+    return detected_counts(counts_of_light(light, sensor, axis), sensor)
 
 
 def _merging(bench: Bench) -> Part:

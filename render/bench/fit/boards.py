@@ -149,7 +149,7 @@ class BoardData:
         return replace(self, good=self.good & ~odd)
 
     def shifted(self, board: int, change_m: float) -> BoardData:
-        """Take a board to have stood further away; the measured ranges stay."""
+        """Return the data with one board farther away; the measured ranges stay."""
         factor = 1 + change_m / self.distance_m[board]
         truth, error, light = self.truth_m.copy(), self.error_m.copy(), self.light.copy()
         truth[board] *= factor
@@ -223,7 +223,7 @@ def known_distance_std(
 
 
 def say_of_distances(std_m: Sequence[float], *, assumed: bool) -> str:
-    """Say how well the distances were taken to be known."""
+    """Describe the assumed uncertainty of the distances."""
     if not any(std_m):
         return "The distances were taken to be exact; standard errors hold only as far as they are."
     shown = dict.fromkeys(f"{1e3 * one:.3g}" for one in std_m)
