@@ -79,13 +79,13 @@ class Matcher:
     false_alarm : float
         Share of good frames that the test of the fit may refuse.
     on : {"ranges", "phasors", "histograms", "targets"}
-        What "refine" explains: of a direct sensor with a [histogram] table the counts of every bin, Poisson, with the
-        landmark's brightness and the ambient light of every zone estimated too; or the targets that its chip reports.
-        Both take a scene that holds the landmark alone. Otherwise ranges, or amplitude · exp(iφ) with the landmark's
-        albedo estimated too. Phasors need frames with amplitudes, best from :func:`~phasemark.matcher.phasor_mean`.
-        Of several modulation frequencies ranges are the unwrapped ones with their combined variance; phasors, and the
-        phases that "nearest" compares, are those of every frequency, each wrapped by itself: nothing is unwrapped, and
-        mixed pixels count.
+        What "refine" explains: ranges, or amplitude · exp(iφ) with the landmark's albedo estimated too. Phasors need
+        frames with amplitudes, best from :func:`~phasemark.matcher.phasor_mean`. Of several modulation frequencies
+        ranges are the unwrapped ones with their combined variance; phasors, and the phases that "nearest" compares, are
+        those of every frequency, each wrapped by itself: nothing is unwrapped, and mixed pixels count. Of a direct
+        sensor with a [histogram] table also the counts of every bin, Poisson, with the landmark's brightness and the
+        ambient light of every zone estimated, or the targets that its chip reports; both take a scene that holds the
+        landmark alone.
     pixels : {"all", "lower"}
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool

@@ -77,7 +77,7 @@ def test_targets_are_those_of_the_histograms_and_range_is_that_of_the_nearest(fr
     np.testing.assert_array_equal(sample["target_status"], found.status[:, 0])
     np.testing.assert_array_equal(sample["target_distance_m"], found.distance_m[:, 0].astype(np.float32))
     for one, other in zip(frames.targets([2, 5]), found, strict=True):
-        np.testing.assert_array_equal(one, other[[2, 5]].astype(np.float32))
+        np.testing.assert_array_equal(one, np.asarray(other)[[2, 5]].astype(np.float32))
     z_m = sample["range_m"] * frames.sensor.axis_cosine()
     np.testing.assert_allclose(z_m, sample["target_distance_m"][..., 0], rtol=1e-6)
     np.testing.assert_array_equal(sample["flags"] == 0, sample["target_status"][..., 0] == Status.VALID)

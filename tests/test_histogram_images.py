@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -121,7 +123,7 @@ def test_a_mount_that_is_turned_and_raised_is_one_with_a_view_that_is() -> None:
         (lambda: HistogramRenderer(None, ZONES).render(1.0, workers=0), "'workers' must be at least 1"),
     ],
 )
-def test_what_cannot_be_rendered_is_refused_in_one_line(call: object, message: str) -> None:
+def test_what_cannot_be_rendered_is_refused_in_one_line(call: Callable[[], object], message: str) -> None:
     with pytest.raises(UsageError, match=message) as caught:
         call()
     assert "\n" not in str(caught.value)

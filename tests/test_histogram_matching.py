@@ -14,6 +14,7 @@ from phasemark import UsageError
 from phasemark.data import Bank, BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, Matches, cramer_rao, kalman_filter
+from phasemark.matcher.direct_method import Measured
 from phasemark.matcher.histograms.poisson_fit import deviance_moments, deviance_test, frame_sums, moments_of
 from phasemark.matcher.statistics import nees, view_errors
 from phasemark.render import Background, Frames, Sensor, Views, preset
@@ -42,7 +43,7 @@ def renderer_of(name: str, sensor: Sensor) -> HistogramRenderer:
 
 
 @lru_cache(maxsize=4)
-def matcher_of(free: tuple[str, ...] | None = FREE, on: str = "histograms", sensor: str = SENSOR) -> Matcher:
+def matcher_of(free: tuple[str, ...] | None = FREE, on: Measured = "histograms", sensor: str = SENSOR) -> Matcher:
     return Matcher(bank_of(sensor), "refine", free=free, on=on, workers=1)
 
 
@@ -212,7 +213,7 @@ def test_nothing_a_wall_and_another_thing_are_not_accepted() -> None:
     sensor = bank_of().camera
     empty = np.tile(detected_counts(np.zeros((1, 64, sensor.histogram.bins)), sensor), (20, 1, 1))
     nothing = matcher_of().match(capture_histograms(empty, sensor, rng=rng))
-    assert (nothing.class_name == None).all()  # noqa: E711 - of every element
+    assert all(name is None for name in nothing.class_name)
     assert not nothing.accepted.any()
     assert (nothing.class_probability["none"] > 0.9).all()
     views = Views.broadcast([1.0, 1.1, 1.2])

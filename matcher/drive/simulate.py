@@ -190,7 +190,7 @@ class RobotEquipment:
                 raise UsageError(f"'map.landmark.class' must be one of {', '.join(specs)}, got {name!r}")
         bank = _bank(plan, names, workers)
         tilts = plan.camera.tilt_std_rad
-        known = {f"{name.removesuffix('_rad')}_std_rad": std for name, std in tilts.items()}
+        known: dict[str, Any] = {f"{name.removesuffix('_rad')}_std_rad": std for name, std in tilts.items()}
         matcher = Matcher(bank, "refine", free=(*FREE, *tilts), background="auto", workers=workers, **known)
         return cls(sensor, matcher, {name: _renderer(specs[name], sensor) for name in names})
 
@@ -358,7 +358,8 @@ class _Driver:
         view = view_of(lens, xy, yaw)
         renderer = self.equipment.renderers[landmark.class_name]
         tilt = {name: std * self.rng.standard_normal() for name, std in camera.tilt_std_rad.items()}
-        image = renderer.render(*view, **tilt, background=self._wall(lens[:2], xy))
+        pitch_rad, roll_rad = (tilt.get(name, 0.0) for name in ("pitch_rad", "roll_rad"))
+        image = renderer.render(*view, pitch_rad=pitch_rad, roll_rad=roll_rad, background=self._wall(lens[:2], xy))
         filtered = kalman_filter(capture(image, sensor, rng=self.rng, n_frames=camera.n_frames))
         standing_s = camera.n_frames / sensor.frame_rate_hz
         self.world.stand(standing_s)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,8 @@ class ModelImages:
 
     def __getitem__(self, which: NDArray[np.integer]) -> ModelImages:
         """Return the images of some of the views."""
-        return ModelImages(*(None if values is None else values[which] for values in self.arrays()))
+        some: list[Any] = [None if values is None else values[which] for values in self.arrays()]
+        return ModelImages(*some)
 
     def arrays(self) -> tuple[NDArray[np.complex128] | NDArray[np.float64] | None, ...]:
         """Return the fields in their order."""

@@ -48,7 +48,7 @@ def _scout(start, stop, weights):  # type: ignore[no-untyped-def]
 
 @kernel
 def share_faces(n, mesh, share, scout_face, samples, poses, camera, state):  # type: ignore[no-untyped-def]
-    """Assign the face of a scout ray to its interval where no other face can be seen, and list the samples left to cast.
+    """Assign the face of a scout ray to its interval where it sees no other, and list the samples left to cast.
 
     On a plain patch the plane is the same for all samples, and where the scout met nothing nothing is met. On a
     searched patch each sample's face is looked for from the scout's, and on any other curved patch it is cast.
