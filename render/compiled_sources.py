@@ -17,10 +17,11 @@ ROOT = Path(__file__).resolve().parents[1]
 _FOLDERS = {
     "matcher": "pixel_agreement",
     "matcher/filters": "loops",
+    "matcher/histograms": "histogram_table poisson_fit table_search target_matcher",
     "matcher/likelihood": "bank_images residuals",
     "matcher/nearest": "bank_minima search templates",
     "render": "background compile_cache kernel unwrapping",
-    "render/direct": "fit_model footprints photon_counts scene_samples targets transients",
+    "render/direct": "bin_counts fit_model footprints photon_counts sample_counts scene_samples targets transients",
     "render/exposure": "capture photoelectrons random_streams taps",
     "render/integral": (
         "arguments bent_edges borders circular edge_motion edge_projection edges_in_pixels face_search floor_phase"
