@@ -244,11 +244,11 @@ def test_what_contradicts_a_lens_is_refused(fields, message):
 
 def test_intrinsics_of_another_image_size_are_refused(tmp_path):
     matrix = [[60, 0, 90], [0, 60, 12], [0, 0, 1]]
-    with pytest.raises(UsageError, match="'lens.cx' must lie near the middle of an image of 32 columns, got 90"):
+    with pytest.raises(UsageError, match=r"'lens\.cx' must lie near the middle of an image of 32 columns, got 90"):
         Sensor.from_opencv(matrix, size=(32, 24))
     file = tmp_path / "my.toml"
     file.write_text("rows = 24\ncols = 32\n[lens]\nfx = 60\nfy = 60\ncx = 90\ncy = 12\n")
-    with pytest.raises(UsageError, match="my.toml: 'lens.cx' must lie near the middle"):
+    with pytest.raises(UsageError, match=r"my\.toml: 'lens\.cx' must lie near the middle"):
         Sensor.from_toml(file)
 
 

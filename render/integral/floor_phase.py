@@ -12,7 +12,7 @@ from phasemark.render.integral.arguments import towards_level
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.kernel import inlined, kernel
 
-_PER_PART_RAD = 1.5
+_PER_PART_RAD = 1.0
 """Turn of the phase that two Gauss points a side integrate."""
 _MOST_PARTS = 32.0
 _DARK = 2e-6

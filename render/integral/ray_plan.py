@@ -13,6 +13,7 @@ from phasemark.render.integral.edge_projection import project_edges
 from phasemark.render.integral.edges_in_pixels import bin_segments
 from phasemark.render.integral.floor_phase import parts_of_pixel
 from phasemark.render.integral.image_rays import trace
+from phasemark.render.integral.limbs import lists_limb
 from phasemark.render.integral.pixel_splitting import sample_pixel
 from phasemark.render.kernel import kernel
 
@@ -22,6 +23,11 @@ SPLIT = 1
 """Pixel state: sampled, split exactly."""
 UNTRUSTED = 2
 """Pixel state: sampled, but too many edges for an exact split."""
+_TURN_RAD = 0.15
+"""Turn of the fastest phase over a pixel's width at the landmark above which every pixel is cut into 2 × 2 boxes: a
+face seen at a slant is about as deep as the pixel is wide."""
+_SMALL = 2.0
+"""Pixels; behind a lens with distortion, pixels are cut into 2 × 2 boxes where all limbs together extend over less."""
 SHORT_LINKS = -1
 """Next view that says that ``edges.link`` is too short."""
 SHORT_SEGMENTS = -2
@@ -77,6 +83,12 @@ def plan_rays(  # type: ignore[no-untyped-def]
             return SHORT_SEGMENTS, n
         if bin_segments(n_edges, camera, edges) < 0:
             return SHORT_LINKS, n
+        x, y, z = poses.lens[view, 0], poses.lens[view, 1], poses.lens[view, 2]
+        turn = fastest * camera.slope_u * math.sqrt(x * x + y * y + z * z)
+        small = bent_lens and (
+            bent_high_u - bent_low_u < _SMALL * camera.slope_u and bent_high_v - bent_low_v < _SMALL * camera.slope_v
+        )
+        least_parts = max(splits, 2) if small or turn > _TURN_RAD else splits
         start, first_border = n, n_borders
         for row in range(rows):
             r = camera.first_row + row
@@ -98,7 +110,9 @@ def plan_rays(  # type: ignore[no-untyped-def]
                 before = n
                 bent = left < bent_high_u and right > bent_low_u and top < bent_high_v and bottom > bent_low_v
                 parts_u, parts_v = parts_of_pixel(r, c, background, fastest, cos_b, sin_b, poses.level[view], camera)
-                parts_u, parts_v = max(splits, parts_u), max(splits, parts_v)
+                if parts_u != parts_v and _near_limb(r + 1, c + 1, edges):
+                    parts_u = parts_v = max(parts_u, parts_v)
+                parts_u, parts_v = max(least_parts, parts_u), max(least_parts, parts_v)
                 n, region, trusted = sample_pixel(
                     r, c, bent, parts_u, parts_v, camera, edges, scratch, samples, borders, n, region
                 )
@@ -139,6 +153,16 @@ def _add_background(background, cos_b, sin_b, level, camera, edges, n):  # type:
     else:
         return n
     return add_bent_edge(ya, za, yb, zb, -1, -1, 0, camera, edges, n)
+
+
+@kernel
+def _near_limb(i, j, edges):  # type: ignore[no-untyped-def]
+    """Return whether a limb runs through a pixel or one beside it: the rules beside a limb want square boxes."""
+    head = edges.head
+    for entry in (head[i, j], head[i, j - 1], head[i, j + 1], head[i - 1, j], head[i + 1, j]):
+        if lists_limb(entry, edges):
+            return True
+    return False
 
 
 @kernel
