@@ -25,7 +25,7 @@ UNTRUSTED = 2
 """Pixel state: sampled, but too many edges for an exact split."""
 _TURN_RAD = 0.15
 """Turn of the fastest phase over a pixel's width at the landmark above which every pixel is cut into 2 × 2 boxes: a
-face seen at a slant is about as deep as the pixel is wide."""
+face seen at a slant is about as deep as the pixel is wide. Half of it is enough at edges and beside limbs."""
 _SMALL = 2.0
 """Pixels; behind a lens with distortion, pixels are cut into 2 × 2 boxes where all limbs together extend over less."""
 SHORT_LINKS = -1
@@ -110,8 +110,11 @@ def plan_rays(  # type: ignore[no-untyped-def]
                 before = n
                 bent = left < bent_high_u and right > bent_low_u and top < bent_high_v and bottom > bent_low_v
                 parts_u, parts_v = parts_of_pixel(r, c, background, fastest, cos_b, sin_b, poses.level[view], camera)
-                if parts_u != parts_v and _near_limb(r + 1, c + 1, edges):
+                near_limb = _near_limb(r + 1, c + 1, edges)
+                if near_limb and parts_u != parts_v:
                     parts_u = parts_v = max(parts_u, parts_v)
+                if turn > 0.5 * _TURN_RAD and (near_limb or head[r + 1, c + 1] >= 0):
+                    parts_u, parts_v = max(parts_u, 2), max(parts_v, 2)
                 parts_u, parts_v = max(least_parts, parts_u), max(least_parts, parts_v)
                 n, region, trusted = sample_pixel(
                     r, c, bent, parts_u, parts_v, camera, edges, scratch, samples, borders, n, region
