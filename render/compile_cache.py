@@ -126,5 +126,5 @@ def _make_private(folder: Path) -> bool:
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077
 
 
-stamp_with_all_sources()
 prepare_compile_cache()
+stamp_with_all_sources()

@@ -77,13 +77,16 @@ def test_frames_of_a_sensor_at_rest_are_added_up(folder: Path, capsys: pytest.Ca
     [
         (("bank.h5", "log.npz", "--on", "histograms"), "--on goes with --method refine"),
         (("phase.h5", "log.npz", *FIXED, "--on", "histograms"), "take a bank of a direct sensor"),
-        (("bank.h5", "targets.csv", *FIXED, "--on", "histograms"), "match it --on targets"),
+        (("bank.h5", "targets.csv", *FIXED, "--on", "histograms"), "match it on targets"),
         (("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--wall", "3"), "--wall goes with images of ranges"),
         (("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--unit", "mm"), "--unit goes with images of ranges"),
         (("bank.h5", "log.npz", *FIXED, "--on", "targets", "--robust"), "--robust goes with images of ranges"),
         (("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--plot", "a.png"), "--plot draws ranges"),
-        (("bank.h5", "log.npz", *FIXED, "--on", "targets", "--valid-status", "5"), "--valid-status goes with targets"),
-        (("bank.h5", "log.npz", *FIXED), "--on histograms"),
+        (
+            ("bank.h5", "log.npz", *FIXED, "--on", "targets", "--valid-status", "5"),
+            "a valid status goes with targets from CSV",
+        ),
+        (("bank.h5", "log.npz", *FIXED), "match it on histograms"),
     ],
 )
 def test_what_does_not_go_together_is_refused_in_one_line(

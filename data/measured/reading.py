@@ -511,7 +511,7 @@ def _read_npz(file: BinaryIO, path: Path) -> _Raw:
                 raise InputFileError(f"{path}: '{name}' must be a word, got {members[name].file_size} bytes")
         if not {"range", "frequency_range"} & set(archive):
             if "histogram" in archive:
-                raise InputFileError(f"{path}: a log of histograms, not of ranges: match it --on histograms")
+                raise InputFileError(f"{path}: a log of histograms, not of ranges: match it on histograms")
             raise InputFileError(f"{path}: must have an array 'range', got {', '.join(archive) or 'nothing'}")
         arrays = {name: np.asarray(archive[name]) for name in _FIELDS if name in archive}
         stated = {name: str(archive[name]) for name in ("unit", "quantity") if name in archive}

@@ -84,11 +84,11 @@ def read_positions(
     """
     if path.suffix.lower() == ".csv":
         if on == "histograms":
-            raise UsageError(f"{path}: CSV holds targets, not histograms: match it --on targets")
+            raise UsageError(f"{path}: CSV holds targets, not histograms: match it on targets")
         targets = read_targets(path, sensor=sensor, valid_status=valid_status or _VALID_STATUS)
         return DirectPositions(_each(targets, lambda values: np.swapaxes(values, 0, 1)) if moving else targets)
     if valid_status is not None:
-        raise UsageError(f"--valid-status goes with targets from CSV: {path} has histograms")
+        raise UsageError(f"{path}: has histograms, and a valid status goes with targets from CSV")
     log = read_histograms(path, sensor=sensor).frames
     if moving:
         return DirectPositions(log, None if log.time_s is None else log.time_s[:, 0])
