@@ -280,8 +280,8 @@ class Matcher:
         if one.stacked and self.method == "refine" and "calibration" in self._systematic:
             if names := frames.sensor.calibration_fields:
                 raise UsageError(
-                    f"what the calibration leaves of '{names[0]}' is carried over on ranges alone with several"
-                    ' modulation frequencies: match on="ranges", or leave "calibration" out of \'systematic\''
+                    f"what a calibration leaves of '{names[0]}' is carried over on unwrapped ranges alone with several"
+                    " modulation frequencies: leave \"calibration\" out of 'systematic'"
                 )
         return one.frames(frames)
 
