@@ -264,7 +264,8 @@ def test_information_is_the_sum_of_that_of_the_frequencies():
     views = Views.broadcast([1.0, 1.3], [0.3, 1.2])
     together = cramer_rao(Renderer(CYLINDER, TWO), views, pixels="lower")
     alone = [cramer_rao(Renderer(CYLINDER, camera), views, pixels="lower") for camera in TWO.by_frequency]
-    np.testing.assert_allclose(together.information, sum(one.information for one in alone), rtol=1e-6)
+    # the highest frequency decides how finely pixels are cut: a slower camera alone is rendered a little differently
+    np.testing.assert_allclose(together.information, sum(one.information for one in alone), rtol=1e-4)
     assert together.pixels.shape == (2, 16, 16)
 
 
