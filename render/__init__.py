@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 from phasemark.render import compile_cache  # noqa: F401 - first, for the modules below compile functions
 from phasemark.render.background import Background
+from phasemark.render.direct import histogram_frames, histogram_images
 from phasemark.render.direct.capture import capture
-from phasemark.render.direct.histogram_frames import HistogramFrames
-from phasemark.render.direct.histogram_images import HistogramImages, HistogramRenderer
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m
 from phasemark.render.renderer import Renderer, background_image
@@ -32,9 +31,6 @@ __all__ = [
     "Background",
     "Flag",
     "Frames",
-    "HistogramFrames",
-    "HistogramImages",
-    "HistogramRenderer",
     "PhasorImages",
     "Renderer",
     "Sensor",
@@ -69,14 +65,16 @@ def _figure_of_image(images: PhasorImages, index: int) -> "matplotlib.figure.Fig
     return phasor_figure(images, index)
 
 
-def _figure_of_histograms(frames: HistogramFrames, index: int, frame: int) -> "matplotlib.figure.Figure":
+def _figure_of_histograms(
+    frames: histogram_frames.HistogramFrames, index: int, frame: int
+) -> "matplotlib.figure.Figure":
     """Draw histograms of one frame and the range of the nearest target."""
     from phasemark.render.direct.figures import histogram_figure
 
     return histogram_figure(frames, index, frame)
 
 
-def _figure_of_expected_histograms(images: HistogramImages, index: int) -> "matplotlib.figure.Figure":
+def _figure_of_expected_histograms(images: histogram_images.HistogramImages, index: int) -> "matplotlib.figure.Figure":
     """Draw the expected histograms of one view."""
     from phasemark.render.direct.figures import expected_figure
 
@@ -84,6 +82,6 @@ def _figure_of_expected_histograms(images: HistogramImages, index: int) -> "matp
 
 
 Frames.figure = staticmethod(_figure_of_frame)
-HistogramFrames.figure = staticmethod(_figure_of_histograms)
-HistogramImages.figure = staticmethod(_figure_of_expected_histograms)
+histogram_frames.HistogramFrames.figure = staticmethod(_figure_of_histograms)
+histogram_images.HistogramImages.figure = staticmethod(_figure_of_expected_histograms)
 PhasorImages.figure = staticmethod(_figure_of_image)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
@@ -177,3 +178,9 @@ ODD: dict[str, Callable[[], trimesh.Trimesh]] = {
     "lump": lump,
     "scan": scan,
 }
+
+
+def cut_alike(monkeypatch: pytest.MonkeyPatch, sensor: Sensor) -> None:
+    """Let every camera cut pixels as finely as the highest frequency of a camera makes it do."""
+    fastest = max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
+    monkeypatch.setattr("phasemark.render.renderer._fastest", lambda _: fastest)

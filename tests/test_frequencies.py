@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders import wrapped
+from builders import cut_alike, wrapped
 from oracles.images import integrate_pixels, plane_light
 from oracles.integer_search import best_counts
 from scipy import stats
@@ -103,20 +103,20 @@ def test_phase_images_of_all_frequencies_fit_the_frame():
 
 
 @pytest.mark.parametrize("sensor", [TWO, FOUR, preset("pmd-16x16-wiggle").with_(modulation_hz=[20e6, 50e6])])
-def test_each_frequency_of_an_image_is_that_of_a_camera_of_this_frequency_alone(sensor):
+def test_each_frequency_of_an_image_is_that_of_a_camera_of_this_frequency_alone(sensor, monkeypatch):
+    cut_alike(monkeypatch, sensor)
     view: dict[str, Any] = {"distance_m": [0.9, 1.7], "delta_rad": [0.3, 1.4], "bearing_rad": 0.03, "height_m": 0.02}
     background = Background(wall_m=3.0)
     together = Renderer(CYLINDER, sensor).render(**view, background=background)
     np.testing.assert_array_equal(together.phasor, together.at_frequency(sensor.frequencies_hz[0]))
     for hz, part in zip(sensor.frequencies_hz, together.by_frequency, strict=True):
         alone = Renderer(CYLINDER, sensor.with_(modulation_hz=hz)).render(**view, background=background)
-        # the highest frequency decides how finely pixels are cut; else phases are only rounded once more on their way
-        alike = hz == max(sensor.frequencies_hz)
-        np.testing.assert_allclose(part.phasor, alone.phasor, rtol=0, atol=1e-13 if alike else 1e-4)
-        np.testing.assert_allclose(part.intensity, alone.intensity, rtol=0, atol=0 if alike else 1e-4)
+        # the same samples; phases are rounded once more on their way
+        np.testing.assert_allclose(part.phasor, alone.phasor, rtol=0, atol=1e-13)
+        np.testing.assert_array_equal(part.intensity, alone.intensity)
         assert part.harmonics.keys() >= alone.harmonics.keys()
         for k, values in alone.harmonics.items():
-            np.testing.assert_allclose(part.harmonic(k), values, rtol=0, atol=1e-12 if alike else 1e-4)
+            np.testing.assert_allclose(part.harmonic(k), values, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("hz", FOUR.frequencies_hz)
@@ -159,7 +159,8 @@ def test_a_frequency_that_was_not_rendered_is_refused_with_those_that_were():
         image.at_frequency(30e6)
 
 
-def test_slopes_at_every_frequency_are_those_of_single_cameras():
+def test_slopes_at_every_frequency_are_those_of_single_cameras(monkeypatch):
+    cut_alike(monkeypatch, FOUR)
     views = Renderer(CYLINDER, PMD).render([0.9, 1.3], 0.4, 0.02, 0.03).views
     background = Background(wall_m=3.0)
     _, together = Renderer(CYLINDER, FOUR).render_with_slopes(views, background=background)
@@ -167,11 +168,9 @@ def test_slopes_at_every_frequency_are_those_of_single_cameras():
     for j, hz in enumerate(FOUR.frequencies_hz):
         single = Renderer(CYLINDER, PMD.with_(modulation_hz=hz))
         _, alone = single.render_with_slopes(views, background=background)
-        # the highest frequency decides how finely pixels are cut; slopes beside limbs are good to 1.5 % of the largest
-        share = 1e-6 if hz == max(FOUR.frequencies_hz) else 2e-2
-        np.testing.assert_allclose(together[:, :, j], alone, rtol=0, atol=share * np.abs(alone).max())
+        np.testing.assert_allclose(together[:, :, j], alone, rtol=0, atol=1e-6 * np.abs(alone).max())
         by_difference = single.jacobian(0.9, 0.4, 0.02, 0.03, background=background)
-        np.testing.assert_allclose(differences[:, :, j], by_difference, rtol=0, atol=share * np.abs(alone).max())
+        np.testing.assert_allclose(differences[:, :, j], by_difference, rtol=0, atol=1e-6 * np.abs(alone).max())
 
 
 def test_the_range_of_an_image_is_unwrapped_beyond_the_highest_frequency():

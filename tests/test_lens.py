@@ -233,6 +233,7 @@ def test_half_angles_and_principal_point_follow_from_the_lens():
         ),
         ({"lens": {"fx": 60, "fy": 60, "cx": 16, "cy": 12, "k1": 0}}, r"'k1' is no key of \[lens\]"),
         ({"lens": {"fx": 60, "fy": 60, "cx": 16}}, "'lens.cy' is missing"),
+        ({"lens": {"fx": 60, "fy": 60, "cx": 90, "cy": 12}}, "another image size"),
     ],
 )
 def test_what_contradicts_a_lens_is_refused(fields, message):

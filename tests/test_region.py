@@ -13,6 +13,7 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.matcher.filters.region import read_region
 from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, predicted_range_std, preset
 from phasemark.render.sensor.region import Region
+from phasemark.render.sensor.sensor_file import sensor_toml
 
 LARGE = Sensor(rows=84, cols=112, half_angle_h_deg=31, half_angle_v_deg=24, signal_e=5000, max_phase_std_rad=0.25)
 OVERRIDES = LARGE.model_dump(mode="json")
@@ -90,11 +91,14 @@ def test_a_small_region_in_a_corner_of_the_image_is_a_camera_too(geometry):
     assert error < 1e-4 * np.abs(whole.phasor).max()  # both are exact to that
 
 
-def test_a_principal_point_far_outside_is_still_refused_in_a_file(tmp_path):
+def test_a_file_may_hold_the_camera_of_a_region_in_a_corner(tmp_path):
+    camera = Region(4, 12, 6, 18, 2).camera(LARGE.with_(lens=LENS))
     path = tmp_path / "camera.toml"
-    text = "rows = 16\ncols = 16\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\nprincipal_point_px = [90, 3]\n"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(UsageError, match=r"camera.toml: 'principal_point_px' must lie within one image width"):
+    path.write_text(sensor_toml(camera, {}, header=(), otherwise="measured"), encoding="utf-8")
+    assert Sensor.from_toml(path) == camera
+    text = path.read_text(encoding="utf-8")
+    path.write_text("".join(line for line in text.splitlines(True) if "whole_image_px" not in line), encoding="utf-8")
+    with pytest.raises(UsageError, match=r"camera.toml: 'lens.cx' must lie near the middle of an image of 6 columns"):
         Sensor.from_toml(path)
 
 

@@ -88,7 +88,9 @@ DIRECT = preset("vl53l5cx-8x8")
         ({"dead_pixels": ((16, 0),)}, "'dead_pixels' must lie in the image of 16 × 16 pixels, got \\(16, 0\\)"),
         ({"dead_pixels": ((1, 2),), "hot_pixels": ((1, 2),)}, "must not share a pixel, got \\(1, 2\\) in both"),
         ({"wrap_guard_m": 7.5}, "'wrap_guard_m' must be below c / 4f = 7.495, got 7.5"),
-        ({"principal_point_px": (9e3, 3)}, "'principal_point_px' must lie within .*, got \\(9000.0, 3.0\\)"),
+        ({"whole_image_px": (15, 16)}, "'whole_image_px' must hold this image of 16 columns and 16 rows"),
+        ({"whole_image_px": (64, 48), "principal_point_px": (105, 3)}, "one and a half of the whole image's width"),
+        ({"principal_point_px": (90, 3)}, "'principal_point_px' must lie within .*, got \\(90.0, 3.0\\)"),
         ({"max_range_m": 4.0}, "'max_range_m' must be left out for 'kind' = 'phase', got 4.0"),
     ],
 )

@@ -29,9 +29,10 @@ TERMS = (*_INTRINSICS, *_NAMES["opencv"])
 LENS_FIELD = "lens."
 """What stands before a term where it is named among the fields of a sensor, as in `calibration_fields`."""
 
-MOST_PIXELS = 4096
-"""Pixels along a side of an image."""
+_MOST_PIXELS = 4096  # along a side of an image
 _OFF_CENTRE = 0.4  # of the image's size, how far from its centre the principal point of a whole image may lie
+_FARTHEST = 1.0  # the same of a camera that may read a part of an image
+_FARTHEST_OF_PART = 1.5  # of the whole image's size, from the centre of a part of it
 _SOLVED = 1e-13  # relative difference of tangents up to which focal lengths are solved for
 _MOST_STEPS = 30
 _SAME = 1e-5  # relative difference up to which a stated field agrees with the lens
@@ -165,7 +166,11 @@ def with_geometry_of_lens(data: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(lens, Lens) or rows is None or cols is None:
         return fields  # what is wrong about them is found where fields are checked
     centre = (lens.cx + 0.5, lens.cy + 0.5)
-    check_image_size(lens, rows, cols, MOST_PIXELS / min(rows, cols))
+    whole = fields.get("whole_image_px")
+    if whole is None or not _is_pair(whole):
+        check_image_size(lens, rows, cols, farthest=_FARTHEST)
+    else:
+        check_image_size(lens, rows, cols, whole)
     try:
         tan_h, tan_v = lens.before(rows, cols).tan_half_angles
     except ValueError as error:
@@ -183,15 +188,52 @@ def with_geometry_of_lens(data: Mapping[str, Any]) -> dict[str, Any]:
     return {**fields, **derived}
 
 
-def check_image_size(lens: Lens, rows: int, cols: int, farthest: float = _OFF_CENTRE) -> None:
+def farthest_principal_point(
+    image_px: tuple[float, float], whole_image_px: tuple[float, float] | None
+) -> tuple[float, float]:
+    """Return how far from the centre of an image its principal point may lie at most, along columns and rows, pixels.
+
+    Parameters
+    ----------
+    image_px : (width, height)
+    whole_image_px : (width, height) or None
+        The image that this one is a part of.
+    """
+    size, share = (image_px, _FARTHEST) if whole_image_px is None else (whole_image_px, _FARTHEST_OF_PART)
+    return share * size[0], share * size[1]
+
+
+def check_image_size(
+    lens: Lens,
+    rows: int,
+    cols: int,
+    whole_image_px: tuple[float, float] | None = None,
+    *,
+    farthest: float = _OFF_CENTRE,
+) -> None:
     """Refuse a lens whose principal point lies farther from the centre of an image than `farthest` image sizes.
+
+    Parameters
+    ----------
+    lens : Lens
+    rows, cols : int
+        Of the image.
+    whole_image_px : (width, height), optional
+        The image that this one is a part of; how far the point may lie then follows from it.
+    farthest : float
+        Of a whole image, in its sizes.
 
     Raises
     ------
     UsageError
     """
-    for name, at, size, side in (("cx", lens.cx, cols, "columns"), ("cy", lens.cy, rows, "rows")):
-        if abs(at + 0.5 - size / 2) > farthest * size:
+    if whole_image_px is None:
+        limits = farthest * cols, farthest * rows
+    else:
+        limits = farthest_principal_point((cols, rows), whole_image_px)
+    sides = (("cx", lens.cx, cols, "columns"), ("cy", lens.cy, rows, "rows"))
+    for (name, at, size, side), limit in zip(sides, limits, strict=True):
+        if abs(at + 0.5 - size / 2) > limit:
             raise UsageError(
                 f"'lens.{name}' must lie near the middle of an image of {size} {side}, got {at:g}: do the intrinsics"
                 " belong to another image size?"
@@ -226,9 +268,17 @@ def changed_lens(lens: Lens, rows: int, cols: int, changes: Mapping[str, Any]) -
 
 def _pixels(value: Any) -> int | None:
     """Return a side of an image as a whole number, None where it is none."""
-    if not isinstance(value, int | float | np.integer) or not 1 <= value <= MOST_PIXELS or value != int(value):
+    if not isinstance(value, int | float | np.integer) or not 1 <= value <= _MOST_PIXELS or value != int(value):
         return None
     return int(value)
+
+
+def _is_pair(value: Any) -> bool:
+    """Tell whether a value is two numbers; what else is wrong about it is found where fields are checked."""
+    try:
+        return np.asarray(value, float).shape == (2,)
+    except (TypeError, ValueError):
+        return False
 
 
 def _agrees(stated: Any, derived: Any) -> bool:

@@ -99,6 +99,7 @@ class Region(NamedTuple):
         changes: dict[str, Any] = {
             "rows": rows,
             "cols": cols,
+            "whole_image_px": self._whole_image(sensor),
             "dead_pixels": self._moved(sensor.dead_pixels),
             "hot_pixels": self._moved(sensor.hot_pixels),
         }
@@ -116,6 +117,12 @@ class Region(NamedTuple):
         cut = values[..., self.first_row : self.stop_row, self.first_col : self.stop_col]
         parts = cut.reshape(*values.shape[:-2], rows, n, cols, n)
         return np.moveaxis(parts, -3, -2).reshape(*values.shape[:-2], rows, cols, n * n)
+
+    def _whole_image(self, sensor: Sensor) -> tuple[float, float] | None:
+        """Return the size of the whole image in blocks, None where the blocks are all of it."""
+        width, height = sensor.whole_image_px or (sensor.cols, sensor.rows)
+        whole, (rows, cols) = (width / self.binning, height / self.binning), self.shape
+        return None if whole == (cols, rows) else whole
 
     def _ideal_geometry(self, sensor: Sensor) -> dict[str, Any]:
         """Return half angles and principal point of a camera without distortion that reads this region."""

@@ -16,7 +16,7 @@ from phasemark import UsageError
 from phasemark.inputs.numbers import in_words
 from phasemark.inputs.toml_file import read_toml
 from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD, Lens, changed_lens, check_image_size
-from phasemark.render.sensor.sensor_checks import check_fields, check_principal_point_of_file
+from phasemark.render.sensor.sensor_checks import check_fields
 from phasemark.render.sensor.sensor_fields import CALIBRATION, OPTICS
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
 from phasemark.render.sensor.sources import without_sources
@@ -54,6 +54,9 @@ class Sensor(SensorQuantities):
         principal point.
     principal_point_px : (u0, v0), optional
         Where the optical axis meets the image, pixels from the top left corner. None: the centre.
+    whole_image_px : (width, height), optional
+        Size of the image of which this camera reads a part, in its own pixels: its principal point may lie as far
+        outside the part as it lies in that image. None: this is the whole image.
     pitch_deg, roll_deg : float
         How the camera is mounted; pitch is positive looking down.
     bearing_offset_deg : float
@@ -416,8 +419,7 @@ class Sensor(SensorQuantities):
         try:
             sensor = cls(**without_sources(table)[0])
             if sensor.lens is not None:
-                check_image_size(sensor.lens, sensor.rows, sensor.cols)
-            check_principal_point_of_file(sensor)
+                check_image_size(sensor.lens, sensor.rows, sensor.cols, sensor.whole_image_px)
             return sensor
         except UsageError as error:
             raise UsageError(f"{path}: {error}") from None

@@ -6,11 +6,10 @@ import math
 
 import numpy as np
 
-from phasemark import UsageError
 from phasemark.inputs.numbers import in_words
 from phasemark.render.sensor.correlation import SQUARE_PEAK, correlation_peak, pulse_harmonics
 from phasemark.render.sensor.frequencies import check_frequencies
-from phasemark.render.sensor.lens_fields import LENS_FIELD, MOST_PIXELS
+from phasemark.render.sensor.lens_fields import LENS_FIELD, farthest_principal_point
 from phasemark.render.sensor.sensor_fields import CALIBRATION, DIRECT_ONLY, PHASE_ONLY, SensorFields
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
 
@@ -29,28 +28,21 @@ _ROUNDING = 1e-9  # of a limit that files state in decimals
 
 
 def check_principal_point(sensor: SensorQuantities) -> None:
-    """Refuse a principal point farther off than that of any camera that reads a region of the largest image."""
-    if sensor.principal_point_px is not None:
-        u0, v0 = sensor.principal_point_px
-        if not (abs(u0 - sensor.cols / 2) <= MOST_PIXELS and abs(v0 - sensor.rows / 2) <= MOST_PIXELS):
+    """Refuse a principal point far from the image, or from the image that this one is a part of."""
+    image = sensor.cols, sensor.rows
+    whole = sensor.whole_image_px
+    if whole is not None and (whole[0] < image[0] or whole[1] < image[1]):
+        raise ValueError(
+            f"'whole_image_px' must hold this image of {image[0]} columns and {image[1]} rows, got {whole}"
+        )
+    if sensor.principal_point_px is None:
+        return
+    limits = farthest_principal_point(image, whole)
+    for at, size, farthest in zip(sensor.principal_point_px, image, limits, strict=True):
+        if not abs(at - size / 2) <= farthest:
+            of = "image" if whole is None else "and a half of the whole image's"
             raise ValueError(
-                f"'principal_point_px' must lie within {MOST_PIXELS} pixels of the image's centre, got "
-                f"{sensor.principal_point_px}"
-            )
-
-
-def check_principal_point_of_file(sensor: SensorQuantities) -> None:
-    """Refuse a principal point that does not belong to a whole image, where a person stated it.
-
-    Raises
-    ------
-    UsageError
-    """
-    if sensor.principal_point_px is not None:
-        u0, v0 = sensor.principal_point_px
-        if not (abs(u0 - sensor.cols / 2) <= sensor.cols and abs(v0 - sensor.rows / 2) <= sensor.rows):
-            raise UsageError(
-                "'principal_point_px' must lie within one image width and height of the image's centre, got "
+                f"'principal_point_px' must lie within one {of} width and height of the image's centre, got "
                 f"{sensor.principal_point_px}"
             )
 

@@ -40,6 +40,7 @@ _TiltDeg = Annotated[float, Field(ge=-45, le=45)]
 _TurnDeg = Annotated[float, Field(ge=-180, le=180)]
 _MountHeight = Annotated[float, Field(ge=-10, le=10)]
 _PixelCount = Annotated[int, Field(ge=1, le=4096)]
+_ImageSide = Annotated[float, Field(gt=0, le=4096)]
 _Share = Annotated[float, Field(ge=0, lt=1)]
 _Finite = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST, allow_inf_nan=False)]
 _Order = Annotated[int, Field(ge=2, le=199)]
@@ -151,6 +152,7 @@ class SensorFields(BaseModel):
     half_angle_h_deg: _HalfAngleDeg
     half_angle_v_deg: _HalfAngleDeg
     principal_point_px: tuple[float, float] | None = None
+    whole_image_px: tuple[_ImageSide, _ImageSide] | None = None
     pitch_deg: _TiltDeg = 0.0
     roll_deg: _TiltDeg = 0.0
     bearing_offset_deg: _TurnDeg = 0.0
