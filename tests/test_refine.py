@@ -228,6 +228,25 @@ def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, ren
 
 
 @pytest.mark.parametrize(
+    ("name", "n"), [("cone", 24), *(pytest.param(name, 300, marks=pytest.mark.soak) for name in NAMES[:3])]
+)
+def test_an_automatic_background_knows_how_well_it_knows_a_view_above_a_floor(bank, renderers, name, n):
+    """A floor that cuts the landmark moves its lower edge; wall, floor and view share what the frame tells."""
+    setup = TrialSetup(background=Background(wall_m=3.0, floor_m=0.25), nuisances=("wall_m",))
+    matcher = Matcher(bank, "refine", free=VIEW[:2], background="auto")
+    trials = run_trials(matcher.match, renderers[name], name, setup, n, np.random.default_rng(11))
+    wrong = trials.accepted & ((trials.found != name) | (np.abs(trials.error[:, 0]) > 0.03))
+    assert not wrong.any()
+    assert trials.accepted.mean() > 0.5
+    summary = trials.summary()
+    z = 3.3 / 1.96  # intervals of 95 % widened to 99.9 %
+    for ratio in summary.ratio.values():  # of the bound of a known floor
+        assert ratio.value - z * (ratio.high - ratio.value) <= 1.3
+    assert summary.nees.value - z * (summary.nees.high - summary.nees.value) <= 1.3
+    assert summary.coverage.high >= 0.92
+
+
+@pytest.mark.parametrize(
     ("name", "free", "n"),
     [
         *((name, VIEW[:2], 40) for name in STRANGERS),
