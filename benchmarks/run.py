@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from direct import direct
 from matching import matching
 from mounting import design, mounting
 from policy import policy
@@ -534,6 +535,7 @@ SECTIONS: dict[str, tuple[str, Callable[[], Table]]] = {
     "design": ("Designing a set of landmarks", design),
     "matching": ("Errors over the Cramér–Rao bound", partial(matching, SENSOR, SEED)),
     "tolerance": ("In a world that is not the model's", partial(tolerance, SENSOR, SEED)),
+    "direct": ("A direct sensor of 8 × 8 zones and 128 bins", partial(direct, SEED, median_seconds)),
     "regions": ("A large camera, binned", partial(regions, SENSOR, SEED)),
     "policy": ("What the tuning numbers of the search do", partial(policy, SENSOR, SEED)),
 }
