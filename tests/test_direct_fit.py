@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from oracles.simple_scenes import block_on_table, poses_around
+from scipy.stats import norm
 
 from phasemark.cli import main
 from phasemark.render import Sensor, preset
 from phasemark.render.direct.bin_counts import expected_counts
+from phasemark.render.direct.fit_crosstalk import fit_crosstalk, peak_shapes
 from phasemark.render.direct.fit_sensor import zone_orders
 from phasemark.render.direct.footprints import footprint_grid
 from phasemark.render.direct.histogram_frames import capture_histograms
@@ -37,6 +39,7 @@ def true_sensor() -> Sensor:
         zone_offset_m=offsets.tolist(),
         histogram={
             **BASE.histogram.model_dump(), "cycles": 2.6e6, "stray": 0.1,
+            "crosstalk": 400.0, "crosstalk_range_m": 0.008,
             "zone_bin_scale": scales.reshape(3, 3).tolist(), "zone_scale": (1.05, 1.1), "zone_blur": 0.025,
         },
     )  # fmt: skip
@@ -86,6 +89,11 @@ def test_the_command_finds_the_sensor_that_made_the_logs(logs: Path, capsys: pyt
     assert fitted.roll_deg == pytest.approx(truth.roll_deg, abs=1.0)
     assert fitted.histogram.cycles == pytest.approx(truth.histogram.cycles, rel=0.05)
     assert fitted.histogram.stray == pytest.approx(truth.histogram.stray, abs=0.02)
+    glass = found["crosstalk"]
+    assert glass["counts"] == fitted.histogram.crosstalk
+    assert glass["counts"] == pytest.approx(400, abs=5 * glass["counts_std"])
+    assert glass["counts_std"] < 40
+    assert glass["range_m"] == pytest.approx(0.008, abs=3e-3 + 5 * glass["range_std_m"])  # zones' own delays apart
     scale = np.array(fitted.histogram.zone_bin_scale)
     np.testing.assert_allclose(scale, truth.histogram.zone_bin_scale, atol=0.004)
     assert max(found["range_rms_mm"]) < 0.5  # sub-bin wiggles of the spline that stands for the response
@@ -128,6 +136,41 @@ def test_what_cannot_be_fitted_is_refused_in_one_line(
     said = capsys.readouterr().err.strip()
     assert message in " ".join(said.split())
     assert not Path("a.toml").exists()
+
+
+def plane_with_crosstalk(counts: float, rng: np.random.Generator) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return Poisson counts of a moving peak of a Gaussian response, and of a peak that stays at 5 cm."""
+    x = np.arange(-16, 17) / 8
+    response: dict[str, Any] = {"cumulative": np.tile(norm.cdf(x / 0.6), (4, 1)), "first": -1.0, "step": 1 / 8}
+    widths = np.full(4, 0.02)
+    planes = [peak_shapes(**response, range_bins=np.full(4, at), bins=64) for at in np.linspace(12, 40, 60)]
+    level = 30 + 20_000 * np.stack(planes) + counts * peak_shapes(**response, range_bins=0.05 / widths, bins=64)
+    return rng.poisson(level).astype(float), {**response, "bin_widths_m": widths}
+
+
+def test_crosstalk_is_found_with_its_standard_deviation() -> None:
+    rng = np.random.default_rng(12)
+    runs = [fit_crosstalk(*plane_with_crosstalk(60, rng)[:1], **plane_with_crosstalk(0, rng)[1]) for _ in range(60)]
+    height = np.array([(one.counts - 60) / one.counts_std for one in runs])
+    place = np.array([(one.range_m - 0.05) / one.range_std_m for one in runs])
+    for z in (height, place):  # χ² of 60 within 99.9 %
+        assert 0.49 * 60 < (z**2).sum() < 1.66 * 60
+
+
+def test_no_crosstalk_is_told_where_there_is_none() -> None:
+    rng = np.random.default_rng(13)
+    for _ in range(40):
+        counts, response = plane_with_crosstalk(0, rng)
+        found = fit_crosstalk(counts, **response)
+        assert found.counts == 0
+        assert found.range_std_m == math.inf
+        assert 0 < found.counts_std < 5
+
+
+def test_no_crosstalk_is_told_where_every_histogram_begins_with_the_plane() -> None:
+    counts, response = plane_with_crosstalk(60, np.random.default_rng(14))
+    found = fit_crosstalk(counts[:, :, 30:], **response)
+    assert found.counts == 0
 
 
 def test_the_support_is_the_largest_level_surface() -> None:

@@ -227,6 +227,19 @@ def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, ren
         assert match.delta_rad == pytest.approx(delta, abs=math.radians(0.3))
 
 
+def test_a_wall_that_leaves_no_room_for_a_landmark_is_not_taken(bank, renderers, monkeypatch):
+    """Frames with damaged pixels led the fit there: the view then lay inside the landmark."""
+
+    def too_near(model, evidence, class_index, view, free, background):
+        return replace(background, wall_m=0.2), view
+
+    monkeypatch.setattr("phasemark.matcher.likelihood.auto_background.fit_background", too_near)
+    view, setup = Views.broadcast(0.9, 0.5), TrialSetup(background=Background(wall_m=3.0, floor_m=0.25))
+    frames = noisy_frames(renderers["cone"], SENSOR, view, setup, np.random.default_rng(6))
+    match = Matcher(bank, "refine", free=VIEW[:2], background="auto").match(frames)[0]
+    assert match.background.wall_m == pytest.approx(3.0, abs=0.1)
+
+
 @pytest.mark.parametrize(
     ("name", "n"), [("cone", 24), *(pytest.param(name, 300, marks=pytest.mark.soak) for name in NAMES[:3])]
 )

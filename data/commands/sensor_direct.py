@@ -41,9 +41,9 @@ def sensor_fit_direct(
 ) -> None:
     """Fit a direct sensor to histograms of a plane at known distances and of known objects at known poses.
 
-    The plane tells bin widths, delays, response and pile-up; objects tell where each zone looks, in which order zones
-    are logged, how large they are and how much light strays. Each log holds `histogram`, a plane's `distance_m`, an
-    object's `sensor2world`; an object's mesh holds the table that it stands on.
+    The plane tells bin widths, delays, response, pile-up and the crosstalk of a cover glass; objects tell where each
+    zone looks, in which order zones are logged, how large they are and how much light strays. Each log holds
+    `histogram`, a plane's `distance_m`, an object's `sensor2world`; an object's mesh holds the table that it stands on.
     """
     from phasemark.data.files.atomic_write import write_atomically
     from phasemark.data.files.same_file import refuse_inputs
@@ -82,10 +82,12 @@ def sensor_fit_direct(
 def _echo_fit(fit: DirectFit, spread_mm: list[float]) -> None:
     """Print the fitted parameters, and how well each zone measures the plane."""
     names = fit.parameters.names
-    echo_table(
-        ("parameter", "value", "std"),
-        ((n, f"{fit.parameters[n]:.5g}", f"{fit.std[n]:.2g}" if n in fit.std else "fixed") for n in names),
-    )
+    rows = [(n, f"{fit.parameters[n]:.5g}", f"{fit.std[n]:.2g}" if n in fit.std else "fixed") for n in names]
+    glass = fit.crosstalk
+    rows.append(("crosstalk", f"{glass.counts:.5g}", f"{glass.counts_std:.2g}"))
+    if glass.counts:
+        rows.append(("crosstalk_range_m", f"{glass.range_m:.5g}", f"{glass.range_std_m:.2g}"))
+    echo_table(("parameter", "value", "std"), rows)
     echo_table(
         ("zone", "range r.m.s. (mm)", "chi2/nu"),
         ((str(k), f"{s:.2f}", f"{c:.3g}") for k, (s, c) in enumerate(zip(spread_mm, fit.reduced_chi2, strict=True))),

@@ -62,6 +62,8 @@ class AutoBackground:
         tilted = bool(set(setup.free) & set(VIEW[4:]))
         around = estimate_surroundings(one, bearing_known=known, tilt_known=not tilted)
         background, seen = around.background, evidence.seen
+        if background is not None and not self._leaves_room(background):
+            background = None
         if background is not None:
             seen = without_background(seen, around)
         fits = search_views(setup, self._scene(background, False), evidence, seen, bare)
@@ -97,6 +99,11 @@ class AutoBackground:
             if not is_doubtful(self._setup, found[1]):
                 break
         return found
+
+    def _leaves_room(self, background: Background) -> bool:
+        """Return True if a landmark has a place between the lens and a wall."""
+        nearest, farthest = self._rendered.with_background(background).limits()
+        return nearest < farthest
 
     def _other_angles(self, background: Background, evidence: Evidence, fits: Fits) -> Fits:
         """Fit one frame from its best view turned to other angles; distance and bearing are found more easily."""
@@ -135,7 +142,7 @@ class AutoBackground:
                 setup.free,
                 background,
             )
-            if found == background:
+            if found == background or not self._leaves_room(found):
                 break
             scene = self._scene(found, False)
             settings = replace(scene.settings(setup), look_beside_rad=policy.close_by_rad)

@@ -184,8 +184,12 @@ def fit_background(
 
     def sums_at(at: NDArray[np.float64], place: NDArray[np.float64]) -> Sums | None:
         views = at[None]
+        before = model.with_background(moved(place))
+        nearest, farthest = before.limits()
+        if not nearest <= at[0] <= farthest:
+            return None
         try:
-            image = model.with_background(moved(place)).images(which, views, free)
+            image = before.images(which, views, free)
             beside = [
                 model.with_background(moved(place + step)).images(which, views, ()).phasor
                 for step in np.eye(len(place)) * _BACKGROUND_STEP_M

@@ -98,18 +98,25 @@ def start_parameters(sensor: Sensor, objects: Sequence[ObjectRecording], convert
 
 
 class Responses(NamedTuple):
-    """Cumulative instrument response of each zone over the delay in bins, (zones, nodes), and how nodes lie.
+    """Cumulative instrument response of each zone over the delay in bins, how nodes lie, and what the window adds.
 
     Parameters
     ----------
     cumulative : (zones, nodes) float64
     first, step : float
         Delay of node 0 and distance of nodes, bins; delays count from the lower edge of bin 0.
+    crosstalk : (zones, bins) float64
+        Expected counts of light from the sensor's own window, the same in every histogram of a zone.
     """
 
     cumulative: NDArray[np.float64]
     first: float
     step: float
+    crosstalk: NDArray[np.float64]
+
+    def counts_beside_crosstalk(self, measured: NDArray[np.float64], cycles: float) -> NDArray[np.float64]:
+        """Return counts (n, zones, bins) without pile-up and crosstalk."""
+        return np.asarray(undo_pile_up(measured, cycles) - self.crosstalk)
 
 
 class Prediction(NamedTuple):
@@ -187,13 +194,14 @@ class FitModel:
             light, self.axis.first_m, self.axis.step_m, self.histogram.bin_width_m * scales, delays,
             responses.cumulative, responses.first, responses.step, shape,
         )  # fmt: skip
-        counts = undo_pile_up(measured, cycles)
+        counts = responses.counts_beside_crosstalk(measured, cycles)
         ambient = counts[..., _AMBIENT_BINS[0] : _AMBIENT_BINS[1]].mean(axis=-1, keepdims=True)
         window = signal_window(measured)
         bright = np.where(window, counts - ambient, 0).sum(axis=-1) / np.maximum(
             np.where(window, shape, 0).sum(axis=-1), 1e-300
         )
-        expected = piled_up(np.maximum(np.maximum(bright, 0)[..., None] * shape + ambient, 1e-3), cycles)
+        level = np.maximum(bright, 0)[..., None] * shape + ambient + responses.crosstalk
+        expected = piled_up(np.maximum(level, 1e-3), cycles)
         total = light.sum(axis=2)
         share_of_object = seen[:, 1].sum(axis=2) / np.where(total > 0, total, 1)
         return Prediction(expected, measured, share_of_object)

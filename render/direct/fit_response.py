@@ -52,7 +52,9 @@ def _at(delay: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(inside[..., None], table[k] * (1 - f) + table[k + 1] * f, 0.0)
 
 
-def fit_responses(model: FitModel, p: Parameters, plane: PlaneRecording) -> tuple[Responses, NDArray[np.float64]]:
+def fit_responses(
+    model: FitModel, p: Parameters, plane: PlaneRecording, crosstalk: NDArray[np.float64]
+) -> tuple[Responses, NDArray[np.float64]]:
     """Fit the response of each zone.
 
     Parameters
@@ -61,6 +63,8 @@ def fit_responses(model: FitModel, p: Parameters, plane: PlaneRecording) -> tupl
     p : Parameters
         The geometry; delays count as part of the response, as if they were 0.
     plane : PlaneRecording
+    crosstalk : (zones, bins) float64
+        Expected counts of light from the sensor's own window.
 
     Returns
     -------
@@ -75,9 +79,11 @@ def fit_responses(model: FitModel, p: Parameters, plane: PlaneRecording) -> tupl
     rows = []
     for zone in range(light.shape[1]):
         width = model.histogram.bin_width_m * p[f"converter_{model.converters[zone]}"]
-        rows.append(_fit_zone(light[:, zone], model.axis.nodes_m / width, measured[:, zone], drift, cycles))
+        rows.append(
+            _fit_zone(light[:, zone], model.axis.nodes_m / width, measured[:, zone], drift, cycles, crosstalk[zone])
+        )
     coefficients = np.stack(rows)
-    return responses_of(coefficients), coefficients
+    return responses_of(coefficients, crosstalk), coefficients
 
 
 def _fit_zone(
@@ -86,6 +92,7 @@ def _fit_zone(
     measured: NDArray[np.float64],
     drift: NDArray[np.float64],
     cycles: float,
+    crosstalk: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return the spline of one zone, and its delay."""
     tops = measured.argmax(axis=1)
@@ -96,6 +103,7 @@ def _fit_zone(
         counts = undo_pile_up(measured[i], cycles)
         left = np.exp(-np.cumsum(counts) / cycles)  # how much an error of a count grows
         std = np.sqrt(np.maximum(measured[i], 1.0) / left**2 + (SHAPE_FLOOR * counts) ** 2)
+        counts = counts - crosstalk
         ambient = counts[_AMBIENT_BINS].mean()
         window = slice(max(top - _WINDOW[0], 0), min(top + _WINDOW[1], len(counts)))
         at, weight = _gathered(nodes_bins, light[i])
@@ -126,8 +134,8 @@ def _gathered(
     return np.bincount(group, light[lit] * nodes[lit]) / total, total / total.sum()
 
 
-def responses_of(coefficients: NDArray[np.float64]) -> Responses:
-    """Return cumulative responses from splines.
+def responses_of(coefficients: NDArray[np.float64], crosstalk: NDArray[np.float64]) -> Responses:
+    """Return cumulative responses from splines, beside the crosstalk that was taken out.
 
     The spline is the mean of the response over a bin about a delay. Its integral over delays, taken at the lower
     edges of bins, is the cumulative response convolved with half a bin's shift; sums of whole bins then telescope.
@@ -156,7 +164,7 @@ def responses_of(coefficients: NDArray[np.float64]) -> Responses:
     for zone, row in enumerate(cumulative):
         out[zone] = np.interp(x, own + delays[zone], row, left=0.0, right=1.0)
     # the bin whose lower edge is b has its mean at delay b: the cumulative at its upper edge holds it
-    return Responses(out, first + 1.0, _STEP)
+    return Responses(out, first + 1.0, _STEP, crosstalk)
 
 
 def delays_of(responses: Responses) -> NDArray[np.float64]:

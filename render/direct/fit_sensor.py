@@ -1,9 +1,10 @@
-"""Fit a direct sensor to histograms of known scenes: geometry, response, bin widths, pile-up, stray light.
+"""Fit a direct sensor to histograms of known scenes: geometry, response, bin widths, pile-up, stray light, crosstalk.
 
 A plane at known distances tells bin widths, delays, response and pile-up, and of the geometry only how far zones look
 off the axis. Known objects from known poses tell where each zone looks, in which order zones are logged, how large
 they are and how much light strays. Both are fitted together: geometry by robust least squares with the responses
-fixed, then the responses from the plane with the geometry fixed, until nothing moves.
+fixed, then the responses from the plane with the geometry fixed, and the crosstalk of the sensor's window from what
+comes before the plane's light, until nothing moves.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from scipy.optimize import least_squares, minimize_scalar
 
 from phasemark import UsageError
 from phasemark.render.direct.bin_counts import expected_counts
+from phasemark.render.direct.fit_crosstalk import NO_CROSSTALK, Crosstalk, fit_crosstalk, peak_shapes
 from phasemark.render.direct.fit_model import (
     FitModel,
     Parameters,
@@ -55,6 +57,8 @@ class DirectFit:
     sensor : Sensor
     parameters : Parameters
     responses : Responses
+    crosstalk : Crosstalk
+        Of the sensor's window.
     std : dict of str to float
         Standard deviation of every parameter, scaled by the residuals.
     reduced_chi2 : (zones,) float64
@@ -65,6 +69,7 @@ class DirectFit:
     sensor: Sensor
     parameters: Parameters
     responses: Responses
+    crosstalk: Crosstalk
     std: dict[str, float]
     reduced_chi2: NDArray[np.float64]
     model: FitModel
@@ -88,6 +93,7 @@ class DirectFit:
         names = self.parameters.names
         return {
             "parameters": {name: {"value": self.parameters[name], "std": self.std.get(name)} for name in names},
+            "crosstalk": self.crosstalk._asdict(),
             "reduced_chi2": self.reduced_chi2.tolist(),
             "sensor": self.sensor.as_dict(),
         }
@@ -133,7 +139,8 @@ def fit_direct_sensor(
         raise UsageError(f"'converters' must name the converter of each of {n} zones, got {len(groups)}")
     model = FitModel(base, groups, zone_brightness(plane, histogram_of(base).cycles))
     p = start_parameters(base, objects, groups)
-    responses, _ = fit_responses(model, p, plane)
+    crosstalk, counts = NO_CROSSTALK, np.zeros((n, model.histogram.bins))
+    responses, _ = fit_responses(model, p, plane, counts)
     free = _free_parameters(p, objects)
     shifts = [one.frames.reference_shift_bins for one in objects] + [plane.frames.reference_shift_bins]
     if not any(shift.any() for shift in shifts):
@@ -145,14 +152,16 @@ def fit_direct_sensor(
     for _ in range(rounds):
         p, jacobian, cost = _fit_parameters(model, p, responses, recordings, free)
         p = _anchored(p, n)
-        responses, _ = fit_responses(model, p, plane)
+        responses, _ = fit_responses(model, p, plane, counts)
+        crosstalk, counts = _crosstalk(model, p, responses, plane)
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * max(cost, 1.0)
     std = {
         name: float(math.sqrt(max(covariance[k, k], 0.0)) * p.scales[p.names.index(name)])
         for k, name in enumerate(free)
     }
-    sensor = _as_sensor(base, model, p, responses, plane)
-    return DirectFit(sensor, p, responses, std, _reduced_chi2(model, p, responses, plane), model)
+    responses = responses._replace(crosstalk=counts)
+    sensor = _as_sensor(base, model, p, responses, crosstalk, plane)
+    return DirectFit(sensor, p, responses, crosstalk, std, _reduced_chi2(model, p, responses, plane), model)
 
 
 def converters_of(sensor: Sensor) -> tuple[int, ...]:
@@ -263,6 +272,19 @@ def _anchored(p: Parameters, zones: int) -> Parameters:
     return p.with_values(**{f"delay_{k}": 0.0 for k in range(zones)})
 
 
+def _crosstalk(
+    model: FitModel, p: Parameters, responses: Responses, plane: PlaneRecording
+) -> tuple[Crosstalk, NDArray[np.float64]]:
+    """Return the crosstalk of the sensor's window, and the counts that it adds, (zones, bins)."""
+    widths = model.histogram.bin_width_m * np.array([p[f"converter_{k}"] for k in model.converters])
+    counts = undo_pile_up(plane.frames.zone_counts, 1e6 / max(p["inverse_cycles"], 1e-9))
+    found = fit_crosstalk(counts, responses.cumulative, responses.first, responses.step, widths)
+    shapes = peak_shapes(
+        responses.cumulative, responses.first, responses.step, found.range_m / widths, model.histogram.bins
+    )
+    return found, found.counts * shapes
+
+
 def _plane_ranges(model: FitModel, p: Parameters, responses: Responses, plane: PlaneRecording) -> NDArray[np.float64]:
     """Return each zone's own best distance, by weighted least squares about the peak."""
     n, zones = len(plane.frames), model.sensor.rows * model.sensor.cols
@@ -279,11 +301,11 @@ def _plane_ranges(model: FitModel, p: Parameters, responses: Responses, plane: P
         path = model.axis.nodes_m[lit] / 0.5  # range over distance
         weight = light[zone][lit]
         for i in range(n):
-            counts = undo_pile_up(measured[i, zone], cycles)
+            counts = undo_pile_up(measured[i, zone], cycles) - responses.crosstalk[zone]
             signal = counts - counts[_AMBIENT_BINS].mean()
             top = int(measured[i, zone].argmax())
             low, high = max(top - _RANGE_WINDOW[0], 0), min(top + _RANGE_WINDOW[1], len(counts))
-            left = np.exp(-np.cumsum(counts) / cycles)
+            left = np.exp(-np.cumsum(counts + responses.crosstalk[zone]) / cycles)
             std = np.sqrt(np.maximum(measured[i, zone], 1.0) / left**2 + (0.01 * counts) ** 2)[low:high]
             edges = np.arange(low, high + 1)
             target = signal[low:high] / std
@@ -326,7 +348,14 @@ def _reduced_chi2(model: FitModel, p: Parameters, responses: Responses, plane: P
     return np.asarray(chi2 / np.maximum(window.sum(axis=(0, 2)) - 2 * len(got.measured), 1))
 
 
-def _as_sensor(base: Sensor, model: FitModel, p: Parameters, responses: Responses, plane: PlaneRecording) -> Sensor:
+def _as_sensor(
+    base: Sensor,
+    model: FitModel,
+    p: Parameters,
+    responses: Responses,
+    crosstalk: Crosstalk,
+    plane: PlaneRecording,
+) -> Sensor:
     """Return the fitted sensor in the fields of a sensor file."""
     h = histogram_of(base)
     rows, cols = base.rows, base.cols
@@ -341,7 +370,7 @@ def _as_sensor(base: Sensor, model: FitModel, p: Parameters, responses: Response
         cumulative = np.interp(grid / scales[zone] + delays[zone], x, responses.cumulative[zone], left=0.0, right=1.0)
         density = np.maximum(np.gradient(cumulative, grid), 0.0)  # rounding alone makes it negative
         irf.append(tuple(float(f"{v:.4g}") for v in density / density.max()))
-    measured = undo_pile_up(plane.frames.zone_counts, 1e6 / p["inverse_cycles"])
+    measured = responses.counts_beside_crosstalk(plane.frames.zone_counts, 1e6 / p["inverse_cycles"])
     ambient = measured[..., _AMBIENT_BINS].mean(axis=-1)
     signal = (measured - ambient[..., None]).sum(axis=-1)
     intensity = model.transients(p, plane).sum(axis=(1, 3)) / model.gain
@@ -362,6 +391,8 @@ def _as_sensor(base: Sensor, model: FitModel, p: Parameters, responses: Response
             "photons": float(per_light.mean() / cycles),
             "ambient": float(np.median(ambient) / cycles),
             "dark": 0.0,
+            "crosstalk": crosstalk.counts,
+            "crosstalk_range_m": crosstalk.range_m,
             "irf_std_m": None,
             "irf": irf,
             "irf_start_m": float(grid[0] * width_m),

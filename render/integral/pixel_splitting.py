@@ -150,7 +150,7 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
                     n += 1
             region += 1
         return n, region, True
-    # sweep along the limb if there is one, else along those that are near, else along most of the edges
+    # sweep along the limb if there is one, else along where one is near, else along most of the edges
     crease_u, crease_v, limb_u, limb_v = 0.0, 0.0, 0.0, 0.0
     entry = head[i, j]
     while entry >= 0:
@@ -166,7 +166,9 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
     has_limb = limb_u > 0.0 or limb_v > 0.0
     if has_limb:
         sweep_v = limb_v >= limb_u
-    elif sideways or upright:
+    elif sideways != upright:
+        sweep_v = sideways
+    elif sideways:
         for near in (head[i, j - 1], head[i, j + 1], head[i - 1, j], head[i + 1, j]):
             du, dv = _extent_of_limbs(near, edges, c - 1, r - 1, c + 2, r + 2)
             limb_u, limb_v = limb_u + du, limb_v + dv
