@@ -138,6 +138,66 @@ def test_what_a_cell_shows_stands_below_it(tmp_path):
     assert page == "# Adds\n\n```python\nx = 2\nprint('two')\nx + 1\n```\n\n```text\ntwo\n3\n```\n"
 
 
+# --- the reference ---
+
+MODEL = '''
+class Base:
+    def __init__(self, **data): ...
+    size: int = 3
+
+
+class Plan(Base):
+    """A plan.
+
+    Parameters
+    ----------
+    size : int
+    name : str
+    shares : dict
+    step : {1, 2}
+    """
+
+    name: str
+    shares: dict = Field(default_factory=lambda: {"a": 1})
+    step: int = Field(default=STEP, gt=0)
+
+
+def read(path, *, unit=None, up="z", down="y"):
+    """Read.
+
+    Parameters
+    ----------
+    path : str
+    unit : {'m', 'mm'}
+    up, down : str
+    """
+'''
+
+
+def test_defaults_are_those_of_signatures_and_fields(tmp_path):
+    griffe = pytest.importorskip("griffe")
+    (tmp_path / "planned.py").write_text(MODEL)
+    extensions = griffe.load_extensions("dataclasses", str(SITE / "stated_defaults.py"))
+    loader = griffe.GriffeLoader(extensions=extensions, search_paths=[tmp_path], docstring_parser="numpy")
+    found = {
+        f"{member}.{parameter.name}": None if parameter.value is None else str(parameter.value)
+        for member in ("Plan", "read")
+        for section in loader.load("planned")[member].docstring.parsed
+        if section.kind is griffe.DocstringSectionKind.parameters
+        for parameter in section.value
+    }
+    assert found == {
+        "Plan.size": "3",
+        "Plan.name": None,
+        "Plan.shares": "{'a': 1}",
+        "Plan.step": "STEP",
+        "read.path": None,
+        "read.unit": "None",
+        "read.up": "'z'",
+        "read.down": "'y'",
+    }
+
+
 # --- the dialect of the site's builder ---
 
 
@@ -152,6 +212,10 @@ def test_what_a_cell_shows_stands_below_it(tmp_path):
         ("- a\n\ntext\n\n    code", "- a\n\ntext\n\n    code"),
         (r"| `a\|b` | \|S\| |", r"| `a|b` | \|S\| |"),
         (
+            r"| `ranges\|phasors\|histograms\|targets` |",
+            "| <code>ranges&#124;phasors&#124;histograms&#124;targets</code> |",
+        ),
+        (
             "| `test_folders.py::test_a_folder_is_kept` |",
             "| <code>test&#95;<wbr>folders.py::<wbr>test&#95;<wbr>a&#95;<wbr>folder&#95;<wbr>is&#95;<wbr>kept</code> |",
         ),
@@ -160,6 +224,21 @@ def test_what_a_cell_shows_stands_below_it(tmp_path):
 )
 def test_lists_and_tables_are_written_as_the_sites_builder_reads_them(text, expected):
     assert module("markdown_dialect").for_site(text) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("as :func:`read_frames` reads", "as `read_frames` reads"),
+        ("of :class:`~phasemark.render.Sensor`", "of `Sensor`"),
+        ("in `~/.cache/phasemark/digests.json`", "in `~/.cache/phasemark/digests.json`"),
+    ],
+)
+def test_marks_of_sphinx_are_not_shown(text, shown):
+    assert module("markdown_dialect").without_roles(text) == shown
+    html = re.sub("`([^`]+)`", r"<code>\1</code>", text)
+    expected = re.sub("`([^`]+)`", r"<code>\1</code>", shown)
+    assert module("markdown_dialect").without_roles(html, code=("<code>", "</code>")) == expected
 
 
 def test_links_to_the_repositorys_root_lead_to_pages_of_the_site():

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from markdown_dialect import without_roles
 from public_names import public_names
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
@@ -29,7 +30,7 @@ def reference_path(module: str) -> str:
 def first_line(thing: object) -> str:
     """Return the first sentence of what a docstring says."""
     text = inspect.cleandoc(getattr(thing, "__doc__", None) or "").split("\n\n")[0]
-    return " ".join(text.split()).replace("|", "\\|")
+    return without_roles(" ".join(text.split())).replace("|", "\\|")
 
 
 def reference_page(*, linked: bool) -> str:
@@ -135,6 +136,8 @@ def _stated(value: object) -> str:
         if list(stated) == ["fixed"]:
             return f"`{stated['fixed']}`"
         value = "{ " + ", ".join(f"{key} = {each}" for key, each in stated.items()) + " }"
+    if value == "":
+        return "empty"
     return "none" if value is None else f"`{str(value).lower() if isinstance(value, bool) else value}`"
 
 
@@ -144,7 +147,7 @@ def _rows(schema: dict[str, Any], model: dict[str, Any]) -> Iterator[str]:
     for name, key in model.get("properties", {}).items():
         taken = _type(schema, key)
         default = "required" if name in required else _default(key["default"], taken) if "default" in key else ""
-        text = " ".join((key.get("description") or explained.get(name, "")).split()).replace("|", "\\|")
+        text = without_roles(" ".join((key.get("description") or explained.get(name, "")).split())).replace("|", "\\|")
         yield f"| `{name}` | {taken} | {default} | {text} |"
 
 

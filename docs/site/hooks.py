@@ -10,7 +10,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 
 from generated_pages import ROOT, SOURCES, site_pages
-from markdown_dialect import ROOT_PAGES, for_site, with_site_links
+from markdown_dialect import ROOT_PAGES, for_site, with_site_links, without_roles
 from mkdocs.structure.files import File, Files
 from notebooks import notebook_page
 from pymdownx.slugs import slugify
@@ -60,7 +60,7 @@ def _sections_of_physics() -> dict[str, str]:
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
     """Drop the marks of Sphinx from docstrings, and let what cites physics.md lead there."""
-    html = re.sub(r":(?:mod|class|func|meth|data|attr):(?=<code>)", "", html)
+    html = without_roles(html, code=("<code>", "</code>"))
     anchors = _sections_of_physics()
     root = "../" * page.url.count("/")
 
@@ -68,7 +68,9 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
         anchor = anchors.get(match[1])
         return f'<a href="{root}physics.html#{anchor}">{match[0]}</a>' if anchor else match[0]
 
-    return re.sub(r"PHYSICS,? sections? (\d+)", linked, html) if page.url.startswith("reference/phasemark") else html
+    return (
+        re.sub(r"PHYSICS,?\s+sections?\s+(\d+)", linked, html) if page.url.startswith("reference/phasemark") else html
+    )
 
 
 def on_post_page(output: str, page: Any, **_: Any) -> str:

@@ -30,7 +30,8 @@ def _in_a_table(code: str) -> str:
     if len(code) <= _LONG_CODE or " " in code:
         return f"`{code}`"
     breakable = re.sub("(::|/|_)", r"\1<wbr>", html.escape(code))
-    return f"<code>{breakable.replace('_', '&#95;')}</code>"  # an underscore would be read as emphasis
+    # an underscore would be read as emphasis, and a bar as the border of a cell
+    return f"<code>{breakable.replace('_', '&#95;').replace('|', '&#124;')}</code>"
 
 
 def for_site(text: str) -> str:
@@ -67,6 +68,24 @@ def for_site(text: str) -> str:
             line = re.sub(r"`([^`]+)`", lambda code: _in_a_table(code[1].replace(r"\|", "|")), line)
         done.append(line)
     return "\n".join(done)
+
+
+def without_roles(text: str, code: tuple[str, str] = ("`", "`")) -> str:
+    """Drop the marks of Sphinx: the role before code, and of a name that begins with a tilde all but its last part.
+
+    Parameters
+    ----------
+    text : str
+    code : (str, str), optional
+        What stands before code and after it.
+
+    Returns
+    -------
+    str
+    """
+    before, after = map(re.escape, code)
+    text = re.sub(rf":(?:mod|class|func|meth|data|attr):(?={before})", "", text)
+    return re.sub(rf"{before}~(?:\w+\.)+(\w+){after}", lambda name: f"{code[0]}{name[1]}{code[1]}", text)
 
 
 ROOT_PAGES = {
