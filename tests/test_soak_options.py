@@ -20,6 +20,7 @@ from builders import error_lines
 from phasemark.cli import app
 from phasemark.landmarks import build_mesh, catalog, export_mesh
 from phasemark.render import Renderer, Views, capture, preset
+from phasemark.render.direct import expected_counts, footprint_grid, plane_samples, range_axis, zone_transients
 
 pytestmark = pytest.mark.soak
 PHASEMARK = str(Path(sys.executable).with_name("phasemark"))
@@ -68,9 +69,12 @@ SMALL = {
     "landmark show": ("cone", "-o", "out"),
     "match": ("bank.h5", "frames.h5", "--no-diagnosis"),
     "plan check": ("plan.toml",),
+    "pose report": ("estimates.csv", "simulated.csv"),
     "render": ("--class", "cone", "-o", "out.png"),
     "sensor characterise": ("ideal", "--frames", "2", "-o", "out"),
     "sensor fit": ("board.csv", "--distance", "1", "--unit", "m", "--quantity", "range", "-o", "out.toml"),
+    "sensor fit-direct": ("plane.npz", "-o", "out.toml"),
+    "sensor import": ("camera.yaml", "-o", "out.toml"),
     "sensor list": (),
     "sensor show": ("ideal",),
     "sweep compare": ("sweep", "sweep"),
@@ -79,8 +83,17 @@ SMALL = {
     "sweep run": ("sweep.toml", "-o", "out"),
 }
 """Arguments with which a command does little."""
-LONG = {"demo": 60, "landmark design": 40, "drive": 30, "sweep run": 30, "sweep report": 30, "calibrate": 120}
+LONG = {
+    "demo": 60, "landmark design": 40, "drive": 30, "sweep run": 30, "sweep report": 30, "calibrate": 120,
+    "sensor fit-direct": 60,
+}  # fmt: skip
 """Seconds of commands that cannot do little, while another test runs beside them."""
+CAMERA = """image_width: 16
+image_height: 12
+distortion_model: plumb_bob
+camera_matrix: {rows: 3, cols: 3, data: [20, 0, 7.5, 0, 20, 5.5, 0, 0, 1]}
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0, 0, 0, 0]}
+"""
 PLAN = 'views = 1\nclasses = ["cone"]\n'
 DESIGN = "n_classes = 2\n[sampling]\ndistances = 2\ndelta_step_deg = 15\n[search]\nboxes = 4\nuppers = 8\nstep_mm = 3\n"
 DRIVE = """[map]
@@ -132,10 +145,16 @@ def odd_values(case):
 def inputs(tmp_path_factory):
     """A folder of small inputs of every command, made by commands, which fill Numba's cache as well."""
     folder = tmp_path_factory.mktemp("inputs")
+    rng = np.random.default_rng(0)
     for name, text in (("plan", PLAN), ("design", DESIGN), ("drive", DRIVE), ("sweep", SWEEP)):
         (folder / f"{name}.toml").write_text(text, encoding="utf-8")
+    (folder / "camera.yaml").write_text(CAMERA, encoding="utf-8")
+    direct, distance_m = preset("tmf8820-3x3"), np.linspace(0.1, 0.4, 12)
+    axis = range_axis(direct, longest_m=1.0)
+    seen = zone_transients(plane_samples(distance_m, footprint_grid(direct)), direct, axis)
+    counts = rng.poisson(expected_counts(seen, direct, axis, 0.8))
+    np.savez(folder / "plane.npz", histogram=counts.astype(np.uint32), distance_m=distance_m)
     (folder / "mesh.stl").write_bytes(export_mesh(build_mesh(catalog()["cone"]), "stl"))
-    rng = np.random.default_rng(0)
     np.savetxt(folder / "board.csv", 1 + 0.01 * rng.standard_normal((10, 256)), delimiter=",", fmt="%.4f")
     poses = [(0.8 + 0.1 * k, 45.0 * k) for k in range(8)]
     rows = [f"{distance_m:.1f},{delta_deg:g},5" for distance_m, delta_deg in poses]
@@ -157,6 +176,8 @@ def inputs(tmp_path_factory):
         "frames build plan.toml --views 2 --shard 1/2 -o frames1.h5",
         "frames build plan.toml --views 2 --shard 2/2 -o frames2.h5",
         "sweep run sweep.toml -o sweep",
+        "frames simulate --class cone --frames 3 --distance 1 -o simulated.csv",
+        "match bank.h5 simulated.csv --moving --no-diagnosis --estimates estimates.csv",
     ):
         subprocess.run([PHASEMARK, *command.split()], cwd=folder, check=True, capture_output=True)
     return folder
