@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from phasemark.cli import main
-from phasemark.data import BankPlan, build_bank
+from phasemark.data import BankPlan, FramePlan, build_bank, build_frames
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Views, preset
 from phasemark.render.direct import HistogramRenderer, capture_histograms
@@ -97,3 +97,29 @@ def test_what_does_not_go_together_is_refused_in_one_line(
     assert code in (2, 3)
     assert problem in err
     assert len(err.strip().splitlines()) == 1
+
+
+def test_a_frame_set_is_matched_view_by_view_or_frame_by_frame(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = {
+        "classes": ("cone",),
+        "views": 2,
+        "distance_m": 1.0,
+        "bearing_deg": 0.0,
+        "frames_per_view": 3,
+        "histograms": True,
+    }
+    for sensor in ("vl53l5cx-8x8", "vl53l5cx-4x4"):
+        build_frames(FramePlan(sensor=sensor, **plan), folder / f"{sensor}.h5").close()
+    matched = ("match", folder / "bank.h5", folder / "vl53l5cx-8x8.h5", *FIXED, "--json")
+    for on, moving, n in (("histograms", (), 2), ("histograms", ("--moving",), 6), ("targets", ("--moving",), 6)):
+        code, out, _ = run(capsys, *matched, "--on", on, *moving)
+        assert code == 0
+        found = json.loads(out)["matches"]
+        assert len(found) == n
+        assert {one["class"] for one in found} == {"cone"}
+        assert all(abs(one["distance_m"] - 1.0) < 0.01 for one in found)
+    code, _, err = run(capsys, "match", folder / "bank.h5", folder / "vl53l5cx-4x4.h5", *FIXED, "--on", "histograms")
+    assert code == 2
+    assert "has 4 × 4 zones of 128 bins, and the bank's sensor 8 × 8 of 128" in " ".join(err.split())

@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
+from phasemark.data.frames.frame_set_file import is_frame_set, open_frames
 from phasemark.data.measured.histogram_logs import read_histograms, read_targets
 from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.render import Sensor
+from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
 
@@ -65,13 +67,14 @@ def read_positions(
     Parameters
     ----------
     path : Path
-        NPZ or lines of JSON with histograms, or CSV with targets.
+        NPZ or lines of JSON with histograms, CSV with targets, or a frame set with histograms.
     sensor : Sensor
         The bank's, with a [histogram] table.
     on : {"histograms", "targets"}
         On targets histograms serve too: the chip's estimator makes targets of them.
     moving : bool
-        Whether every frame is a position of its own; otherwise all are frames of one.
+        Whether every frame is a position of its own; otherwise all of a log are frames of one, and those of each view
+        of a frame set.
     valid_status : collection of int, optional
         Which codes of a CSV file's status columns mark a target; None: 5 and 9.
 
@@ -80,7 +83,8 @@ def read_positions(
     InputFileError
         The file cannot be read, or holds something else.
     UsageError
-        Histograms are asked of a CSV file, or a status of a file that has none.
+        Histograms are asked of a CSV file or of a frame set without them, a status of a file that has none, or the
+        frame set is that of another sensor.
     """
     if path.suffix.lower() == ".csv":
         if on == "histograms":
@@ -89,10 +93,28 @@ def read_positions(
         return DirectPositions(_each(targets, lambda values: np.swapaxes(values, 0, 1)) if moving else targets)
     if valid_status is not None:
         raise UsageError(f"{path}: has histograms, and a valid status goes with targets from CSV")
+    if is_frame_set(path):
+        return _of_frame_set(path, sensor, moving=moving)
     log = read_histograms(path, sensor=sensor).frames
     if moving:
         return DirectPositions(log, None if log.time_s is None else log.time_s[:, 0])
     return DirectPositions(_added(log), None if log.time_s is None else np.array([log.time_s.mean()]))
+
+
+def _of_frame_set(path: Path, sensor: Sensor, *, moving: bool) -> DirectPositions:
+    """Return the histograms of a frame set, a position each view, or each frame."""
+    with open_frames(path, untrusted=True) as opened:
+        of_view = np.argsort(opened.view_index, kind="stable")
+        frames, n_views = opened.histograms()[of_view], len(np.unique(opened.view_index))
+    found, wanted = frames.counts.shape[2:], (sensor.rows, sensor.cols, histogram_of(sensor).bins)
+    if found != wanted:
+        raise UsageError(
+            f"{path}: has {found[0]} × {found[1]} zones of {found[2]} bins, and the bank's sensor"
+            f" {wanted[0]} × {wanted[1]} of {wanted[2]}"
+        )
+    if not moving:
+        frames = HistogramFrames(frames.counts.reshape(n_views, -1, *found), sensor=frames.sensor)
+    return DirectPositions(frames)
 
 
 def match_directly(matcher: Matcher, positions: DirectPositions, *, at_once: int) -> Iterator[DirectBatch]:
