@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
 import manifold3d
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.landmarks.revolve import Triangles, revolve
 from phasemark.landmarks.spec import Box, LandmarkSpec
+
+if TYPE_CHECKING:
+    import trimesh
 
 Part = Literal["both", "lower", "upper"]
 
@@ -36,6 +39,28 @@ _BOX_FACES = np.array(
     [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
      [1, 5, 7], [1, 7, 3]]
 )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of a landmark: what a renderer needs of a mesh, with the names that trimesh gives them.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float64
+        Metres, landmark frame.
+    faces : (f, 3) int64
+        Corners of each triangle, counter-clockwise from outside.
+    face_attributes : dict
+        ``part``: 0 for faces of the lower part, 1 for faces of the upper one, (f,) uint8.
+    metadata : dict
+        ``name``, ``symmetry`` and ``albedo``.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    face_attributes: dict[str, Any]
+    metadata: dict[str, Any]
 
 
 def build_mesh(spec: LandmarkSpec, part: Part = "both", tolerance_m: float = DEFAULT_TOLERANCE_M) -> trimesh.Trimesh:
@@ -71,6 +96,36 @@ def build_mesh(spec: LandmarkSpec, part: Part = "both", tolerance_m: float = DEF
     >>> bool(mesh.is_watertight), mesh.extents.round(6).tolist()
     (True, [0.24, 0.16, 0.3])
     """
+    import trimesh  # takes a third of a second: what is only rendered does without
+
+    surface = build_surface(spec, part, tolerance_m)
+    return trimesh.Trimesh(
+        vertices=surface.vertices,
+        faces=surface.faces,
+        face_attributes=surface.face_attributes,
+        metadata=surface.metadata,
+        process=False,
+    )
+
+
+def build_surface(spec: LandmarkSpec, part: Part = "both", tolerance_m: float = DEFAULT_TOLERANCE_M) -> Surface:
+    """Build a landmark's surface as :func:`build_mesh` does, without a mesh library around its arrays.
+
+    Parameters
+    ----------
+    spec : LandmarkSpec
+    part : {'both', 'lower', 'upper'}
+    tolerance_m : float
+
+    Returns
+    -------
+    Surface
+
+    Raises
+    ------
+    UsageError
+        As :func:`build_mesh`.
+    """
     if part not in ("both", "lower", "upper"):
         raise UsageError(f"'part' must be 'both', 'lower' or 'upper', got {part!r}")
     if not (math.isfinite(tolerance_m) and tolerance_m > 0):
@@ -85,12 +140,11 @@ def build_mesh(spec: LandmarkSpec, part: Part = "both", tolerance_m: float = DEF
         solids.append((UPPER, revolve(spec.upper, tolerance_m, max_faces=MAX_FACES)))
     stands_on_a_point = len(solids) == 2 and not _has_base(solids[1][1])
     vertices, faces, parts = _side_by_side(solids) if len(solids) == 1 or stands_on_a_point else _union(solids)
-    return trimesh.Trimesh(
-        vertices=vertices,
-        faces=faces,
+    return Surface(
+        vertices=np.asarray(vertices, np.float64),
+        faces=np.asarray(faces, np.int64),
         face_attributes={"part": parts},
         metadata={"name": spec.name, "symmetry": spec.symmetry, "albedo": spec.albedo},
-        process=False,
     )
 
 

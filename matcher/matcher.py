@@ -18,7 +18,7 @@ from phasemark.matcher.direct_method import (
 )
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.region import read_region
-from phasemark.matcher.frequencies import OneFrequency, OneFrequencyBank
+from phasemark.matcher.frequencies import OneFrequencyBank
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import (
     BEARING_STD_RAD,
@@ -31,6 +31,7 @@ from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPol
 from phasemark.matcher.likelihood.systematic import SYSTEMATICS, check_systematic
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
+from phasemark.matcher.one_frequency import OneFrequency
 from phasemark.render import Background
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets

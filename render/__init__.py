@@ -5,12 +5,9 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 from phasemark.render import compile_cache  # noqa: F401 - first, for the modules below compile functions
 from phasemark.render.background import Background
-from phasemark.render.direct import histogram_frames, histogram_images
-from phasemark.render.direct.capture import capture
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor_images import PhasorImages, phasor_to_range_m
 from phasemark.render.renderer import Renderer, background_image
-from phasemark.render.sensor.camera_unit import camera_unit
 from phasemark.render.sensor.range_noise import measured_range_std, predicted_range_std
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.shipped_sensors import preset, preset_names
@@ -23,8 +20,10 @@ if TYPE_CHECKING:
     import numpy.typing
 
     from phasemark.render.bench.data_sheet.characterise import characterise
+    from phasemark.render.direct.capture import capture
+    from phasemark.render.sensor.camera_unit import camera_unit
 else:
-    __getattr__, __dir__ = on_use.imported_on_use(__name__)  # the bench takes time to import, and few need it
+    __getattr__, __dir__ = on_use.imported_on_use(__name__)  # what takes time to import, and few need
 
 
 __all__ = [
@@ -65,23 +64,5 @@ def _figure_of_image(images: PhasorImages, index: int) -> "matplotlib.figure.Fig
     return phasor_figure(images, index)
 
 
-def _figure_of_histograms(
-    frames: histogram_frames.HistogramFrames, index: int, frame: int
-) -> "matplotlib.figure.Figure":
-    """Draw histograms of one frame and the range of the nearest target."""
-    from phasemark.render.direct.figures import histogram_figure
-
-    return histogram_figure(frames, index, frame)
-
-
-def _figure_of_expected_histograms(images: histogram_images.HistogramImages, index: int) -> "matplotlib.figure.Figure":
-    """Draw the expected histograms of one view."""
-    from phasemark.render.direct.figures import expected_figure
-
-    return expected_figure(images, index)
-
-
 Frames.figure = staticmethod(_figure_of_frame)
-histogram_frames.HistogramFrames.figure = staticmethod(_figure_of_histograms)
-histogram_images.HistogramImages.figure = staticmethod(_figure_of_expected_histograms)
 PhasorImages.figure = staticmethod(_figure_of_image)

@@ -24,9 +24,9 @@ _FOLDERS = {
     "render/direct": "bin_counts fit_model footprints photon_counts sample_counts scene_samples targets transients",
     "render/exposure": "capture photoelectrons random_streams taps",
     "render/integral": (
-        "arguments bent_edges borders circular edge_motion edge_projection edges_in_pixels face_search floor_phase"
-        " image_rays intersect intervals light limbs mesh_topology pixel_splitting quadrature_rules ray_plan strips"
-        " swept_light visible_faces"
+        "arguments bent_edges borders circular components edge_motion edge_projection edges_in_pixels"
+        " face_search floor_phase image_rays intersect intervals light limbs mesh_topology pixel_splitting"
+        " quadrature_rules ray_plan strips swept_light visible_faces"
     ),
 }
 COMPILED_SOURCES = tuple(f"{folder}/{name}.py" for folder, names in _FOLDERS.items() for name in names.split())

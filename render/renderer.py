@@ -14,7 +14,6 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
@@ -30,6 +29,7 @@ from phasemark.render.integral.pixel_splitting import Scratch
 from phasemark.render.integral.ray_plan import SHORT_LINKS, SHORT_SEGMENTS, UNTRUSTED, plan_rays
 from phasemark.render.integral.shells import unite_shells
 from phasemark.render.integral.slopes import STEP, SlopeSums
+from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
@@ -181,7 +181,7 @@ class Renderer:
 
     def __init__(
         self,
-        mesh: trimesh.Trimesh | None,
+        mesh: SurfaceMesh | None,
         sensor: Sensor,
         *,
         albedo: float = 0.8,
@@ -664,7 +664,7 @@ _TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
 _MOST_TOPOLOGIES = 16
 
 
-def _topology(mesh: trimesh.Trimesh) -> MeshTopology:
+def _topology(mesh: SurfaceMesh) -> MeshTopology:
     """Analyse a mesh, or return the analysis of the same mesh from a few calls ago."""
     arrays = (mesh.vertices, mesh.faces, mesh.face_attributes.get("part", ()))
     digest = hashlib.blake2b()

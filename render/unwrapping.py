@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from phasemark import UsageError
 from phasemark.render.sensor.sensor import Sensor
@@ -111,6 +110,8 @@ def unwrap_ranges(range_m: ArrayLike, std_m: ArrayLike, sensor: Sensor) -> Unwra
     total = np.sqrt(np.sum(np.where(std > 0, std, np.inf) ** -2.0, axis=0))
     exact = (std == 0).any(axis=0)
     combined = np.where(exact, 0.0, np.divide(1.0, total, out=np.full(shape, np.inf), where=total > 0))
+    from scipy import special  # takes a fifth of a second
+
     limit = special.chdtri(m - 1, INCONSISTENT_SHARE) if m > 1 else math.inf
     return Unwrapped(
         best.reshape(shape),
@@ -160,6 +161,8 @@ def unwrapping_error_probability(std_m: ArrayLike, sensor: Sensor) -> NDArray[np
     periods, multiples = _periods(sensor)
     if m == 1:
         return np.zeros(std.shape[1:])
+    from scipy import special
+
     if m == 2:
         step = sensor.unambiguous_range_m / float(multiples.prod())
         return np.asarray(special.erfc(step / np.sqrt(8 * np.sum(std**2, axis=0))))

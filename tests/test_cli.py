@@ -261,6 +261,22 @@ def test_help_imports_nothing_heavy() -> None:
     assert heavy.isdisjoint(done.stdout.splitlines()[-1].split())
 
 
+def test_the_accuracy_of_a_class_loads_no_mesh_library_and_nothing_of_files() -> None:
+    slow = {
+        "h5py",
+        "matplotlib",
+        "phasemark.data.bank.bank_file",
+        "phasemark.render.direct",
+        "scipy.spatial",
+        "trimesh",
+    }
+    command = ["accuracy", "--class", "cone", "--distance", "1.5"]
+    program = f"import sys; from phasemark import cli; code = cli.main({command}); print(*sys.modules); sys.exit(code)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert slow.isdisjoint(done.stdout.splitlines()[-1].split())
+
+
 def test_a_table_in_pieces_is_aligned_and_has_no_spaces_at_the_end(capsys: pytest.CaptureFixture[str]) -> None:
     table = console.Table(("class", "[D]", "m"))
     table.echo([("cone", "1.0", "")])

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
     from phasemark.data import Bank, FrameSet
+    from phasemark.landmarks import LandmarkSpec
+    from phasemark.landmarks.mesh import Surface
     from phasemark.render import Background, Sensor
+    from phasemark.render.integral.surface_mesh import SurfaceMesh
 
 
 def open_any_bank(path: Path) -> Bank:
@@ -63,18 +66,32 @@ def read_landmark(name_or_file: str, reading: MeshReading) -> tuple[str, Trimesh
 
 def class_mesh(name: str) -> Trimesh:
     """Return the mesh of a class of the catalogue."""
-    from phasemark.landmarks import build_mesh, catalog
+    from phasemark.landmarks import build_mesh
+
+    return build_mesh(_class_spec(name))
+
+
+def class_surface(name: str) -> Surface:
+    """Return the triangles of a class of the catalogue, which is faster than its mesh."""
+    from phasemark.landmarks.mesh import build_surface
+
+    return build_surface(_class_spec(name))
+
+
+def _class_spec(name: str) -> LandmarkSpec:
+    """Return a class of the catalogue."""
+    from phasemark.landmarks import catalog
 
     specs = catalog()
     if name not in specs:
         raise UsageError(f"unknown class '{name}': the catalogue has {', '.join(specs)}")
-    return build_mesh(specs[name])
+    return specs[name]
 
 
-def read_class_or_mesh(class_name: str | None, mesh: str | None, reading: MeshReading) -> tuple[str, Trimesh]:
+def read_class_or_mesh(class_name: str | None, mesh: str | None, reading: MeshReading) -> tuple[str, SurfaceMesh]:
     """Return the name and mesh that one of --class and --mesh names."""
     if class_name is not None:
-        return class_name, class_mesh(class_name)
+        return class_name, class_surface(class_name)
     name, path = name_and_file(mesh or "")
     return name, read_landmark(path, reading)[1]
 

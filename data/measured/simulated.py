@@ -12,7 +12,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from phasemark import UsageError, __version__
@@ -20,6 +19,7 @@ from phasemark.data.files.atomic_write import replacing, write_atomically
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.data.seeds import stream
 from phasemark.render import Background, Flag, Frames, Renderer, Sensor, Views, capture
+from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.view import VIEW_FIELDS
 
 STATUS_VALID = 5
@@ -51,7 +51,7 @@ class SimulatedRecording:
 
 
 def simulate_recording(
-    mesh: trimesh.Trimesh,
+    mesh: SurfaceMesh,
     class_name: str,
     sensor: Sensor,
     views: Views,

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from phasemark import UsageError
-from phasemark.matcher.accuracy.histogram_bound import histogram_information
-from phasemark.matcher.frequencies import OneFrequency, OneFrequencyRenderer
 from phasemark.matcher.information import covariance_of, eliminated
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.systematic import (
     calibrated_covariance,
     calibrated_fields,
@@ -27,10 +24,14 @@ from phasemark.matcher.likelihood.systematic import (
     check_systematic,
     declared_covariance,
 )
+from phasemark.matcher.one_frequency import OneFrequency, OneFrequencyRenderer
 from phasemark.matcher.pixel_agreement import counts, pixel_mask
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, predicted_range_std
-from phasemark.render.direct.histogram_images import HistogramRenderer
 from phasemark.render.sensor.range_noise import phase_image_variance
+
+if TYPE_CHECKING:
+    from phasemark.matcher.likelihood.residuals import ResidualKind
+    from phasemark.render.direct.histogram_images import HistogramRenderer
 
 _WALL_STEP_M = 1e-4
 _WEAK_SHARE = 1e-13  # of information in metres and radians
@@ -129,13 +130,15 @@ def cramer_rao(
     >>> [round(float(bound.std(name)[0]), 5) for name in bound.free]
     [0.00036, 0.00531]
     """
-    if isinstance(renderer, HistogramRenderer):
+    if not isinstance(renderer, Renderer):
         if on != "ranges" or pixels != "all" or background is not None or nuisances is not None:
             raise UsageError(
                 "of histograms all zones count, brightness and ambient light are unknown, and nothing stands behind the"
                 " landmark: leave 'on', 'pixels', 'background' and 'nuisances' out"
             )
         _check_free(free)
+        from phasemark.matcher.accuracy.histogram_bound import histogram_information  # direct sensors alone need it
+
         information = histogram_information(renderer, views, free, n_frames, workers)
         everywhere = np.ones((len(views), renderer.sensor.rows, renderer.sensor.cols), np.bool_)
         declared = None
@@ -263,5 +266,7 @@ def confusion_probability(distance_squared: ArrayLike) -> NDArray[np.float64]:
         d², the whitened squared distance of the noise-free frame from the nearest image of each other class, over all
         its views: what a matcher reports as cost on frames without noise.
     """
+    from scipy import special  # takes a fifth of a second
+
     d = np.sqrt(np.asarray(distance_squared, np.float64))
     return np.asarray(special.ndtr(-d / 2).sum(axis=-1))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.accuracy.appearance import Appearance
-from phasemark.matcher.frequencies import phases_of
+from phasemark.matcher.one_frequency import phases_of
 from phasemark.render import Background, Renderer, Views
 
 _SHIFT_M = np.arange(-0.04, 0.041, 0.02)

@@ -45,9 +45,9 @@ from phasemark.matcher.filters.filtered_frames import (
     phasor_mean,
 )
 from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
-from phasemark.matcher.frequencies import OneFrequency
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
+from phasemark.matcher.one_frequency import OneFrequency
 from phasemark.matcher.pixel_agreement import MIN_RETURNS
 from phasemark.render import Background, Frames, Sensor
 from phasemark.render.phasor_images import wrap_difference_m, wrap_range_m

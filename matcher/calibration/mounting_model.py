@@ -21,8 +21,8 @@ from phasemark import UsageError
 from phasemark.matcher.calibration.known_poses import KnownPoses
 from phasemark.matcher.calibration.lens_terms import farthest_lens, lens_of, natural_units, numbers_of
 from phasemark.matcher.calibration.pose_track import PoseTrack
-from phasemark.matcher.frequencies import OneFrequency, OneFrequencyRenderer
 from phasemark.matcher.likelihood.residuals import ResidualKind
+from phasemark.matcher.one_frequency import OneFrequency, OneFrequencyRenderer
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 from phasemark.render.sensor.lens_fields import LENS_FIELD, TERMS, Lens
 

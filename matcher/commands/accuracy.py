@@ -12,7 +12,7 @@ import typer
 from phasemark.data.commands.console import echo_json
 from phasemark.data.commands.inputs import (
     background_of,
-    class_mesh,
+    class_surface,
     note_too_far,
     read_class_or_mesh,
     read_sensor,
@@ -58,7 +58,7 @@ def accuracy_line(
     if delta is None:
         views = sides_of(distance, _period_rad(name if class_name else None))
     others = {
-        other: Renderer(class_mesh(other), camera, albedo=spec.albedo)
+        other: Renderer(class_surface(other), camera, albedo=spec.albedo)
         for other, spec in catalog().items()
         if class_name is None or other != name
     }

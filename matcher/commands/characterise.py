@@ -11,7 +11,7 @@ import typer
 
 from phasemark import PhasemarkError
 from phasemark.data.commands.console import LongWork, echo_json, readable
-from phasemark.data.commands.inputs import class_mesh, read_sensor
+from phasemark.data.commands.inputs import class_surface, read_sensor
 from phasemark.data.commands.options import Force, Json, Seed, a_preset
 from phasemark.data.commands.outputs import output_folder
 from phasemark.data.commands.sensor import Frequency, which_frequency
@@ -66,7 +66,7 @@ def _bound(sensor: Sensor, distance_m: float) -> str | None:
     specs = catalog()
     try:
         first, *others = (
-            (name, Renderer(class_mesh(name), sensor, albedo=spec.albedo)) for name, spec in specs.items()
+            (name, Renderer(class_surface(name), sensor, albedo=spec.albedo)) for name, spec in specs.items()
         )
         name, renderer = first
         views = sides_of(distance_m, delta_period_rad(specs[name].symmetry))

@@ -20,7 +20,7 @@ from phasemark.landmarks.spec import Box, Upper
 from phasemark.matcher.accuracy.appearance import Appearance
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.position_bound import SEARCH_TOLERANCE_M, box_alone
-from phasemark.matcher.frequencies import phases_of
+from phasemark.matcher.one_frequency import phases_of
 from phasemark.render import Renderer, Sensor, Views
 
 _TURN_BIAS_RAD = np.radians(np.arange(-30.0, 31.0, 6.0))

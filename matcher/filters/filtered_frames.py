@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from phasemark import UsageError
 from phasemark.matcher.filters.loops import add_up, count, follow
@@ -148,6 +147,8 @@ class FilteredFrames:
         """
         if self.sensor.kind != "direct" or not self.std_from_scatter:
             return self
+        from scipy import special  # takes a fifth of a second
+
         law = assumed_std_m(np.nan_to_num(self.range_m, nan=1.0), self.sensor)
         n = self.n_effective
         ratio = np.divide(self.std_m**2 * n, law**2, out=np.full(n.shape, np.nan), where=(n > 1.5) & (law > 0))

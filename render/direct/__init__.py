@@ -3,18 +3,20 @@
 from typing import TYPE_CHECKING
 
 from phasemark.inputs import on_use
+from phasemark.render.direct.histogram_frames import (
+    HistogramFrames,
+    capture_histograms,
+    nearest_ranges,
+    reference_centroid,
+)
+from phasemark.render.direct.histogram_images import HistogramImages, HistogramRenderer
 
 if TYPE_CHECKING:
+    import matplotlib.figure
+
     from phasemark.render.direct.bin_counts import detected_counts, expected_counts, piled_up, without_pile_up
     from phasemark.render.direct.fit_sensor import DirectFit, fit_direct_sensor, score_zone_orders
     from phasemark.render.direct.footprints import footprint_grid
-    from phasemark.render.direct.histogram_frames import (
-        HistogramFrames,
-        capture_histograms,
-        nearest_ranges,
-        reference_centroid,
-    )
-    from phasemark.render.direct.histogram_images import HistogramImages, HistogramRenderer
     from phasemark.render.direct.recordings import (
         ObjectRecording,
         PlaneRecording,
@@ -56,3 +58,21 @@ __all__ = [
     "world2cam",
     "zone_transients",
 ]
+
+
+def _figure_of_histograms(frames: HistogramFrames, index: int, frame: int) -> "matplotlib.figure.Figure":
+    """Draw histograms of one frame and the range of the nearest target."""
+    from phasemark.render.direct.figures import histogram_figure
+
+    return histogram_figure(frames, index, frame)
+
+
+def _figure_of_expected_histograms(images: HistogramImages, index: int) -> "matplotlib.figure.Figure":
+    """Draw the expected histograms of one view."""
+    from phasemark.render.direct.figures import expected_figure
+
+    return expected_figure(images, index)
+
+
+HistogramFrames.figure = staticmethod(_figure_of_histograms)
+HistogramImages.figure = staticmethod(_figure_of_expected_histograms)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
@@ -21,6 +20,7 @@ from phasemark.render.direct.bin_counts import bin_response, counts_of_light, de
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
 from phasemark.render.direct.scene_samples import BACKGROUND, SceneMesh
 from phasemark.render.direct.transients import range_axis, zone_transients
+from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
@@ -92,7 +92,7 @@ class HistogramRenderer:
 
     def __init__(
         self,
-        mesh: trimesh.Trimesh | None,
+        mesh: SurfaceMesh | None,
         sensor: Sensor,
         *,
         albedo: float = 0.8,

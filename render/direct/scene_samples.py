@@ -12,7 +12,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark.render.background import Background, background_hit
@@ -23,6 +22,7 @@ from phasemark.render.integral.light import landmark_hit
 from phasemark.render.integral.mesh_topology import MeshTopology
 from phasemark.render.integral.quadrature_rules import G2W, G2X, gauss_legendre
 from phasemark.render.integral.ray_plan import SKIPPED, plan_rays
+from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.kernel import kernel
 from phasemark.render.renderer import _Buffers, _poses, _topology
@@ -81,7 +81,7 @@ class SceneMesh:
         As for :class:`~phasemark.render.Renderer`.
     """
 
-    def __init__(self, mesh: trimesh.Trimesh | None, *, intersector: str = "auto") -> None:
+    def __init__(self, mesh: SurfaceMesh | None, *, intersector: str = "auto") -> None:
         self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
         self._room: tuple[tuple[int, int], _Buffers] | None = None

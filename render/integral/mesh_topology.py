@@ -10,12 +10,13 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import trimesh
 from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
+from phasemark.render.integral.components import component_labels
 from phasemark.render.integral.face_search import FaceGrid
+from phasemark.render.integral.surface_mesh import SurfaceMesh
 
 CREASE_RAD = math.radians(30.0)
 CLUSTER = 32
@@ -102,7 +103,7 @@ class MeshTopology(NamedTuple):
     closed: bool
 
     @classmethod
-    def from_mesh(cls, mesh: trimesh.Trimesh) -> MeshTopology:
+    def from_mesh(cls, mesh: SurfaceMesh) -> MeshTopology:
         """Analyse a mesh; faces without area are dropped, vertices at one point merged.
 
         Raises
@@ -133,7 +134,7 @@ class MeshTopology(NamedTuple):
         turn = np.where(other >= 0, _angle_between(normals[first], normals[other]), np.inf)
         crease = ~regular | (turn > CREASE_RAD + 1e-9)
         fold = ~crease & (turn > _COPLANAR_RAD)
-        patch = _components(len(faces), edges[~crease][:, 2:])
+        patch = component_labels(len(faces), edges[~crease][:, 2:])
         corners = _corner_normals(vertices, faces, normals, patch)
         flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
         # the corner of the other face off the edge lies before the first face's plane
@@ -147,7 +148,7 @@ class MeshTopology(NamedTuple):
         fold_reach = _fold_reach(edges[fold], normals)
         smooth_faces, clusters = _cluster_faces(vertices[faces], planes, fold_reach)
         folds, first_fold = _folds_in_order(edges[fold], smooth_faces)
-        shell = _components(len(faces), edges[other >= 0][:, 2:])
+        shell = component_labels(len(faces), edges[other >= 0][:, 2:])
         six_volumes = np.bincount(
             shell, np.einsum("ij,ij->i", a, np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
         )
@@ -312,15 +313,6 @@ def _cluster_faces(
         for values in (turn, np.abs(offset - mean_offset[own]), fold_reach[smooth], radius)
     ]
     return smooth.astype(np.int32), np.ascontiguousarray(np.column_stack([point, normal, mean_offset, *bounds]))
-
-
-def _components(n: int, pairs: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Give the nodes of each connected component one number."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32)
 
 
 def _corner_shares(corners: NDArray[np.float64]) -> NDArray[np.float32]:

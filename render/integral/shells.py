@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import manifold3d
 import numpy as np
-import trimesh
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from numpy.typing import NDArray
+
+from phasemark.render.integral.components import component_labels
+from phasemark.render.integral.surface_mesh import SurfaceMesh
+
+_Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
 
 
-def unite_shells(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def unite_shells(mesh: SurfaceMesh) -> SurfaceMesh:
     """Return the union of a mesh's shells if they may intersect, otherwise the mesh itself.
 
     Pixels are split along the edges of the mesh; where shells cross there would be none. Shells whose bounding boxes do
@@ -17,29 +20,31 @@ def unite_shells(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
     Parameters
     ----------
-    mesh : trimesh.Trimesh
+    mesh : SurfaceMesh
         Any mesh.
 
     Returns
     -------
-    trimesh.Trimesh
+    SurfaceMesh
         Part labels are lost in a union; they follow from the height again.
     """
-    shells = _shells(mesh)
+    shells = _shells(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
     if len(shells) < 2:
         return mesh
-    if not _may_intersect(np.array([shell.bounds for shell in shells])):
+    if not _may_intersect(np.array([(points.min(axis=0), points.max(axis=0)) for points, _ in shells])):
         return mesh
-    if not all(shell.is_volume for shell in shells):
+    import trimesh  # takes a third of a second, and few meshes need it
+
+    if not all(trimesh.Trimesh(points, faces, process=False).is_volume for points, faces in shells):
         return mesh
     solids = [
         manifold3d.Manifold(
             manifold3d.Mesh64(
-                vert_properties=np.ascontiguousarray(shell.vertices, dtype=np.float64),
-                tri_verts=np.ascontiguousarray(shell.faces, dtype=np.uint64),
+                vert_properties=np.ascontiguousarray(points, dtype=np.float64),
+                tri_verts=np.ascontiguousarray(faces, dtype=np.uint64),
             )
         )
-        for shell in shells
+        for points, faces in shells
     ]
     if any(solid.status() != manifold3d.Error.NoError for solid in solids):
         return mesh
@@ -52,19 +57,31 @@ def unite_shells(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     )
 
 
-def _shells(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+def _shells(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> list[_Triangles]:
     """Split a mesh where no edge joins its faces; holes stay holes."""
-    n, (first, second) = len(mesh.faces), np.asarray(mesh.face_adjacency).reshape(-1, 2).T
-    label = connected_components(coo_array((np.ones(len(first), bool), (first, second)), shape=(n, n)))[1]
+    label = component_labels(len(faces), _adjacent_faces(faces))
+    if not label.any():
+        return [(vertices, faces)]
     order = np.argsort(label, kind="stable")
     shells = []
-    for faces in np.split(mesh.faces[order], np.flatnonzero(np.diff(label[order])) + 1):
-        used, renumbered = np.unique(faces, return_inverse=True)
-        shells.append(trimesh.Trimesh(mesh.vertices[used], renumbered.reshape(-1, 3), process=False))
+    for own in np.split(faces[order], np.flatnonzero(np.diff(label[order])) + 1):
+        used, renumbered = np.unique(own, return_inverse=True)
+        shells.append((vertices[used], renumbered.reshape(-1, 3)))
     return shells
 
 
-def _may_intersect(bounds: np.ndarray) -> bool:
+def _adjacent_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the pairs of faces, (m, 2), that meet at an edge where no third face does."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    edges = edges[order]
+    starts = np.flatnonzero(np.concatenate([[True], (edges[1:] != edges[:-1]).any(axis=1)]))
+    first = starts[np.diff(np.append(starts, len(edges))) == 2]
+    owner = order % max(len(faces), 1)
+    return np.column_stack([owner[first], owner[first + 1]])
+
+
+def _may_intersect(bounds: NDArray[np.float64]) -> bool:
     """Return True if any two of (n, 2, 3) bounding boxes overlap by more than rounding."""
     margin = 1e-9 * np.ptp(bounds, axis=(0, 1)).max()
     overlap = (bounds[:, None, 0] < bounds[None, :, 1] - margin).all(axis=-1)

@@ -7,7 +7,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from phasemark.render.sensor.sensor import Sensor
 
@@ -132,6 +131,8 @@ def phase_density(phase_error_rad: ArrayLike, s: float) -> NDArray[np.float64]:
     s : float
         amplitude_e² over the variance of one phase image, 1 / (2 · law's phase std²).
     """
+    from scipy import special  # takes a fifth of a second
+
     root = math.sqrt(s) * np.cos(np.asarray(phase_error_rad, dtype=np.float64))
     hill = math.sqrt(math.pi) * root * np.exp(root**2 - s) * (1 + special.erf(root))
     return np.asarray((math.exp(-s) + hill) / (2 * math.pi))
