@@ -147,7 +147,7 @@ def printed_and_expected(page: Path, folder: Path) -> Iterator[tuple[str, str, s
     for block in read_blocks(page.read_text(encoding="utf-8")):
         if "prints" not in block.directives:
             continue
-        for part in re.split(r"^\$ ", block.text, flags=re.MULTILINE)[1:]:
+        for part in re.split(r"^\$ ", block.text.replace("\\\n", " "), flags=re.MULTILINE)[1:]:
             command, _, expected = part.partition("\n")
             printed = io.StringIO()
             words = shlex.split(command)

@@ -98,6 +98,39 @@ def test_a_page_made_from_the_program_is_up_to_date(name):
     assert (ROOT / "docs" / name).read_text(encoding="utf-8") == module("generated_pages").WRITTEN[name]()
 
 
+def test_every_key_of_every_plan_has_a_meaning():
+    rows = [line for line in module("generated_pages").plans_page().splitlines() if line.startswith("| `")]
+    assert len(rows) > 100
+    assert [row for row in rows if not row.split(" | ")[-1].strip("| ")] == []
+
+
+@pytest.mark.parametrize(
+    ("value", "written"), [(2**64, "2⁶⁴"), (2**31 - 1, "2³¹ − 1"), (1_000_000, "1 000 000"), (-45, "−45"), (0.5, "0.5")]
+)
+def test_limits_are_written_as_a_person_would(value, written):
+    assert module("generated_pages").limit(value) == written
+
+
+def test_no_limit_of_a_plan_has_an_exponent():
+    assert re.findall(r"\de[+-]\d", module("generated_pages").plans_page()) == []
+
+
+def test_comments_of_example_plans_fit_a_line_of_100_characters():
+    plans = [*ROOT.glob("data/plans/**/*.toml"), *ROOT.glob("matcher/**/*.toml"), *ROOT.glob("examples/*.toml")]
+    assert len(plans) > 6
+    assert [
+        line for plan in plans for line in plan.read_text("utf-8").splitlines() if "#" in line and len(line) > 100
+    ] == []
+
+
+def test_code_in_the_readme_fits_a_line_of_88_characters():
+    from readme_commands import read_blocks
+
+    blocks = read_blocks((ROOT / "README.md").read_text(encoding="utf-8"))
+    lines = [line for block in blocks for line in block.text.splitlines() if not line.startswith(("position", "0 "))]
+    assert [line for line in lines if len(line) > 88] == []
+
+
 def test_an_undocumented_name_would_be_noticed(monkeypatch):
     monkeypatch.setattr(phasemark, "__all__", [*phasemark.__all__, "undocumented"])
     assert "undocumented" in module("public_names").public_names()["phasemark"]

@@ -83,7 +83,7 @@ def _positive(values: tuple[float, ...], info: ValidationInfo) -> tuple[float, .
 
 
 _GRID_SCHEMA = {
-    "description": "START:STOP:STEP, V1,V2,… or V",
+    "description": "a grid: START:STOP:STEP, V1,V2,…, one number, or a list of numbers",
     "anyOf": [{"type": "string"}, {"type": "number"}, {"type": "array", "items": {"type": "number"}}],
 }
 _Grid = Annotated[
@@ -257,25 +257,30 @@ class BankPlan(ScenePlan):
         A preset's name, or a sensor file (with a ``/`` or ending in ``.toml``).
     sensor_overrides : mapping
         Fields of the sensor that replace those of `sensor`.
-    distance_m, delta_deg : str, number or sequence of numbers
-        Grids as :func:`phasemark.data.plans.parse_grid` reads them. A last δ that repeats the first by the landmarks'
-        common symmetry is dropped. Default: 0.7 m to 2.1 m in steps of 1 cm, and one period in steps of 1°.
+    distance_m : str, number or sequence of numbers
+        Grid of distances D, metres: ``START:STOP:STEP``, ``V1,V2,…``, one number or a list of numbers
+        (:func:`phasemark.data.plans.parse_grid`).
+    delta_deg : str, number or sequence of numbers, optional
+        Grid of viewing angles δ, degrees, in the same form. A last δ that repeats the first by the landmarks' common
+        symmetry is dropped. Without it: one period in steps of 1°.
     model : {"ray", "hard", "planar"}
-        The exact integral; the centre ray of each pixel alone, so that nothing is mixed; or the paper's own
-        generator in two dimensions.
+        ``ray``: the exact integral. ``hard``: the centre ray of each pixel alone, so that no ranges mix. ``planar``:
+        the paper's own generator in two dimensions.
     layout : {"factored", "full"}
-        Lower and upper images apart (the paper's saving), or every class at every distance and angle.
+        ``factored``: images of lower and upper parts are stored separately and combined, which saves memory as in the
+        paper. ``full``: one image for each class, distance and angle.
     albedo : float, optional
-        Replaces the landmarks' own.
+        Share of light that the landmarks return, in place of their own.
     harmonics : sequence of int
-        Orders k > 1 to keep beside the fundamental.
+        Orders k > 1 of harmonics that are stored beside the fundamental.
     region : "whole", "landmark" or (first row, stop row, first column, stop column)
-        Which pixels of the camera the images hold. "landmark": those that a landmark of the bank can reach, and a
-        margin. Frames of the whole camera are cut down to the same pixels when they are matched.
+        Which pixels of the camera the images hold. ``landmark``: those that a landmark of the bank can reach, and a
+        margin. Four numbers: first row, stop row, first column, stop column. Frames of the whole camera are cut down
+        to the same pixels when they are matched.
     binning : int
-        n × n pixels become one, whose phasor is their sum. The region holds whole blocks.
+        n: blocks of n × n pixels become one pixel, whose phasor is their sum. The region holds whole blocks.
     margin_deg : float
-        Of the region "landmark": how far the landmark may be off its place in the image, to every side.
+        With ``region = "landmark"``: how far the landmark may be off its place in the image to every side, degrees.
 
     Raises
     ------

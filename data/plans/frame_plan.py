@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import (
     BeforeValidator,
     Field,
+    JsonValue,
     PlainSerializer,
     SerializerFunctionWrapHandler,
     ValidationInfo,
@@ -28,6 +29,7 @@ from phasemark.landmarks import LandmarkSpec
 from phasemark.render.view import FARTHEST_M
 
 KINDS = ("fixed", "uniform", "normal", "sobol")
+_DEFAULT_SPLITS: dict[str, JsonValue] = {"train": 0.8, "val": 0.1, "test": 0.1}
 MOST_SPLITS = 256
 """The number of a view's split is a byte in the file."""
 Variant = Literal["hard", "mixed", "shot"]
@@ -42,16 +44,16 @@ class Distribution(PlanModel):
     Parameters
     ----------
     fixed : float
-        The same in all views; in a plan simply the number.
+        One value for all views; in a plan the number alone means the same.
     uniform : (low, high)
-        Independent in each view.
+        Drawn uniformly between the two, for each view by itself.
     normal : (mean, standard deviation)
-        Independent in each view.
+        Drawn from a normal distribution, for each view by itself.
     sobol : (low, high)
-        Uniform, from one scrambled Sobol sequence over all quantities that ask for it: the views fill their product
-        more evenly than independent draws would.
+        Uniform between the two, from one scrambled Sobol sequence over all quantities that ask for it: the views fill
+        their product more evenly than independent draws would.
     within : (low, high), optional
-        Only with `normal`: the tails beyond are cut off, and the rest is scaled to 1.
+        Only with `normal`: limits beyond which no value is drawn.
     """
 
     fixed: _Finite | None = None
@@ -133,7 +135,7 @@ def _to_plain(value: Distribution | None) -> Any:
 
 
 _PAIR_SCHEMA = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
-_SPREAD_SCHEMA = {
+SPREAD_SCHEMA = {
     "description": "a number, or how the quantity is spread over the views",
     "anyOf": [
         {"type": "number"},
@@ -147,7 +149,7 @@ _SPREAD_SCHEMA = {
         },
     ],
 }
-_FORM = (BeforeValidator(_to_distribution), PlainSerializer(_to_plain), WithJsonSchema(_SPREAD_SCHEMA))
+_FORM = (BeforeValidator(_to_distribution), PlainSerializer(_to_plain), WithJsonSchema(SPREAD_SCHEMA))
 _Spread = Annotated[Distribution, *_FORM]
 _MaybeSpread = Annotated[Distribution | None, *_FORM]
 _Share = Annotated[float, Field(ge=0, le=1)]
@@ -176,31 +178,42 @@ class FramePlan(ScenePlan):
     sensor_overrides : mapping
         Fields of the sensor that replace those of `sensor`.
     views : int
-        How many views.
+        Number of views.
     frames_per_view : int
-        Noisy frames of each view.
+        Number of noisy frames of each view.
     seed : int
-        Root of all random numbers, 0 … 2⁶⁴ − 1.
-    distance_m, delta_deg, bearing_deg, height_m : number or Distribution
-        The view (PHYSICS section 1).
-    pitch_deg, roll_deg : number or Distribution, optional
-        Tilt of what the camera is mounted on (PHYSICS section 9), within ± 90° and ± 180°; level if left out.
+        Root of all random numbers.
+    distance_m : number or Distribution
+        Distance D from the lens to the landmark's axis, metres (PHYSICS section 1).
+    delta_deg : number or Distribution
+        Viewing angle δ: the side from which the landmark is seen, degrees.
+    bearing_deg : number or Distribution
+        Azimuth of the landmark in the camera frame, degrees, positive to the left.
+    height_m : number or Distribution
+        Height of the landmark's origin above the lens, metres.
+    pitch_deg : number or Distribution, optional
+        Pitch of the camera's mount, degrees, within ± 90° (PHYSICS section 9); level if left out.
+    roll_deg : number or Distribution, optional
+        Roll of the camera's mount, degrees, within ± 180°; level if left out.
     albedo : number or Distribution, optional
-        Replaces the landmarks' own.
-    wall_m, floor_m : number or Distribution, optional
-        What stands behind; nothing if left out.
+        Share of light that the landmarks return, in place of their own.
+    wall_m : number or Distribution, optional
+        Distance of a wall behind the landmark, metres; no wall if left out.
+    floor_m : number or Distribution, optional
+        How far a floor lies below the lens, metres; no floor if left out.
     wall_albedo, floor_albedo : float
+        Share of light that the wall and the floor return.
     variants : sequence of {"hard", "mixed", "shot"}
-        What to keep beside the full frames: what the centre ray sees, the range of the exact integral without noise,
-        and frames with shot noise alone.
+        What is stored beside the full frames. ``hard``: the range of each pixel's centre ray. ``mixed``: the range of
+        the exact integral without noise. ``shot``: frames with shot noise alone.
     keep_taps : bool
-        Whether to keep what each tap reported.
+        Whether the counts of each tap are stored, too.
     histograms : bool, optional
         Whether a direct sensor with a [histogram] table is simulated photon by photon: histograms and targets are kept,
         and `range` is that of the nearest target. False: ranges alone, with the noise that `range_std_m` states. Left
         out, it is true for a sensor with the table.
     splits : mapping of str to float
-        Shares of the views, adding up to 1. All frames of a view are in one split.
+        Names of splits with their shares of the views, which add up to 1. All frames of a view are in one split.
 
     Raises
     ------
@@ -231,7 +244,7 @@ class FramePlan(ScenePlan):
     keep_taps: bool = False
     histograms: bool | None = None
     splits: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], _Share] = Field(
-        default_factory=lambda: {"train": 0.8, "val": 0.1, "test": 0.1}
+        default_factory=_DEFAULT_SPLITS.copy, json_schema_extra={"default": dict(_DEFAULT_SPLITS)}
     )
 
     @model_validator(mode="after")

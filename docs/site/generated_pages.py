@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import json
 import re
 from collections.abc import Iterator
 from functools import partial
@@ -15,7 +16,9 @@ from markdown_dialect import without_roles
 from public_names import public_names
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
+from phasemark.data.plans.frame_plan import SPREAD_SCHEMA, Distribution
 from phasemark.matcher.plan_kinds import KINDS, plan_example, plan_schema
+from phasemark.matcher.sweep.plan import AXES_SCHEMA, Condition
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 SOURCES = ("inputs", "landmarks", "render", "data", "matcher")
@@ -83,14 +86,16 @@ def reference_pages() -> dict[str, str]:
 def _type(schema: dict[str, Any], key: dict[str, Any]) -> str:
     """Return in words what a key of a plan takes."""
     if "$ref" in key:
-        return f"[{key['$ref'].rpartition('/')[2]}](#{key['$ref'].rpartition('/')[2].lower()})"
+        return _linked(key["$ref"].rpartition("/")[2])
+    if key.get("anyOf") == SPREAD_SCHEMA["anyOf"]:
+        return f"number or {_linked(Distribution.__name__)}"
     for several in ("anyOf", "oneOf"):
         if several in key:
             return " or ".join(dict.fromkeys(_type(schema, each) for each in key[several]))
     if "enum" in key or "const" in key:
         return ", ".join(f"`{word}`" for word in key.get("enum", [key.get("const")]))
     if key.get("type") == "array":
-        return f"list of {_type(schema, key['items'])}" if isinstance(key.get("items"), dict) else "list"
+        return f"list of {_items(schema, key)}"
     if key.get("type") == "object":
         inner = key.get("additionalProperties")
         return f"table of {_type(schema, inner)}" if isinstance(inner, dict) else "table"
@@ -102,8 +107,45 @@ def _type(schema: dict[str, Any], key: dict[str, Any]) -> str:
         "null": "none",
     }
     limits = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
-    stated = [f"{sign} {key[name]:g}" for name, sign in limits.items() if isinstance(key.get(name), int | float)]
+    stated = [f"{sign} {limit(key[name])}" for name, sign in limits.items() if isinstance(key.get(name), int | float)]
     return " ".join([words.get(key.get("type", ""), "any"), ", ".join(stated)]).strip()
+
+
+def _linked(table: str) -> str:
+    """Return a table's name as a link to its section."""
+    return f"[{table}](#{table.lower()})"
+
+
+def _items(schema: dict[str, Any], key: dict[str, Any]) -> str:
+    """Return in words what a list takes: how many values, and of which kind."""
+    kinds = dict.fromkeys(_type(schema, each) for each in key.get("prefixItems", [key.get("items", {})]))
+    count = f"{key['maxItems']} " if key.get("maxItems") and key.get("maxItems") == key.get("minItems") else ""
+    return count + _plural(*kinds) if len(kinds) == 1 else f"{count}values: {'; '.join(kinds)}"
+
+
+def _plural(kind: str) -> str:
+    """Return a kind of value in the plural; words of the program and names of tables stay as they are."""
+    for one, many in (("whole number", "whole numbers"), ("number", "numbers"), ("text", "texts"), ("list", "lists")):
+        if kind.startswith(one):
+            return many + kind.removeprefix(one)
+    return kind
+
+
+def limit(value: float) -> str:
+    """Return a limit as a person would write it: groups of three digits, and powers of two where they are meant.
+
+    Examples
+    --------
+    >>> limit(2**64 - 1), limit(1_000_000), limit(0.5)
+    ('2⁶⁴ − 1', '1 000 000', '0.5')
+    """
+    for exponent in (31, 32, 62, 63, 64):  # of seeds and counts
+        power = "2" + "".join("⁰¹²³⁴⁵⁶⁷⁸⁹"[int(digit)] for digit in str(exponent))
+        if value in (2**exponent, 2**exponent - 1):
+            return power if value == 2**exponent else f"{power} − 1"
+    if value == int(value) and abs(value) >= 10_000:
+        return f"{int(value):,}".replace(",", " ")
+    return f"{value:g}".replace("-", "−")
 
 
 def _explained(docstring: str) -> dict[str, str]:
@@ -135,9 +177,11 @@ def _stated(value: object) -> str:
         stated = {key: each for key, each in value.items() if each is not None}
         if list(stated) == ["fixed"]:
             return f"`{stated['fixed']}`"
-        value = "{ " + ", ".join(f"{key} = {each}" for key, each in stated.items()) + " }"
-    if value == "":
+        value = "{ " + ", ".join(f"{key} = {each}" for key, each in stated.items()) + " }" if stated else ""
+    if value in ("", []):
         return "empty"
+    if isinstance(value, list):
+        value = json.dumps(value)  # as TOML writes lists of numbers and words, too
     return "none" if value is None else f"`{str(value).lower() if isinstance(value, bool) else value}`"
 
 
@@ -145,10 +189,25 @@ def _rows(schema: dict[str, Any], model: dict[str, Any]) -> Iterator[str]:
     required = model.get("required", [])
     explained = _explained(model.get("description", ""))
     for name, key in model.get("properties", {}).items():
-        taken = _type(schema, key)
-        default = "required" if name in required else _default(key["default"], taken) if "default" in key else ""
-        text = without_roles(" ".join((key.get("description") or explained.get(name, "")).split())).replace("|", "\\|")
+        taken = AXES_LINK if key.get("properties") == AXES_SCHEMA["properties"] else _type(schema, key)
+        default = "required" if name in required else _default(key["default"], taken) if "default" in key else "empty"
+        text = explained.get(name) or explained.get(f"{name}_name") or key.get("description", "")
+        text = without_roles(" ".join(text.split())).replace("|", "\\|")
         yield f"| `{name}` | {taken} | {default} | {text} |"
+
+
+AXES_LINK = "table of [axes](#axes-of-a-sweep)"
+
+
+def _axes_table() -> list[str]:
+    """Return the section of the axes of a sweep."""
+    explained = _explained(inspect.cleandoc(Condition.__doc__ or ""))
+    lines = ["### Axes of a sweep", "", "Each takes one value, a list of values, or `START:STOP:STEP` as a text.", ""]
+    lines += ["| axis | takes | default | meaning |", "|---|---|---|---|"]
+    for name, axis in AXES_SCHEMA["properties"].items():
+        value, default = axis["anyOf"][1], _stated(getattr(Condition, name))
+        lines.append(f"| `{name}` | {_type({}, value)} | {default} | {explained[name]} |")
+    return [*lines, ""]
 
 
 def plans_page() -> str:
@@ -168,7 +227,8 @@ def plans_page() -> str:
         lines += [*_rows(schema, schema), "", f"The example of kind `{kind}`:", "", "```toml"]
         lines += [plan_example(kind).rstrip(), "```", ""]
         tables.update(schema.get("$defs", {}))
-    lines += ["## Tables within plans", ""]
+    tables[Distribution.__name__] = Distribution.model_json_schema()
+    lines += ["## Tables within plans", "", *_axes_table()]
     for name, model in sorted(tables.items()):
         if model.get("properties"):
             lines += [f"### {name}", "", "| key | takes | default | meaning |", "|---|---|---|---|"]

@@ -29,20 +29,24 @@ class LimitsPlan(PlanModel):
     Parameters
     ----------
     extents_m : (x, y, z)
-        Largest extents of the whole landmark.
+        Largest extents of the whole landmark, metres.
     fit : {"axis", "whole"}
-        How "fits the view at the near end" is measured: in the plane of the landmark's axis, the field of view that
-        PHYSICS section 5 quotes; or for every point, nearest corners included.
-    least_lower_px, least_upper_px : int
-        Pixels at the far end that one frame measures to 0.1 rad, on the box and on the part above it.
-    least_box_edge_px, least_upper_edge_px : float
-        Narrowest side of the box, and width and height of the part above it, in pixels at the far end.
+        Where a landmark has to fit the field of view at the near end. ``axis``: in the plane of its axis (PHYSICS
+        section 5). ``whole``: at every point, nearest corners included.
+    least_lower_px : int
+        Least number of pixels on the box, at the far end, that one frame measures to 0.1 rad.
+    least_upper_px : int
+        Least number of pixels on the part above the box, at the far end, that one frame measures to 0.1 rad.
+    least_box_edge_px : float
+        Least width of the box's narrowest side, in pixels at the far end.
+    least_upper_edge_px : float
+        Least width and height of the part above the box, in pixels at the far end.
     most_phase_std_rad : float
-        Phase noise of one frame at the far end on a surface that slants by 60°.
+        Largest phase noise of one frame at the far end on a surface that slants by 60°, radians.
     least_class_distance : float
-        Least noncentrality d between two classes over the range.
+        Least noncentrality d between two classes over the working range.
     least_turn_distance : float
-        Least noncentrality d between a box that is not square and itself a quarter-turn on.
+        Least noncentrality d between a box that is not square and the same box a quarter-turn on.
     """
 
     extents_m: tuple[_Positive, _Positive, _Positive] = (0.30, 0.30, 0.30)
@@ -62,9 +66,9 @@ class SamplingPlan(PlanModel):
     Parameters
     ----------
     distances : int
-        Evenly over the working range, both ends included.
+        Number of distances, evenly over the working range, both ends included.
     delta_step_deg : float
-        Step in δ, over half of the box's period: the other half is its mirror image.
+        Step in δ, degrees, over half of the box's period: the other half is its mirror image.
     """
 
     distances: Annotated[int, Field(ge=2, le=200)] = 7
@@ -76,10 +80,12 @@ class SearchPlan(PlanModel):
 
     Parameters
     ----------
-    boxes, uppers : int
-        Boxes, and parts above them, that are tried before the best are refined.
+    boxes : int
+        Number of boxes that are tried before the best are refined.
+    uppers : int
+        Number of parts above the box that are tried before the best are refined.
     step_mm : float
-        Dimensions are multiples of this.
+        Millimetres: all dimensions are multiples of this.
     """
 
     boxes: Annotated[int, Field(ge=8, le=10_000)] = 128
@@ -97,19 +103,23 @@ class DesignPlan(PlanModel):
     sensor_overrides : mapping
         Fields of the sensor that replace those of `sensor`.
     distance_m : (near, far)
-        Working range.
+        Ends of the working range, metres.
     n_classes : int
-        How many landmarks the set has, each a class of its own.
+        Number of landmarks of the set, each a class of its own.
     n_frames : int
-        Frames averaged for one measurement.
+        Number of frames that are averaged for one measurement.
     albedo : float
+        Share of light that the landmarks return.
     symmetry : {"any", 2, 4}
         From how many sides the box may look the same; 4 is a square box.
     seed : int
         Root of all random numbers.
     limits : LimitsPlan
+        Limits that every landmark has to keep.
     sampling : SamplingPlan
+        Views at which bounds are computed.
     search : SearchPlan
+        Effort of the search.
 
     Raises
     ------

@@ -31,17 +31,19 @@ class PathPlan(PlanModel):
     Parameters
     ----------
     waypoints_m : sequence of (x, y)
-        The path runs straight from one to the next; the robot starts at the first, facing the second.
+        Points of the path, metres, with straight lines between them. The robot starts at the first, facing the second.
     speed_m_s : float
-        As the wheels have it.
+        Speed that the wheels report, metres a second.
     lookahead_m : float
-        The robot steers for the point of the path so far ahead of it (pure pursuit).
+        Distance along the path to the point that the robot steers for (pure pursuit), metres.
     turn_limit_deg_s : float
-        Fastest turn.
+        Largest turning rate, degrees a second.
     step_s : float
-        Time between two readings of the odometry.
-    start_std_m, start_std_deg : float
-        How well the first pose is known.
+        Time between two readings of the odometry, seconds.
+    start_std_m : float
+        Standard deviation of each coordinate of the first pose, metres.
+    start_std_deg : float
+        Standard deviation of the first heading, degrees.
     """
 
     waypoints_m: Annotated[tuple[Point, ...], Field(min_length=2)]
@@ -71,17 +73,19 @@ class OdometryPlan(PlanModel):
     Parameters
     ----------
     slip_std : float
-        Of the share of the way by which the wheels turn in vain, drawn once a drive.
+        Standard deviation of the slip, the share of the way by which the wheels turn in vain; drawn once for a drive.
     slip_walk_per_sqrt_m : float
-        How that share wanders.
-    along_m_per_sqrt_m, across_m_per_sqrt_m : float
-        Random error of the way driven, forward and sideways.
+        Random walk of the slip, for each √m of way.
+    along_m_per_sqrt_m : float
+        Random error of the way driven, forward: metres for each √m.
+    across_m_per_sqrt_m : float
+        Random error of the way driven, sideways: metres for each √m.
     gyro_bias_std_deg_s : float
-        Of the gyro's bias at the start.
+        Standard deviation of the gyro's bias at the start, degrees a second.
     gyro_bias_walk_deg_s_per_sqrt_s : float
-        How the bias wanders.
+        Random walk of the gyro's bias, degrees a second for each √s.
     gyro_noise_deg_per_sqrt_s : float
-        Angle random walk.
+        Angle random walk of the gyro, degrees for each √s.
     """
 
     slip_std: Std = 0.03
@@ -99,19 +103,22 @@ class CameraPlan(PlanModel):
     Parameters
     ----------
     sensor : str
-        A preset's name.
+        Name of a preset.
     n_frames : int
-        Frames a stop.
+        Number of frames at each stop.
     pan_limit_deg : float
-        The pan unit turns so far to both sides.
+        Largest angle of the pan unit to either side, degrees.
     pan_std_deg : float
-        How well it reaches the angle it was told.
-    pan_offset_m, lens_offset_m : (x, y)
-        Where the pan axis is on the robot, and the lens on the pan unit (PHYSICS section 8).
+        Standard deviation of the pan angle about the one that was set, degrees.
+    pan_offset_m : (x, y)
+        Place of the pan axis on the robot, metres (PHYSICS section 8).
+    lens_offset_m : (x, y)
+        Place of the lens on the pan unit, metres.
     wall_albedo : float
+        Share of light that the walls of the room return.
     pitch_std_deg, roll_std_deg : float
-        How far an uneven floor tilts the camera at a stop. Where one is above 0, tilts are drawn with it, and the
-        matcher estimates them with it as the prior.
+        Standard deviation of the tilt that an uneven floor gives the camera at a stop, degrees. Above 0, tilts are
+        drawn with it, and the matcher estimates them with it as the prior.
     """
 
     sensor: str = "pmd-16x16"
@@ -137,17 +144,18 @@ class StopPlan(PlanModel):
     Parameters
     ----------
     distance_m : (low, high)
-        A landmark is in view between these distances of the lens.
+        Nearest and farthest distance between lens and landmark at which the robot may stop, metres.
     across_std_m : float
-        Largest predicted D·σ_δ, from the Cramér–Rao bound at the view that the robot believes in.
+        Largest standard deviation D·σ_δ at which the robot stops, metres: predicted by the Cramér–Rao bound at the
+        view that it expects.
     every_m : float
-        How often it looks for a landmark while it drives.
+        Way between two looks for a landmark, metres.
     again_m : float
-        Way before it stops for the same landmark again after a correction.
+        Way before the robot stops for the same landmark again after a correction, metres.
     retry_m : float
-        And after a measurement that was refused.
+        Way before it stops for the same landmark again after a measurement that was refused, metres.
     gate : float
-        A measurement as improbable as 1 − gate is refused.
+        Level of the test of a measurement: one that is less probable than 1 − gate is refused.
     """
 
     distance_m: tuple[_Positive, _Positive] = (0.8, 1.8)
@@ -170,11 +178,15 @@ class DrivePlan(PlanModel):
     Parameters
     ----------
     map : LandmarkMap
-        In a file either a table, or the name of a map file relative to the plan's folder.
+        Landmarks and walls; in a file a table, or the name of a map file relative to the plan's folder.
     path : PathPlan
+        Path of the robot.
     odometry : OdometryPlan
+        Errors of wheels and gyro.
     camera : CameraPlan
+        Camera on its pan unit.
     stop : StopPlan
+        Rules for stopping at a landmark and for accepting a match.
 
     Raises
     ------

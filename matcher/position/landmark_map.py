@@ -28,15 +28,17 @@ class MappedLandmark(PlanModel):
     Parameters
     ----------
     name : str
-        Of this one landmark.
+        Name of this one landmark.
     class_name : str
-        Its class, as the matcher's bank calls it; ``class`` in a file.
+        Its class, by the name that the matcher's bank has. The key of a file is ``class``.
     x_m, y_m : float
-        Where its axis stands.
+        Place of its axis in the room, metres.
     yaw_deg : float
-        Heading of its x' axis, the box's length.
-    xy_std_m, yaw_std_deg : float
-        How well that was surveyed: standard deviations of each coordinate, and of the heading.
+        Heading of its x' axis, which runs along the box's length, degrees.
+    xy_std_m : float
+        Standard deviation of each surveyed coordinate, metres.
+    yaw_std_deg : float
+        Standard deviation of the surveyed heading, degrees.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_by_name=True, validate_by_alias=True)
@@ -71,8 +73,9 @@ class LandmarkMap(PlanModel):
     Parameters
     ----------
     landmark : sequence of MappedLandmark
+        Landmarks of the room, at least one.
     room_m : sequence of (x, y)
-        Corners of the room in order, a simple polygon; empty: no walls.
+        Corners of the room in order, metres: a polygon that does not cross itself. Empty: no walls.
 
     Examples
     --------

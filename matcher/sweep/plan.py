@@ -36,24 +36,31 @@ class Condition:
     Parameters
     ----------
     class_name : str
-    distance_m, delta_deg : float
-        Middle of the true views.
+        Class of the landmark, or name of the stranger.
+    distance_m : float
+        Distance D of the middle of the true views, metres.
+    delta_deg : float
+        Viewing angle δ of the middle of the true views, degrees.
     noise_factor : float
-        σ of a range, relative to the sensor's: `signal_e` is divided by its square.
+        Standard deviation of a range, relative to the sensor's: `signal_e` is divided by its square.
     n_frames : int
-        Frames that are averaged.
-    bearing_deg, height_m, pitch_deg, roll_deg : float
-        Of the true view and mounting; a method takes 0 unless it estimates them.
+        Number of frames that are averaged.
+    bearing_deg : float
+        True bearing of the landmark, degrees; a method takes 0 unless it estimates it.
+    height_m : float
+        True height of the landmark's origin above the lens, metres; a method takes 0 unless it estimates it.
+    pitch_deg, roll_deg : float
+        True tilt of the camera's mount, degrees; a method takes 0 unless it estimates it.
     albedo : float
         The landmark's true albedo.
     wall_m : float
-        Wall behind the landmark; 0: none.
+        Distance of a wall behind the landmark, metres; 0: no wall.
     wiggling : float
-        Harmonics of the correlation, in units of those of square against square up to the seventh.
+        Size of the correlation's harmonics: 0 none, 1 those of a square wave against a square wave up to the seventh.
     unit : int
-        Which physical camera, with a phase offset in each pixel; 0: the camera without.
+        Number of the camera unit, which has a phase offset in each pixel of its own; 0: a camera without offsets.
     dimension_error : float
-        By how much the true landmark is larger than the model, relative.
+        Relative excess of the true landmark's dimensions over the model's.
     """
 
     class_name: str
@@ -96,7 +103,7 @@ def _axis(value: Any) -> Any:
 
 
 _Axis = Annotated[tuple[float, ...], BeforeValidator(_axis), Field(min_length=1)]
-_AXES_SCHEMA = {
+AXES_SCHEMA = {
     "type": "object",
     "description": "Axis to its values: START:STOP:STEP, V1,V2,…, a number or a list",
     "additionalProperties": False,
@@ -114,22 +121,26 @@ class Method(PlanModel):
     Parameters
     ----------
     name : str
-        For tables and figures.
+        Name in tables and figures.
     method : str
-        ``nearest``, ``refine``, or a callable ``module:name`` from filtered frames to a sequence of matches.
+        ``nearest``: the nearest image of the bank. ``refine``: maximum likelihood. ``module:name``: a Python function
+        from filtered frames to a sequence of matches.
     filter : {"kalman", "phasor-mean"}
+        How the frames of one measurement become one image: a Kalman filter of each pixel's range, or the mean phasor.
     on : {"ranges", "phasors"}
-        What ``refine`` explains. On phasors frames are taken without a validity threshold.
+        What ``refine`` explains: ranges, or phasors, of which frames are taken without a validity threshold.
     pixels : {"all", "lower"}
+        Which pixels ``refine`` compares: all, or the lower half of the rows.
     free : sequence of {"bearing", "height", "pitch", "roll"}
         What is estimated beside distance and angle.
     knows : {"wall", "auto", "nothing"}
-        Whether the background is known, estimated from the frames, or taken to be none.
+        Background that the method assumes: the true one, one estimated from the frames, or none.
     bank_model : {"ray", "hard", "planar"}
-        As in :class:`phasemark.data.BankPlan`; "hard" and "planar" know no mixed pixels and go with ``nearest`` only.
+        `model` of the method's bank; ``hard`` and ``planar`` have no mixed pixels and go with ``nearest`` only.
     bank_step : (metres, degrees)
-        Spacing of the bank's grid.
+        Spacing of the bank's grid in distance and angle.
     false_alarm : float
+        Probability with which a frame that the model explains is refused.
     """
 
     name: Annotated[str, Field(min_length=1, max_length=60)]
@@ -179,36 +190,52 @@ class SweepPlan(ScenePlan):
 
     Parameters
     ----------
-    name, question : str
-        What it is called, and what it asks, for the report.
+    name : str
+        Name of the sweep, in its report and its files.
+    question : str
+        Question that the sweep answers: the heading of its report.
     seed : int
+        Root of all random numbers.
     trials : int
-        Of each condition; with `until_percent` of each round.
+        Number of trials of each condition; with `until_percent` of each round.
     until_percent : float, optional
-        Go on with a condition, round by round, until every method's RMSE is known to ± this, or `max_trials` is met.
+        Repeat rounds of trials of a condition until every method's RMSE is known to ± this percentage, or `max_trials`
+        is reached.
     max_trials : int, optional
-        Of a condition; default 20 · `trials`.
+        Largest number of trials of a condition; 20 · `trials` if left out.
     design : {"grid", "star", "sobol"}
-        Every combination of the axes' values; or each axis alone, the others at their first value; or `points`
-        points of a scrambled Sobol sequence, numbers uniform between an axis's least and largest value.
+        Conditions that are run. ``grid``: every combination of the axes' values. ``star``: each axis alone, the others
+        at their first value. ``sobol``: `points` points of a scrambled Sobol sequence, uniform between an axis's least
+        and largest value.
     points : int
+        Number of conditions of the design ``sobol``.
     axes : mapping
-        Axis to its values: a list, a number, or START:STOP:STEP. The names are those of :class:`Condition`.
+        Values of each axis: a list, a number, or ``START:STOP:STEP``. The names are those of :class:`Condition`.
     spread : (metres, degrees)
-        True views are uniform in a box of this size about a condition's distance and angle, off any grid.
+        Size of a box about a condition's distance and angle, in which the true views are uniform, off any grid.
     methods : sequence of Method
-    classes, landmarks, meshes, sensor, sensor_overrides
-        As in :class:`phasemark.data.BankPlan`.
+        Methods that are compared on the same frames.
+    classes : sequence of str
+        Names from the catalogue. Without classes, landmarks and meshes: the whole catalogue.
+    landmarks : sequence of LandmarkSpec
+        Further boxes with a solid of revolution, spelled out.
+    meshes : sequence of MeshPlan
+        Landmarks from mesh files.
+    sensor : str
+        A preset's name, or a sensor file (with a ``/`` or ending in ``.toml``).
+    sensor_overrides : mapping
+        Fields of the sensor that replace those of `sensor`.
     strangers : sequence of LandmarkSpec
         Objects that stand in no bank, seen under the same conditions: the right answer is that there is no landmark.
     stranger_trials : int
-        Of each stranger under each condition, at most.
+        Largest number of trials of each stranger under each condition.
     bank_distance_m : (low, high)
-        Distances that the banks cover.
+        Distances that the banks cover, metres.
     fixed_pattern_rad : float
-        Standard deviation of a unit's phase offsets.
+        Standard deviation of a camera unit's phase offsets, radians.
     outlier : (metres, degrees)
-        An error beyond either, and beyond 5 σ of the bound, is an outlier: it is counted apart from bias and RMSE.
+        Limits of an error: beyond either, and beyond 5 σ of the bound, it is an outlier, which is counted by itself
+        and left out of bias and RMSE.
 
     Raises
     ------
@@ -224,7 +251,7 @@ class SweepPlan(ScenePlan):
     max_trials: Annotated[int, Field(ge=2, le=10_000_000)] | None = None
     design: Literal["grid", "star", "sobol"] = "grid"
     points: Annotated[int, Field(ge=1, le=_MOST_CELLS)] = 64
-    axes: Annotated[dict[str, _Axis], WithJsonSchema(_AXES_SCHEMA)] = Field(default_factory=dict)
+    axes: Annotated[dict[str, _Axis], WithJsonSchema(AXES_SCHEMA)] = Field(default_factory=dict)
     spread: tuple[Annotated[float, Field(ge=0, le=1)], Annotated[float, Field(ge=0, le=360)]] = (0.01, 1.0)
     methods: Annotated[tuple[Method, ...], Field(min_length=1)] = (Method(name="refine"),)
     strangers: tuple[LandmarkSpec, ...] = ()
