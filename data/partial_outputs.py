@@ -67,6 +67,7 @@ def parse_part(text: str) -> tuple[int, int]:
     Parameters
     ----------
     text : str
+        The part, as ``i/n``.
 
     Returns
     -------
@@ -167,6 +168,7 @@ def build_part(
     Parameters
     ----------
     plan : BankPlan or FramePlan
+        Plan of the bank or frame set.
     part : (i, n)
         Counted from 1.
     path : path-like
@@ -335,6 +337,7 @@ def estimate_build(
     Parameters
     ----------
     plan : BankPlan or FramePlan
+        Plan of the bank or frame set.
     workers : int
         Processors that will work on it.
     trial_seconds : float, optional

@@ -22,6 +22,7 @@ def checksum_path(path: str | os.PathLike[str]) -> Path:
     Parameters
     ----------
     path : path-like
+        The file.
 
     Returns
     -------
@@ -45,6 +46,7 @@ def sha256_of(source: str | os.PathLike[str] | BinaryIO) -> str:
     Parameters
     ----------
     source : path-like or binary file
+        What is hashed.
 
     Returns
     -------

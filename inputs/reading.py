@@ -15,7 +15,7 @@ from phasemark import InputFileError
 from phasemark.inputs.vouching import is_vouched_for
 
 MOST_TOML_BYTES = 1 << 22
-"""Plans, maps and sensor files are written by hand, or by a program that writes a line a landmark."""
+"""Largest size of a plan, a map or a sensor file, bytes."""
 _BLOCK_BYTES = 1 << 20
 
 _delivered: ContextVar[dict[tuple[int, int, int], bytes] | None] = ContextVar("delivered", default=None)

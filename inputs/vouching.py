@@ -50,6 +50,7 @@ def vouching_begun(path: Path) -> Iterator[None]:
     Parameters
     ----------
     path : Path
+        The file.
 
     Yields
     ------
@@ -76,6 +77,7 @@ def is_vouched_for(path: Path, content: bytes | BinaryIO | None = None) -> bool:
     Parameters
     ----------
     path : Path
+        The file.
     content : bytes or binary file, optional
         The file's content, if it has been read, or the open file, which stands at its beginning afterwards.
 

@@ -216,7 +216,9 @@ def export_mesh(mesh: trimesh.Trimesh, file_type: str) -> bytes:
     Parameters
     ----------
     mesh : trimesh.Trimesh
+        The mesh, metres.
     file_type : {"stl", "ply", "obj", "off"}
+        Format of the file.
 
     Raises
     ------

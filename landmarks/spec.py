@@ -204,7 +204,7 @@ class LandmarkSpec(_Spec):
     """
 
     figure: ClassVar[Callable[..., bytes]]
-    """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
+    """Function that draws it; the package sets it, because drawing imports matplotlib, which takes half a second."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
     box: Box

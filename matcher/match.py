@@ -27,12 +27,15 @@ class Candidate:
     Parameters
     ----------
     class_name : str
+        Name of the class.
     distance_m, delta_rad : float
+        Distance and viewing angle, metres and radians.
     cost : float
         Whitened squared distance of the frame from the candidate's image.
     weight : float
         Its share of the likelihood, among all explanations with the match itself and "none".
     bearing_rad, height_m, pitch_rad, roll_rad : float
+        Other parameters of the view, metres and radians.
     """
 
     class_name: str
@@ -189,18 +192,26 @@ class Matches(Sequence[Match]):
     Parameters
     ----------
     matches : iterable of Match
+        One match for each position.
 
     Attributes
     ----------
     class_name : (n,) object
         Names, None where there is no landmark.
     reason : (n,) object
+        Why a match is refused; empty if it is accepted.
     accepted : (n,) bool
+        Whether the test of the fit accepts the match.
     distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : (n,) float64
+        Estimated views, metres and radians.
     chi2, p_value, condition_number : (n,) float64
+        χ² of the fit, its p-value, and the condition number of the information.
     dof : (n,) int64
+        Degrees of freedom of χ².
     covariance : (n, p, p) float64, or None
+        Covariance of the estimated parameters, metres and radians.
     class_probability : dict of str to (n,) float64
+        Probability of each class.
     """
 
     def __init__(self, matches: Iterable[Match]) -> None:

@@ -63,6 +63,7 @@ class Matcher:
     Parameters
     ----------
     bank : Bank
+        Model images.
     method : {"nearest", "refine"}
         "nearest" is the paper's minimum-distance classifier: the answer is the nearest model image. In a factored
         bank the lower pixels choose distance and angle, and the upper pixels the class at that distance; in a full

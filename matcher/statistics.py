@@ -36,6 +36,7 @@ class Interval:
     Parameters
     ----------
     value, low, high : float
+        Estimate, and the ends of its interval.
     """
 
     value: float
@@ -52,6 +53,7 @@ def binomial_interval(successes: int, n: int, *, law: Law = "normal") -> Interva
     Parameters
     ----------
     successes, n : int
+        Number of successes, and of all trials.
     law : {"normal", "student"}
         The exact interval (Clopper and Pearson 1934), which is never too narrow; or Wilson's score interval (1927),
         which holds the truth in 95 % of the cases on average.
@@ -90,7 +92,9 @@ def mean_interval(values: ArrayLike, *, law: Law = "student") -> Interval:
     Parameters
     ----------
     values : (n,) array_like
+        The sample.
     law : {"student", "normal"}
+        Distribution of the mean that the interval's width is taken from.
     """
     array = np.asarray(values, np.float64)
     n = len(array)
@@ -113,6 +117,7 @@ def rms_interval(values: ArrayLike, *, law: Law = "student") -> Interval:
     values : (n,) array_like
         Of errors over their bounds this is the ratio to the bound, √mean(e² / CRLB²): 1 at the bound.
     law : {"student", "normal"}
+        Distribution of the mean that the interval's width is taken from.
     """
     squares = np.asarray(values, np.float64) ** 2
     n = len(squares)
@@ -156,6 +161,7 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> NDArray[np.float64]:
     error : (n, p) array_like
         Estimate less truth, angles wrapped.
     covariance : (n, p, p) array_like
+        Covariance matrices of the errors.
     """
     e, matrix = np.asarray(error, np.float64), np.asarray(covariance, np.float64)
     return np.asarray(np.einsum("ni,ni->n", e, np.linalg.solve(matrix, e[:, :, None])[:, :, 0]))
@@ -169,6 +175,7 @@ def within_ellipsoid(error: ArrayLike, covariance: ArrayLike, level: float = 0.9
     error : (n, p) array_like
         Estimate less truth, angles wrapped.
     covariance : (n, p, p) array_like
+        Covariance matrices of the errors.
     level : float
         The ellipsoid's probability.
 

@@ -62,6 +62,7 @@ class Background:
         vertices : (v, 3) float64
             Points of the landmark, landmark frame.
         views : Views
+            Views of the landmark.
 
         Raises
         ------
@@ -92,6 +93,7 @@ class Background:
         vertices : (v, 3) float64
             Points of the landmark, landmark frame.
         views : Views
+            Views of the landmark.
 
         Returns
         -------

@@ -116,6 +116,7 @@ def range_figure(
     near_m, far_m : float, optional
         Ranges drawn white and black; by default the image's own nearest and farthest. What lies farther is grey.
     title : str, optional
+        Title above the figure.
 
     Returns
     -------

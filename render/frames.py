@@ -76,7 +76,7 @@ class Frames:
     """
 
     figure: ClassVar[Callable[..., Figure]]
-    """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
+    """Function that draws it; the package sets it, because drawing imports matplotlib, which takes half a second."""
 
     def __init__(
         self,

@@ -61,6 +61,7 @@ def wrap_range_m(range_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
     range_m : array_like
         Metres.
     sensor : Sensor
+        The camera.
 
     Returns
     -------
@@ -80,6 +81,7 @@ def wrap_difference_m(difference_m: ArrayLike, sensor: Sensor) -> NDArray[np.flo
     difference_m : array_like
         Metres.
     sensor : Sensor
+        The camera.
 
     Returns
     -------
@@ -104,7 +106,9 @@ class PhasorImages:
     coverage : (n, rows, cols) float64
         Share of the active area that sees the landmark, 0 … 1.
     sensor : Sensor
+        The camera.
     views : Views
+        Views of the landmark.
     upper_coverage : (n, rows, cols) float64, or None
         Share of the active area that sees the landmark's upper part; the rest of `coverage` sees the lower one. None
         where parts are not distinguished.
@@ -115,7 +119,7 @@ class PhasorImages:
     """
 
     figure: ClassVar[Callable[..., Figure]]
-    """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
+    """Function that draws it; the package sets it, because drawing imports matplotlib, which takes half a second."""
 
     phasor: NDArray[np.complex128]
     intensity: NDArray[np.float64]

@@ -114,6 +114,7 @@ def planar_images(
     Parameters
     ----------
     landmark : PlanarLandmark
+        The landmark, as the paper draws it from above.
     sensor : Sensor
         With an even number of rows and a centred principal point, not tilted.
     views : Views

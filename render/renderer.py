@@ -146,6 +146,7 @@ class Renderer:
         The landmark, metres, landmark frame (PHYSICS section 1). Open or inverted meshes are rendered two-sided, closed
         shells that run through one another as their union. None: no landmark, only what stands behind it.
     sensor : Sensor
+        The camera.
     albedo : float
         Of the Lambertian landmark, in (0, 1].
     harmonics : sequence of int, optional
@@ -211,6 +212,7 @@ class Renderer:
         Parameters
         ----------
         sensor : Sensor
+            The camera.
         """
         other = copy.copy(self)
         other.sensor, other.untrusted_pixels = sensor, 0
@@ -284,6 +286,7 @@ class Renderer:
         Parameters
         ----------
         views : Views
+            Views of the landmark.
         """
         tilted = np.flatnonzero((views.pitch_rad != 0) | (views.roll_rad != 0))
         if not tilted.size or not len(self.topology.faces):
@@ -310,6 +313,7 @@ class Renderer:
         Parameters
         ----------
         views : Views
+            Views of the landmark.
 
         Raises
         ------
@@ -463,6 +467,7 @@ class Renderer:
         views : Views
             As the camera itself has them, :meth:`~phasemark.render.Views.in_camera`.
         background : Background, optional
+            Wall and floor; nothing stands behind the landmark without it.
 
         Raises
         ------
@@ -650,7 +655,9 @@ def background_image(background: Background, sensor: Sensor) -> PhasorImages:
     Parameters
     ----------
     background : Background
+        Wall and floor.
     sensor : Sensor
+        The camera.
 
     Returns
     -------

@@ -134,6 +134,7 @@ def unwrapping_error_probability(std_m: ArrayLike, sensor: Sensor) -> NDArray[np
     std_m : (m, ...) array_like
         Standard deviation of the range at each of the sensor's m frequencies, metres.
     sensor : Sensor
+        The camera.
 
     Returns
     -------

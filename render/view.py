@@ -193,6 +193,7 @@ class Views:
         Parameters
         ----------
         sensor : Sensor
+            Camera with the offsets of its mounting.
         """
         if not (sensor.bearing_offset_deg or sensor.height_offset_m):
             return self

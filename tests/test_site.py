@@ -89,7 +89,14 @@ def test_every_public_name_gets_a_page():
     pages = module("generated_pages").reference_pages()
     for place, names in module("public_names").public_names().items():
         page = pages[f"reference/{place}.md"]
-        assert [name for name in names if f"\n::: {place}.{name}\n" not in page] == []
+        described = [module("public_names").described_at(place, name) for name in names]
+        assert [name for name in described if f"\n::: {name}\n" not in page] == []
+
+
+def test_a_function_beside_a_module_of_its_name_is_described_itself():
+    found = module("public_names").described_at
+    assert found("phasemark.landmarks", "catalog") == "phasemark.landmarks.catalog.catalog"
+    assert found("phasemark.landmarks", "build_mesh") == "phasemark.landmarks.build_mesh"
 
 
 @pytest.mark.parametrize("name", ["reference.md", "plans.md"])

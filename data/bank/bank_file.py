@@ -49,10 +49,13 @@ class BankGroup:
     Parameters
     ----------
     name : {"lower", "upper", "full"}
+        Name of the group.
     group : h5py.Group
+        Group of the file.
     path : Path
         Name of the file, for messages.
     sensor : Sensor
+        The camera.
 
     Attributes
     ----------
@@ -239,9 +242,13 @@ class Bank:
     plan : BankPlan
         The resolved plan the bank was made from.
     layout : {"factored", "full"}
+        Whether images of lower and upper parts are stored separately.
     classes : tuple of str
+        Names of the classes, in the order of their numbers.
     distance_m : (n_distance,) float64
+        Grid of distances, metres.
     delta_rad : (n_delta,) float64
+        Grid of viewing angles, radians.
     lower, upper : BankGroup or None
         The groups of a factored bank.
     full : BankGroup or None
@@ -316,7 +323,9 @@ class Bank:
         Parameters
         ----------
         class_name : str
+            Name of the class.
         i, j : int
+            Indices of the distance and of the angle.
         hz : float, optional
             Modulation frequency; None: the sensor's first.
 
@@ -427,6 +436,7 @@ def open_bank(path: str | os.PathLike[str], *, untrusted: bool = False) -> Bank:
     Parameters
     ----------
     path : path-like
+        The file.
     untrusted : bool
         Whether a child process with limits reads the file first, unless ``FILE.sha256`` vouches for it.
 

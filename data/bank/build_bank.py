@@ -80,6 +80,7 @@ def build_bank(
     Parameters
     ----------
     plan : BankPlan
+        Plan of the bank.
     path : path-like, optional
         The file to write; ``FILE.sha256`` goes beside it. None: a temporary file, gone once the bank is closed.
     force : bool

@@ -44,7 +44,9 @@ def bank_build(
     mesh_reading: MeshReading,
     symmetry: Annotated[
         int | None,
-        typer.Option("--symmetry", help="Turns that leave the mesh as it is; found from the mesh if not given."),
+        typer.Option(
+            "--symmetry", help="Number of turns that leave the mesh as it is; found from the mesh unless stated."
+        ),
     ] = None,
     sensor: Annotated[
         str | None,
@@ -59,9 +61,12 @@ def bank_build(
             help="ray: the exact integral; hard: centre rays, nothing mixed; or planar: the paper's own generator.",
         ),
     ] = None,
-    albedo: Annotated[float | None, typer.Option("--albedo", help="Of the landmarks, in place of their own.")] = None,
+    albedo: Annotated[
+        float | None, typer.Option("--albedo", help="Share of light that the landmarks return, in place of their own.")
+    ] = None,
     full: Annotated[
-        bool, typer.Option("--full", help="Every class at every D and δ; taken where nothing less will do.")
+        bool,
+        typer.Option("--full", help="Store every class at every D and δ; without it only where a landmark needs it."),
     ] = False,
     region: Annotated[
         str | None,
@@ -74,7 +79,9 @@ def bank_build(
     margin: Annotated[
         float | None, typer.Option("--margin", help="Degrees around the landmark that --region landmark keeps too.")
     ] = None,
-    binning: Annotated[int | None, typer.Option("--binning", metavar="N", help="N × N pixels become one.")] = None,
+    binning: Annotated[
+        int | None, typer.Option("--binning", metavar="N", help="Blocks of N × N pixels become one pixel.")
+    ] = None,
     building: Building,
 ) -> None:
     """Build a bank of noise-free model images."""

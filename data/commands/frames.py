@@ -56,7 +56,7 @@ def frames_build(
     seed: Annotated[
         int | None, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")
     ] = None,
-    views: Annotated[int | None, typer.Option("--views", min=1, help="How many views.")] = None,
+    views: Annotated[int | None, typer.Option("--views", min=1, help="Number of views.")] = None,
     building: Building,
 ) -> None:
     """Build a set of noisy frames with their truth."""
@@ -162,16 +162,20 @@ def frames_simulate(
         float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis, in the first frame.")
     ] = 1.0,
     delta: Annotated[
-        float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen, in the first frame.")
+        float, typer.Option("--delta", metavar="DEG", help="Side δ from which the landmark is seen in the first frame.")
     ] = 0.0,
-    bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
-    height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the lens.")] = 0.0,
+    bearing: Annotated[
+        float, typer.Option("--bearing", metavar="DEG", help="Azimuth of the landmark in the camera frame.")
+    ] = 0.0,
+    height: Annotated[
+        float, typer.Option("--height", metavar="M", help="Height of the landmark's origin above the lens.")
+    ] = 0.0,
     pitch: Pitch = 0.0,
     roll: Roll = 0.0,
     wall: Wall = None,
     floor: Floor = None,
     moving: Annotated[
-        bool, typer.Option("--moving/--still", help="Whether D and δ change evenly until the last frame.")
+        bool, typer.Option("--moving/--still", help="Change D and δ evenly until the last frame.")
     ] = False,
     to_distance: Annotated[
         float | None,
@@ -180,7 +184,7 @@ def frames_simulate(
     to_delta: Annotated[
         float | None, typer.Option("--to-delta", metavar="DEG", help="With --moving, δ in the last frame; 40 more.")
     ] = None,
-    n_frames: Annotated[int, typer.Option("--frames", min=1, help="How many frames.")] = 20,
+    n_frames: Annotated[int, typer.Option("--frames", min=1, help="Number of frames.")] = 20,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:

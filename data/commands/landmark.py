@@ -47,7 +47,7 @@ def landmark_show(
         str,
         typer.Argument(metavar="NAME|FILE", help="A class, or an STL, PLY, OBJ or OFF file.", autocompletion=a_class),
     ],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for NAME.png and NAME.html.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder that NAME.png and NAME.html go to.")] = None,
     mesh_reading: MeshReading,
     force: Force = False,
 ) -> None:

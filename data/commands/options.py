@@ -69,7 +69,8 @@ Quantity = Annotated[
     ),
 ]
 InvalidMeans = Annotated[
-    InvalidMeansWord, typer.Option("--invalid-means", help="What an invalid pixel stands for: missing or no-return.")
+    InvalidMeansWord,
+    typer.Option("--invalid-means", help="Meaning of an invalid pixel: missing (not measured) or no-return."),
 ]
 ValidStatus = Annotated[
     list[int] | None, typer.Option("--valid-status", help="Value of 'status' that marks a valid pixel; repeatable.")
@@ -78,7 +79,10 @@ FlipH = Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")]
 FlipV = Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")]
 Rotate = Annotated[Turn, typer.Option("--rotate", help="Turn the image clockwise by 0, 90, 180 or 270 degrees.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue an unfinished run of the same plan.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Say how large it would be and how long it would take.")]
+DryRun = Annotated[
+    bool,
+    typer.Option("--dry-run", help="Print how large the file would be and how long it would take, and build nothing."),
+]
 Scheduler = Annotated[
     str, typer.Option("--scheduler", metavar="WHERE", help="threads, local:N processes, or a Dask scheduler's address.")
 ]
@@ -89,7 +93,7 @@ ShardItems = Annotated[
 MaxSize = Annotated[
     str, typer.Option("--max-size", metavar="SIZE", help="Refuse to write a larger file, e.g. 500MB or 20GB.")
 ]
-Sample = Annotated[int, typer.Option("--sample", min=0, help="How many random items to render again.")]
+Sample = Annotated[int, typer.Option("--sample", min=0, help="Number of random items that are rendered again.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")]
 Workers = Annotated[int | None, typer.Option("--workers", min=1, help="Threads; the result does not depend on it.")]
 

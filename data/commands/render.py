@@ -33,9 +33,15 @@ def render_frame(
     distance: Annotated[
         float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")
     ] = 1.0,
-    delta: Annotated[float, typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen.")] = 0.0,
-    bearing: Annotated[float, typer.Option("--bearing", metavar="DEG", help="Its azimuth in the camera.")] = 0.0,
-    height: Annotated[float, typer.Option("--height", metavar="M", help="Its height above the lens.")] = 0.0,
+    delta: Annotated[
+        float, typer.Option("--delta", metavar="DEG", help="Side δ from which the landmark is seen.")
+    ] = 0.0,
+    bearing: Annotated[
+        float, typer.Option("--bearing", metavar="DEG", help="Azimuth of the landmark in the camera frame.")
+    ] = 0.0,
+    height: Annotated[
+        float, typer.Option("--height", metavar="M", help="Height of the landmark's origin above the lens.")
+    ] = 0.0,
     pitch: Pitch = 0.0,
     roll: Roll = 0.0,
     class_name: Annotated[
@@ -50,7 +56,7 @@ def render_frame(
         Literal["exact", "hard"],
         typer.Option(
             "--variant",
-            help="exact, or hard: what the centre ray of each pixel sees, nothing mixed.",
+            help="exact: the exact integral; hard: the centre ray of each pixel alone.",
         ),
     ] = "exact",
     force: Force = False,

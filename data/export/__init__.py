@@ -62,6 +62,7 @@ def export_frames(
     Parameters
     ----------
     frames : FrameSet
+        The frame set.
     path : path-like
         The file, or for ``png16``, ``ply``, ``bop`` and ``rosbag`` the folder, to write.
     to : {"npz", "csv", "jsonl", "png16", "ply", "bop", "rosbag"}

@@ -31,6 +31,7 @@ def mesh_sha256(mesh: trimesh.Trimesh) -> str:
     Parameters
     ----------
     mesh : trimesh.Trimesh
+        The mesh, metres.
 
     Returns
     -------

@@ -58,6 +58,7 @@ def build_frames(
     Parameters
     ----------
     plan : FramePlan
+        Plan of the frame set.
     path : path-like
         The file to write; ``FILE.sha256`` goes beside it.
     force, resume, workers, scheduler

@@ -66,18 +66,24 @@ class FrameSet:
     Parameters
     ----------
     path : Path
+        The file.
     file : h5py.File
         The file, open for reading and checked.
 
     Attributes
     ----------
     path : Path
+        The file.
     plan : FramePlan
         The resolved plan.
     sensor : Sensor
+        The camera.
     classes : tuple of str
+        Names of the classes, in the order of their numbers.
     splits : tuple of str
+        Names of the splits, in the order of their numbers.
     versions : dict of str to str
+        Versions of the program and its libraries that wrote the file.
     truth : dict of str to (views,) array
         ``class_index``, ``distance_m``, ``delta_rad``, ``bearing_rad``, ``height_m``, ``pitch_rad``,
         ``roll_rad``, ``albedo``, ``wall_m``, ``floor_m``, ``split_index``.
@@ -477,6 +483,7 @@ class FrameSubset:
     Parameters
     ----------
     frames : FrameSet
+        The frame set.
     numbers : (n,) int array
         Which frames, in which order.
     transform : callable, optional
@@ -523,6 +530,7 @@ def open_frames(path: str | os.PathLike[str], *, untrusted: bool = False) -> Fra
     Parameters
     ----------
     path : path-like
+        The file.
     untrusted : bool
         Whether a child process with limits reads the file first, unless ``FILE.sha256`` vouches for it.
 
@@ -552,6 +560,7 @@ def is_frame_set(path: str | os.PathLike[str]) -> bool:
     Parameters
     ----------
     path : path-like
+        The file.
 
     Returns
     -------

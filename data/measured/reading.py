@@ -109,6 +109,7 @@ def read_frames(
     Parameters
     ----------
     path : path-like
+        The file.
     sensor : Sensor
         The camera that took the frames.
     unit : {"m", "cm", "mm"}
@@ -327,7 +328,9 @@ def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool 
     Parameters
     ----------
     frames : Frames
+        The frames.
     path : path-like
+        The file.
     force : bool
         Whether an existing file may be replaced.
 

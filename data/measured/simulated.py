@@ -70,12 +70,15 @@ def simulate_recording(
     mesh : trimesh.Trimesh
         The landmark.
     class_name : str
+        Name of the class.
     sensor : Sensor
+        The camera.
     views : Views
         One view a frame; a camera at rest has the same each time.
     seed : int
         Root of the noise.
     albedo : float
+        Share of light that the landmark returns.
     background : Background, optional
         As seen from the first view.
 
@@ -143,6 +146,7 @@ def write_recording(
     Parameters
     ----------
     recording : SimulatedRecording
+        Frames with their views.
     path : path-like
         Its suffix gives the form: .csv, .npz or .h5.
     description : str

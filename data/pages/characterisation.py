@@ -61,6 +61,7 @@ def write_characterisation(
     Parameters
     ----------
     found : Characterisation
+        Result of :func:`phasemark.render.characterise`.
     name : str
         What the sensor is called: preset or file.
     folder : Path
@@ -103,6 +104,7 @@ def summary_sentences(found: Characterisation, name: str) -> list[str]:
     Parameters
     ----------
     found : Characterisation
+        Result of :func:`phasemark.render.characterise`.
     name : str
         What the sensor is called.
 

@@ -403,6 +403,7 @@ def read_bank_plan(path: str | os.PathLike[str]) -> BankPlan:
     Parameters
     ----------
     path : path-like
+        The file.
 
     Returns
     -------
@@ -424,6 +425,7 @@ def read_plan(path: str | os.PathLike[str], model: type[P]) -> P:
     Parameters
     ----------
     path : path-like
+        The file.
     model : type
         :class:`BankPlan` or :class:`phasemark.data.FramePlan`.
 

@@ -66,6 +66,7 @@ def format_grid(values: NDArray[np.float64] | Sequence[float]) -> str:
     Parameters
     ----------
     values : sequence of float
+        Values of the grid, increasing.
 
     Returns
     -------

@@ -40,6 +40,7 @@ def planned_size(plan: BankPlan | FramePlan) -> dict[str, int]:
     Parameters
     ----------
     plan : BankPlan or FramePlan
+        Plan of the bank or frame set.
 
     Returns
     -------

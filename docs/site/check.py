@@ -18,7 +18,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from public_names import public_names
+from public_names import described_at, public_names
 
 WIDTHS_PX = (390, 1280)
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -127,7 +127,7 @@ def faults_of_names(site: Path, pages: dict[Path, Page]) -> Iterator[str]:
     for module, names in public_names().items():
         path = (site / "reference" / f"{module}.html").resolve()
         for name in names:
-            if path not in pages or f"{module}.{name}" not in pages[path].anchors:
+            if path not in pages or described_at(module, name) not in pages[path].anchors:
                 yield f"reference: {module}.{name} is not described"
 
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import itertools
 import json
 import re
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from markdown_dialect import without_roles
-from public_names import public_names
+from public_names import described_at, public_names
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data.plans.frame_plan import SPREAD_SCHEMA, Distribution
@@ -61,14 +63,34 @@ def reference_page(*, linked: bool) -> str:
         heading = f"[{module}]({reference_path(module)})" if linked else module
         lines += [f"## {heading}", "", first_line(thing), "", "| name | what it is |", "|---|---|"]
         for name in names:
-            label = f"[`{name}`]({reference_path(module)}#{module}.{name})" if linked else f"`{name}`"
-            lines.append(f"| {label} | {_described(getattr(thing, name))} |")
+            label = f"[`{name}`]({reference_path(module)}#{described_at(module, name)})" if linked else f"`{name}`"
+            lines.append(f"| {label} | {_described(thing, name)} |")
         lines.append("")
     return "\n".join(lines)
 
 
-def _described(value: object) -> str:
-    return first_line(value) if callable(value) else "A constant."
+def _described(module: ModuleType, name: str) -> str:
+    """Return the first sentence of what a public name is; a constant has it in the text below its assignment."""
+    value = getattr(module, name)
+    if callable(value):
+        return first_line(value)
+    for path in (ROOT / room for room in _sources(module)):
+        body = ast.parse(path.read_text(encoding="utf-8")).body
+        for statement, after in itertools.pairwise(body):
+            targets = statement.targets if isinstance(statement, ast.Assign) else [getattr(statement, "target", None)]
+            if any(isinstance(target, ast.Name) and target.id == name for target in targets):
+                if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+                    text = str(after.value.value).split("\n\n")[0]
+                    return without_roles(" ".join(text.split())).replace("|", "\\|")
+    return ""
+
+
+def _sources(module: ModuleType) -> list[str]:
+    """Return the files in which a public name of a module may be assigned."""
+    place = module.__name__.removeprefix("phasemark").lstrip(".").replace(".", "/")
+    folder = ROOT / place
+    files = sorted(folder.rglob("*.py")) if folder.is_dir() and place else [folder.with_suffix(".py")]
+    return [str(path.relative_to(ROOT)) for path in files]
 
 
 def reference_pages() -> dict[str, str]:
@@ -76,8 +98,8 @@ def reference_pages() -> dict[str, str]:
     pages = {}
     for module, names in public_names().items():
         thing = importlib.import_module(module)
-        rows = [f"| [`{name}`](#{module}.{name}) | {_described(getattr(thing, name))} |" for name in names]
-        body = [line for name in names for line in (f"::: {module}.{name}", "")]
+        rows = [f"| [`{name}`](#{described_at(module, name)}) | {_described(thing, name)} |" for name in names]
+        body = [line for name in names for line in (f"::: {described_at(module, name)}", "")]
         head = [f"# {module}", "", first_line(thing), "", "| name | what it is |", "|---|---|", *rows, ""]
         pages[reference_path(module)] = "\n".join([*head, *body])
     return pages

@@ -50,6 +50,17 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return for_site(with_site_links(markdown, root=False))
 
 
+_EMPTY_DESCRIPTION = re.compile(r"\s*–\s*(?=(<div[^>]*>\s*</div>\s*)?</li>)")
+"""The dash behind a type that has no description."""
+
+
+def _with_breaks(cell: re.Match[str]) -> str:
+    """Let long code in a cell of a table break behind its separators, so that the table fits on a phone."""
+    return re.sub(
+        r"(?<=<code>)[^<]+(?=</code>)", lambda code: re.sub(r"(?<=\w)([|_/.,:])(?=\w)", r"\1<wbr>", code[0]), cell[0]
+    )
+
+
 def _sections_of_physics() -> dict[str, str]:
     """Return the anchors of physics.md by the numbers of its sections."""
     headings = re.findall(
@@ -61,6 +72,8 @@ def _sections_of_physics() -> dict[str, str]:
 def on_page_content(html: str, page: Any, **_: Any) -> str:
     """Drop the marks of Sphinx from docstrings, and let what cites physics.md lead there."""
     html = without_roles(html, code=("<code>", "</code>"))
+    html = re.sub(r"(?<=<td>).*?(?=</td>)", _with_breaks, html, flags=re.DOTALL)
+    html = _EMPTY_DESCRIPTION.sub("", html)
     anchors = _sections_of_physics()
     root = "../" * page.url.count("/")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import pkgutil
 
 import phasemark
@@ -29,3 +30,21 @@ def public_names() -> dict[str, list[str]]:
             found[place] = sorted({*found.get(place, []), *names})
     order = sorted(name for name in found if found[name] and name not in ROOMS)
     return {name: [each for each in found[name] if each != "__version__"] for name in (*ROOMS, *order)}
+
+
+def described_at(module: str, name: str) -> str:
+    """Return the dotted name under which the site describes a public name.
+
+    It is the place of import, unless a module of the same name lies there: then the place where the name is defined.
+
+    Parameters
+    ----------
+    module, name : str
+
+    Returns
+    -------
+    str
+    """
+    place = f"{module}.{name}"
+    known = inspect.getattr_static(importlib.import_module(module), name, None)
+    return f"{place}.{name}" if getattr(known, "__module__", None) == place else place

@@ -97,14 +97,17 @@ def cramer_rao(
     renderer : Renderer or HistogramRenderer
         The landmark and the camera.
     views : Views
+        Views of the landmark.
     free : sequence of str
         Parameters of the view to be estimated; the others are known.
     n_frames : array_like
         Frames that were averaged; broadcasts against (n, rows, cols).
     on : {"ranges", "phasors"}
+        What is compared: ranges, or phasors with the albedo unknown.
     pixels : {"all", "lower"} or (rows, cols) or (n, rows, cols) bool
         Which pixels may count: "lower" the lower half of the rows; an array is taken as it is.
     background : Background, optional
+        Wall and floor; nothing stands behind the landmark without it.
     nuisances : sequence of str, optional
         Which of :data:`NUISANCES` are unknown too; None: the albedo on phasors, nothing on ranges.
     systematic : collection of {"calibration", "declared"}

@@ -34,6 +34,7 @@ class AccuracyCard:
     Parameters
     ----------
     views : Views
+        Views of the landmark.
     free : tuple of str
         Parameters of the view that are estimated, in the order of the matrices.
     n_frames : int
@@ -154,9 +155,11 @@ def sides_of(distance_m: float, period_rad: float, n: int = _SIDES) -> Views:
     Parameters
     ----------
     distance_m : float
+        Distance D, metres.
     period_rad : float
         After which the landmark looks the same.
     n : int
+        Number of sides.
 
     Returns
     -------
@@ -185,6 +188,7 @@ def accuracy_card(
     renderer : Renderer
         The landmark and the camera.
     views : Views
+        Views of the landmark.
     others : mapping of str to Renderer, optional
         Other classes before the same camera, for the class error.
     n_frames : int
@@ -192,6 +196,7 @@ def accuracy_card(
     free : sequence of str
         Parameters that are estimated, distance_m and delta_rad among them.
     background : Background, optional
+        Wall and floor; nothing stands behind the landmark without it.
 
     Returns
     -------

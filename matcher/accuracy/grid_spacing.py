@@ -64,19 +64,26 @@ class GridLoss:
 
     Parameters
     ----------
-    views, frames : int
-        How many views were matched; how many frames' noise they were weighed with.
+    views : int
+        Number of views that were matched.
+    frames : int
+        Number of frames whose averaged noise weighs the views.
     nearest : SpacingLoss
-        For the nearest image.
+        Error added to the nearest image.
     refined : SpacingLoss or None
-        For the maximum likelihood in between; None for a bank of the planar generator, which cannot be refined.
-    mismatch_median, mismatch_99 : float
-        Median and 99th percentile of 1 − ⟨S, S_bank⟩ / (|S| |S_bank|), the share of the view's signal that the nearest
-        image leaves unexplained, in phasors whitened by the noise.
-    suggested_distance_m, suggested_delta_deg : float or None
-        Steps at which a view amid four images of the grid is one standard deviation of the noise from them, half of its
-        square due to each step: √2 over the root of the Fisher information of the ranges that the nearest image is
-        chosen by, in the median over the views. None where nothing depends on the parameter.
+        Error added to maximum likelihood; None for a bank of the planar generator, which cannot be refined.
+    mismatch_median : float
+        Median of 1 − ⟨S, S_bank⟩ / (|S| |S_bank|), the share of the view's signal that the nearest image leaves
+        unexplained, in phasors whitened by the noise.
+    mismatch_99 : float
+        99th percentile of the same share.
+    suggested_distance_m : float or None
+        Step in distance, metres: √2 over the root of the Fisher information of the ranges that the nearest image is
+        chosen by, in the median over the views. With both suggested steps, a view amid four images of the grid is one
+        standard deviation of the noise from them, half of its square due to each step. None where nothing depends on
+        the distance.
+    suggested_delta_deg : float or None
+        Step in δ, degrees, by the same rule.
     """
 
     views: int

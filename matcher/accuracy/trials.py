@@ -42,6 +42,7 @@ class TrialSetup:
     n_frames : int
         Frames that are filtered.
     background : Background, optional
+        Wall and floor; nothing stands behind the landmark without it.
     on : {"ranges", "phasors"}
         On phasors frames are taken without a validity threshold and averaged coherently: a threshold would let only
         the brighter ones of a weak pixel count.
@@ -90,6 +91,7 @@ class Trials:
     views : Views
         The truth.
     free : tuple of str
+        Names of the parameters that are estimated.
     error : (n, p) float64
         Estimate less truth, δ wrapped by the symmetry; NaN where no landmark was found.
     bound : (n, p, p) float64
@@ -99,7 +101,9 @@ class Trials:
     found : (n,) object
         Class names found.
     accepted : (n,) bool
+        Whether the test of the fit accepts the match.
     p_value : (n,) float64
+        p-value of the fit.
     """
 
     class_name: str
@@ -202,6 +206,7 @@ class Trials:
         step : (distance_m, delta_rad)
             Steps of the grid.
         bins : int
+            Number of bins over a cell of the grid.
 
         Returns
         -------
@@ -225,9 +230,11 @@ class TrialSummary:
     Parameters
     ----------
     n : int
+        Number of trials.
     ratio : dict of str to Interval
         √mean(e²/CRLB²) without outliers, by parameter.
     ratio_with_outliers : dict of str to Interval
+        RMSE over the bound of each parameter, outliers included.
     bias : dict of str to Interval
         Mean error in units of the bound.
     nees : Interval
@@ -305,8 +312,11 @@ def run_trials(
     class_name : str
         What the matcher calls it.
     setup : TrialSetup
+        What the trials have in common.
     n : int
+        Number of trials.
     rng : numpy.random.Generator
+        Source of the random numbers.
     symmetry : int
         Of the landmark.
     choose : callable, optional

@@ -257,6 +257,7 @@ def calibrate(
         One for each pose; their sensor is the camera before the calibration. For phasors best from
         :func:`~phasemark.matcher.phasor_mean`.
     poses : KnownPoses
+        Known poses of the camera.
     free : sequence of str, optional
         What to estimate: :data:`NAMES`, and of a sensor with a lens fx, fy, cx, cy and the coefficients that it states
         (all of them: ``lens``) in place of half angles. None: all of it but the lens. On ranges the albedo is told only

@@ -291,6 +291,7 @@ def frames_of_poses(frames: Sequence[Frames], poses: KnownPoses) -> list[Frames]
         What was read from each file, in order: one position a pose; or one position whose frames belong to all poses
         in turn, `KnownPoses.frames` each or all the same number.
     poses : KnownPoses
+        Known poses of the camera.
 
     Returns
     -------

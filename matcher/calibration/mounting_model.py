@@ -110,7 +110,9 @@ class Mounting:
     bearing_rad : float
         Azimuth of the landmark's axis in the camera frame, where a pose's own bearing is zero.
     half_angle_h_rad, half_angle_v_rad : float
+        Half of the field of view, horizontally and vertically, radians.
     range_offset_m : float
+        Constant error of all ranges, metres.
     albedo : float
         Of the landmark.
     delay_s : float
@@ -153,6 +155,7 @@ class Mounting:
         Parameters
         ----------
         theta : (21,) float64
+            The numbers in the order of the fields, metres and radians.
         sensor : Sensor
             Whose kind of lens the terms belong to, if it has one.
 

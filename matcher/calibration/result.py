@@ -56,7 +56,9 @@ class Calibration:
     chi2, dof, p_value : float, int, float
         Test of the fit.
     on : {"ranges", "phasors"}
+        What is compared: ranges, or phasors with the albedo unknown.
     poses : KnownPoses
+        Known poses of the camera.
     pose_shift : (K, 3) float64
         Estimated errors of the poses in D, δ and b; zero where poses are taken as exact.
     pose_chi2, pose_residuals : (K,) float64, (K,) int64

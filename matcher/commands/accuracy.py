@@ -26,7 +26,7 @@ def accuracy_line(
     *,
     delta: Annotated[
         float | None,
-        typer.Option("--delta", metavar="DEG", help="Side δ from which it is seen; all sides unless given."),
+        typer.Option("--delta", metavar="DEG", help="Side δ from which the landmark is seen; all sides unless stated."),
     ] = None,
     class_name: Annotated[
         str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=a_class)

@@ -96,21 +96,25 @@ def calibrate_camera(
         typer.Option("--zones/--no-zones", help="Offsets of zones and noise law of a direct sensor; with --moving."),
     ] = None,
     position_std: Annotated[
-        float | None, typer.Option("--position-std", metavar="M", help="How well the places of the lens are known.")
+        float | None,
+        typer.Option("--position-std", metavar="M", help="Standard deviation of the coordinates of the lens."),
     ] = None,
     heading_std: Annotated[
-        float | None, typer.Option("--heading-std", metavar="DEG", help="How well the camera's headings are known.")
+        float | None, typer.Option("--heading-std", metavar="DEG", help="Standard deviation of the camera's headings.")
     ] = None,
     delta_std: Annotated[
-        float | None, typer.Option("--delta-std", metavar="DEG", help="How well the landmark is turned to its side.")
+        float | None,
+        typer.Option(
+            "--delta-std", metavar="DEG", help="Standard deviation of the side δ that the landmark was turned to."
+        ),
     ] = None,
     landmark_xy: Annotated[
-        tuple[float, float], typer.Option("--landmark-xy", metavar="X Y", help="Where it stands, for x_m,y_m.")
+        tuple[float, float], typer.Option("--landmark-xy", metavar="X Y", help="Place of the landmark, for x_m,y_m.")
     ] = (0.0, 0.0),
     landmark_yaw: Annotated[float, typer.Option("--landmark-yaw", metavar="DEG", help="Heading of its x' axis.")] = 0.0,
     on: Annotated[
         Literal["auto", "ranges", "phasors"],
-        typer.Option("--on", help="auto, ranges, or phasors: amplitudes too."),
+        typer.Option("--on", help="What is explained: ranges, or phasors, which use amplitudes too; auto chooses."),
     ] = "auto",
     wall: Wall = None,
     floor: Floor = None,

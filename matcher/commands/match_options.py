@@ -35,7 +35,8 @@ class Search:
     """Options for averaging and matching frames."""
 
     filter_name: Annotated[
-        Literal["kalman", "phasor-mean"], typer.Option("--filter", help="kalman or phasor-mean.")
+        Literal["kalman", "phasor-mean"],
+        typer.Option("--filter", help="How frames are averaged: kalman or phasor-mean."),
     ] = "kalman"
     method: Annotated[
         Literal["nearest", "refine"],
@@ -48,33 +49,41 @@ class Search:
         list[str] | None,
         typer.Option(
             "--free",
-            help="With refine, estimate this: bearing, height, pitch or roll; repeatable. Nothing is known of bearing"
-            " and height before; pitch and roll are near 0.",
+            help="With refine: estimate bearing, height, pitch or roll too; repeatable. Bearing and height are taken as"
+            " unknown, pitch and roll as near 0.",
             autocompletion=one_of(*_FREE),
         ),
     ] = None
     pitch_std: Annotated[
         float | None,
-        typer.Option("--pitch-std", metavar="DEG", help="With --free pitch, how level the camera is (3)."),
+        typer.Option(
+            "--pitch-std", metavar="DEG", help="With --free pitch: standard deviation of the pitch; 3 unless stated."
+        ),
     ] = None
     roll_std: Annotated[
         float | None,
-        typer.Option("--roll-std", metavar="DEG", help="With --free roll, how level the camera is (3)."),
+        typer.Option(
+            "--roll-std", metavar="DEG", help="With --free roll: standard deviation of the roll; 3 unless stated."
+        ),
     ] = None
     height_std: Annotated[
         float | None,
-        typer.Option("--height-std", metavar="M", help="With --free height, how well the height is known (not)."),
+        typer.Option(
+            "--height-std",
+            metavar="M",
+            help="With --free height: standard deviation of the height; unknown unless stated.",
+        ),
     ] = None
     fix: Annotated[
         Literal["bearing"] | None,
-        typer.Option("--fix", help="With refine, leave this at 0: bearing.", metavar="NAME"),
+        typer.Option("--fix", help="With refine: keep at 0, not estimated; only: bearing.", metavar="NAME"),
     ] = None
     bearing_std: Annotated[
         float | None,
         typer.Option(
             "--bearing-std",
             metavar="DEG",
-            help="With refine, how well the camera points at the landmark (1.5 unless --free or --fix is given).",
+            help="With refine: standard deviation of the bearing; 1.5 unless --free or --fix is given.",
         ),
     ] = None
     on: Annotated[
@@ -86,14 +95,16 @@ class Search:
     ] = "ranges"
     pixels: Annotated[
         Literal["all", "lower"],
-        typer.Option("--pixels", help="With refine, what gives the view: all or lower."),
+        typer.Option("--pixels", help="With refine: pixels that are compared, all or the lower half of the rows."),
     ] = "all"
-    robust: Annotated[bool, typer.Option("--robust", help="With refine, count residuals beyond 3 σ less.")] = False
+    robust: Annotated[bool, typer.Option("--robust", help="With refine: give residuals beyond 3 σ less weight.")] = (
+        False
+    )
     false_alarm: Annotated[
         float, typer.Option("--false-alarm", help="Share of good frames that the test of the fit may refuse.")
     ] = 0.01
     auto_background: Annotated[
-        bool, typer.Option("--auto-background", help="With refine, estimate wall and floor from each frame.")
+        bool, typer.Option("--auto-background", help="With refine: estimate wall and floor from each frame.")
     ] = False
     unknown_background: Annotated[
         bool,
@@ -208,7 +219,7 @@ class Place:
 
     landmark_xy: Annotated[
         tuple[float, float] | None,
-        typer.Option("--landmark-xy", metavar="X Y", help="Where the landmark stands, metres."),
+        typer.Option("--landmark-xy", metavar="X Y", help="Place of the landmark, metres."),
     ] = None
     landmark_yaw: Annotated[float, typer.Option("--landmark-yaw", metavar="DEG", help="Heading of its x' axis.")] = 0.0
     pan: Annotated[float, typer.Option("--pan", metavar="DEG", help="Pan angle of the camera on the robot.")] = 0.0
@@ -220,11 +231,15 @@ class Place:
     ] = None
     prior_std: Annotated[
         tuple[float, float] | None,
-        typer.Option("--prior-std", metavar="M DEG", help="How well: standard deviations of x and y, and of heading."),
+        typer.Option(
+            "--prior-std",
+            metavar="M DEG",
+            help="Standard deviations of the expected pose: of x and y, and of the heading.",
+        ),
     ] = None
     map_file: Annotated[
         Path | None,
-        typer.Option("--map", metavar="MAP", help="Where the landmarks stand (.toml), instead of --landmark-xy."),
+        typer.Option("--map", metavar="MAP", help="Map of the landmarks (.toml), instead of --landmark-xy."),
     ] = None
 
     def check(self) -> None:

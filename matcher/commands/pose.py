@@ -30,7 +30,7 @@ def pose_report_command(
         ),
     ],
     symmetry: Annotated[
-        int, typer.Option("--symmetry", min=1, help="Turns about its axis that leave the landmark as it is.")
+        int, typer.Option("--symmetry", min=1, help="Number of turns about its axis that leave the landmark as it is.")
     ] = 1,
     delay_s: Annotated[
         float, typer.Option("--delay", help="Seconds added to the stamps of the estimates, for poses by time.")

@@ -89,8 +89,10 @@ def sweep_report(
 
 def sweep_frames_again(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A sweep's folder.")],
-    condition: Annotated[int, typer.Argument(metavar="CONDITION", help="As in its trials.csv.", min=0)],
-    trial: Annotated[int, typer.Argument(metavar="TRIAL", help="As in its trials.csv.", min=0)],
+    condition: Annotated[
+        int, typer.Argument(metavar="CONDITION", help="Number of the condition in trials.csv.", min=0)
+    ],
+    trial: Annotated[int, typer.Argument(metavar="TRIAL", help="Number of the trial in trials.csv.", min=0)],
     out: Annotated[Path, typer.Option("-o", "--out", help="The noisy frames as .npz, to be matched again.")],
     force: Force = False,
 ) -> None:
@@ -107,8 +109,8 @@ def sweep_frames_again(
 
 def sweep_compare(
     first: Annotated[Path, typer.Argument(metavar="DIR1", help="A sweep's folder.")],
-    second: Annotated[Path, typer.Argument(metavar="DIR2", help="Another one's.")],
-    everything: Annotated[bool, typer.Option("--all", help="Show the differences that may be chance too.")] = False,
+    second: Annotated[Path, typer.Argument(metavar="DIR2", help="Folder of the other sweep.")],
+    everything: Annotated[bool, typer.Option("--all", help="Show differences that may be chance, too.")] = False,
     as_json: Json = False,
 ) -> None:
     """Compare two sweeps cell by cell; significant differences are marked, corrected for their number."""

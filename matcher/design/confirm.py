@@ -51,6 +51,7 @@ class Trial:
     error_m : float64
         Distance of the lens from where it is; NaN where no landmark was found.
     class_right : bool
+        Whether the class is the true one.
     """
 
     distance_m: NDArray[np.float64]
@@ -118,7 +119,9 @@ def confirm(
     Parameters
     ----------
     scored : Scored
+        The set of landmarks.
     sensor : Sensor
+        The camera.
     plan : DesignPlan
         Its seed, range and number of frames count.
     n : int
@@ -235,11 +238,13 @@ def confirm_design(
     Parameters
     ----------
     design : Design
+        The design.
     n : int
         Filtered frames at every side.
     workers : int, optional
         Threads; None: one for each processor.
     progress : callable (done, total), optional
+        Called with the work done and the work in all.
 
     Returns
     -------

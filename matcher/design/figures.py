@@ -22,6 +22,7 @@ def pareto_figure(design: Design) -> Figure:
     Parameters
     ----------
     design : Design
+        The design.
 
     Returns
     -------
@@ -90,6 +91,7 @@ def bound_figure(design: Design, confirmed: tuple[Confirmation, Confirmation] | 
     Parameters
     ----------
     design : Design
+        The design.
     confirmed : (Confirmation, Confirmation), optional
         Of the result and of the catalogue.
 

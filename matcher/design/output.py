@@ -238,9 +238,11 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
     Parameters
     ----------
     design : Design
+        The design.
     confirmed : (Confirmation, Confirmation), optional
         Of the result and of the catalogue.
     folder : Path
+        Folder that the files go to.
     force : bool
         Whether existing files may be replaced.
 

@@ -199,6 +199,7 @@ def read_design_plan(path: str | os.PathLike[str]) -> DesignPlan:
     Parameters
     ----------
     path : path-like
+        The file.
 
     Returns
     -------

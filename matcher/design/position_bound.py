@@ -27,8 +27,11 @@ class RangeBound:
     Parameters
     ----------
     distance_m : (n,) float64
+        Distances, metres.
     delta_rad : (k,) float64
+        Viewing angles, radians.
     distance_std_m, delta_std_rad : (n, k) float64
+        Cramér–Rao bounds of distance and angle, metres and radians.
     pixels : (n, k) int64
         How many lower pixels count.
     """
@@ -81,9 +84,13 @@ def range_bound(
     Parameters
     ----------
     spec : LandmarkSpec
+        The landmark.
     sensor : Sensor
+        The camera.
     plan : DesignPlan
+        Plan of the design.
     distance_m, delta_rad : (n,), (k,) float64, optional
+        Distances and angles, metres and radians; those of the plan's sampling if left out.
     tolerance_m : float
         Of the tessellation.
     workers : int

@@ -32,8 +32,11 @@ class Check:
     Parameters
     ----------
     rule : str
+        Name of the rule.
     value, limit : float
+        Value of the landmark, and the rule's limit.
     unit : str
+        Unit of value and limit.
     at_most : bool
         Whether the limit is the largest value allowed, or the least.
     """
@@ -77,7 +80,9 @@ class AllowedDimensions:
     Parameters
     ----------
     plan : DesignPlan
+        Plan of the design.
     sensor : Sensor
+        The camera.
     """
 
     plan: DesignPlan

@@ -23,9 +23,11 @@ def run_design(plan: DesignPlan, *, workers: int | None = None, progress: Progre
     Parameters
     ----------
     plan : DesignPlan
+        Plan of the design.
     workers : int, optional
         Threads that render; None: one for each processor.
     progress : callable (done, total), optional
+        Called with the work done and the work in all.
 
     Returns
     -------

@@ -43,6 +43,7 @@ class Candidate:
     Parameters
     ----------
     box : Box
+        Lower part of the landmarks.
     bound : RangeBound
         Of the box, lower pixels.
     uppers : tuple of int
@@ -50,6 +51,7 @@ class Candidate:
     class_distance : float
         Least d between two of them; infinite for one class, 0 if the box does not carry that many.
     turn_distance : float
+        Noncentrality between the box and itself a quarter-turn on.
     checks : tuple of Check
         The rules, those that need images included.
     refined : bool
@@ -82,11 +84,13 @@ class Scored:
     Parameters
     ----------
     specs : tuple of LandmarkSpec
+        Landmarks of the set.
     bound : RangeBound
         Of the box.
     class_distances : (n, n) float64
         d of each pair at the worst distance, infinite on the diagonal.
     turn_distance : float
+        Noncentrality between the box and itself a quarter-turn on.
     checks : dict of str to tuple of Check
         The rules by landmark.
     """
@@ -301,12 +305,15 @@ class Design:
     Parameters
     ----------
     plan : DesignPlan
+        Plan of the design.
     candidates : tuple of Candidate
         Every box with its set, refined ones last.
     chosen : Candidate
+        The set that was chosen.
     result, catalogue : Scored
         The set that was found, and the catalogue by the same measure.
     search : Search
+        All candidates that were tried.
     """
 
     plan: DesignPlan

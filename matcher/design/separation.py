@@ -100,6 +100,7 @@ def choose_far_apart(distance: NDArray[np.float64], n: int) -> NDArray[np.int64]
     distance : (m, m) float64
         Symmetric, infinite on the diagonal.
     n : int
+        Number of landmarks.
 
     Returns
     -------

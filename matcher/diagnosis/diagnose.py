@@ -250,6 +250,7 @@ def diagnose(
     matcher : Matcher
         The one that refused.
     frames : FilteredFrames
+        Filtered frames.
     index : int
         Which of them.
     background : Background, optional

@@ -34,6 +34,7 @@ def drive_figure(drive: Drive) -> Figure:
     Parameters
     ----------
     drive : Drive
+        The drive.
 
     Returns
     -------
@@ -68,6 +69,7 @@ def drive_animation(drive: Drive) -> bytes:
     Parameters
     ----------
     drive : Drive
+        The drive.
     """
     figure = Figure(figsize=(9.0, 4.8), layout="constrained")
     canvas = FigureCanvasAgg(figure)

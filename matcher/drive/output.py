@@ -74,7 +74,9 @@ def write_drive(drive: Drive, folder: Path, *, force: bool = False) -> list[Path
     Parameters
     ----------
     drive : Drive
+        The drive.
     folder : Path
+        Folder that the files go to.
     force : bool
         Whether existing files may be replaced.
 

@@ -235,6 +235,7 @@ def read_drive_plan(path: str | os.PathLike[str]) -> DrivePlan:
     Parameters
     ----------
     path : path-like
+        The file.
 
     Returns
     -------

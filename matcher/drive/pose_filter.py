@@ -25,8 +25,11 @@ class PoseFilter:
     Parameters
     ----------
     pose : (x, y, heading)
+        Pose at the start, metres and radians.
     pose_covariance : (3, 3) float64
+        Covariance of that pose.
     model : OdometryModel
+        Errors of wheels and gyro.
     gate : float
         Measurements as improbable as 1 − gate are refused.
 
@@ -35,6 +38,7 @@ class PoseFilter:
     state : (5,) float64
         In the order of :data:`~phasemark.matcher.drive.odometry.STATE`.
     covariance : (5, 5) float64
+        Covariance of pose, slip and gyro bias.
     """
 
     def __init__(

@@ -40,8 +40,10 @@ class Stop:
 
     Parameters
     ----------
-    time_s, way_m : float
-        When the frames were all taken, and what the wheels had turned by then.
+    time_s : float
+        Time at which all frames were taken, seconds.
+    way_m : float
+        Way that the wheels had turned by then, metres.
     landmark : MappedLandmark
         Which one the robot stopped for.
     predicted_across_std_m : float
@@ -51,9 +53,11 @@ class Stop:
     pan_rad : float
         Which the pan unit was told.
     match : Match
+        Match of the frames at the stop.
     measured : (3,) float64, or None
         The robot's pose after the match, of all solutions the one nearest to what the filter believed.
     measured_covariance : (3, 3) float64, or None
+        Covariance of the measured pose; None if the match was refused.
     distance_squared : float
         Its squared Mahalanobis distance from that belief.
     used : bool
@@ -61,6 +65,7 @@ class Stop:
     true, before, after : (3,) float64
         The true pose, and the filter's before and after the correction.
     covariance_before, covariance_after : (3, 3) float64
+        Covariance of the pose before and after the correction.
     range_m : (rows, cols) float64
         The filtered frame.
     """
@@ -91,14 +96,23 @@ class Drive:
     Parameters
     ----------
     plan : DrivePlan
+        Plan of the drive.
     seed : int
-    time_s, way_m : (n,) float64
-        At every step, and what the wheels had turned by then.
-    true, dead_reckoned, corrected : (n, 3) float64
-        The true pose; that of the odometry alone; the filter's.
+        Seed of the drive.
+    time_s : (n,) float64
+        Time of every step, seconds.
+    way_m : (n,) float64
+        Way that the wheels had turned by then, metres.
+    true : (n, 3) float64
+        True pose.
+    dead_reckoned : (n, 3) float64
+        Pose from the odometry alone.
+    corrected : (n, 3) float64
+        Pose of the filter, corrected at the stops.
     covariance : (n, 3, 3) float64
-        Of the corrected pose.
+        Covariance of the corrected pose.
     stops : tuple of Stop
+        Stops at landmarks, in order.
     """
 
     plan: DrivePlan
@@ -159,8 +173,11 @@ class RobotEquipment:
     Parameters
     ----------
     sensor : Sensor
+        The camera.
     matcher : Matcher
+        Matcher of the frames at stops.
     renderers : dict of str to Renderer
+        Renderer of each class.
     """
 
     sensor: Sensor
@@ -174,6 +191,7 @@ class RobotEquipment:
         Parameters
         ----------
         plan : DrivePlan
+            Plan of the drive.
         workers : int, optional
             Threads; None: one for each processor.
 
@@ -231,6 +249,7 @@ def run_drive(
     Parameters
     ----------
     plan : DrivePlan
+        Plan of the drive.
     seed : int
         Of everything random.
     equipment : RobotEquipment, optional

@@ -66,6 +66,7 @@ class FilteredFrames:
         How many frames the result is worth, R / P: the number of valid frames where every frame counts alike.
         0 unless the state is RETURN.
     sensor : Sensor
+        The camera.
     std_from_scatter : bool
         True if `std_m` was estimated from the scatter of the frames themselves, with n − 1 degrees of freedom, rather
         than predicted from amplitude and intensity: tests then need F, not χ².

@@ -124,7 +124,9 @@ class LandmarkMap(PlanModel):
         Parameters
         ----------
         xy_m : (x, y)
+            Where the ray starts, metres.
         heading_rad : float
+            Direction of the ray, radians.
         """
         if not self.room_m:
             return None
@@ -196,7 +198,9 @@ class Placement:
     Parameters
     ----------
     landmark : MappedLandmark
+        The landmark of the map.
     pose : RobotPose
+        Pose of the robot that follows.
     """
 
     landmark: MappedLandmark
@@ -209,6 +213,7 @@ def read_landmark_map(path: str | os.PathLike[str]) -> LandmarkMap:
     Parameters
     ----------
     path : path-like
+        The file.
 
     Returns
     -------

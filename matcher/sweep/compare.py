@@ -25,10 +25,13 @@ class Difference:
     Parameters
     ----------
     condition : Condition
+        The condition.
     method : str
+        Name of the method.
     quantity : str
         ``rmse distance_m`` or ``class_right``, for instance.
     first, second : float
+        RMSE in the first and in the second sweep.
     p_value : float
         Two-sided, not corrected.
     significant : bool
@@ -57,6 +60,7 @@ def compare_cells(first: Sequence[Cell], second: Sequence[Cell]) -> tuple[Differ
     Parameters
     ----------
     first, second : sequence of Cell
+        Cells of the two sweeps.
 
     Returns
     -------

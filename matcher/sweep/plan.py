@@ -429,6 +429,7 @@ def read_sweep_plan(name_or_file: str | os.PathLike[str]) -> SweepPlan:
     Parameters
     ----------
     name_or_file : str or path-like
+        Name of a shipped sweep, or a plan file.
 
     Returns
     -------

@@ -39,14 +39,19 @@ class SweepTrials:
     Parameters
     ----------
     conditions : tuple of Condition
+        Conditions of the design.
     methods : tuple of str
+        Names of the methods.
     free : tuple of tuple of str
         What each method estimates.
     classes : tuple of str
+        Names of the classes, in the order of their numbers.
     symmetry : tuple of int
         Of each class.
     outlier : (metres, degrees)
+        Limits beyond which an error counts as an outlier.
     condition, trial : (n,) int64
+        Numbers of the condition and of the trial.
     truth : (n, p) float64
         distance_m, delta_rad, bearing_rad, height_m, and with a tilt pitch_rad, roll_rad.
     confusion : (n,) float64
@@ -56,9 +61,11 @@ class SweepTrials:
     bound, covariance : (n, m, p, p) float64
         NaN where a parameter is not estimated, and where a method has no covariance.
     chi2, p_value, p_none, seconds : (n, m) float64
+        χ², p-value, probability of "no landmark", and time of a match in seconds.
     dof, found, modes : (n, m) int64
         `found` is the class's number, −1 for none.
     accepted : (n, m) bool
+        Whether the method accepted its match.
     """
 
     conditions: tuple[Condition, ...]
@@ -235,8 +242,11 @@ class Cell:
     number : int
         Of the condition in the design.
     condition : Condition
+        The condition.
     method : str
+        Name of the method.
     free : tuple of str
+        Names of the parameters that are estimated.
     n : int
         Trials.
     stranger : bool
@@ -254,6 +264,7 @@ class Cell:
     bias, rmse : dict of str to Interval
         Of the answered trials that are no outliers.
     rmse_with_outliers : dict of str to Interval
+        RMSE of each parameter, outliers included.
     bound : dict of str to float
         Cramér–Rao bound on the standard deviation, root mean square over the true views.
     ratio : dict of str to Interval

@@ -54,6 +54,7 @@ def run_sweep(
     Parameters
     ----------
     plan : SweepPlan
+        Plan of the sweep.
     folder : path-like
         Gets ``plan.json``, ``trials-000.h5`` (a file for each round), ``trials.csv``, ``cells.csv``, ``sweep.json``.
     workers : int, optional
@@ -146,6 +147,7 @@ def read_sweep(folder: str | os.PathLike[str]) -> tuple[SweepPlan, SweepTrials]:
     Parameters
     ----------
     folder : path-like
+        Folder of a sweep.
 
     Returns
     -------

@@ -168,6 +168,7 @@ def detected_counts(signal: NDArray[np.float64], sensor: Sensor) -> NDArray[np.f
     signal : (..., zones, bins) float64
         From :func:`signal_counts`, or their sum over parts of a scene.
     sensor : Sensor
+        The camera.
 
     Returns
     -------
@@ -192,6 +193,7 @@ def piled_up(counts: NDArray[np.float64], cycles: float) -> NDArray[np.float64]:
     counts : (..., bins) float64
         Expected counts λ if every photon were counted.
     cycles : float
+        Laser pulses of a frame.
     """
     before = np.cumsum(counts, axis=-1) - counts
     return np.asarray(-cycles * np.exp(-before / cycles) * np.expm1(-counts / cycles))

@@ -55,8 +55,11 @@ class DirectFit:
     Parameters
     ----------
     sensor : Sensor
+        The camera.
     parameters : Parameters
+        Fitted numbers.
     responses : Responses
+        Response of each zone.
     crosstalk : Crosstalk
         Of the sensor's window.
     std : dict of str to float
@@ -64,6 +67,7 @@ class DirectFit:
     reduced_chi2 : (zones,) float64
         χ²/ν of each zone's plane histograms with Poisson noise alone.
     model : FitModel
+        Model of the histograms.
     """
 
     sensor: Sensor
@@ -208,6 +212,7 @@ def score_zone_orders(logged: ObjectRecording, base: Sensor) -> dict[str, float]
     logged : ObjectRecording
         Its zones in the order of the log.
     base : Sensor
+        The camera, whose order of zones is replaced.
     """
     axis = range_axis(base, longest_m=1.5)
     samples = SceneMesh(logged.mesh).samples(world2cam(logged.sensor2world), footprint_grid(base))

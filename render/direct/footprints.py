@@ -121,6 +121,7 @@ def footprint_grid(sensor: Sensor, margin_cells: int = 0, cells: int | None = No
     Parameters
     ----------
     sensor : Sensor
+        The camera.
     margin_cells : int
         Further cells on each side.
     cells : int, optional

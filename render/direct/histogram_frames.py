@@ -48,7 +48,7 @@ class HistogramFrames:
     """
 
     figure: ClassVar[Callable[..., Figure]]
-    """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
+    """Function that draws it; the package sets it, because drawing imports matplotlib, which takes half a second."""
 
     def __init__(
         self,
@@ -200,6 +200,7 @@ def capture_histograms(
     expected : (n, zones, bins) array_like
         From :func:`~phasemark.render.direct.expected_counts`.
     sensor : Sensor
+        The camera.
     rng : numpy.random.Generator
         Source of all noise; it is advanced by the same amount whatever is captured.
     n_frames : int

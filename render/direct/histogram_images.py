@@ -42,11 +42,13 @@ class HistogramImages:
     signal : (n, rows, cols) float64
         Counts of the landmark and what stands behind it, all bins together, without pile-up.
     sensor : Sensor
+        The camera.
     views : Views
+        Views of the landmark.
     """
 
     figure: ClassVar[Callable[..., Figure]]
-    """Draws it; given by the package, for what draws imports matplotlib, which takes half a second to load."""
+    """Function that draws it; the package sets it, because drawing imports matplotlib, which takes half a second."""
 
     expected: NDArray[np.float64]
     signal: NDArray[np.float64]
@@ -73,6 +75,7 @@ class HistogramRenderer:
     albedo : float
         Of the Lambertian landmark, in (0, 1].
     intersector : {"auto", "embree", "float64"}
+        Library that traces rays, as for :class:`~phasemark.render.Renderer`.
 
     Raises
     ------
@@ -167,8 +170,11 @@ class HistogramRenderer:
         Parameters
         ----------
         views : Views
+            Views of the landmark.
         background : Background, optional
+            Wall and floor; nothing stands behind the landmark without it.
         workers : int
+            Number of threads.
 
         Returns
         -------
@@ -210,6 +216,7 @@ class HistogramRenderer:
         Parameters
         ----------
         views : Views
+            Views of the landmark.
 
         Raises
         ------

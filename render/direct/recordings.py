@@ -55,6 +55,7 @@ class ObjectRecording:
     Parameters
     ----------
     name : str
+        Name of the object.
     frames : HistogramFrames
         n positions.
     mesh : trimesh.Trimesh
@@ -134,6 +135,7 @@ def label_object(mesh: trimesh.Trimesh, support_z_m: float, tolerance_m: float =
     Parameters
     ----------
     mesh : trimesh.Trimesh
+        The mesh, metres.
     support_z_m : float
         Height of the support's surface.
     tolerance_m : float

@@ -138,7 +138,9 @@ class SceneMesh:
         views : Views
             As the camera itself has them, :meth:`~phasemark.render.Views.in_camera`.
         grid : Camera
+            Cells that are sampled, from :func:`~phasemark.render.direct.footprint_grid`.
         background : Background, optional
+            Wall and floor; nothing stands behind the landmark without it.
         finest_m : float
             Cells along which the background's range changes by more than this are cut finely enough to resolve it.
         farthest_m : float
@@ -213,6 +215,7 @@ def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float]
     distance_m : (n,) array_like
         Where the plane meets the optical axis.
     grid : Camera
+        Cells that are sampled, from :func:`~phasemark.render.direct.footprint_grid`.
     tilt : (float, float)
         The plane is x + tilt[0] · y + tilt[1] · z = distance, frame of the tilted camera.
 

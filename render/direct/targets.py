@@ -61,6 +61,7 @@ def find_targets(frames: Counted) -> Targets:
     Parameters
     ----------
     frames : HistogramFrames
+        Histograms.
 
     Returns
     -------

@@ -48,6 +48,7 @@ def range_axis(sensor: Sensor, *, longest_m: float | None = None) -> RangeAxis:
     Parameters
     ----------
     sensor : Sensor
+        The camera.
     longest_m : float, optional
         Where the axis may end before the histogram does, for scenes that do.
     """
@@ -69,7 +70,9 @@ def zone_transients(
     samples : SceneSamples
         n poses.
     sensor : Sensor
+        The camera.
     axis : RangeAxis
+        Range axis of the transients.
     footprints : Footprints, optional
         Without it those of the sensor.
 

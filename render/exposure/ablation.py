@@ -45,6 +45,7 @@ def ablate(
     image : PhasorImages
         The same views, integrated, with the harmonics that the sensor needs.
     sensor : Sensor
+        The camera.
     rng : numpy.random.Generator
         Advanced once; all variants draw from the same streams.
     n_frames : int

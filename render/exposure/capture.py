@@ -225,11 +225,13 @@ def capture_moving(
     Parameters
     ----------
     renderer : Renderer
+        Landmark and camera.
     views : Views
         The views at mid-frame: the truth of every frame.
     sensor : Sensor
         The camera, with the renderer's optics and timing.
     motion : Motion
+        Movement of the camera during a frame.
     rng, n_frames, keep_taps, workers
         As in :func:`capture`; each of the frames starts from the same views.
     background : Background, optional

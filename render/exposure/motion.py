@@ -104,10 +104,12 @@ def render_moving(
     views : Views
         The views at mid-frame: the truth that the frame is labelled with.
     motion : Motion
+        Movement of the camera during a frame.
     background : Background, optional
         Given as seen at mid-frame. A wall stands square to each view's own line of sight (PHYSICS section 3), so the
         motion must keep that line: turning on the spot, or driving along it.
     workers : int
+        Number of threads.
 
     Returns
     -------

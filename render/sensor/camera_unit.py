@@ -31,6 +31,7 @@ class CameraUnit:
     delay_rad : (2, rows, cols) float64
         Phase by which each tap sees the light late: pixel's and tap's offset, and the camera's range offset.
     dead, hot : (rows, cols) bool
+        Pixels that measure nothing, and pixels with a large dark current.
     """
 
     response: NDArray[np.float64]
@@ -51,6 +52,7 @@ def camera_unit(sensor: Sensor, frequency: int = 0) -> CameraUnit:
     Parameters
     ----------
     sensor : Sensor
+        The camera.
     frequency : int
         Which of the sensor's modulation frequencies `delay_rad` is for, counted from 0.
 

@@ -29,6 +29,7 @@ def predicted_range_std(amplitude: ArrayLike, intensity: ArrayLike, sensor: Sens
     intensity : array_like
         Mean amplitude over the pixel; broadcasts against `amplitude`.
     sensor : Sensor
+        The camera.
 
     Returns
     -------
@@ -58,6 +59,7 @@ def measured_range_std(amplitude_e: ArrayLike, intensity_e: ArrayLike, sensor: S
     amplitude_e, intensity_e : array_like
         Electrons per phase image, as in :class:`~phasemark.render.Frames`; they broadcast.
     sensor : Sensor
+        The camera.
 
     Returns
     -------
@@ -114,6 +116,7 @@ def phase_image_variance(intensity_e: ArrayLike, sensor: Sensor) -> NDArray[np.f
         Electrons in both taps of a phase image, ambient light and dark current included. Read noise can take a
         measured value below zero; no electrons have no shot noise.
     sensor : Sensor
+        The camera.
     """
     shot = np.maximum(np.asarray(intensity_e, dtype=np.float64), 0.0) if sensor.shot_noise else 0.0
     return np.asarray(shot + np.zeros(np.shape(intensity_e)) + sensor.read_variance_e2)

@@ -348,6 +348,7 @@ class Sensor(SensorQuantities):
         size : (cols, rows)
             Of the image, in OpenCV's order.
         model : {"opencv", "fisheye"}
+            Lens model of OpenCV.
         **fields
             Any other field of the sensor.
 

@@ -118,6 +118,7 @@ class SheetQuantity:
     title : str
         What it is, in words, with its unit.
     predicted, simulated : float
+        Value that follows from the sensor model, and value in simulated frames.
     std_error : float
         Of `simulated`.
     samples : int
@@ -151,12 +152,15 @@ class Characterisation:
     Parameters
     ----------
     sensor : Sensor
+        The camera.
     n_frames : int
         Frames at each point.
     reference_range_m : float
         Range of the flat fields whose range is of no account.
     comparisons : tuple of Comparison
+        Predicted and simulated values, with their tests.
     quantities : tuple of SheetQuantity
+        Rows of the data sheet.
     maps : mapping of str to (rows, cols) float64
         Simulated patterns by name with unit; NaN where a pixel is dead or hot.
     defects : mapping of str to (rows, cols) bool

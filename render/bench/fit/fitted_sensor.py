@@ -24,6 +24,7 @@ class FittedField:
     Parameters
     ----------
     value : float
+        Fitted value.
     std_error : float or None
         None where the number was not measured.
     note : str
