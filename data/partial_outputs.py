@@ -109,7 +109,7 @@ class PartJob:
         return "phasemark.data.partial_outputs:job_of"
 
     def spec(self) -> dict[str, Any]:
-        """Return what another process makes the same job from."""
+        """Return a description from which another process makes the same job."""
         return {"kind": "part", "of": self._job.spec(), "part": self._part, "parts": self._parts}
 
     @property
@@ -295,7 +295,7 @@ class MergeJob:
         return "phasemark.data.partial_outputs:job_of"
 
     def spec(self) -> dict[str, Any]:
-        """Return what the parts were made from."""
+        """Return the description that the parts were made from."""
         return self._job.spec()
 
     @property

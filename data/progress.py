@@ -10,7 +10,7 @@ Progress = Callable[[int, int], None]
 
 
 def counter(progress: Progress | None, total: int) -> Callable[[], None]:
-    """Return what counts one step and reports it; the total grows where it was reckoned too small.
+    """Return a function that counts one step and reports it; the total grows where it was too small.
 
     Parameters
     ----------

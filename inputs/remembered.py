@@ -82,7 +82,7 @@ def _sign(status: os.stat_result) -> str:
 
 
 def _read() -> dict[str, tuple[str, str]]:
-    """Return what is remembered; nothing of a file that is damaged or somebody else's."""
+    """Return the remembered digests; none from a file that is damaged or somebody else's."""
     path = cache_file()
     try:
         if path is None:

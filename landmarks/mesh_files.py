@@ -198,7 +198,7 @@ def _is_outward(mesh: trimesh.Trimesh) -> bool:
 
 
 def _doubts(mesh: trimesh.Trimesh) -> list[str]:
-    """Return what may be wrong with a mesh."""
+    """Return the possible faults of a mesh, one sentence each."""
     found = []
     if not mesh.is_watertight:
         found.append("the surface is open; it is rendered two-sided")

@@ -57,7 +57,7 @@ def direct_method(
     declared: bool,
     workers: int | None,
 ) -> HistogramMatcher | TargetMatcher:
-    """Return what matches histograms or targets against a bank.
+    """Return a matcher of histograms or targets with a bank.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
 def model_image(
     bank: Bank, match: Match, background: Background | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what :func:`model_range_m` does, and the share of each pixel on the landmark; (rows, cols) each."""
+    """Return the result of :func:`model_range_m` and the share of each pixel on the landmark; (rows, cols) each."""
     name = match.class_name or match.alternatives[0].class_name
     if match.covariance is not None:
         mesh = bank.mesh(name)

@@ -85,7 +85,7 @@ class OneFrequencyBank(Bank):
 
 
 def renderer_of(bank: Bank, mesh: trimesh.Trimesh | None, albedo: float = 0.8) -> Renderer:
-    """Return what renders a landmark as a bank has it.
+    """Return a renderer whose images have the form of a bank's.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def renderer_of(bank: Bank, mesh: trimesh.Trimesh | None, albedo: float = 0.8) -
 
 
 def background_of(bank: Bank, background: Background) -> PhasorImages:
-    """Return what a background alone returns, straight ahead, as a bank has its images."""
+    """Return the image of a background alone, straight ahead, in the form of a bank's images."""
     return renderer_of(bank, None).render(distance_m=1.0, background=background)
 
 

@@ -278,7 +278,7 @@ class Matcher:
         return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
 
     def _of_one_frequency(self, frames: FilteredFrames, one: OneFrequency) -> FilteredFrames:
-        """Return what a camera of one frequency would have measured in place of the camera of several."""
+        """Return the frames that a camera of one frequency would have measured in place of the camera of several."""
         if one.stacked and self.method == "refine" and "calibration" in self._systematic:
             if names := frames.sensor.calibration_fields:
                 raise UsageError(

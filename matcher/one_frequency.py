@@ -148,7 +148,7 @@ class OneFrequency:
         return halves.get(rows)
 
     def images(self, seen: PhasorImages) -> PhasorImages:
-        """Return what the camera of one frequency has of images of the camera."""
+        """Return images of the camera in the form of the camera of one frequency."""
         phasor = self.stack(seen.phasors) if self.stacked else self._combined_phasor(seen)
         upper = seen.upper_coverage
         return PhasorImages(
@@ -192,7 +192,7 @@ class OneFrequency:
         return np.asarray(np.where(lit, np.abs(seen.phasor) * turn, 0.0))
 
     def frames(self, frames: FilteredFrames) -> FilteredFrames:
-        """Return what the camera of one frequency would have measured.
+        """Return the frames that the camera of one frequency would have measured.
 
         Raises
         ------
@@ -290,7 +290,7 @@ class OneFrequencyRenderer(Renderer):
 
 
 def phases_of(renderer: Renderer) -> Renderer:
-    """Return what renders the phases of every frequency as one image, stacked; of one frequency the renderer itself."""
+    """Return a renderer of the phases of all frequencies, stacked; of one frequency the renderer itself."""
     if len(renderer.sensor.frequencies_hz) == 1:
         return renderer
     return OneFrequencyRenderer(renderer, OneFrequency(renderer.sensor, "stacked"))

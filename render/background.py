@@ -169,7 +169,7 @@ def nearer_plane(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyp
 
 @inlined
 def hit_of_plane(parameters, plane, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Return what :func:`background_hit` does, of one plane, whether it is the nearer one or not."""
+    """Return the result of :func:`background_hit` for one plane, whether it is the nearer one or not."""
     forward = dx * cos_b + dy * sin_b
     if plane == 1 and forward > 0.0:
         return parameters[0] / forward, parameters[2], forward

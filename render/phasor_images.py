@@ -54,7 +54,7 @@ def _orders_of(hz: float, frequencies_hz: Sequence[float]) -> set[int]:
 
 
 def wrap_range_m(range_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
-    """Bring ranges into [0, c/2f), of several frequencies into [0, c / (2 · gcd)).
+    """Wrap ranges into [0, c/2f), of several frequencies into [0, c / (2 · gcd)).
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def wrap_range_m(range_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
 
 
 def wrap_difference_m(difference_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
-    """Bring differences of ranges into [−c/4f, c/4f), of several frequencies into ± c / (4 · gcd).
+    """Wrap differences of ranges into [−c/4f, c/4f), of several frequencies into ± c / (4 · gcd).
 
     Parameters
     ----------

@@ -641,7 +641,7 @@ def _fastest(sensor: Sensor) -> float:
 
 
 def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:
-    """Return what was rendered in an order as the views came."""
+    """Return rendered arrays in the order of the views."""
     if isinstance(order, slice):
         return values
     restored = np.empty_like(values)
@@ -650,7 +650,7 @@ def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray
 
 
 def background_image(background: Background, sensor: Sensor) -> PhasorImages:
-    """Return what a background alone returns, straight ahead.
+    """Return the image of a background alone, straight ahead.
 
     Parameters
     ----------

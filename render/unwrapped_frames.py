@@ -71,7 +71,7 @@ def unwrap_frames(parts: Sequence[Frames], sensor: Sensor, *, taps_e: NDArray[np
 def unwrapped(
     range_m: Sequence[NDArray[np.float64]], std_m: Sequence[NDArray[np.float64]], sensor: Sensor
 ) -> Unwrapped:
-    """Return what wrapped ranges say together where each frequency has errors that no averaging removes.
+    """Return the unwrapped range of several frequencies, each with errors that no averaging removes.
 
     Parameters
     ----------

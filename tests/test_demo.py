@@ -140,7 +140,7 @@ def test_the_page_leads_with_maximum_likelihood_between_grid_points(written, res
     assert text.index(answer(result)) < text.index("Errors between grid points")
     headings = [text.index(title) for title in ("Maximum likelihood, between grid", "Nearest image, between grid")]
     assert headings == sorted(headings)
-    assert "it named the very grid point in 12 of 12 trials" in text
+    assert "it found the true grid point in 12 of 12 trials" in text
     assert text.count("0.00") < 10  # no rows of errors that cannot be anything else
     for name in ("distance_m", "delta_deg", "median_abs"):
         assert name not in text

@@ -47,6 +47,10 @@ NAMES = ("classes told apart, d", "sides told apart, d")
 NO_VERBS = QUESTIONS | {"The", "A", "An", "It", "If", "One", "Names", "Sides", "That", "This", "These", "There"}
 
 
+MENDED = ("calibration", "commands", "demo", "design", "drive", "sweep")
+"""Packages of the matcher whose functions name their result."""
+
+
 def _words(text: str) -> list[str]:
     """Return the avoided words of a text, a line break counting as a space."""
     return [found[0] for found in RIDDLES.finditer(re.sub(r"\s*\n[ #>]*", " ", text))]
@@ -127,6 +131,19 @@ def test_the_first_line_of_a_function_is_an_imperative() -> None:
         if ROOT / "tests" not in path.parents
         for node, line in _docstrings(path)
         if isinstance(node, ast.FunctionDef) and not _is_property(node) and line.split()[0] in NO_VERBS
+    ]
+    assert found == []
+
+
+def test_a_result_is_named_and_not_paraphrased() -> None:
+    # "Return the fitted values", not "Return what was fitted"; private functions too
+    mended = ("inputs", "data", "landmarks", "render", *(f"matcher/{part}" for part in MENDED))
+    found = [
+        f"{path.relative_to(ROOT)}:{node.lineno}: {line}"
+        for room in mended
+        for path in (ROOT / room).rglob("*.py")
+        for node, line in _docstrings(path)
+        if isinstance(node, ast.FunctionDef) and line.startswith("Return what ")
     ]
     assert found == []
 

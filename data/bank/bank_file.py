@@ -295,7 +295,7 @@ class Bank:
         self._file.close()
 
     def __repr__(self) -> str:
-        """Say in one line what the bank holds, open or closed."""
+        """Return one line with the content of the bank, open or closed."""
         delta_deg = np.degrees(self.delta_rad)
         return (
             f"Bank({self.path.name}: {', '.join(self.classes)}; D {self.distance_m[0]:g} … {self.distance_m[-1]:g} m"
@@ -370,13 +370,13 @@ class Bank:
         return read_mesh_group(self._file, class_name, self.path)
 
     def identity(self) -> dict[str, Any]:
-        """Return what the bank's bytes depend on: resolved plan, versions, mesh hashes."""
+        """Return everything that the bank's bytes depend on: resolved plan, versions, mesh hashes."""
         with reading(self.path):
             hashes = {name: str(self._file[f"meshes/{name}"].attrs["sha256"]) for name in self.classes}
         return {"plan": json_attribute(self._file, self.path, "plan"), "versions": self.versions, "mesh_sha256": hashes}
 
     def info(self) -> dict[str, Any]:
-        """Return what the bank holds, in plain numbers and text."""
+        """Return the content of the bank in plain numbers and text."""
         groups = [group for group in (self.lower, self.upper, self.full) if group is not None]
         views = {group.name: int(np.prod(self._file[group.name]["phasor"].shape[:-4])) for group in groups}
         with reading(self.path):

@@ -220,7 +220,7 @@ class BankJob:
         return "phasemark.data.partial_outputs:job_of"
 
     def spec(self) -> dict[str, Any]:
-        """Return what another process makes the same job from."""
+        """Return a description from which another process makes the same job."""
         return {"kind": "bank", "plan": self.plan.model_dump(mode="json")}
 
     @property
@@ -229,7 +229,7 @@ class BankJob:
         return [len(slab.views) for slab in self._slabs]
 
     def whole_images(self) -> list[ImagesOf]:
-        """Return what makes whole images of each class, whatever parts the bank holds."""
+        """Return a renderer of whole images for each class, whatever parts the bank holds."""
         rows = (0, self.sensor.rows)
         return [_images_of(self.plan, self.sensor, landmark, "both", rows) for landmark in self.landmarks]
 
@@ -272,7 +272,7 @@ class BankJob:
         return [stored[field] for field in _FIELDS]
 
     def read(self, file: h5py.File, slab: int, item: int) -> dict[str, NDArray[Any]]:
-        """Return what a file holds of one image, as :meth:`make` makes it."""
+        """Return one image of a file in the form of :meth:`make`."""
         at = self._slabs[slab]
         group = file[at.group]
         n_dims = len(VIEW_DIMS[at.group])
@@ -362,7 +362,7 @@ def _images_of(
 
 
 def _top_view(spec: LandmarkSpec) -> PlanarLandmark:
-    """Return what the paper's generator knows of a landmark."""
+    """Return a landmark as the paper's generator describes it."""
     upper = spec.upper
     if upper is None:
         return PlanarLandmark(spec.box.length_m, spec.box.width_m)

@@ -117,7 +117,7 @@ def _parsed_region(text: str) -> str | tuple[int, ...]:
 
 
 def _mesh_plan(name_and_path: str, reading: MeshReading, symmetry: int | None) -> MeshPlan:
-    """Return what a plan says of a mesh that an option names."""
+    """Return the plan of a mesh that an option names."""
     from phasemark.data.plans.bank_plan import MeshPlan
 
     name, path = name_and_file(name_and_path)

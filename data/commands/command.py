@@ -43,7 +43,7 @@ class Commands(typer.Typer):
     """Commands that note which files they read."""
 
     def command(self, name: str | None = None, **options: Any) -> Callable[[_Function], _Function]:
-        """Return what adds a function as a command."""
+        """Return a decorator that adds a function as a command."""
         add = super().command(name, cls=_Command, **options)
 
         def added(function: _Function) -> _Function:

@@ -139,7 +139,7 @@ def frames_import(
     topic: Annotated[str | None, typer.Option("--topic", help="Which images of a ROS bag.")] = None,
     force: Force = False,
 ) -> None:
-    """Bring measured frames into one form: range along the ray, in metres, upright."""
+    """Convert measured frames to one form: range along the ray, in metres, upright."""
     from phasemark.data.measured.reading import write_measured
 
     if out.suffix.lower() != ".npz":

@@ -113,7 +113,7 @@ def name_and_file(text: str) -> tuple[str, str]:
 
 
 def background_of(wall: float | None, floor: float | None) -> Background | None:
-    """Return what the options say of wall and floor."""
+    """Return the background that the options state; None without wall and floor."""
     from phasemark.render import Background
 
     return None if wall is None and floor is None else Background(wall_m=wall, floor_m=floor)

@@ -18,7 +18,7 @@ _ORIGIN_HELP = "What becomes the origin: file (its own), base (centre of its foo
 
 
 def one_of(*words: str) -> Callable[[str], list[str]]:
-    """Return what completes an argument to one of some words; a shell goes on with files where none fits."""
+    """Return a function that completes an argument to one of some words; a shell completes files where none fits."""
     return lambda incomplete: [word for word in words if word.startswith(incomplete)]
 
 

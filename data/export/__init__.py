@@ -112,7 +112,7 @@ def export_frames(
 def _writer_of(
     frames: FrameSet, to: str, content: Content, quantity: RangeOrZ | None
 ) -> tuple[Writer, tuple[RangeOrZ, ...]]:
-    """Return what writes one content of a frame set, and which quantity it holds.
+    """Return the writer of one content of a frame set, and the quantity that it writes.
 
     Raises
     ------

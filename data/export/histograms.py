@@ -32,7 +32,7 @@ def times_s(frames: FrameSet, start: int, n: int) -> NDArray[np.float64]:
 
 
 def histogram_arrays(frames: FrameSet, sample: Sample, start: int) -> dict[str, NDArray[Any]]:
-    """Return what an NPZ file holds of histograms."""
+    """Return the arrays of histograms in an NPZ file."""
     return {
         "histogram": logged(sample["histogram"], frames.sensor),
         "t_s": times_s(frames, start, len(sample["view"])),
@@ -40,7 +40,7 @@ def histogram_arrays(frames: FrameSet, sample: Sample, start: int) -> dict[str, 
 
 
 def target_arrays(sample: Sample) -> dict[str, NDArray[Any]]:
-    """Return what an NPZ file holds of targets, (n, rows, cols, targets)."""
+    """Return the arrays of targets in an NPZ file, (n, rows, cols, targets)."""
     return {name: sample[name if name in sample else f"{name}_m"] for name in TARGET_FIELDS}
 
 

@@ -56,7 +56,7 @@ def write_atomically(
 
 @contextmanager
 def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bool = False) -> Iterator[Path]:
-    """Hand out an empty temporary file beside `path` and put it in the place of `path` when the block ends well.
+    """Open an empty temporary file beside `path`, and rename it to `path` when the block ends without an error.
 
     Whatever ends the block early, an interrupt included, removes the temporary file and leaves `path` as it was. With
     `checksum` the old ``FILE.sha256`` goes before the file is replaced and the new one comes after, so a crash in
@@ -97,7 +97,7 @@ def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bo
 
 
 def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
-    """Give a finished file its name, and the checksum file that goes with it, as :func:`replacing` does.
+    """Rename a finished file to its final name and write its checksum file, as :func:`replacing` does.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ def _create(path: Path, *, private: bool) -> None:
 
 
 def _take_over(part: Path, target: Path) -> None:
-    """Give a finished file the permissions, and where the system allows it the owner, of what it replaces."""
+    """Copy the permissions of the replaced file to a finished one, and its owner where the system allows it."""
     try:
         old = target.stat()
     except FileNotFoundError:
@@ -289,7 +289,7 @@ def _names_checksum_of(path: Path) -> bool:
 
 
 def sync(path: Path) -> None:
-    """Have the content of a file, or the names in a folder, written to the disk."""
+    """Flush the content of a file, or the names in a folder, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

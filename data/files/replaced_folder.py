@@ -26,7 +26,7 @@ from phasemark.data.files.lock_file import exclusive
 
 @contextmanager
 def replacing_folder(path: Path, content: str, *, force: bool = False) -> Iterator[Path]:
-    """Hand out an empty folder beside `path` and give it that name when the block ends well.
+    """Make an empty folder beside `path`, and rename it to `path` when the block ends without an error.
 
     Whatever ends the block early removes the temporary folder and leaves `path` as it was. A link is followed, and a
     folder that is replaced keeps its permissions. What a killed run left is tidied up by the next one.
@@ -123,7 +123,7 @@ def _seal(folder: Path, content: str) -> None:
 
 
 def _take_over(staging: Path, real: Path) -> None:
-    """Give a folder the permissions, and where the system allows it the owner, of the one that it replaces."""
+    """Copy the permissions of the replaced folder to a new one, and its owner where the system allows it."""
     old = real.stat()
     with suppress(PermissionError):
         os.chown(staging, old.st_uid, old.st_gid)
@@ -131,7 +131,7 @@ def _take_over(staging: Path, real: Path) -> None:
 
 
 def _exchange(staging: Path, real: Path, aside: Path) -> None:
-    """Give the new folder the name of the old one, and remove the old one."""
+    """Rename the new folder to the name of the old one, and remove the old one."""
     if renames.exchange(staging, real):
         return  # the old folder has the temporary name now
     os.replace(real, aside)

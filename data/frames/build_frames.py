@@ -131,7 +131,7 @@ class FrameJob:
         return "phasemark.data.partial_outputs:job_of"
 
     def spec(self) -> dict[str, Any]:
-        """Return what another process makes the same job from."""
+        """Return a description from which another process makes the same job."""
         return {"kind": "frames", "plan": self.plan.model_dump(mode="json")}
 
     @property
@@ -300,7 +300,7 @@ class FrameJob:
         return [stored[name] for name in self.fields]
 
     def read(self, file: h5py.File, slab: int, item: int) -> dict[str, NDArray[Any]]:
-        """Return what a file holds of one view, as :meth:`make` makes it."""
+        """Return one view of a file in the form of :meth:`make`."""
         per = self.plan.frames_per_view
         return {
             name: file[name][item * per : (item + 1) * per] if name in FRAME_FIELDS else file[name][item]
@@ -407,7 +407,7 @@ def _alike(truth: dict[str, NDArray[Any]]) -> Iterator[tuple[NDArray[np.intp], _
 
 
 def _of_each_frequency(frames: Frames) -> dict[str, NDArray[Any]]:
-    """Return what each frequency measured, (n, frames, frequency, rows, cols)."""
+    """Return the measurement of each frequency, (n, frames, frequency, rows, cols)."""
     parts = frames.by_frequency
 
     def stacked(name: str, kind: str) -> NDArray[Any]:

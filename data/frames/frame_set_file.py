@@ -356,7 +356,7 @@ class FrameSet:
         return self._checked(name, self._take(name, numbers))
 
     def reported_quantity(self) -> Literal["range", "z"]:
-        """Return what the chip reports as the distance of targets.
+        """Return the quantity that the chip reports as the distance of targets.
 
         Raises
         ------
@@ -408,7 +408,7 @@ class FrameSet:
         return FrameSubset(self, self.split(frames) if isinstance(frames, str) else np.asarray(frames), transform)
 
     def __repr__(self) -> str:
-        """Say in one line what the frame set holds, open or closed."""
+        """Return one line with the content of the frame set, open or closed."""
         distance_m = self.truth["distance_m"]
         return (
             f"FrameSet({self.path.name}: {len(self)} frames of {self.plan.views} views; {', '.join(self.classes)};"
@@ -443,14 +443,14 @@ class FrameSet:
         return read_mesh_group(self._open(), class_name, self.path)
 
     def identity(self) -> dict[str, Any]:
-        """Return what the file's bytes depend on: resolved plan, versions, mesh hashes."""
+        """Return everything that the file's bytes depend on: resolved plan, versions, mesh hashes."""
         file = self._open()
         with reading(self.path):
             hashes = {name: str(file[f"meshes/{name}"].attrs["sha256"]) for name in self.classes}
         return {"plan": json_attribute(file, self.path, "plan"), "versions": self.versions, "mesh_sha256": hashes}
 
     def info(self) -> dict[str, Any]:
-        """Return what the frame set holds, in plain numbers and text."""
+        """Return the content of the frame set in plain numbers and text."""
         file = self._open()
         of_class = np.bincount(self.truth["class_index"], minlength=len(self.classes))
         of_split = np.bincount(self.truth["split_index"], minlength=len(self.splits))

@@ -223,7 +223,7 @@ def _zones(frames: Frames) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _arrays(recording: SimulatedRecording) -> tuple[dict[str, NDArray[Any]], str, str]:
-    """Return what NPZ and HDF5 files hold, with unit and quantity."""
+    """Return the arrays of NPZ and HDF5 files, with unit and quantity."""
     frames = recording.frames
     assert frames.time_s is not None
     arrays: dict[str, NDArray[Any]] = {"t_s": frames.time_s[0]}

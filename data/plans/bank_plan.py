@@ -305,7 +305,7 @@ class BankPlan(ScenePlan):
 
     @model_serializer(mode="wrap")
     def _without_whole_region(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave the region out where it is the whole image, as files had it before plans had regions."""
+        """Omit a region that is the whole image, so that these plans read as before plans had regions."""
         fields: dict[str, Any] = dump(self)
         if self.region == "whole" and self.binning == 1:
             for name in ("region", "binning", "margin_deg"):

@@ -277,7 +277,7 @@ class FramePlan(ScenePlan):
 
     @model_serializer(mode="wrap")
     def _without_absent_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what a level phase camera does not have: its plans, and the files with them, stay as they are."""
+        """Omit keys that a level phase camera does not have, so that its plans and files keep their bytes."""
         absent = (*TILT, "histograms")
         return {name: value for name, value in write(self).items() if name not in absent or value is not None}
 
@@ -321,7 +321,7 @@ class FramePlan(ScenePlan):
         return [part.name for part in parts]
 
     def draw_truth(self, start: int = 0, stop: int | None = None) -> dict[str, NDArray[Any]]:
-        """Return what is true of some views of a resolved plan; a view's truth depends on seed and number alone.
+        """Return the truth of some views of a resolved plan; that of a view depends on seed and number alone.
 
         Returns
         -------

@@ -91,7 +91,7 @@ def make_shard(job: Job, start: int, stop: int) -> list[NDArray[Any]]:
 
 
 def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Return what differs between two identities, one ``key: old → new`` each."""
+    """Return the differences between two identities, one ``key: old → new`` each."""
     before, after = dict(_flat(old)), dict(_flat(new))
     return [
         f"{key}: {_shown(before.get(key))} → {_shown(after.get(key))}"
@@ -298,7 +298,7 @@ class _Run:
                 )
 
     def begin(self, job: Job, *, resume: bool, force: bool, shard_items: int | None) -> None:
-        """Lay the file out, or find what is left of an earlier run."""
+        """Create the file with its datasets, or find the shards of an earlier run."""
         layout, places = job.lay_out()
         identity = json.loads(json.dumps(job.identity()))
         header_sha256 = layout.sha256()
@@ -412,7 +412,7 @@ class _Run:
             self._worth_keeping = True
 
     def publish(self, *, force: bool) -> None:
-        """Give the finished file its name."""
+        """Rename the finished file to its final name."""
         digest = sha256_of(self.partial)
         self._note(_line(file_sha256=digest))
         publish(self.partial, self.path, digest, force=force)

@@ -28,7 +28,7 @@ class Maker(Protocol):
         """Return how many shards are worth asking for at once."""
 
     def close(self) -> None:
-        """End what makes shards; calls of :meth:`make` that wait for an answer fail."""
+        """Close the executor; calls of :meth:`make` that wait for an answer fail."""
 
 
 def processors() -> int:

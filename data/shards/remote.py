@@ -66,7 +66,7 @@ def check_scheduler(scheduler: str) -> int | None:
 
 
 def open_maker(scheduler: str, job: Job) -> Maker | None:
-    """Return what makes a job's shards: None for threads of this process.
+    """Return the maker of a job's shards: None for threads of this process.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class ProcessMaker:
         return self._n
 
     def make(self, start: int, stop: int) -> Sequence[NDArray[Any]]:
-        """Have a process make a shard; another one if it dies."""
+        """Make a shard in a process; in another one if it dies."""
         worker = self._idle.get()
         try:
             for _ in range(ATTEMPTS):

@@ -652,7 +652,7 @@ def _delay_doubts(
 
 
 def _of_pose_errors(recording: Recording, found: Recorded) -> NDArray[np.float64]:
-    """Return what the estimated errors of the poses add to ranges, (K, pixels)."""
+    """Return the ranges that the estimated errors of the poses add, (K, pixels)."""
     _, pose = recording.slopes(found.theta)
     return np.asarray(np.einsum("ks,ksr->kr", found.pose_error, pose))
 

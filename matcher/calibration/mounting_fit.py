@@ -139,7 +139,7 @@ class _Linear:
     def gradients(
         self, residual: NDArray[np.float64], u: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return what each pose says: gradients by the mounting, (K, p), and by its own errors, (K, q)."""
+        """Return the gradients of each pose: by the mounting, (K, p), and by its own errors, (K, q)."""
         own = np.einsum("kqr,kr->kq", self.own_rows, residual) - u
         eliminated = np.einsum("kpq,kq->kp", self.cross, self._solved(own))
         return np.einsum("kpr,kr->kp", self.rows, residual) - eliminated, own
@@ -154,7 +154,7 @@ class _Linear:
         return self._solved(own_gradient - np.einsum("kpq,p->kq", self.cross, step))
 
     def own_promise(self, own_gradient: NDArray[np.float64]) -> float:
-        """Return what the errors of the poses would save if they alone moved."""
+        """Return by how much the cost would fall if the errors of the poses alone changed."""
         return float((own_gradient * self._solved(own_gradient)).sum())
 
     def _solved(self, own_gradient: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -280,7 +280,7 @@ class Fit:
         return Knowledge(linear.information, by_pose.T @ by_pose)
 
     def information(self, theta: NDArray[np.float64], use: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return what the pixels given tell at a mounting, (p, p), at little cost."""
+        """Return the information of some pixels in a mounting, (p, p), at little cost."""
         return self._linearise(self._at(theta, np.zeros((len(use), self.factor.shape[2])), use)).information
 
     def linear(self, place: Place) -> _Linear:

@@ -210,7 +210,7 @@ class Mounting:
 
 
 def clipped(theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Keep a mounting within what a camera can have."""
+    """Clip a mounting to the limits of its parameters."""
     return np.asarray(np.clip(theta, _LEAST, _MOST))
 
 
@@ -478,7 +478,7 @@ class CalibrationModel:
         return self._render(mounting, views, alone=True).coverage.reshape(len(views), -1)
 
     def _turn(self, mounting: Mounting, image: PhasorImages) -> NDArray[np.complex128]:
-        """Return what turns rendered phasors into those that this program got from the camera, (1 or K, rows, cols).
+        """Return the factor from rendered phasors to those measured by the camera, (1 or K, rows, cols).
 
         The range offset; and where the camera reports z, that its ranges were made with half angles that may be wrong.
         """

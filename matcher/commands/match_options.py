@@ -140,7 +140,7 @@ class Search:
         return ["distance_m", "delta_rad", *(_FREE[name] for name in sorted(free, key=list(_FREE).index))]
 
     def filter(self) -> Callable[[Frames], FilteredFrames]:
-        """Return what averages the frames of a position."""
+        """Return the filter that averages the frames of a position."""
         from phasemark.matcher import kalman_filter, phasor_mean
 
         return kalman_filter if self.filter_name == "kalman" else phasor_mean

@@ -162,8 +162,8 @@ def on_grid(result: DemoResult) -> str:
     total = sum(len(r.matches) for r in results)
     exact = sum(int((r.class_right & (r.position_error_m < _SAME_PLACE_M)).sum()) for r in results)
     return (
-        f"it named the very grid point in {exact} of {total} trials, an error of 0 that says nothing about its"
-        " accuracy, for it has no other answers."
+        f"it found the true grid point in {exact} of {total} trials. That error of 0 says nothing about its accuracy,"
+        " because its answers are grid points."
     )
 
 

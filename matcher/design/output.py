@@ -59,7 +59,7 @@ def _sensor_reference(plan: DesignPlan) -> str:
 
 
 def _sensor_overrides(design: Design) -> Mapping[str, Any]:
-    """Return what the sensor's name does not say: everything, if it is a file that may move."""
+    """Return the fields that the sensor's name does not fix: all of them, if it is a file that may move."""
     plan = design.plan
     if _sensor_reference(plan) == plan.sensor:
         return plan.sensor_overrides

@@ -30,7 +30,7 @@ _GAUSS_NEWTON_STEPS = 4
 
 
 def upper_appearance(upper: Upper, sensor: Sensor, plan: DesignPlan) -> Appearance:
-    """Return what the upper rows see of a part at the sampled distances; its slope is by D."""
+    """Return the image of a part in the upper rows at the sampled distances; its slope is by D."""
     side = 2 * max(plan.limits.extents_m)
     stand = Box(length_m=side, width_m=side, height_m=side)  # below the upper rows: not built, not seen
     spec = LandmarkSpec(name="upper", box=stand, upper=upper, albedo=plan.albedo)

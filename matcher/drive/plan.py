@@ -68,7 +68,7 @@ class PathPlan(PlanModel):
 
 
 class OdometryPlan(PlanModel):
-    """Errors of wheels and gyro; the filter knows these figures, never the errors themselves.
+    """Errors of wheels and gyro; the filter is given these standard deviations, not the errors.
 
     Parameters
     ----------

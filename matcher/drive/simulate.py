@@ -290,7 +290,7 @@ class _Driver:
         self.stops: list[Stop] = []
 
     def drive(self, progress: Progress | None) -> Drive:
-        """Go to the end of the path."""
+        """Drive to the end of the path."""
         path, plan = self.path, self.plan
         next_look_m = 0.0
         self._note()
@@ -368,7 +368,7 @@ class _Driver:
         return distance * std if math.isfinite(std) else math.inf
 
     def _measure(self, k: int, promised: float) -> None:
-        """Stand still, take frames at the true pose, match, correct."""
+        """Take frames at the true pose while standing, match them, and correct the filter."""
         plan, landmark = self.plan, self.plan.map.landmark[k]
         camera, sensor = plan.camera, self.equipment.sensor
         xy, yaw = self.really[k]

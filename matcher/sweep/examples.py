@@ -128,6 +128,7 @@ def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, method: str) ->
     if name is None:
         text += "no landmark"
     else:
-        text += f"{name}, off by {1e3 * error[0]:+.2f} mm and {math.degrees(error[1]):+.2f}°"
+        errors = f"{1e3 * error[0]:+.2f} mm and {math.degrees(error[1]):+.2f}°".replace("-", "−")
+        text += f"{name}, error {errors}"
         text += f", p = {trials.p_value[k, m]:.2g}" if math.isfinite(trials.p_value[k, m]) else ""
     return Example(method, number, trial, text, match_figure(frames, match, job.bank(m), background, title=False))

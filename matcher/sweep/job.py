@@ -47,7 +47,7 @@ NONE = -1
 
 
 def _own_fields(p: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
-    """Return what is kept of each method's match of a trial; views have p numbers."""
+    """Return the fields that are stored of each method's match of a trial; views have p numbers."""
     names = ", ".join(VIEW[:p])
     order = ", ".join(name.split("_")[0] for name in VIEW[:p])
     return (
@@ -66,7 +66,7 @@ def _own_fields(p: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
 
 
 def _shared_fields(p: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
-    """Return what is kept of each trial; views have p numbers."""
+    """Return the fields that are stored of each trial; views have p numbers."""
     return (
         ("truth", (p,), "<f8", ", ".join(VIEW[:p])),
         ("confusion", (), "<f8", "bound on the probability of a wrong class; NaN where it was not computed"),
@@ -130,7 +130,7 @@ class SweepJob:
         return "phasemark.matcher.sweep.job:job_of"
 
     def spec(self) -> dict[str, Any]:
-        """Return what another process makes the same job from."""
+        """Return a description from which another process makes the same job."""
         return {
             "plan": self.plan.model_dump(mode="json"),
             "round": [self.of.number, list(self.of.conditions), self.of.first, self.of.trials],
@@ -244,7 +244,7 @@ class SweepJob:
         return self.believed_sensor(number).with_(**changes)
 
     def renderer(self, number: int, sensor: Sensor, *, dimension_error: float | None = None) -> Renderer:
-        """Return what renders the true landmark of a condition; a mesh's edges take time, and the latest are kept."""
+        """Return the renderer of a condition's true landmark; the latest are kept, for analysing a mesh takes time."""
         condition = self.all_conditions[number]
         if dimension_error is None:
             dimension_error = condition.dimension_error
@@ -261,12 +261,12 @@ class SweepJob:
             return self._renderers[key].seen_by(sensor)
 
     def background(self, number: int) -> Background | None:
-        """Return what truly stands behind the landmark."""
+        """Return the true background of a condition."""
         wall_m = self.all_conditions[number].wall_m
         return Background(wall_m=wall_m) if wall_m else None
 
     def image(self, number: int, views: Views) -> PhasorImages:
-        """Return what the true camera of a condition sees at some views, without noise."""
+        """Return noise-free images of a condition's true camera at some views."""
         return self.renderer(number, self.true_sensor(number)).render_views(views, background=self.background(number))
 
     def frames(self, number: int, method: Method, image: PhasorImages, first: int) -> FilteredFrames:
@@ -473,7 +473,7 @@ def _matches_of_plugin(
 
 
 def _wrong_field(match: Match, names: Sequence[str]) -> str | None:
-    """Return what is wrong with the types of a user's match, or None."""
+    """Return the fault in the types of a user's match, or None."""
     if not isinstance(match.class_name, str | None):
         return f"'class_name' {match.class_name!r}: it must be a str or None"
     for name in (*names, "chi2", "p_value"):

@@ -99,7 +99,7 @@ def _write_report(ours: OwnedFiles) -> Path:
         answer=answer(landmarks),
         card=None if card is None else f"{_first_class(landmarks)} {card.line()}",
         summary=summary(trials, cells),
-        contents=[*(one["title"] for one in shown), "Cells", "Worst trials", "Where this comes from", _AGAIN],
+        contents=[*(one["title"] for one in shown), "Cells", "Worst trials", "How it was made", _AGAIN],
         figures=shown,
         examples=examples,
         header=(
@@ -202,7 +202,7 @@ def _first_class(cells: Sequence[Cell]) -> str:
 
 
 def _commands(plan: SweepPlan, folder: Path) -> list[str]:
-    """Return what runs the sweep again into a new folder, and what writes this page from the trials that are there."""
+    """Return two commands: run the sweep again into a new folder, and write this page from existing trials."""
     where = shlex.quote(str(folder))
     given, again = shlex.quote(str(folder / "plan.json")), shlex.quote(f"{folder}-again")
     run = f"phasemark sweep run {given} --out {again}"

@@ -128,7 +128,7 @@ class SweepTrials:
         return slice(*np.searchsorted(self.condition, [condition, condition + 1]))
 
     def trial_table(self, rows: slice) -> dict[str, list[Any]]:
-        """Return what trials.csv holds of some trials: columns, trial by trial and method by method."""
+        """Return the columns of trials.csv for some trials, trial by trial and method by method."""
         m, names_of_view = len(self.methods), self.numbers
         number = self.condition[rows]
         error = self.error_of(rows)

@@ -123,7 +123,7 @@ def _run(
 
 
 def sweep_outputs(folder: Path) -> tuple[Path, ...]:
-    """Return what a sweep writes into its folder, but for later rounds and figures."""
+    """Return the files that a sweep writes into its folder, without later rounds and figures."""
     return (*map(folder.joinpath, (_PLAN, *_TABLES)), *outputs_of(_round_path(folder, 0)))
 
 

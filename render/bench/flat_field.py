@@ -32,7 +32,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
 def flat_field(sensor: Sensor, range_m: float, amplitude: float, *, modulated: bool = True) -> PhasorImages:
-    """Return what every pixel sees of a surface that lies at one range all over, as a sphere about the lens does.
+    """Return the images of a surface at one range in every pixel, a sphere about the lens for instance.
 
     Parameters
     ----------

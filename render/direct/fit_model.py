@@ -165,7 +165,7 @@ class FitModel:
         return Footprints(centre, half, np.array([blur, blur]), light)
 
     def transients(self, p: Parameters, recording: PlaneRecording | ObjectRecording) -> NDArray[np.float64]:
-        """Return what each zone sees of a recording's scene, support and object apart, stray light included."""
+        """Return the transients of a recording's scene in each zone, support and object separate, with stray light."""
         key = (recording, *(p[name] for name in _GEOMETRY), *self._scene_key(p, recording))
         if key not in self._transients:
             if len(self._transients) >= 4:

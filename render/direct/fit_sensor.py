@@ -93,7 +93,7 @@ class DirectFit:
         return np.asarray(bins * histogram_of(self.sensor).bin_width_m)
 
     def as_dict(self) -> dict[str, object]:
-        """Return what was fitted as plain numbers, for JSON."""
+        """Return the fitted values as plain numbers, for JSON."""
         names = self.parameters.names
         return {
             "parameters": {name: {"value": self.parameters[name], "std": self.std.get(name)} for name in names},

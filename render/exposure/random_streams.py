@@ -121,7 +121,7 @@ def fill_normal(uniform, chosen, out):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _central_quantile(q):
-    """Wichura's algorithm AS 241 (1988), good to 1e-15, for |q| = |p − ½| up to 0.425."""
+    """Return the normal quantile for |q| = |p − ½| up to 0.425: AS 241 (Wichura, 1988), good to 1e-15."""
     r = _CENTRAL * _CENTRAL - q * q
     num = 2.5090809287301226727e3
     num = num * r + 3.3430575583588128105e4
@@ -144,7 +144,7 @@ def _central_quantile(q):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _near_tail(r):
-    """AS 241 outside the middle, for r = √(−ln p) up to 5 of the smaller share p: the deviate's size."""
+    """Return the size of the normal quantile by AS 241 for r = √(−ln p) up to 5, p being the smaller share."""
     r -= 1.6
     num = 7.74545014278341407640e-4
     num = num * r + 2.27238449892691845833e-2
@@ -167,7 +167,7 @@ def _near_tail(r):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _far_tail(r):
-    """AS 241 further out."""
+    """Return the size of the normal quantile by AS 241 for r above 5."""
     r -= 5.0
     num = 2.01033439929228813265e-7
     num = num * r + 2.71155556874348757815e-5

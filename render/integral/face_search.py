@@ -55,7 +55,7 @@ class FaceGrid(NamedTuple):
 
     @classmethod
     def of_faces(cls, corners: NDArray[np.float64], wanted: NDArray[np.bool_]) -> FaceGrid:
-        """Lay a grid over faces, given their corners (f, 3, 3) and which of them are wanted.
+        """Build a grid over faces from their corners (f, 3, 3) and a mask of the faces that are searched.
 
         A cell gets the face that runs nearest to its middle, judged by points no further apart than half a cell; a cell
         without any gets that of the nearest cell, counted along the axes.
@@ -94,7 +94,7 @@ def _shortest_edge_first(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @kernel
 def _fill_grid(corners, numbers, faces, distance):  # type: ignore[no-untyped-def]
-    """Give each cell the face that runs nearest to its middle.
+    """Assign to each cell the face that runs nearest to its middle.
 
     `corners` (f, 3, 3) in cells, the shortest edge first, so that a sliver takes a row of points and no square of them.
     """
@@ -120,7 +120,7 @@ def _fill_grid(corners, numbers, faces, distance):  # type: ignore[no-untyped-de
 
 @kernel
 def _spread(faces, distance):  # type: ignore[no-untyped-def]
-    """Give cells without a face that of the nearest one, whose `distance` is 0; once up and once down the axes."""
+    """Assign to cells without a face that of the nearest cell with one, in one pass up and one down each axis."""
     nx, ny, nz = faces.shape
     for step in (1, -1):
         for a in range(nx):

@@ -274,7 +274,7 @@ def _pixels(value: Any) -> int | None:
 
 
 def _is_pair(value: Any) -> bool:
-    """Tell whether a value is two numbers; what else is wrong about it is found where fields are checked."""
+    """Return True if a value is two numbers; other faults are found where fields are checked."""
     try:
         return np.asarray(value, float).shape == (2,)
     except (TypeError, ValueError):

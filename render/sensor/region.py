@@ -163,7 +163,7 @@ def _rate(sensor: Sensor, there: Sensor, name: str, binning: int) -> float:
 
 
 def _added_up(sensor: Sensor, n: int) -> dict[str, Any]:
-    """Return what changes in the electrons of a camera whose pixels are n × n of another one's."""
+    """Return the changed fields of a camera whose pixels are n × n pixels of another one."""
     area = n * n
     well = sensor.saturation_e
     return {

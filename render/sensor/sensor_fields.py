@@ -234,7 +234,7 @@ class SensorFields(BaseModel):
 
     @model_serializer(mode="wrap")
     def _without_absent_tables(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave `histogram` and `lens` out where there is none, as files had it before sensors had these tables."""
+        """Omit `histogram` and `lens` where there is none, so that files read as before sensors had these tables."""
         fields: dict[str, Any] = dump(self)
         for name in TABLES:
             if fields.get(name, ...) is None:

@@ -88,7 +88,7 @@ def against_axis(cells: Sequence[Cell], axis: str, axes: Sequence[str]) -> Figur
 
 
 def maps(cells: Sequence[Cell], quantity: str) -> Figure:
-    """Draw RMSE or its ratio to the bound over distance and angle, the median over what else varies."""
+    """Draw RMSE or its ratio to the bound over distance and angle, the median over the other axes."""
     methods = methods_of(cells)
     figure, rows = panels(2, len(methods), height=3.2)
     x, y, groups = _over_plane(cells)

@@ -27,8 +27,8 @@ def _error_figures(plan: SweepPlan, trials: SweepTrials, cells: Sequence[Cell]) 
     for axis in axes if plan.design != "sobol" else ():
         text = (
             "Above, marks: root mean square error with its 95 % interval, outliers left out; dotted: the Cramér–Rao "
-            "bound. Below: mean error. What else varies is pooled, by the median cell above and the mean below, or is "
-            "at its first value where the design varies each axis alone."
+            "bound. Below: mean error. The other axes are pooled, by the median cell above and the mean below; a "
+            "design that varies each axis alone keeps them at their first value."
         )
         if axis in ("noise_factor", "n_frames"):
             text += (
@@ -54,7 +54,10 @@ def _error_figures(plan: SweepPlan, trials: SweepTrials, cells: Sequence[Cell]) 
             ("rmse", "Error by distance and angle", "Root mean square error without outliers."),
         ):
             yield SweepFigure(
-                f"map-{quantity}", title, f"{text} The median over what else varies.", errors.maps(cells, quantity)
+                f"map-{quantity}",
+                title,
+                f"{text} Each cell is the median over the other axes.",
+                errors.maps(cells, quantity),
             )
         yield SweepFigure(
             "bias-arrows",
@@ -65,9 +68,9 @@ def _error_figures(plan: SweepPlan, trials: SweepTrials, cells: Sequence[Cell]) 
         )
         yield SweepFigure(
             "observability",
-            "What can be known worst",
+            "Weak direction of the bound",
             "Left: condition number of the bound, lengths in centimetres and angles in degrees; 1: D and δ are known "
-            "equally well. Right: the direction known worst and the standard deviation along it.",
+            "equally well. Right: the weak direction and the standard deviation along it.",
             errors.observability(cells),
         )
     yield SweepFigure(
@@ -92,16 +95,16 @@ def _trust_figures(trials: SweepTrials, cells: Sequence[Cell]) -> Iterator[Sweep
     if any(math.isfinite(cell.coverage[0.95].value) for cell in cells):
         yield SweepFigure(
             "nees",
-            "Is the covariance honest?",
+            "Test of the stated covariance",
             "Quantiles of the squared error by the method's own covariance, against χ². On the diagonal the covariance "
-            "is honest; above it, too small. The axis is cut at one and a half times its neighbour.",
+            "is right; above it, too small. The axis is cut at one and a half times its neighbour.",
             trust.nees_quantiles(trials),
         )
         yield SweepFigure(
             "coverage",
             "Coverage of the ellipsoids",
             "Share of errors within the ellipsoid of 50, 90, 95 and 99 % that a method states, cell by cell with 95 % "
-            "intervals. Lines: what it should be.",
+            "intervals. Lines: the stated shares.",
             trust.coverage(cells),
         )
     yield SweepFigure(
@@ -114,15 +117,15 @@ def _trust_figures(trials: SweepTrials, cells: Sequence[Cell]) -> Iterator[Sweep
         yield SweepFigure(
             "confusion-bound",
             "Wrong classes beside their bound",
-            "Each mark is a cell. On the line a method errs as often as the union bound allows one that knows the "
-            "world; a mark that points down is the interval's upper end of a cell in which no class was wrong.",
+            "Each mark is a cell. On the line a method errs as often as the union bound allows with a perfect "
+            "model; a mark that points down is the interval's upper end of a cell in which no class was wrong.",
             trust.confusion_bound(cells),
         )
     yield SweepFigure(
         "risk",
         "Risk against coverage",
         "Root mean square error in distance of the trials kept, if only those with the best p-values are kept. A curve "
-        "that falls to the left says that the p-value knows a bad match.",
+        "that falls to the left shows that bad matches have small p-values.",
         trust.risk(trials),
     )
     strange = trials.true_class < 0
@@ -131,6 +134,6 @@ def _trust_figures(trials: SweepTrials, cells: Sequence[Cell]) -> Iterator[Sweep
             "roc",
             "Landmark or none",
             "Landmarks accepted against strangers accepted, as the least p-value varies. The mark with its 95 % "
-            "intervals is the matcher's own choice, which by design refuses a share of good landmarks.",
+            "intervals is the matcher's threshold, which by design refuses a share of good landmarks.",
             trust.roc(trials),
         )

@@ -93,7 +93,7 @@ class BoardData:
         )
 
     def of_usable_boards(self, distance_m: Sequence[float] | NDArray[np.floating], notes: list[str]) -> BoardData:
-        """Leave out the distances at which too few pixels answer, and then the pixels that do not answer at the rest.
+        """Omit distances at which too few pixels measure, and then pixels that do not measure at all the others.
 
         Raises
         ------
@@ -145,7 +145,7 @@ class BoardData:
         return np.asarray((self.share < DEAD_SHARE).all(axis=0))
 
     def without(self, odd: NDArray[np.bool_]) -> BoardData:
-        """Leave out some pixels."""
+        """Return the boards without some pixels."""
         return replace(self, good=self.good & ~odd)
 
     def shifted(self, board: int, change_m: float) -> BoardData:
