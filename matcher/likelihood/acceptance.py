@@ -162,15 +162,20 @@ def _reason(
 def _is_ambiguous(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float64]) -> bool:
     """Return whether other classes, or views beyond the tolerance, are too probable; `kept` is best first."""
     policy, best = setup.policy, kept[0]
-    period = delta_period_rad(setup.shapes.symmetry[fits.class_index[best]])
-    apart = np.abs(fits.view[kept] - fits.view[best])
-    apart[:, 1] = np.abs(wrap_delta_difference_rad(apart[:, 1], period))
-    own = [VIEW.index(name) for name in setup.free]
-    std = np.sqrt(np.nan_to_num(np.einsum("kpp->kp", fits.covariance[kept]), posinf=0.0))
-    apart[1:, own] += policy.tolerated_sigma * std[1:]  # the truth may be on the far side of the other view
-    far = (apart > [setup.tolerance[name] for name in VIEW]).any(axis=1)
     other = fits.class_index[kept] != fits.class_index[best]
+    if weight[other].sum() > policy.ambiguity * weight.sum():
+        return True
     # where a landmark looks alike from two sides, a single pixel at an edge must not decide between them
     enough = DISAGREEMENT * (policy.pixels_against_far_view if setup.unknown else 1)
-    alike = far & ~other & (fits.cost[kept] < fits.cost[best] + enough)
-    return bool(weight[other].sum() > policy.ambiguity * weight.sum() or alike.any())
+    alike = np.flatnonzero(~other & (fits.cost[kept] < fits.cost[best] + enough))
+    if len(alike) < 2:
+        return False
+    near = np.array(kept)[alike]
+    apart = np.abs(fits.view[near] - fits.view[best])
+    apart[:, 1] = np.abs(
+        wrap_delta_difference_rad(apart[:, 1], delta_period_rad(setup.shapes.symmetry[fits.class_index[best]]))
+    )
+    own = [VIEW.index(name) for name in setup.free]
+    std = np.sqrt(np.nan_to_num(np.einsum("kpp->kp", fits.covariance[near]), posinf=0.0))
+    apart[1:, own] += policy.tolerated_sigma * std[1:]  # the truth may be on the far side of the other view
+    return bool((apart > [setup.tolerance[name] for name in VIEW]).any())

@@ -14,6 +14,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -53,13 +54,13 @@ class BankModel:
         self._distance, self._delta = bank.distance_m, bank.delta_rad
         self._period = closing_period(bank.delta_rad)
         if bank.full is not None:
-            self._lower = _stack(bank.full)
-            self._upper = np.zeros((len(bank.classes), len(self._distance), 4, 0), np.float32)
+            self._lower = _Stack.of(_read(bank.full))
+            self._upper = _Stack.of(np.zeros((len(bank.classes), len(self._distance), 4, 0), np.float32))
         else:
             assert bank.lower is not None
             assert bank.upper is not None
-            self._lower = _stack(bank.lower)[None]
-            self._upper = _stack(bank.upper)
+            self._lower = _Stack.of(_read(bank.lower)[None])
+            self._upper = _Stack.of(_read(bank.upper))
 
     def before(self, behind: PhasorImages | None) -> BankModel:
         """Return the same model before another background: one image of it is composed with the landmark's."""
@@ -158,8 +159,38 @@ class BankModel:
         return float(self._distance[0]), step_d, float(self._delta[0]), step_a, self._period is not None
 
 
-def _stack(group: BankGroup) -> NDArray[np.float32]:
-    """Return real and imaginary part, intensity and coverage of a group's images, (class, D[, δ], 4, pixels).
+class _Stack(NamedTuple):
+    """Images of a bank, whose pixels are ordered so that those that see no landmark come last.
+
+    Parameters
+    ----------
+    values : (class, D[, δ], 4, pixels) float32
+        Real and imaginary part, intensity and coverage.
+    pixel : (pixels,) int64
+        Which pixel of the images stands at each place.
+    n_lit : (D,) int64
+        Places from this one on are dark at this distance and beyond.
+    """
+
+    values: NDArray[np.float32]
+    pixel: NDArray[np.int64]
+    n_lit: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, values: NDArray[np.float32]) -> _Stack:
+        """Order the pixels of some images, in place, by the farthest distance at which they see the landmark."""
+        n_d = values.shape[1]
+        last = np.full(values.shape[-1], -1)
+        for i in range(n_d):
+            last[values[:, i].any(axis=tuple(range(values.ndim - 2)))] = i
+        pixel = np.argsort(-last, kind="stable")
+        for i in range(n_d):
+            values[:, i] = values[:, i][..., pixel]
+        return cls(values, pixel, (last >= np.arange(n_d)[:, None]).sum(axis=1))
+
+
+def _read(group: BankGroup) -> NDArray[np.float32]:
+    """Return real and imaginary part, intensity and coverage of a group's images, ([class,] D[, δ], 4, pixels).
 
     The images are read some at a time: together with a second copy of a large bank they would not fit into memory.
     """
@@ -207,22 +238,22 @@ _vectorised = njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 
 
 @_vectorised
-def _along_delta(b0, b1, b2, b3, w, dw, out):  # type: ignore[no-untyped-def]
-    """Interpolate four neighbours in δ, (4, pixels) each, into `out` (8, pixels).
+def _along_delta(n, b0, b1, b2, b3, w, dw, out):  # type: ignore[no-untyped-def]
+    """Interpolate the first n pixels of four neighbours in δ, (4, pixels) each, into `out` (8, pixels).
 
     Its rows are value and slope of the real part, of the imaginary part and of the coverage, and the least and greatest
     squared amplitude.
     """
     w0, w1, w2, w3 = np.float32(w[0]), np.float32(w[1]), np.float32(w[2]), np.float32(w[3])
     d0, d1, d2, d3 = np.float32(dw[0]), np.float32(dw[1]), np.float32(dw[2]), np.float32(dw[3])
-    for q in range(out.shape[1]):
+    for q in range(n):
         out[0, q] = w0 * b0[0, q] + w1 * b1[0, q] + w2 * b2[0, q] + w3 * b3[0, q]
         out[1, q] = d0 * b0[0, q] + d1 * b1[0, q] + d2 * b2[0, q] + d3 * b3[0, q]
         out[2, q] = w0 * b0[1, q] + w1 * b1[1, q] + w2 * b2[1, q] + w3 * b3[1, q]
         out[3, q] = d0 * b0[1, q] + d1 * b1[1, q] + d2 * b2[1, q] + d3 * b3[1, q]
         out[4, q] = w0 * b0[3, q] + w1 * b1[3, q] + w2 * b2[3, q] + w3 * b3[3, q]
         out[5, q] = d0 * b0[3, q] + d1 * b1[3, q] + d2 * b2[3, q] + d3 * b3[3, q]
-    for q in range(out.shape[1]):
+    for q in range(n):
         s0, s1 = b0[0, q] * b0[0, q] + b0[1, q] * b0[1, q], b1[0, q] * b1[0, q] + b1[1, q] * b1[1, q]
         s2, s3 = b2[0, q] * b2[0, q] + b2[1, q] * b2[1, q], b3[0, q] * b3[0, q] + b3[1, q] * b3[1, q]
         out[6, q] = min(min(s0, s1), min(s2, s3))
@@ -230,8 +261,8 @@ def _along_delta(b0, b1, b2, b3, w, dw, out):  # type: ignore[no-untyped-def]
 
 
 @_vectorised
-def _along_distance(lines, w, dw, cubic):  # type: ignore[no-untyped-def]
-    """Interpolate four lines of :func:`_along_delta` in D, into `cubic` (11, pixels).
+def _along_distance(n, lines, w, dw, cubic):  # type: ignore[no-untyped-def]
+    """Interpolate n pixels of four lines of :func:`_along_delta` in D, into `cubic` (11, pixels).
 
     Its rows are value, slope by D and slope by δ of the real part, of the imaginary part and of the coverage, and the
     least and greatest squared amplitude.
@@ -240,21 +271,21 @@ def _along_distance(lines, w, dw, cubic):  # type: ignore[no-untyped-def]
     d0, d1, d2, d3 = np.float32(dw[0]), np.float32(dw[1]), np.float32(dw[2]), np.float32(dw[3])
     for part in range(3):
         value, slope = 2 * part, 2 * part + 1
-        for q in range(cubic.shape[1]):
+        for q in range(n):
             x0, x1, x2, x3 = lines[0, value, q], lines[1, value, q], lines[2, value, q], lines[3, value, q]
             cubic[3 * part, q] = w0 * x0 + w1 * x1 + w2 * x2 + w3 * x3
             cubic[3 * part + 1, q] = d0 * x0 + d1 * x1 + d2 * x2 + d3 * x3
             cubic[3 * part + 2, q] = (
                 w0 * lines[0, slope, q] + w1 * lines[1, slope, q] + w2 * lines[2, slope, q] + w3 * lines[3, slope, q]
             )
-    for q in range(cubic.shape[1]):
+    for q in range(n):
         cubic[9, q] = min(min(lines[0, 6, q], lines[1, 6, q]), min(lines[2, 6, q], lines[3, 6, q]))
         cubic[10, q] = max(max(lines[0, 7, q], lines[1, 7, q]), max(lines[2, 7, q], lines[3, 7, q]))
 
 
 @_vectorised
-def _between(b00, b01, b10, b11, d, a, step_d, step_a, straight):  # type: ignore[no-untyped-def]
-    """Interpolate linearly between two distances and two angles, into `straight` (10, pixels).
+def _between(n, b00, b01, b10, b11, d, a, step_d, step_a, straight):  # type: ignore[no-untyped-def]
+    """Interpolate n pixels linearly between two distances and two angles, into `straight` (10, pixels).
 
     Its first nine rows are those of :func:`_along_distance`, the last one is the intensity; `d` and `a` are the places
     between the neighbours.
@@ -265,20 +296,20 @@ def _between(b00, b01, b10, b11, d, a, step_d, step_a, straight):  # type: ignor
     a0, a1 = np.float32((1 - d) / step_a), np.float32(d / step_a)
     for part in range(3):
         plane = 3 if part == 2 else part
-        for q in range(straight.shape[1]):
+        for q in range(n):
             x00, x01, x10, x11 = b00[plane, q], b01[plane, q], b10[plane, q], b11[plane, q]
             straight[3 * part, q] = w00 * x00 + w01 * x01 + w10 * x10 + w11 * x11
             straight[3 * part + 1, q] = d0 * (x10 - x00) + d1 * (x11 - x01)
             straight[3 * part + 2, q] = a0 * (x01 - x00) + a1 * (x11 - x10)
-    for q in range(straight.shape[1]):
+    for q in range(n):
         straight[9, q] = w00 * b00[2, q] + w01 * b01[2, q] + w10 * b10[2, q] + w11 * b11[2, q]
 
 
 @njit(cache=True, nogil=True)
-def _conclude(m, first, cubic, straight, behind, behind_intensity, phasor, slope, shade):  # type: ignore[no-untyped-def]
-    """Choose for every pixel between cubic and straight, put the background behind it, and store it."""
-    for q in range(cubic.shape[1]):
-        at = first + q
+def _conclude(m, n, pixel, first, cubic, straight, behind, behind_intensity, phasor, slope, shade):  # type: ignore[no-untyped-def]
+    """Choose for each of n pixels between cubic and straight, put the background behind it, and store it."""
+    for q in range(n):
+        at = first + pixel[q]
         chosen = cubic if cubic[9, q] > _DIM * _DIM * cubic[10, q] else straight
         phasor[m, at] = complex(chosen[0, q], chosen[3, q])
         slope[m, 0, at] = complex(chosen[1, q], chosen[4, q])
@@ -289,6 +320,10 @@ def _conclude(m, first, cubic, straight, behind, behind_intensity, phasor, slope
             slope[m, 0, at] -= chosen[7, q] * behind[at]
             slope[m, 1, at] -= chosen[8, q] * behind[at]
             shade[m, 0, at] += (1 - straight[6, q]) * behind_intensity[at]
+    if len(behind):
+        for q in range(n, len(pixel)):
+            phasor[m, first + pixel[q]] = behind[first + pixel[q]]
+            shade[m, 0, first + pixel[q]] = behind_intensity[first + pixel[q]]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -303,9 +338,9 @@ def _interpolate(  # type: ignore[no-untyped-def]
     class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, behind, behind_intensity,
     phasor, slope, shade,
 ):  # fmt: skip
-    """Fill phasor, its slopes by D and δ, and intensity with coverage, of m views."""
-    n_d, n_a = lower.shape[1], lower.shape[2]
-    n_up, n_low = upper.shape[-1], lower.shape[-1]
+    """Fill phasor, its slopes by D and δ, and intensity with coverage, of m views; what comes in is 0."""
+    n_d, n_a = lower.values.shape[1], lower.values.shape[2]
+    n_up, n_low = upper.values.shape[-1], lower.values.shape[-1]
     wd, dwd, wa, dwa = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     once, never = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4)
     lines, cubic = np.empty((4, 8, n_low), np.float32), np.empty((11, n_low), np.float32)
@@ -313,7 +348,7 @@ def _interpolate(  # type: ignore[no-untyped-def]
     straight, straight_up = np.empty((10, n_low), np.float32), np.empty((10, n_up), np.float32)
     for m in range(len(class_index)):
         c = class_index[m]
-        cl = c if lower.shape[0] > 1 else 0
+        cl = c if lower.values.shape[0] > 1 else 0
         i0, td = _cell((view[m, 0] - first_d) / step_d, n_d, False)
         x = (view[m, 1] - first_a) / step_a
         if closes:
@@ -324,24 +359,25 @@ def _interpolate(  # type: ignore[no-untyped-def]
         dwd /= step_d
         dwa /= step_a
         j1, j2, j3, j4 = j0 % n_a, (j0 + 1) % n_a, (j0 + 2) % n_a, (j0 + 3) % n_a
+        lit, lit_up = lower.n_lit[i0], upper.n_lit[i0]
         for a in range(4):
-            block = lower[cl, i0 + a]
-            _along_delta(block[j1], block[j2], block[j3], block[j4], wa, dwa, lines[a])
+            block = lower.values[cl, i0 + a]
+            _along_delta(lit, block[j1], block[j2], block[j3], block[j4], wa, dwa, lines[a])
             if n_up:
-                one = upper[c, i0 + a]
-                _along_delta(one, one, one, one, once, never, lines_up[a])
-        _along_distance(lines, wd, dwd, cubic)
+                one = upper.values[c, i0 + a]
+                _along_delta(lit_up, one, one, one, one, once, never, lines_up[a])
+        _along_distance(lit, lines, wd, dwd, cubic)
         k, d = _straight_cell(td)
         kj, a = _straight_cell(ta)
-        near, far = lower[cl, i0 + k], lower[cl, i0 + k + 1]
+        near, far = lower.values[cl, i0 + k], lower.values[cl, i0 + k + 1]
         ja, jb = (j0 + kj) % n_a, (j0 + kj + 1) % n_a
-        _between(near[ja], near[jb], far[ja], far[jb], d, a, step_d, step_a, straight)
+        _between(lit, near[ja], near[jb], far[ja], far[jb], d, a, step_d, step_a, straight)
         if n_up:
-            _along_distance(lines_up, wd, dwd, cubic_up)
-            near_up, far_up = upper[c, i0 + k], upper[c, i0 + k + 1]
-            _between(near_up, near_up, far_up, far_up, d, 0.0, step_d, step_a, straight_up)
-            _conclude(m, 0, cubic_up, straight_up, behind, behind_intensity, phasor, slope, shade)
-        _conclude(m, n_up, cubic, straight, behind, behind_intensity, phasor, slope, shade)
+            _along_distance(lit_up, lines_up, wd, dwd, cubic_up)
+            near_up, far_up = upper.values[c, i0 + k], upper.values[c, i0 + k + 1]
+            _between(lit_up, near_up, near_up, far_up, far_up, d, 0.0, step_d, step_a, straight_up)
+            _conclude(m, lit_up, upper.pixel, 0, cubic_up, straight_up, behind, behind_intensity, phasor, slope, shade)
+        _conclude(m, lit, lower.pixel, n_up, cubic, straight, behind, behind_intensity, phasor, slope, shade)
 
 
 @njit(cache=True, nogil=True)
@@ -349,38 +385,45 @@ def _extremes(  # type: ignore[no-untyped-def]
     class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, low, high
 ):
     """Fill the least and greatest coverage among the neighbours of m views."""
-    n_d, n_a = lower.shape[1], lower.shape[2]
-    n_up = upper.shape[-1]
+    least, most = np.empty(lower.values.shape[-1]), np.empty(lower.values.shape[-1])
+    n_d, n_a = lower.values.shape[1], lower.values.shape[2]
+    n_up = upper.values.shape[-1]
     for m in range(len(class_index)):
         c = class_index[m]
-        cl = c if lower.shape[0] > 1 else 0
+        cl = c if lower.values.shape[0] > 1 else 0
         i0, _ = _cell((view[m, 0] - first_d) / step_d, n_d, False)
         x = (view[m, 1] - first_a) / step_a
         if closes:
             x -= n_a * np.floor(x / n_a)
         j0, _ = _cell(x, n_a, closes)
-        low[m], high[m] = np.inf, 0.0
+        low[m], high[m] = 0.0, 0.0
+        for q in range(upper.n_lit[i0]):
+            at = upper.pixel[q]
+            low[m, at] = np.inf
+            for a in range(4):
+                cover = upper.values[c, i0 + a, 3, q]
+                low[m, at], high[m, at] = min(low[m, at], cover), max(high[m, at], cover)
+        least[:], most[:] = np.inf, 0.0
+        lit = lower.n_lit[i0]
         for a in range(4):
-            for q in range(n_up):
-                cover = upper[c, i0 + a, 3, q]
-                low[m, q], high[m, q] = min(low[m, q], cover), max(high[m, q], cover)
             for b in range(4):
                 j = (j0 + b) % n_a if closes else j0 + b
-                for q in range(lower.shape[-1]):
-                    cover = lower[cl, i0 + a, j, 3, q]
-                    low[m, n_up + q] = min(low[m, n_up + q], cover)
-                    high[m, n_up + q] = max(high[m, n_up + q], cover)
+                cover = lower.values[cl, i0 + a, j, 3]
+                for q in range(lit):
+                    least[q], most[q] = min(least[q], cover[q]), max(most[q], cover[q])
+        for q in range(lit):
+            low[m, n_up + lower.pixel[q]], high[m, n_up + lower.pixel[q]] = least[q], most[q]
 
 
 @njit(cache=True, nogil=True)
 def _bends(class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, bend):  # type: ignore[no-untyped-def]
     """Fill the largest second difference of the intensity among the neighbours of m views, over the brightest pixel."""
-    n_d, n_a = lower.shape[1], lower.shape[2]
-    n_up, n_low = upper.shape[-1], lower.shape[-1]
-    js = np.empty(4, np.int64)
+    n_d, n_a = lower.values.shape[1], lower.values.shape[2]
+    n_up = upper.values.shape[-1]
+    js, low, up = np.empty(4, np.int64), lower.values, upper.values
     for m in range(len(class_index)):
         c = class_index[m]
-        cl = c if lower.shape[0] > 1 else 0
+        cl = c if lower.values.shape[0] > 1 else 0
         i0, _ = _cell((view[m, 0] - first_d) / step_d, n_d, False)
         x = (view[m, 1] - first_a) / step_a
         if closes:
@@ -389,24 +432,25 @@ def _bends(class_index, view, first_d, step_d, first_a, step_a, closes, upper, l
         for b in range(4):
             js[b] = (j0 + b) % n_a if closes else j0 + b
         brightest = 1e-30
-        for q in range(n_up):
+        bend[m] = 0.0
+        for q in range(upper.n_lit[i0]):
             most = 0.0
             for a in range(1, 3):
-                middle = upper[c, i0 + a, 2, q]
+                before, middle, after = up[c, i0 + a - 1, 2, q], up[c, i0 + a, 2, q], up[c, i0 + a + 1, 2, q]
                 brightest = max(brightest, middle)
-                most = max(most, abs(upper[c, i0 + a - 1, 2, q] - 2 * middle + upper[c, i0 + a + 1, 2, q]))
-            bend[m, q] = most
-        for q in range(n_low):
+                most = max(most, abs(before - 2 * middle + after))
+            bend[m, upper.pixel[q]] = most
+        for q in range(lower.n_lit[i0]):
             most = 0.0
             for a in range(4):
                 for b in range(4):
-                    middle = lower[cl, i0 + a, js[b], 2, q]
+                    middle = low[cl, i0 + a, js[b], 2, q]
                     brightest = max(brightest, middle)
                     if 0 < a < 3:
-                        ends = lower[cl, i0 + a - 1, js[b], 2, q] + lower[cl, i0 + a + 1, js[b], 2, q]
+                        ends = low[cl, i0 + a - 1, js[b], 2, q] + low[cl, i0 + a + 1, js[b], 2, q]
                         most = max(most, abs(ends - 2 * middle))
                     if 0 < b < 3:
-                        ends = lower[cl, i0 + a, js[b - 1], 2, q] + lower[cl, i0 + a, js[b + 1], 2, q]
+                        ends = low[cl, i0 + a, js[b - 1], 2, q] + low[cl, i0 + a, js[b + 1], 2, q]
                         most = max(most, abs(ends - 2 * middle))
-            bend[m, n_up + q] = most
+            bend[m, n_up + lower.pixel[q]] = most
         bend[m] /= brightest

@@ -71,7 +71,8 @@ def fit_modes(
 ) -> Fits:
     """Refine the first candidate of every frame, the others while they can still win, and at last what is likely.
 
-    Of likely fits that end at one place the best is kept; unlikely ones keep their rough fit.
+    A candidate can win while its cost promises to fall to `margin` above that of the first one. Of likely fits that end
+    at one place the best is kept; unlikely ones keep their rough fit.
     """
     n = len(evidence.weight)
     first = np.isin(np.arange(len(frame)), np.unique(frame, return_index=True)[1])
@@ -79,8 +80,8 @@ def fit_modes(
     limit = least_of_frame(fits, n)[frame[~first]] + margin
     more = refine(model, evidence, frame[~first], class_index[~first], view[~first], settings, limit, roughly=True)
     fits = Fits.joined([fits, more])
-    likely = fits.cost < least_of_frame(fits, n)[fits.frame] + margin
     policy = setup.policy
+    likely = fits.cost < least_of_frame(fits, n)[fits.frame] + policy.margin_cost
     better = distinct_of_frames(fits, np.flatnonzero(likely), setup.shapes.symmetry, policy.same_m, policy.same_rad)
     again = fits[better]
     return Fits.joined([refine(model, evidence, again.frame, again.class_index, again.view, settings), fits[~likely]])

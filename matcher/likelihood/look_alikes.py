@@ -13,11 +13,15 @@ from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import Evidence, range_residuals
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
+from phasemark.render.view import delta_period_rad
 
 __all__ = ["fit_look_alikes"]
 
 _BETTER = 1.0
 """By how much a cost must be lower: below that both views remain, and the answer is ambiguous anyway."""
+_NEAR_SIGMA = 0.3
+"""Within this many standard deviations two fits of one class are one. Other minima may be one deviation away: a fit
+there tells how far the explanations of a frame extend, and keeps its answer from being accepted for too sure."""
 _Views = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Indices of fits, and as many views to try instead of theirs."""
 _OfClasses = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
@@ -72,22 +76,53 @@ def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: 
 
 
 def _refined(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, kinds: list[_OfClasses]) -> Fits:
-    """Refine the most promising views of each kind; `fits` are what they look like."""
+    """Refine the most promising views of each kind; `fits` are what they look like.
+
+    Most of them come back to the fit they look like. So they are refined roughly first, and those that came back are
+    left out unless they cost less.
+    """
     only_distance_and_delta = len(setup.free) == 2  # with more free, a start that costs much may still be near
     chosen = [_most_promising(setup, scene.final, evidence, fits, *kind) for kind in kinds]
     source, class_index, view = (np.concatenate(part) for part in zip(*chosen, strict=True))
-    frame = fits.frame[source]
-    return refine(
+    frame, rival = fits.frame[source], fits.cost[source]
+    limit, settings = rival + setup.policy.likely_cost, scene.settings(setup)
+    rough = refine(
         scene.final,
         evidence,
         frame,
         class_index,
-        _at_measured_distance(setup, scene.final, evidence, frame, class_index, view),
-        scene.settings(setup),
-        fits.cost[source] + setup.policy.likely_cost,
-        fits.cost[source],
+        view,
+        settings,
+        limit,
+        rival,
+        roughly=True,
         at_first_sight=only_distance_and_delta,
     )
+    came_back = _is_near(setup, rough, fits[source]) & (rough.cost >= rival - _BETTER)
+    likely = rough.cost < limit
+    again = np.flatnonzero(likely & ~came_back)
+    final = refine(
+        scene.final,
+        evidence,
+        frame[again],
+        class_index[again],
+        rough.view[again],
+        settings,
+        limit[again],
+        rival[again],
+    )
+    return Fits.joined([final, rough[~likely]])
+
+
+def _is_near(setup: Setup, fits: Fits, others: Fits) -> NDArray[np.bool_]:
+    """Return which fits are where others are, one by one."""
+    columns = [VIEW.index(name) for name in setup.free]
+    away = fits.view - others.view
+    period = np.array([delta_period_rad(setup.shapes.symmetry[c]) for c in fits.class_index])
+    away[:, 1] = np.remainder(away[:, 1] + period / 2, period) - period / 2
+    away = away[:, columns]
+    squared = np.einsum("mp,mpq,mq->m", away, others.information, away)
+    return np.asarray((fits.class_index == others.class_index) & (squared < _NEAR_SIGMA**2))
 
 
 def _most_promising(
@@ -99,7 +134,10 @@ def _most_promising(
     class_index: NDArray[np.int64],
     view: NDArray[np.float64],
 ) -> _OfClasses:
-    """Return the views of one kind that explain their frames best once they are at the measured distance.
+    """Return the views of one kind that explain their frames best, moved to the distances that their frames show.
+
+    A view moves by the median residual of the ranges on its landmark. Of more views than `slides_refined`, those that
+    cost most then are left out.
 
     Parameters
     ----------
@@ -108,23 +146,26 @@ def _most_promising(
     class_index : (k,) int64
     view : (k, 6) float64
     """
-    most = setup.policy.slides_refined
-    if not source.size or np.bincount(source).max() <= most:
+    if not source.size:
         return source, class_index, view
     view = view.copy()
     view[:, 0] = np.clip(view[:, 0], *model.limits())
     frame = fits.frame[source]
-    phasor = model.images(class_index, np.ascontiguousarray(view), ()).phasor
-    residual = range_residuals(phasor, evidence, frame)
-    weight, dark = evidence.seen.weight[frame] * (evidence.weight[frame] > 0), phasor == 0
-    residual[dark | (weight == 0)] = np.nan
-    some = np.isfinite(residual).any(axis=1)
-    residual[some] -= np.nanmedian(residual[some], axis=1, keepdims=True)
+    images = model.images(class_index, np.ascontiguousarray(view), ())
+    residual = range_residuals(images.phasor, evidence, frame)
+    weight = evidence.seen.weight[frame] * (evidence.weight[frame] > 0)
+    residual[(images.phasor == 0) | (weight == 0)] = np.nan
+    on_landmark = np.isfinite(residual) & (images.coverage > 0)
+    some = on_landmark.any(axis=1)
+    nearer = np.zeros(len(view))
+    nearer[some] = np.nanmedian(np.where(on_landmark, residual, np.nan)[some], axis=1)
+    view[:, 0] = np.clip(view[:, 0] + nearer, *model.limits())
+    residual -= np.where(on_landmark, nearer[:, None], 0.0)
     squared = np.where(np.isnan(residual), DISAGREEMENT, weight * residual**2)
     cost = np.where(weight > 0, np.minimum(squared, DISAGREEMENT), 0.0).sum(axis=1)
     order = np.lexsort((cost, source))
     place = np.arange(len(order)) - np.searchsorted(source[order], source[order])
-    kept = np.sort(order[place < most])
+    kept = np.sort(order[place < setup.policy.slides_refined])
     return source[kept], class_index[kept], view[kept]
 
 
@@ -159,12 +200,13 @@ def _from_behind(setup: Setup, scene: Scene, fits: Fits, best: NDArray[np.int64]
 def _next_face(setup: Setup, scene: Scene, fits: Fits, best: NDArray[np.int64], turn_rad: float) -> _OfClasses:
     """Return views of every class a quarter turn away, under several bearings: the next face of something like a box.
 
-    With the bearing fixed the search in the bank compares these sides itself.
+    With the bearing fixed the search in the bank compares these sides itself. Where half a turn changes nothing, the
+    turns to either side are one.
     """
-    n_class = len(setup.shapes.names)
-    which, class_index = np.repeat(best, n_class), np.tile(np.arange(n_class), len(best))
-    same = np.array([setup.shapes.symmetry[c] % 4 == 0 for c in class_index], np.bool_)
-    which, class_index = which[~same], class_index[~same]
+    symmetry = np.array(setup.shapes.symmetry)
+    differs = symmetry % 4 != 0 if turn_rad > 0 else symmetry % 2 != 0
+    classes = np.flatnonzero(differs)
+    which, class_index = np.repeat(best, len(classes)), np.tile(classes, len(best))
     view = fits.view[which].copy()
     view[:, 1] += turn_rad
     slides = (0.0, *setup.policy.slides_with_prior)
@@ -190,27 +232,6 @@ def _slid(
     moves = np.zeros((len(sides), 1, len(VIEW)))
     moves[:, 0, 1] = moves[:, 0, 2] = np.array(sides) * scene.search.column_rad / 2
     return np.tile(which, len(sides)), (view + moves).reshape(-1, len(VIEW))
-
-
-def _at_measured_distance(
-    setup: Setup,
-    model: ImageModel,
-    evidence: Evidence,
-    frame: NDArray[np.int64],
-    class_index: NDArray[np.int64],
-    view: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return views moved along their distance by the median residual of the ranges they explain, (m, 6)."""
-    view = view.copy()
-    for _ in range(setup.policy.registrations):
-        view[:, 0] = np.clip(view[:, 0], *model.limits())
-        phasor = model.images(class_index, np.ascontiguousarray(view), ()).phasor
-        residual = range_residuals(phasor, evidence, frame)
-        compared = (phasor != 0) & (evidence.weight[frame] > 0)
-        residual[~compared] = np.nan
-        some = compared.any(axis=1)
-        view[some, 0] += np.nanmedian(residual[some], axis=1)
-    return view
 
 
 def _rotated(point_m: NDArray[np.float64], delta_rad: NDArray[np.float64]) -> NDArray[np.float64]:

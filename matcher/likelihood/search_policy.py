@@ -19,7 +19,7 @@ def _degrees(*angles: float) -> tuple[float, ...]:
     return tuple(math.radians(angle) for angle in angles)
 
 
-_MAY_BE_ZERO = ("cache_bytes", "settling_rounds", "trimmings", "registrations", "background_rounds")
+_MAY_BE_ZERO = ("cache_bytes", "settling_rounds", "trimmings", "background_rounds")
 _PROBABILITIES = ("doubtful_p", "hopeless_p", "refused_p", "ambiguity")
 
 
@@ -123,8 +123,6 @@ class SearchPolicy:
         Of these, how many are refined for each frame, from the front and from the back.
     sure_bearing : float
         Share of half a column to which a bearing must be known for other bearings to be out of the question.
-    registrations : int
-        How often a look-alike is moved to the distance that the frame shows before it is compared.
 
     strange_sigma : float
         Among unknown things, a return farther from the model than this sees something else.
@@ -206,7 +204,6 @@ class SearchPolicy:
     slides_with_prior: tuple[float, ...] = (-1.0, 1.0)
     slides_refined: int = 3
     sure_bearing: float = 0.05
-    registrations: int = 2
 
     strange_sigma: float = 5.0
     explained_per_parameter: int = 6
