@@ -299,3 +299,13 @@ def test_a_table_is_folded_to_a_narrow_terminal(
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 30
     assert " ".join(" ".join(lines).split()) == "name text cone one two three four five six seven eight"
+
+
+@pytest.mark.parametrize("command", [["match", "frames.csv", "bank.h5"], ["bank", "info", "frames.csv"]])
+def test_frames_in_the_place_of_a_bank_are_named(command, tmp_path, monkeypatch, run):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "frames.csv").write_text("1,2,3\n")
+    (tmp_path / "bank.h5").write_bytes(b"")
+    code, out, err = run(*command)
+    assert (code, out) == (3, "")
+    assert "frames.csv: measured frames, not a bank; the bank comes first: phasemark match BANK FRAMES" in err

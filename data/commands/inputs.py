@@ -25,12 +25,17 @@ if TYPE_CHECKING:
     from phasemark.render.integral.surface_mesh import SurfaceMesh
 
 
+_FRAMES = (".csv", ".npz", ".npy")
+"""Endings of files that hold measured frames and never a bank."""
+
+
 def open_any_bank(path: Path) -> Bank:
     """Open a bank from anywhere; say of a mesh how a bank is made of it."""
     with vouching_begun(path):
         from phasemark.data import open_bank
 
         _refuse_mesh(path)
+        _refuse_frames(path)
         return open_bank(path, untrusted=True)
 
 
@@ -52,6 +57,12 @@ def _refuse_mesh(path: Path) -> None:
             f"{path}: a mesh, not a bank; if it is in millimetres, one is made of it by: phasemark bank build"
             f" --mesh {mesh} --unit mm --out {out}"
         )
+
+
+def _refuse_frames(path: Path) -> None:
+    """Refuse measured frames where a bank is expected, with the order of the arguments."""
+    if path.exists() and path.suffix.lower() in _FRAMES:
+        raise InputFileError(f"{path}: measured frames, not a bank; the bank comes first: phasemark match BANK FRAMES")
 
 
 def read_landmark(name_or_file: str, reading: MeshReading) -> tuple[str, Trimesh]:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from pydantic import (
     BeforeValidator,
     Field,
-    JsonValue,
     PlainSerializer,
     SerializerFunctionWrapHandler,
     ValidationInfo,
@@ -29,7 +28,7 @@ from phasemark.landmarks import LandmarkSpec
 from phasemark.render.view import FARTHEST_M
 
 KINDS = ("fixed", "uniform", "normal", "sobol")
-_DEFAULT_SPLITS: dict[str, JsonValue] = {"train": 0.8, "val": 0.1, "test": 0.1}
+_DEFAULT_SPLITS = {"train": 0.8, "val": 0.1, "test": 0.1}
 MOST_SPLITS = 256
 """The number of a view's split is a byte in the file."""
 Variant = Literal["hard", "mixed", "shot"]
@@ -244,7 +243,7 @@ class FramePlan(ScenePlan):
     keep_taps: bool = False
     histograms: bool | None = None
     splits: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], _Share] = Field(
-        default_factory=_DEFAULT_SPLITS.copy, json_schema_extra={"default": dict(_DEFAULT_SPLITS)}
+        default_factory=_DEFAULT_SPLITS.copy, json_schema_extra={"default": {**_DEFAULT_SPLITS}}
     )
 
     @model_validator(mode="after")
