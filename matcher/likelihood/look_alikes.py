@@ -76,6 +76,8 @@ def _refined(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, kinds: 
     only_distance_and_delta = len(setup.free) == 2  # with more free, a start that costs much may still be near
     chosen = [_most_promising(setup, scene.final, evidence, fits, *kind) for kind in kinds]
     source, class_index, view = (np.concatenate(part) for part in zip(*chosen, strict=True))
+    if not source.size:
+        return fits[:0]
     return refine(
         scene.final,
         evidence,
