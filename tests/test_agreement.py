@@ -108,6 +108,12 @@ def test_pixels_that_are_counted_anew_do_not_let_a_view_slide_away(tmp_path):
     assert count(bank, "bearing", 30, 1, np.random.default_rng([11, 5])).wrong_accepted == 0
 
 
+def test_only_the_final_covariance_excuses_pixels_that_a_view_contradicts(thin_bank):
+    # another face ended two columns before the one that was seen, and its first covariance, far too wide, excused both
+    found = count(thin_bank("bracket", "pmd-16x16"), "bearing", 100, 10, np.random.default_rng([7, 10]))
+    assert found.wrong_accepted == 0
+
+
 def test_the_nearest_image_is_ambiguous_where_another_one_explains_a_frame_as_well(thin_bank):
     # near the camera a face of the bracket's plate, its back and a face of its arm look alike
     found = count(thin_bank("bracket", "pmd-16x16"), "nearest", 60, 1, np.random.default_rng([3, 7]))

@@ -13,15 +13,11 @@ from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import Evidence, range_residuals
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
-from phasemark.render.view import delta_period_rad
 
 __all__ = ["fit_look_alikes"]
 
 _BETTER = 1.0
 """By how much a cost must be lower: below that both views remain, and the answer is ambiguous anyway."""
-_NEAR_SIGMA = 0.3
-"""Within this many standard deviations two fits of one class are one. Other minima may be one deviation away: a fit
-there tells how far the explanations of a frame extend, and keeps its answer from being accepted for too sure."""
 _Views = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Indices of fits, and as many views to try instead of theirs."""
 _OfClasses = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
@@ -76,53 +72,24 @@ def _fit_once(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: 
 
 
 def _refined(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, kinds: list[_OfClasses]) -> Fits:
-    """Refine the most promising views of each kind; `fits` are what they look like.
-
-    Most of them come back to the fit they look like. So they are refined roughly first, and those that came back are
-    left out unless they cost less.
-    """
+    """Refine the most promising views of each kind; `fits` are what they look like."""
     only_distance_and_delta = len(setup.free) == 2  # with more free, a start that costs much may still be near
     chosen = [_most_promising(setup, scene.final, evidence, fits, *kind) for kind in kinds]
     source, class_index, view = (np.concatenate(part) for part in zip(*chosen, strict=True))
-    frame, rival = fits.frame[source], fits.cost[source]
-    limit, settings = rival + setup.policy.likely_cost, scene.settings(setup)
-    rough = refine(
+    if not source.size:
+        return fits[:0]
+    return refine(
         scene.final,
         evidence,
-        frame,
+        fits.frame[source],
         class_index,
         view,
-        settings,
-        limit,
-        rival,
-        roughly=True,
+        scene.settings(setup),
+        fits.cost[source] + setup.policy.likely_cost,
+        fits.cost[source],
         at_first_sight=only_distance_and_delta,
+        look_like=fits[source],
     )
-    came_back = _is_near(setup, rough, fits[source]) & (rough.cost >= rival - _BETTER)
-    likely = rough.cost < limit
-    again = np.flatnonzero(likely & ~came_back)
-    final = refine(
-        scene.final,
-        evidence,
-        frame[again],
-        class_index[again],
-        rough.view[again],
-        settings,
-        limit[again],
-        rival[again],
-    )
-    return Fits.joined([final, rough[~likely]])
-
-
-def _is_near(setup: Setup, fits: Fits, others: Fits) -> NDArray[np.bool_]:
-    """Return which fits are where others are, one by one."""
-    columns = [VIEW.index(name) for name in setup.free]
-    away = fits.view - others.view
-    period = np.array([delta_period_rad(setup.shapes.symmetry[c]) for c in fits.class_index])
-    away[:, 1] = np.remainder(away[:, 1] + period / 2, period) - period / 2
-    away = away[:, columns]
-    squared = np.einsum("mp,mpq,mq->m", away, others.information, away)
-    return np.asarray((fits.class_index == others.class_index) & (squared < _NEAR_SIGMA**2))
 
 
 def _most_promising(

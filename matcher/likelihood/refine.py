@@ -16,7 +16,7 @@ from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels, whole_cost
 from phasemark.matcher.likelihood.descent import descend
 from phasemark.matcher.likelihood.fits import Fits
-from phasemark.matcher.likelihood.images import ImageModel
+from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.kinks import look_beside, settle
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, DescentSettings, Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
@@ -28,6 +28,12 @@ from phasemark.matcher.likelihood.uncertainty import (
     view_covariance,
 )
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
+
+_NEAR_SIGMA = 0.3
+"""Within this many standard deviations two fits of one class are one. Other minima may be one deviation away: a fit
+there tells how far the explanations of a frame extend, and keeps its answer from being accepted for too sure."""
+_BETTER = 1.0
+"""By how much a candidate must cost less than the fit it came back to; see :mod:`~.look_alikes`."""
 
 
 def refine(
@@ -42,6 +48,7 @@ def refine(
     *,
     roughly: bool = False,
     at_first_sight: bool = False,
+    look_like: Fits | None = None,
 ) -> Fits:
     """Move m candidates to the nearest maximum of the likelihood.
 
@@ -64,6 +71,9 @@ def refine(
     at_first_sight : bool
         Whether to give up at the start already, where its cost is far above the limit. Use it only where starts are
         close to a solution.
+    look_like : Fits, optional
+        The fits that the candidates look like, one each. A candidate that comes back to its fit is left out, unless it
+        costs less.
 
     Returns
     -------
@@ -76,10 +86,15 @@ def refine(
     if roughly:
         state = descend(problem, state, settings.policy.rough_cost)
         return conclude(problem, state, look_around=False)
+    if look_like is not None:
+        state = descend(problem, state, settings.policy.rough_cost)
+        problem, state, look_like = _others(problem, state, look_like)
     state = _descend_near(problem, state)
     if settings.look_beside_rad:
         state = look_beside(problem, state)
     state = _recounted(problem, state)
+    if look_like is not None:
+        problem, state, _ = _others(problem, state, look_like)
     if not model.slopes_are_cheap:  # interpolated coverages do not show the step in which an edge enters a pixel
         state = settle(problem, state)
     return conclude(problem, state)
@@ -99,6 +114,17 @@ def costs_at(
         return whole_cost(problem, problem.start(view, False))[0]
     theta = np.column_stack([problem.clipped(view.copy()), np.ones(len(view))])
     return whole_cost(problem, problem.at(theta))[0]
+
+
+def _others(problem: Problem, state: State, look_like: Fits) -> tuple[Problem, State, Fits]:
+    """Leave out the candidates that came back to the fits that they look like, and cost no less."""
+    columns = [VIEW.index(name) for name in problem.settings.free]
+    away = (state.theta[:, :ALBEDO_COLUMN] - look_like.view)[:, columns]
+    squared = np.einsum("mp,mpq,mq->m", away, look_like.information, away)
+    came_back = (problem.class_index == look_like.class_index) & (squared < _NEAR_SIGMA**2)
+    came_back &= whole_cost(problem, state)[0] >= look_like.cost - _BETTER
+    others = np.flatnonzero(~came_back)
+    return problem.some(others), picked(state, others), look_like[others]
 
 
 def _descend_near(problem: Problem, state: State) -> State:
@@ -146,8 +172,8 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     # 2  take the covariance of solutions that may still win from wide differences
     competitive = near[(sums.cost + _further_cost(pixels))[near] <= problem.rival[near] + DISAGREEMENT]
     covariance, without_one = _uncertainty(problem, state, competitive)
-    # 3  count contradicted pixels again, by that covariance
-    if pixels.wrong[competitive].any():
+    # 3  count contradicted pixels again, by that covariance: it may excuse more of them, or fewer
+    if competitive.size:
         pixels = _judged_pixels(problem, state, near, covariance)
     further = _further_cost(pixels)
     n_residuals = pixels.compared * problem.evidence.per_pixel + pixels.wrong + pixels.undecided
