@@ -299,7 +299,7 @@ class Matcher:
         Returns
         -------
         Match
-            The view is that of the first position, and so is what `free` names.
+            The view is that of the first position; `free` names its parameters.
 
         Raises
         ------
