@@ -1,4 +1,4 @@
-"""What a landmark leaves visible of the planes behind it, on the grid of a table, and scenes in between.
+"""Shares of planes that a landmark leaves visible, on the grid of a table, and scenes in between.
 
 A zone's light from a plane is taken as that of the plane with nothing before it, times the share that the landmark
 leaves visible. That is exact where a zone sees the plane within a bin or two, and good enough for a search elsewhere.

@@ -55,7 +55,7 @@ class Counted(NamedTuple):
 
 
 class Search(NamedTuple):
-    """What a fit varies, and how far.
+    """Parameters that a fit varies, and how far.
 
     A state is the six numbers of a view, and after them what the frame leaves open besides: nuisances, the slopes of
     which come after those of the view.

@@ -43,7 +43,7 @@ class Look(NamedTuple):
 
 
 class SceneModel(Protocol):
-    """What can be seen from a view."""
+    """Model of what can be seen from a view."""
 
     @property
     def nuisances(self) -> NDArray[np.float64]:

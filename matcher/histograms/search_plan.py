@@ -1,4 +1,4 @@
-"""What every search for a landmark in histograms is given, and what it returns."""
+"""Inputs and results of every search for a landmark in histograms."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from phasemark.render import Background
 
 
 class SearchPlan(NamedTuple):
-    """Where landmarks are looked for.
+    """Region in which landmarks are looked for.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class SearchPlan(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Where a fit begins.
+    """Initial guess of a fit.
 
     Parameters
     ----------
