@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import usual_workers
 from phasemark.matcher.likelihood.setup import check_free
 from phasemark.matcher.likelihood.systematic import declared_covariance
+from phasemark.render import Background
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
 
@@ -26,7 +27,9 @@ DIRECT_KINDS = ("histograms", "targets")
 """What of it a direct sensor alone measures."""
 
 
-def refuse_direct_options(method: str, on: str, background: object, pixels: str, robust: bool) -> None:
+def refuse_direct_options(
+    method: str, on: str, background: Background | Literal["auto", "unknown"] | None, pixels: str, robust: bool
+) -> None:
     """Refuse options that do not go with histograms and targets.
 
     Raises
@@ -36,7 +39,9 @@ def refuse_direct_options(method: str, on: str, background: object, pixels: str,
     """
     wrong = {
         "'method' must be refine": method != "refine",
-        "'background' must be None, for nothing but the landmark is expected to return": background is not None,
+        "'background' must be a Background, 'auto' or None": background == "unknown",
+        "'background' must be a Background or None, for targets do not tell it": on == "targets"
+        and background == "auto",
         "'pixels' must be all": pixels != "all",
         "'robust' must be False": robust,
     }
@@ -49,6 +54,7 @@ def direct_method(
     bank: Bank,
     on: str,
     *,
+    background: Background | Literal["auto"] | None,
     free: Sequence[str] | None,
     known: Mapping[str, float],
     false_alarm: float,
@@ -63,6 +69,8 @@ def direct_method(
     ----------
     bank : Bank
     on : {"histograms", "targets"}
+    background : Background, "auto" or None
+        What stands behind the landmark.
     free : sequence of str, optional
         None: distance, δ and the bearing.
     known : mapping of str to float
@@ -87,8 +95,11 @@ def direct_method(
         systematic=declared_covariance(bank.camera, names) if declared else np.zeros((len(names), len(names))),
     )
     prior_std = [known.get(name, math.inf) for name in names]
-    kind = HistogramMatcher if on == "histograms" else TargetMatcher
-    return kind(bank, free=names, prior_std=prior_std, rules=rules, workers=workers or usual_workers())
+    common: dict[str, Any] = {
+        "free": names, "prior_std": prior_std, "rules": rules, "background": background,
+        "workers": workers or usual_workers(),
+    }  # fmt: skip
+    return HistogramMatcher(bank, **common) if on == "histograms" else TargetMatcher(bank, **common)
 
 
 def direct_frames(bank: Bank, on: str, frames: object) -> HistogramFrames | Targets:

@@ -7,6 +7,8 @@ from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal, Protocol, cast
 
+from numpy.typing import ArrayLike
+
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.direct_method import (
@@ -19,6 +21,8 @@ from phasemark.matcher.direct_method import (
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.region import read_region
 from phasemark.matcher.frequencies import OneFrequencyBank
+from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
+from phasemark.matcher.histograms.joint_models import relative_poses
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import (
     BEARING_STD_RAD,
@@ -75,9 +79,10 @@ class Matcher:
         bearing at 0.
     background : Background, "auto", "unknown" or None
         What stands behind the landmark. None: nothing is expected to return beside it. "auto", with "refine": wall and
-        floor are estimated from each frame's own far pixels. "unknown", with "refine" on ranges: other things may stand
-        before, beside and behind it; what the landmark does not explain costs a disagreement when views and classes
-        are compared, and is left out of the test of the fit.
+        floor are estimated from each frame's own far pixels; of histograms a wall alone, its distance and brightness.
+        "unknown", with "refine" on ranges: other things may stand before, beside and behind it; what the landmark does
+        not explain costs a disagreement when views and classes are compared, and is left out of the test of the fit.
+        Histograms take the albedos of a Background as guesses, targets as known.
     false_alarm : float
         Share of good frames that the test of the fit may refuse.
     on : {"ranges", "phasors", "histograms", "targets"}
@@ -86,8 +91,7 @@ class Matcher:
         ranges are the unwrapped ones with their combined variance; phasors, and the phases that "nearest" compares, are
         those of every frequency, each wrapped by itself: nothing is unwrapped, and mixed pixels count. Of a direct
         sensor with a [histogram] table also the counts of every bin, Poisson, with the landmark's brightness and the
-        ambient light of every zone estimated, or the targets that its chip reports; both take a scene that holds the
-        landmark alone.
+        ambient light of every zone estimated, or the targets that its chip reports.
     pixels : {"all", "lower"}
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool
@@ -188,12 +192,14 @@ class Matcher:
         self._direct: DirectMethod | None = None
         if on in DIRECT_KINDS:
             refuse_direct_options(method, on, background, pixels, robust)
+            behind = cast(Background | Literal["auto"] | None, background)
             known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
             if free is None:
                 known["bearing_rad"] = bearing_std_rad
             self._direct = direct_method(
                 bank,
                 on,
+                background=behind,
                 free=free,
                 known=known,
                 false_alarm=false_alarm,
@@ -276,6 +282,42 @@ class Matcher:
             )
         frames = self.read_out(frames).without_offset().with_pooled_noise()
         return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
+
+    def match_jointly(self, frames: HistogramFrames, camera2world: ArrayLike) -> Match:
+        """Match histograms of several known poses as those of one landmark that is seen from all of them.
+
+        The likelihoods of all frames are multiplied, so that their information adds. The brightness of the landmark and
+        the ambient light are estimated in each frame, as is the wall of an automatic background. Frames that contradict
+        each other are a poor fit: the test is of all frames together, of each, and of what they gain by views and
+        classes of their own.
+
+        Parameters
+        ----------
+        frames : HistogramFrames
+            n positions, of one sensor that is moved or of n sensors of the bank's kind.
+        camera2world : (n, 4, 4) array_like
+            Pose of the camera at each position, in a frame that all have in common: x along the axis, y left, z up.
+
+        Returns
+        -------
+        Match
+            The view is that of the first position; `free` names its parameters.
+
+        Raises
+        ------
+        UsageError
+            The matcher is not one of histograms, a wall is stated, which stands at another distance at every position,
+            the poses are not as many as the positions, one is not rigid, or the frames are not what is matched on.
+        """
+        if not isinstance(self._direct, HistogramMatcher):
+            raise UsageError(f'match_jointly takes on="histograms", got on="{self.options["on"]}"')
+        behind = self.options["background"]
+        if isinstance(behind, Background) and behind.wall_m is not None:
+            raise UsageError(
+                "'background' must have no wall in match_jointly, for its distance changes with the pose: give \"auto\""
+            )
+        measured = cast(HistogramFrames, direct_frames(self.bank, "histograms", frames))
+        return self._direct.match_jointly(measured, relative_poses(len(measured), camera2world))
 
     def _of_one_frequency(self, frames: FilteredFrames, one: OneFrequency) -> FilteredFrames:
         """Return the frames that a camera of one frequency would have measured in place of the camera of several."""

@@ -25,25 +25,35 @@ def tilt2level(pitch_rad: NDArray[np.float64], roll_rad: NDArray[np.float64]) ->
     return out
 
 
-def rigid_transforms(transforms: ArrayLike) -> NDArray[np.float64]:
+def rigid_transforms(transforms: ArrayLike, name: str = "landmark2cam") -> NDArray[np.float64]:
     """Return (n, 4, 4) float64 transforms that are rigid.
+
+    Parameters
+    ----------
+    transforms : (n, 4, 4) or (4, 4) array_like
+    name : str
+        What messages call them.
 
     Raises
     ------
     UsageError
         A matrix is not finite, or not a rotation with a translation.
     """
-    array = np.asarray(transforms, dtype=np.float64)
+    try:
+        array = np.asarray(transforms, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise UsageError(f"'{name}' must have shape (n, 4, 4), got what is no array of numbers") from None
+    given = array.shape
     if array.ndim == 2:
         array = array[None]
     if array.shape[1:] != (4, 4):
-        raise UsageError(f"'landmark2cam' must have shape (n, 4, 4), got {array.shape}")
+        raise UsageError(f"'{name}' must have shape (n, 4, 4), got {given}")
     if not np.isfinite(array).all():
-        raise UsageError("'landmark2cam' must be finite")
+        raise UsageError(f"'{name}' must be finite")
     square = np.einsum("nij,nkj->nik", array[:, :3, :3], array[:, :3, :3])
     off = np.abs(square - np.eye(3)).max(axis=(1, 2))
     bottom = np.abs(array[:, 3] - [0, 0, 0, 1]).max(axis=1)
     wrong = (off > 1e-4) | (bottom > 1e-9) | (np.linalg.det(array[:, :3, :3]) < 0)
     if wrong.any():
-        raise UsageError(f"'landmark2cam' must be a rotation and a translation, matrix {int(wrong.argmax())} is not")
+        raise UsageError(f"'{name}' must be a rotation and a translation, matrix {int(wrong.argmax())} is not")
     return array

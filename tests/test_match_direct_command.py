@@ -11,7 +11,7 @@ import pytest
 from phasemark.cli import main
 from phasemark.data import BankPlan, FramePlan, build_bank, build_frames
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.render import Views, preset
+from phasemark.render import Background, Views, preset
 from phasemark.render.direct import HistogramRenderer, capture_histograms
 
 VIEWS = Views.broadcast([1.0, 1.1], [0.4, 1.2])
@@ -78,7 +78,14 @@ def test_frames_of_a_sensor_at_rest_are_added_up(folder: Path, capsys: pytest.Ca
         (("bank.h5", "log.npz", "--on", "histograms"), "--on goes with --method refine"),
         (("phase.h5", "log.npz", *FIXED, "--on", "histograms"), "take a bank of a direct sensor"),
         (("bank.h5", "targets.csv", *FIXED, "--on", "histograms"), "match it on targets"),
-        (("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--wall", "3"), "--wall goes with images of ranges"),
+        (
+            ("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--unknown-background"),
+            "--unknown-background goes with images of ranges",
+        ),
+        (
+            ("bank.h5", "log.npz", *FIXED, "--on", "targets", "--auto-background"),
+            "--auto-background takes histograms",
+        ),
         (("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--unit", "mm"), "--unit goes with images of ranges"),
         (("bank.h5", "log.npz", *FIXED, "--on", "targets", "--robust"), "--robust goes with images of ranges"),
         (("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--plot", "a.png"), "--plot draws ranges"),
@@ -123,3 +130,21 @@ def test_a_frame_set_is_matched_view_by_view_or_frame_by_frame(
     code, _, err = run(capsys, "match", folder / "bank.h5", folder / "vl53l5cx-4x4.h5", *FIXED, "--on", "histograms")
     assert code == 2
     assert "has 4 × 4 zones of 128 bins, and the bank's sensor 8 × 8 of 128" in " ".join(err.split())
+
+
+def test_a_log_before_a_wall_is_matched_with_the_wall_stated_or_estimated(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sensor, wall = preset("vl53l5cx-8x8"), Background(wall_m=1.6)
+    mean = HistogramRenderer(build_mesh(catalog()["cone"]), sensor).expected(VIEWS, background=wall)
+    frames = capture_histograms(mean, sensor, rng=np.random.default_rng(2))
+    np.savez(folder / "wall.npz", histogram=frames.zone_counts.astype(int))
+    told = ("match", folder / "bank.h5", folder / "wall.npz", *FIXED, "--moving", "--json", "--on", "histograms")
+    for words, accepted in ((("--wall", 1.6), True), (("--auto-background",), True), ((), False)):
+        code, out, _ = run(capsys, *told, *words)
+        assert code == 0
+        found = json.loads(out)["matches"]
+        assert [one["accepted"] for one in found] == [accepted] * 2
+        if accepted:
+            assert [one["distance_m"] for one in found] == pytest.approx(VIEWS.distance_m.tolist(), abs=0.005)
+            assert [one["wall_m"] for one in found] == pytest.approx([1.6, 1.6], abs=0.005)

@@ -89,8 +89,8 @@ def cramer_rao(
 
     Pixels count where one frame measures the range to 0.1 rad or better (0.24 m at 10 MHz). Of several modulation
     frequencies the information is the sum of that of each. A :class:`~phasemark.render.direct.HistogramRenderer` has
-    the bound of histograms: the Poisson information, with the landmark's brightness and the ambient light of every
-    zone unknown.
+    the bound of histograms: the Poisson information, with the brightness of landmark, wall and floor and the ambient
+    light of every zone unknown.
 
     Parameters
     ----------
@@ -109,7 +109,8 @@ def cramer_rao(
     background : Background, optional
         Wall and floor; nothing stands behind the landmark without it.
     nuisances : sequence of str, optional
-        Which of :data:`NUISANCES` are unknown too; None: the albedo on phasors, nothing on ranges.
+        Which of :data:`NUISANCES` are unknown too; None: the albedo on phasors, nothing on ranges. Of histograms
+        "wall_m" alone can be named, for brightness is unknown anyway.
     systematic : collection of {"calibration", "declared"}
         Which errors of the sensor that all frames share are added: what its calibration leaves, and what it declares.
     workers : int
@@ -134,15 +135,18 @@ def cramer_rao(
     [0.00036, 0.00531]
     """
     if not isinstance(renderer, Renderer):
-        if on != "ranges" or pixels != "all" or background is not None or nuisances is not None:
+        if on != "ranges" or pixels != "all" or not set(nuisances or ()) <= {"wall_m"}:
             raise UsageError(
-                "of histograms all zones count, brightness and ambient light are unknown, and nothing stands behind the"
-                " landmark: leave 'on', 'pixels', 'background' and 'nuisances' out"
+                "of histograms all zones count, and brightness and ambient light are unknown: leave 'on' and 'pixels'"
+                " out, and name nothing but wall_m in 'nuisances'"
             )
         _check_free(free)
+        _check_wall(nuisances or (), background)
         from phasemark.matcher.accuracy.histogram_bound import histogram_information  # direct sensors alone need it
 
-        information = histogram_information(renderer, views, free, n_frames, workers)
+        information = histogram_information(
+            renderer, views, free, n_frames, workers, background=background, free_wall=bool(nuisances)
+        )
         everywhere = np.ones((len(views), renderer.sensor.rows, renderer.sensor.cols), np.bool_)
         declared = None
         if "declared" in check_systematic(systematic):
@@ -153,8 +157,7 @@ def cramer_rao(
         if name not in NUISANCES:
             raise UsageError(f"'nuisances' must be among {', '.join(NUISANCES)}, got {name!r}")
     _check_free(free)
-    if (background is None or background.wall_m is None) and set(nuisances) & {"wall_m", "wall_albedo"}:
-        raise UsageError("a wall can be a nuisance only where there is one: give 'background' a wall")
+    _check_wall(nuisances, background)
     one = None
     if len(renderer.sensor.frequencies_hz) > 1:
         one = OneFrequency(renderer.sensor, "stacked")
@@ -215,6 +218,12 @@ def _check_free(free: Sequence[str]) -> None:
     """Refuse parameters that are unknown or repeated."""
     if not free or any(name not in VIEW for name in free) or len(set(free)) < len(free):
         raise UsageError(f"'free' must name some of {', '.join(VIEW)} once each, got {tuple(free)!r}")
+
+
+def _check_wall(nuisances: Sequence[str], background: Background | None) -> None:
+    """Refuse a wall among the nuisances where there is none."""
+    if (background is None or background.wall_m is None) and set(nuisances) & {"wall_m", "wall_albedo"}:
+        raise UsageError("a wall can be a nuisance only where there is one: give 'background' a wall")
 
 
 def _image_and_slopes(

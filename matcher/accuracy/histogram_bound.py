@@ -12,16 +12,27 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.matcher.histograms.histogram_matcher import glass_counts
 from phasemark.matcher.histograms.poisson_fit import frame_sums
+from phasemark.matcher.histograms.scene_models import FLOOR, WALL, planes_of
 from phasemark.matcher.histograms.view_signals import STEPS
-from phasemark.render import Views
+from phasemark.matcher.information import eliminated
+from phasemark.render import Background, Views
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_images import HistogramRenderer
 
+_ALBEDOS = {WALL: "wall_albedo", FLOOR: "floor_albedo"}
+_WALL_STEP_M = 2e-3
+
 
 def histogram_information(
-    renderer: HistogramRenderer, views: Views, free: Sequence[str], n_frames: ArrayLike = 1, workers: int = 1
+    renderer: HistogramRenderer,
+    views: Views,
+    free: Sequence[str],
+    n_frames: ArrayLike = 1,
+    workers: int = 1,
+    background: Background | None = None,
+    free_wall: bool = False,
 ) -> NDArray[np.float64]:
-    """Return Σ ∂λ ∂λᵀ / λ over the bins of all zones, what unknown brightness and ambient light cost taken off.
+    """Return Σ ∂λ ∂λᵀ / λ over the bins of all zones, less what unknown brightness and ambient light cost.
 
     Parameters
     ----------
@@ -32,6 +43,10 @@ def histogram_information(
     n_frames : array_like
         Frames that are added up, of each view.
     workers : int
+    background : Background, optional
+        What stands behind the landmark; the brightness of each plane is unknown too.
+    free_wall : bool
+        Whether the distance of the wall is unknown too.
 
     Returns
     -------
@@ -48,18 +63,31 @@ def histogram_information(
     frames = np.broadcast_to(frames, (len(views),))
     sensor, histogram, p = renderer.sensor, histogram_of(renderer.sensor), len(free)
 
-    def signal(at: Views) -> NDArray[np.float64]:
-        return renderer.albedo * renderer.signal(at, workers=workers)[:, 0]
+    def signal(at: Views, behind: Background | None = background) -> NDArray[np.float64]:
+        found = renderer.signal(at, background=behind, workers=workers)
+        return renderer.albedo * found[:, 0] + found[:, 1]
 
     here = signal(views)
-    slopes = np.empty((len(views), p, *here.shape[1:]))
-    for k, name in enumerate(free):
+    columns = []
+    for name in free:
         sides = [signal(replace(views, **{name: getattr(views, name) + step})) for step in (STEPS[name], -STEPS[name])]
-        slopes[:, k] = (sides[0] - sides[1]) / (2 * STEPS[name])
+        columns.append((sides[0] - sides[1]) / (2 * STEPS[name]))
+    planes = () if background is None else planes_of(background)
+    for plane in planes:
+        assert background is not None
+        others = {name: 0.0 for kind, name in _ALBEDOS.items() if kind != plane}
+        columns.append(renderer.signal(views, background=replace(background, **others), workers=workers)[:, 1])
+    if free_wall:
+        assert background is not None
+        assert background.wall_m is not None
+        walls = [replace(background, wall_m=background.wall_m + step) for step in (_WALL_STEP_M, -_WALL_STEP_M)]
+        columns.append((signal(views, walls[0]) - signal(views, walls[1])) / (2 * _WALL_STEP_M))
+    slopes = np.stack(columns, axis=1)
+    q = len(columns)
     out = np.empty((len(views), p, p))
     zones, bins = here.shape[1:]
-    level, own, scratch = np.empty((zones, bins)), np.empty((zones, p + 3)), np.empty((2, p + 2))
-    whole, gradient = np.empty((p + 1, p + 1)), np.empty(p + 1)
+    level, own, scratch = np.empty((zones, bins)), np.empty((zones, q + 3)), np.empty((2, q + 2))
+    whole, gradient = np.empty((q + 1, q + 1)), np.empty(q + 1)
     for k, n in enumerate(frames):
         ambient = np.full(zones, n * histogram.cycles * (histogram.ambient + histogram.dark))
         cycles = n * histogram.cycles if histogram.pile_up else math.inf
@@ -67,5 +95,5 @@ def histogram_information(
             np.zeros((zones, bins)), n * here[k], n * slopes[k], 1.0, ambient, n * glass_counts(sensor), cycles, level,
             whole, gradient, own, scratch,
         )  # fmt: skip
-        out[k] = whole[:-1, :-1] - np.outer(whole[:-1, -1], whole[-1, :-1]) / whole[-1, -1]
+        out[k] = eliminated(whole[None], p)[0]
     return out

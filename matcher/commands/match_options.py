@@ -104,7 +104,10 @@ class Search:
         float, typer.Option("--false-alarm", help="Share of good frames that the test of the fit may refuse.")
     ] = 0.01
     auto_background: Annotated[
-        bool, typer.Option("--auto-background", help="With refine: estimate wall and floor from each frame.")
+        bool,
+        typer.Option(
+            "--auto-background", help="With refine: estimate wall and floor from each frame; from histograms a wall."
+        ),
     ] = False
     unknown_background: Annotated[
         bool,
@@ -179,13 +182,14 @@ class Search:
     def _check_direct(self) -> None:
         """Refuse options that belong to images of ranges."""
         foreign = (
-            ("--pixels", self.pixels != "all"), ("--robust", self.robust), ("--auto-background", self.auto_background),
-            ("--unknown-background", self.unknown_background), ("--wall", self.wall is not None),
-            ("--floor", self.floor is not None), ("--filter", self.filter_name != "kalman"),
+            ("--pixels", self.pixels != "all"), ("--robust", self.robust),
+            ("--unknown-background", self.unknown_background), ("--filter", self.filter_name != "kalman"),
         )  # fmt: skip
         for option, used in foreign:
             if used:
                 raise UsageError(f"{option} goes with images of ranges: leave it out with --on {self.on}")
+        if self.auto_background and self.on == "targets":
+            raise UsageError("--auto-background takes histograms: with --on targets give --wall and --floor")
 
     def matcher(self, bank: Bank) -> Matcher:
         """Return the matcher."""

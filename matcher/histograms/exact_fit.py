@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,25 +12,28 @@ from numpy.typing import NDArray
 from phasemark.matcher.histograms.poisson_fit import ambient_step, frame_sums
 from phasemark.matcher.histograms.scene_prediction import shifted
 from phasemark.matcher.histograms.table_search import BRIGHTEST, DIMMEST
-from phasemark.matcher.histograms.view_signals import ViewSignals
-from phasemark.render import Views
 from phasemark.render.view import VIEW_FIELDS
 
+SceneAt = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
+"""Returns signal and slopes of one frame at a state."""
 _INNER_STEPS = 12
 _INNER_HALVINGS = 4
 _INNER_DONE = 1e-2  # squared standard deviations
 _NEAR_ENOUGH = 0.7
 """A step shorter than this share of a standard deviation needs no other scene: slopes are straight over it."""
+_SETTLED = 0.05
+"""A nuisance that moves by less than this share of its longest step needs no other scene."""
 _SHRINK, _LEAST_SHRINK = 0.3, 0.05
 _WORSE = 0.5
 """A scene may be so much worse than the linear one that led to it: less than what a test can see."""
 _SAME = np.array([0.005, *[math.radians(1.0)] * 2, 0.005, *[math.radians(1.0)] * 2])
 """A fit this near to another one, on its way, ends where that one did."""
+_NO_INFORMATION = 1e-300
 _LONGEST = {"m": 0.04, "rad": math.radians(4.0)}
 
 
 class Counted(NamedTuple):
-    """One frame, or several that are added up.
+    """One frame, or several that are added up; or several positions, their zones one after the other.
 
     Parameters
     ----------
@@ -40,15 +43,76 @@ class Counted(NamedTuple):
         First photons that there can be; infinite without pile-up.
     extra : (bins,) float64
         Counts of the cover glass.
-    drift_bins : float
-        How far the histogram is shifted.
+    drift_bins : (positions,) float64
+        How far the histograms of each position are shifted.
     """
 
     counts: NDArray[np.float64]
     n_frames: float
     cycles: float
     extra: NDArray[np.float64]
-    drift_bins: float
+    drift_bins: NDArray[np.float64]
+
+
+class Search(NamedTuple):
+    """Parameters that a fit varies, and how far.
+
+    A state is the six numbers of a view, and after them what the frame leaves open besides: nuisances, the slopes of
+    which come after those of the view.
+
+    Parameters
+    ----------
+    free : tuple of str
+        Parameters of the view.
+    columns : (q,) int64
+        Which numbers of a state are varied: those of `free`, then the nuisances.
+    weight : (q,) float64
+        Information before the frame is seen, of Gaussian priors of mean 0.
+    limits : (2, states) float64
+        Least and greatest values of a state.
+    longest : (q,) float64
+        Longest step between two scenes.
+    most : int
+        Scenes with slopes that are rendered at most.
+    """
+
+    free: tuple[str, ...]
+    columns: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    limits: NDArray[np.float64]
+    longest: NDArray[np.float64]
+    most: int
+
+
+def search_of(
+    free: Sequence[str], prior_std: NDArray[np.float64], limits: NDArray[np.float64], most: int,
+    nuisances: NDArray[np.float64] | None = None,
+) -> Search:  # fmt: skip
+    """Return what a fit varies.
+
+    Parameters
+    ----------
+    free : sequence of str
+        Parameters of the view.
+    prior_std : (p,) float64
+        Of each; infinite where nothing is known.
+    limits : (2, 6) float64
+    most : int
+    nuisances : (3, k) float64, optional
+        Least and greatest value and longest step of each nuisance.
+    """
+    more = np.empty((3, 0)) if nuisances is None else nuisances
+    names = tuple(free)
+    longest = [_LONGEST[name.rpartition("_")[2]] for name in names]
+    columns = [*map(VIEW_FIELDS.index, names), *(len(VIEW_FIELDS) + k for k in range(more.shape[1]))]
+    return Search(
+        names,
+        np.array(columns, dtype=np.int64),
+        np.concatenate([1 / prior_std**2, np.zeros(more.shape[1])]),
+        np.concatenate([limits, more[:2]], axis=1),
+        np.concatenate([longest, more[2]]),
+        most,
+    )
 
 
 class Fit(NamedTuple):
@@ -56,19 +120,19 @@ class Fit(NamedTuple):
 
     Parameters
     ----------
-    view : (6,) float64
+    state : (6 + k,) float64
+        The view, and the nuisances.
     bright : float
     ambient : (zones,) float64
-    deviance : float
-    cost : float
-        The deviance with what was known of the view before.
+    deviance, cost : float
+        The cost has what was known before.
     level : (zones, bins) float64
-        Expected counts.
+        Expected counts, pile-up included.
     information : (p, p) float64
-        Brightness and ambient light eliminated, what was known before included.
+        Brightness, ambient light and nuisances eliminated, what was known before included.
     """
 
-    view: NDArray[np.float64]
+    state: NDArray[np.float64]
     bright: float
     ambient: NDArray[np.float64]
     deviance: float
@@ -76,30 +140,28 @@ class Fit(NamedTuple):
     level: NDArray[np.float64]
     information: NDArray[np.float64]
 
+    @property
+    def view(self) -> NDArray[np.float64]:
+        """The six numbers of the view."""
+        return self.state[: len(VIEW_FIELDS)]
+
 
 def fit_view(
-    signals: ViewSignals, frame: Counted, view: NDArray[np.float64], bright: float, ambient: NDArray[np.float64],
-    free: Sequence[str], prior_std: NDArray[np.float64], limits: NDArray[np.float64], most: int, hopeless: float,
-    known: Sequence[NDArray[np.float64]] = (),
+    scene_at: SceneAt, frame: Counted, state: NDArray[np.float64], bright: float, ambient: NDArray[np.float64],
+    search: Search, hopeless: float, known: Sequence[NDArray[np.float64]] = (),
 ) -> Fit | None:  # fmt: skip
     """Refine a view until a scene rendered there explains the frame best.
 
     Parameters
     ----------
-    signals : ViewSignals
-        Of the class.
+    scene_at : callable
+        Returns the expected signal counts of one frame at a state, (zones, bins), and their slopes, (q, zones, bins).
     frame : Counted
-    view : (6,) float64
+    state : (6 + k,) float64
         Where to start.
     bright : float
     ambient : (zones,) float64
-    free : sequence of str
-    prior_std : (p,) float64
-        Of Gaussian priors of mean 0; infinite where nothing is known.
-    limits : (2, 6) float64
-        Least and greatest values of the view.
-    most : int
-        Scenes with slopes that are rendered at most.
+    search : Search
     hopeless : float
         A fit that will cost more than this is given up.
     known : sequence of (6,) float64
@@ -110,45 +172,46 @@ def fit_view(
     Fit or None
         None of a fit that was given up.
     """
-    columns = [VIEW_FIELDS.index(name) for name in free]
-    longest = np.array([_LONGEST[name.rpartition("_")[2]] for name in free])
-    weight = 1 / prior_std**2
+    columns, n_view = search.columns, len(VIEW_FIELDS)
     best: Fit | None = None
-    step, shrink = np.zeros(len(free)), 1.0
-    view = np.clip(view, *limits)
-    for _ in range(most):
-        scene = _scene_at(signals, frame, view, free, weight, view[columns])
+    step, shrink = np.zeros(len(columns)), 1.0
+    state = np.clip(state, *search.limits)
+    for _ in range(search.most):
+        scene = _scene(scene_at(state), frame, search, state[columns])
         here = scene.at_view(bright, ambient)
         if best is not None and here.cost > best.cost + _WORSE:
             shrink *= _SHRINK
             if shrink < _LEAST_SHRINK:
                 break
-            view = best.view.copy()
-            view[columns] += shrink * step
-            view = np.clip(view, *limits)
+            state = best.state.copy()
+            state[columns] += shrink * step
+            state = np.clip(state, *search.limits)
             continue
-        offset, there = scene.descend(here, longest)
-        best = Fit(view.copy(), here.bright, here.ambient, here.deviance, here.cost, here.level, there.information)
+        offset, there = scene.descend(here, search.longest)
+        best = Fit(state.copy(), here.bright, here.ambient, here.deviance, here.cost, here.level, there.information)
         bright, ambient, shrink, step = there.bright, there.ambient, 1.0, offset
-        view = view.copy()
-        view[columns] += offset
-        view = np.clip(view, *limits)
-        if float(offset @ there.information @ offset) < _NEAR_ENOUGH**2:
-            return Fit(view, bright, ambient, there.deviance, there.cost, there.level, there.information)
-        if there.cost > hopeless or any((np.abs(view - other) < _SAME).all() for other in known):
+        state = state.copy()
+        state[columns] += offset
+        state = np.clip(state, *search.limits)
+        turn, others = np.split(offset, [len(search.free)])
+        settled = (np.abs(others) <= _SETTLED * search.longest[len(search.free) :]).all()
+        if settled and float(turn @ there.information @ turn) < _NEAR_ENOUGH**2:
+            return Fit(state, bright, ambient, there.deviance, there.cost, there.level, there.information)
+        if there.cost > hopeless or any((np.abs(state[:n_view] - other) < _SAME).all() for other in known):
             return None
     return best
 
 
-def _scene_at(
-    signals: ViewSignals, frame: Counted, view: NDArray[np.float64], free: Sequence[str],
-    weight: NDArray[np.float64], theta: NDArray[np.float64],
-) -> Scene:  # fmt: skip
-    """Return the scene rendered at a view, with its slopes."""
-    signal, slope = signals.counts_and_slopes(Views(*view[:, None]), free)
-    whole = np.concatenate([signal, slope[0]])
-    whole = frame.n_frames * shifted(whole, np.full(len(whole), frame.drift_bins))
-    return Scene(frame, whole[0], whole[1:], weight, theta)
+def _scene(
+    found: tuple[NDArray[np.float64], NDArray[np.float64]], frame: Counted, search: Search, theta: NDArray[np.float64]
+) -> Scene:
+    """Return the scene of a frame from the signal of one frame and its slopes."""
+    whole = np.concatenate([found[0][None], found[1]])
+    n_zones, bins = whole.shape[1:]
+    n_positions = len(frame.drift_bins)
+    apart = whole.reshape(-1, n_zones // n_positions, bins)
+    whole = frame.n_frames * shifted(apart, np.tile(frame.drift_bins, len(whole))).reshape(whole.shape)
+    return Scene(frame, whole[0], whole[1:], search.weight, theta, len(search.free))
 
 
 class Point(NamedTuple):
@@ -176,14 +239,16 @@ class Scene:
         Information in the free parameters before the frame is seen.
     theta : (p,) float64
         Free parameters about which the scene is linear.
+    n_view : int
+        How many of them are of the view; the others are nuisances.
     """
 
     def __init__(
         self, frame: Counted, signal: NDArray[np.float64], slope: NDArray[np.float64], weight: NDArray[np.float64],
-        theta: NDArray[np.float64],
+        theta: NDArray[np.float64], n_view: int,
     ) -> None:  # fmt: skip
         self._frame, self._signal, self._weight, self._theta = frame, signal, weight, theta
-        self._slope = np.ascontiguousarray(slope)
+        self._slope, self._n_view = np.ascontiguousarray(slope), n_view
 
     def at_view(self, bright: float, ambient: NDArray[np.float64]) -> Point:
         """Return what is known at the view itself."""
@@ -202,7 +267,8 @@ class Scene:
             if gain < _INNER_DONE:  # what is left changes neither the counts nor their slopes
                 offset = offset + step[:p]
                 break
-            step = step / max(1.0, float((np.abs(offset + step[:p]) / longest).max()), 2 * abs(float(step[p])))
+            farthest = float((np.abs(offset + step[:p]) / longest).max(initial=0.0))
+            step = step / max(1.0, farthest, 2 * abs(float(step[p])))
             better = None
             for _ in range(_INNER_HALVINGS):
                 trial = self._moved(point, step, offset + step[:p])
@@ -216,9 +282,12 @@ class Scene:
         return offset, point._replace(information=self._view_information(point))
 
     def _view_information(self, point: Point) -> NDArray[np.float64]:
-        """Return the information in the view alone, the brightness eliminated."""
+        """Return the information in the view alone, brightness and nuisances eliminated."""
         whole = point.information
-        return np.asarray(whole[:-1, :-1] - np.outer(whole[:-1, -1], whole[-1, :-1]) / whole[-1, -1])
+        while len(whole) > self._n_view:
+            own = max(float(whole[-1, -1]), _NO_INFORMATION)
+            whole = whole[:-1, :-1] - np.outer(whole[:-1, -1], whole[-1, :-1]) / own
+        return np.asarray(whole)
 
     def _at(self, offset: NDArray[np.float64], bright: float, ambient: NDArray[np.float64]) -> Point:
         signal = self._signal

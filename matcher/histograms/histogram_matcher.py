@@ -5,21 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
-from phasemark.matcher.histograms.exact_fit import Counted, Fit, fit_view
-from phasemark.matcher.histograms.histogram_table import Table, TableGrid, build_table, plan_table
-from phasemark.matcher.histograms.poisson_fit import bare_deviance, deviance_test, doubtful_deviance, moments_of
-from phasemark.matcher.histograms.table_search import DESCENT_MARGIN, ambient_light, find_hills
+from phasemark.matcher.histograms.alone_search import AloneSearch
+from phasemark.matcher.histograms.exact_fit import Counted, Fit, fit_view, search_of
+from phasemark.matcher.histograms.histogram_table import TableGrid, plan_table
+from phasemark.matcher.histograms.joint_match import match_together
+from phasemark.matcher.histograms.plane_search import PlaneSearch
+from phasemark.matcher.histograms.poisson_fit import deviance_test, doubtful_deviance, moments_of
+from phasemark.matcher.histograms.scene_models import planes_of, scene_at
+from phasemark.matcher.histograms.search_plan import LandmarkSearch, SearchPlan, Start
+from phasemark.matcher.histograms.table_search import ambient_light
 from phasemark.matcher.histograms.view_answers import Explanation, FitTest, Rules, answer_of, no_answer
 from phasemark.matcher.histograms.view_signals import ViewSignals
 from phasemark.matcher.match import Match
-from phasemark.render import Sensor
+from phasemark.render import Background, Sensor
 from phasemark.render.direct.bin_counts import response_share
 from phasemark.render.direct.fit_model import undo_pile_up
 from phasemark.render.direct.footprints import histogram_of
@@ -52,102 +57,109 @@ class HistogramMatcher:
         Standard deviation of each before a frame is seen, about 0; infinite where nothing is known.
     rules : Rules
         When an answer is accepted.
+    background : Background, "auto" or None
+        What stands behind the landmark; the brightness of its planes is estimated. "auto": a wall whose distance is
+        estimated too.
     workers : int
         Threads; the answers do not depend on their number.
     """
 
     def __init__(
-        self, bank: Bank, *, free: tuple[str, ...], prior_std: Sequence[float], rules: Rules, workers: int = 1
-    ) -> None:
+        self, bank: Bank, *, free: tuple[str, ...], prior_std: Sequence[float], rules: Rules,
+        background: Background | Literal["auto"] | None = None, workers: int = 1,
+    ) -> None:  # fmt: skip
         self.sensor = bank.camera
         check_histogram_sensor(bank)
         self._free, self._rules, self._workers = free, rules, workers
-        self._prior = np.array(prior_std, dtype=np.float64)
+        prior = np.array(prior_std, dtype=np.float64)
         meshes = [bank.mesh(name) for name in bank.classes]
         self.signals = [ViewSignals(mesh, self.sensor, float(mesh.metadata["albedo"])) for mesh in meshes]
         self.grid = plan_table(self.signals, bank.distance_m, bank.delta_rad, math.gcd(*rules.symmetry))
-        self._limits = view_limits(self.grid)
-
-    @property
-    def bearings_rad(self) -> tuple[float, ...]:
-        """Bearings at which a table is made."""
-        if "bearing_rad" not in self._free:
-            return (0.0,)
-        side = min(_BEARING_SIGMA * float(self._prior[self._free.index("bearing_rad")]), _WIDEST_BEARING_RAD)
-        return (0.0, -side, side)
+        bearings: tuple[float, ...] = (0.0,)
+        if "bearing_rad" in free:
+            side = min(_BEARING_SIGMA * float(prior[free.index("bearing_rad")]), _WIDEST_BEARING_RAD)
+            bearings = (0.0, -side, side)
+        plan = SearchPlan(self.signals, self.grid, free, prior, view_limits(self.grid), bearings, workers)
+        self._plan = plan
+        self.search: LandmarkSearch = AloneSearch(plan)
+        if isinstance(background, str) or (background is not None and planes_of(background)):
+            self.search = PlaneSearch(plan, background)
 
     @property
     def table_bytes(self) -> int:
         """How large the tables of histograms are in memory."""
-        return len(self.bearings_rad) * self.grid.n_bytes(self.sensor, len(self.signals))
-
-    @cached_property
-    def tables(self) -> list[Table]:
-        """Histograms on a grid, one table for each bearing; rendered when they are first needed."""
-        return [build_table(self.signals, self.grid, b, self._workers) for b in self.bearings_rad]
+        return self.search.table_bytes
 
     def match(self, frames: HistogramFrames) -> list[Match]:
         """Return an answer for every position of the bank's sensor, whose frames are added up."""
-        counted, _ = counted_frames(frames), self.tables
+        counted = counted_frames(frames)
+        self.search.prepare()
         if self._workers == 1 or len(counted) < 2:
             return [self._match(one) for one in counted]
         with ThreadPoolExecutor(self._workers) as pool:
             return list(pool.map(self._match, counted))
 
-    def _match(self, frame: Counted) -> Match:
-        bare_level, bare_ambient = np.empty(frame.counts.shape), np.empty(len(frame.counts))
-        bare = bare_deviance(frame.counts, frame.extra, frame.cycles, bare_level, bare_ambient)
+    def match_jointly(self, frames: HistogramFrames, first2camera: NDArray[np.float64]) -> Match:
+        """Return one answer for a landmark that several positions see, the view as the first one has it.
+
+        Parameters
+        ----------
+        frames : HistogramFrames
+        first2camera : (n, 4, 4) float64
+            From the frame of the first position's camera to that of each.
+        """
+        counted = counted_frames(frames)
+        self.search.prepare()
+        with ThreadPoolExecutor(self._workers) as pool:
+            looked = list(pool.map(self._looked, counted))
+        starts, bare = zip(*looked, strict=True)
+        return match_together(self.search, self._plan, self._rules, counted, starts, sum(bare), first2camera)
+
+    def _looked(self, frame: Counted) -> tuple[list[Start], float]:
+        """Return where fits of a frame begin, and what it costs without a landmark."""
         counts = shifted_back(
             undo_pile_up(frame.counts, frame.cycles) if math.isfinite(frame.cycles) else frame.counts,
-            frame.drift_bins,
+            float(frame.drift_bins[0]),
         )
         ambient = ambient_light(counts, frame.extra)
-        starts = self._starts(frame, counts, ambient)
+        starts = self.search.starts(frame, counts, ambient)
+        return starts, self.search.bare_cost(frame, ambient) if starts else 0.0
+
+    def _match(self, frame: Counted) -> Match:
+        starts, bare = self._looked(frame)
         if not starts:
             return no_answer(self._rules, self._free)
-        least = starts[0][2]
+        least = starts[0].cost
         fits: list[tuple[int, Fit]] = []
         offset, margin, n_tried = 0.0, _SURE_COST, 0
-        for c, view, cost, bright in starts[:_MOST_FITS]:
-            if fits and cost > least + margin:
+        for start in starts[:_MOST_FITS]:
+            if fits and start.cost > least + margin:
                 break
             n_tried += 1
             hopeless = min((fit.cost for _, fit in fits), default=math.inf) + _SURE_COST
-            known = [fit.view for other, fit in fits if other == c]
+            known = [fit.view for other, fit in fits if other == start.class_index]
+            model, plan = self.search.model(start.class_index), self._plan
+            search = search_of(self._free, plan.prior_std, plan.limits, _SCENES, model.nuisances)
             fit = fit_view(
-                self.signals[c], frame, view, bright, ambient, self._free, self._prior, self._limits, _SCENES, hopeless,
-                known,
-            )  # fmt: skip
+                scene_at(model, self._free), frame, start.state, start.bright, start.ambient, search, hopeless, known
+            )
             if fit is None:
                 continue
             if not fits:
                 offset = fit.cost - least  # of the exact deviance over that of the table
                 margin += _TABLE_ERROR * abs(offset)
-            fits.append((c, fit))
+            fits.append((start.class_index, fit))
         found = [Explanation(c, fit.view, fit.cost, fit.information) for c, fit in fits]
-        found += [Explanation(c, view, cost + offset, None) for c, view, cost, _ in starts[n_tried:]]
-        best = min((fit for _, fit in fits), key=lambda fit: fit.cost)
+        found += [
+            Explanation(s.class_index, s.state[: len(VIEW_FIELDS)], s.cost + offset, None) for s in starts[n_tried:]
+        ]
+        best_class, best = min(fits, key=lambda one: one[1].cost)
         mean, variance = moments_of(best.level)
-        free = len(self._free) + 1 + len(ambient)
+        free = len(self._free) + self.search.model(best_class).nuisances.shape[1] + 1 + len(best.ambient)
         test = FitTest(*deviance_test(best.deviance, mean, variance, free))
         doubt = best.cost - best.deviance + doubtful_deviance(mean, variance, free, self._rules.false_alarm)
-        return answer_of(self._rules, self._free, found, test, bare, doubt)
-
-    def _starts(
-        self, frame: Counted, counts: NDArray[np.float64], ambient: NDArray[np.float64]
-    ) -> list[tuple[int, NDArray[np.float64], float, float]]:
-        """Return class, view, cost and brightness of the hills of all tables, best first."""
-        starts = []
-        limit = math.inf
-        for bearing, table in zip(self.bearings_rad, self.tables, strict=True):
-            hills = find_hills(table, counts, ambient, frame.extra, frame.n_frames, limit=limit)
-            prior = 0.0 if bearing == 0 else (bearing / self._prior[self._free.index("bearing_rad")]) ** 2
-            for c, place, bright, cost in zip(*hills, strict=True):
-                view = np.zeros(len(VIEW_FIELDS))
-                view[:2], view[2] = place, bearing
-                starts.append((int(c), view, float(cost) + prior, float(bright)))
-                limit = min(limit, float(cost) + DESCENT_MARGIN)
-        return sorted(starts, key=lambda start: start[2])
+        behind = self.search.background_of(best)
+        return answer_of(self._rules, self._free, found, test, bare, doubt, behind)
 
 
 def check_histogram_sensor(bank: Bank) -> None:
@@ -198,7 +210,7 @@ def counted_frames(frames: HistogramFrames) -> list[Counted]:
     cycles = histogram.cycles * n_frames if histogram.pile_up else math.inf
     extra = n_frames * glass_counts(frames.sensor)
     return [
-        Counted(np.ascontiguousarray(counts), n_frames, cycles, extra, float(drift))
+        Counted(np.ascontiguousarray(counts), n_frames, cycles, extra, np.array([drift]))
         for counts, drift in zip(frames.zone_counts, frames.drift_bins, strict=True)
     ]
 

@@ -6,7 +6,7 @@ It serves the search and the slopes on the way; the answer itself is taken from 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -129,7 +129,10 @@ def plan_table(
     return TableGrid(distances, angles, False, first, window)
 
 
-def build_table(signals: Sequence[ViewSignals], grid: TableGrid, bearing_rad: float = 0.0, workers: int = 1) -> Table:
+def build_table(
+    signals: Sequence[ViewSignals], grid: TableGrid, bearing_rad: float = 0.0, workers: int = 1,
+    counts_of: Callable[[int, int, Views], NDArray[np.float64]] | None = None,
+) -> Table:  # fmt: skip
     """Render a table.
 
     Parameters
@@ -141,6 +144,8 @@ def build_table(signals: Sequence[ViewSignals], grid: TableGrid, bearing_rad: fl
         Of all views.
     workers : int
         Threads; the result does not depend on their number.
+    counts_of : callable, optional
+        Returns the counts of the landmark at views of a class and a distance, (n, zones, bins); None: it stands alone.
     """
     sensor, window = signals[0].sensor, grid.window
     n_zones, bins = sensor.rows * sensor.cols, histogram_of(sensor).bins
@@ -152,7 +157,8 @@ def build_table(signals: Sequence[ViewSignals], grid: TableGrid, bearing_rad: fl
     m = len(grid.delta_rad)
     for c, one in enumerate(signals):
         for i, first in enumerate(grid.first_bin):
-            counts = one.counts(views[i * m : (i + 1) * m], workers)
+            row = views[i * m : (i + 1) * m]
+            counts = one.counts(row, workers) if counts_of is None else counts_of(c, i, row)
             low, high = int(lowest[i]), int(highest[i])
             signal[c, i, :, :, low - first : high - first] = counts[:, :, low:high]
     u = (np.arange(window) + 0.5 - window / 2) / (window / 2)

@@ -206,6 +206,11 @@ def bare_deviance(counts, extra, cycles, level, ambient):  # type: ignore[no-unt
     return deviance
 
 
+def deviance_of(counts: NDArray[np.float64], level: NDArray[np.float64]) -> float:
+    """Return the summed deviance of counts with these expectations."""
+    return float(2 * (level - counts + special.xlogy(counts, counts / level)).sum())
+
+
 def moments_of(level: NDArray[np.float64]) -> tuple[float, float]:
     """Return mean and variance of the summed deviance of counts with these expectations."""
     table = deviance_moments()

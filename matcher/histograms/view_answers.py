@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.information import covariance_of, weak_direction
 from phasemark.matcher.match import Candidate, Match, Reason
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
+from phasemark.render import Background
 from phasemark.render.view import VIEW_FIELDS, delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
 
 _AMBIGUITY = 1e-3
@@ -72,8 +73,9 @@ class Rules:
 
 
 def answer_of(
-    rules: Rules, free: tuple[str, ...], found: Sequence[Explanation], test: FitTest, bare: float, doubt: float
-) -> Match:
+    rules: Rules, free: tuple[str, ...], found: Sequence[Explanation], test: FitTest, bare: float, doubt: float,
+    background: Background | None = None,
+) -> Match:  # fmt: skip
     """Return the answer for one frame.
 
     Parameters
@@ -88,6 +90,8 @@ def answer_of(
         Cost of a scene without a landmark.
     doubt : float
         Cost from which the test refuses the best of them: "none" is never less probable than a fit so bad.
+    background : Background, optional
+        What the best of them has behind the landmark.
     """
     kept = _distinct(rules, sorted(found, key=lambda one: one.cost))
     best = kept[0]
@@ -124,6 +128,7 @@ def answer_of(
         symmetry=rules.symmetry[best.class_index],
         condition_number=condition,
         weak_direction=weak,
+        background=background,
         reason=reason,
         systematic={"declared": rules.systematic} if rules.systematic.any() else {},
     )

@@ -1,19 +1,19 @@
-"""Expected signal counts of a landmark at some views, and their slopes by differences of exact scenes."""
+"""Expected signal counts of a landmark and the planes behind it at some views, by exact scenes."""
 
 from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from phasemark.render import Sensor, Views
+from phasemark.render import Background, Sensor, Views
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
-from phasemark.render.direct.sample_counts import signal_of_samples
+from phasemark.render.direct.sample_counts import signal_of_samples, signal_of_surfaces
 from phasemark.render.direct.scene_samples import SceneMesh
 from phasemark.render.view import VIEW_FIELDS
 
@@ -29,22 +29,40 @@ STEPS: dict[str, float] = {
 _VIEWS_AT_ONCE = 16
 
 
+def views_about(view: NDArray[np.float64], free: Sequence[str], wider: float = 1.0) -> Views:
+    """Return a view, and those a step, or a multiple of it, above and below in each free parameter, (1 + 2 p)."""
+    moved = np.repeat(view[None], 2 * len(free) + 1, axis=0)
+    for k, name in enumerate(free):
+        column = VIEW_FIELDS.index(name)
+        moved[1 + 2 * k, column] += wider * STEPS[name]
+        moved[2 + 2 * k, column] -= wider * STEPS[name]
+    return Views(*moved.T.copy())
+
+
+def slopes_about(found: NDArray[np.float64], free: Sequence[str]) -> NDArray[np.float64]:
+    """Return the slopes of what was found at :func:`views_about` a view, (p, …): central differences."""
+    slopes = np.empty((len(free), *found.shape[1:]))
+    for k, name in enumerate(free):
+        slopes[k] = (found[1 + 2 * k] - found[2 + 2 * k]) / (2 * STEPS[name])
+    return slopes
+
+
 class ViewSignals:
     """Counts of a direct sensor from one landmark, without pile-up and ambient light.
 
     Parameters
     ----------
-    mesh : trimesh.Trimesh
-        Landmark frame, metres.
+    mesh : trimesh.Trimesh or None
+        Landmark frame, metres. None: there is nothing but what stands behind.
     sensor : Sensor
         With a [histogram] table.
     albedo : float
     """
 
-    def __init__(self, mesh: trimesh.Trimesh, sensor: Sensor, albedo: float = 0.8) -> None:
+    def __init__(self, mesh: trimesh.Trimesh | None, sensor: Sensor, albedo: float = 0.8) -> None:
         histogram_of(sensor)
         self.sensor, self.albedo = sensor, albedo
-        self.vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        self.vertices = np.empty((0, 3)) if mesh is None else np.asarray(mesh.vertices, dtype=np.float64)
         self._grid = footprint_grid(sensor)
         self._scene = SceneMesh(mesh)
         self._own = threading.local()  # a scene has scratch that two threads must not share
@@ -58,45 +76,52 @@ class ViewSignals:
         workers : int
             Threads; the result does not depend on their number.
         """
-        parts = [views[k : k + _VIEWS_AT_ONCE] for k in range(0, len(views), _VIEWS_AT_ONCE)]
-        if workers == 1 or len(parts) < 2:
-            return np.concatenate([self._counts(part) for part in parts])
-        with ThreadPoolExecutor(workers) as pool:
-            return np.concatenate(list(pool.map(self._counts, parts)))
+        return self._in_parts(views, self._counts, workers)
 
-    def counts_and_slopes(self, views: Views, free: Sequence[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the expected signal counts, and their slopes by parameters of the view.
+    def surfaces(
+        self, views: Views, background: Background, workers: int = 1, finest_m: float | None = None
+    ) -> NDArray[np.float64]:
+        """Return the expected signal counts of landmark, wall and floor, (n, 3, zones, bins).
+
+        A landmark that reaches through a wall or a floor hides it: a search may try views that cannot be.
 
         Parameters
         ----------
         views : Views
-        free : sequence of str
-
-        Returns
-        -------
-        counts : (n, zones, bins) float64
-        slopes : (n, p, zones, bins) float64
-            Central differences.
+        background : Background
+        workers : int
+            Threads; the result does not depend on their number.
+        finest_m : float, optional
+            How finely ranges of the background are resolved; None: half a bin.
         """
-        n, p = len(views), len(free)
-        rows = np.stack([getattr(views, name) for name in VIEW_FIELDS], axis=1)
-        moved = np.repeat(rows[None], 2 * p + 1, axis=0)
-        for k, name in enumerate(free):
-            column = VIEW_FIELDS.index(name)
-            moved[1 + 2 * k, :, column] += STEPS[name]
-            moved[2 + 2 * k, :, column] -= STEPS[name]
-        found = self.counts(Views(*moved.reshape(-1, len(VIEW_FIELDS)).T.copy())).reshape(2 * p + 1, n, *self._shape)
-        slopes = np.empty((n, p, *self._shape))
-        for k, name in enumerate(free):
-            slopes[:, k] = (found[1 + 2 * k] - found[2 + 2 * k]) / (2 * STEPS[name])
-        return found[0], slopes
+        histogram = histogram_of(self.sensor)
+        finest = 0.5 * histogram.bin_width_m if finest_m is None else finest_m
+        farthest = histogram.start_m + histogram.bins * histogram.bin_width_m
 
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return self.sensor.rows * self.sensor.cols, histogram_of(self.sensor).bins
+        def counts(part: Views) -> NDArray[np.float64]:
+            samples = self._own_scene().samples_of_views(
+                part.in_camera(self.sensor), self._grid, background=background, finest_m=finest, farthest_m=farthest
+            )
+            return signal_of_surfaces(samples, self.sensor, self.albedo)
+
+        return self._in_parts(views, counts, workers)
+
+    def _in_parts(
+        self, views: Views, counts: Callable[[Views], NDArray[np.float64]], workers: int
+    ) -> NDArray[np.float64]:
+        parts = [views[k : k + _VIEWS_AT_ONCE] for k in range(0, len(views), _VIEWS_AT_ONCE)]
+        if workers == 1 or len(parts) < 2:
+            return np.concatenate([counts(part) for part in parts])
+        with ThreadPoolExecutor(workers) as pool:
+            return np.concatenate(list(pool.map(counts, parts)))
 
     def _counts(self, views: Views) -> NDArray[np.float64]:
+        samples = self._own_scene().samples_of_views(views.in_camera(self.sensor), self._grid)
+        return signal_of_samples(samples, self.sensor, self.albedo)
+
+    def _own_scene(self) -> SceneMesh:
+        """Return the scene of this thread."""
         if not hasattr(self._own, "scene"):
             self._own.scene = self._scene.for_thread()
-        samples = self._own.scene.samples_of_views(views.in_camera(self.sensor), self._grid)
-        return signal_of_samples(samples, self.sensor, self.albedo)
+        scene: SceneMesh = self._own.scene
+        return scene

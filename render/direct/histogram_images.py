@@ -18,7 +18,7 @@ from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.direct.bin_counts import bin_response, counts_of_light, detected_counts
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
-from phasemark.render.direct.scene_samples import BACKGROUND, SceneMesh
+from phasemark.render.direct.scene_samples import WALL, SceneMesh
 from phasemark.render.direct.transients import range_axis, zone_transients
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.renderer import Renderer
@@ -198,7 +198,7 @@ class HistogramRenderer:
                     seen[task], self.grid, background=background, finest_m=0.5 * histogram.bin_width_m,
                     farthest_m=self.axis.nodes_m[-1],
                 )  # fmt: skip
-                samples = samples._replace(part=(samples.part == BACKGROUND).astype(np.int8))
+                samples = samples._replace(part=(samples.part >= WALL).astype(np.int8))
                 light = zone_transients(samples, self.sensor, self.axis)
                 for part in range(1 if background is None else 2):
                     out[task, part] = counts_of_light(light[:, part], self.sensor, self.axis)

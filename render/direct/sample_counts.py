@@ -22,11 +22,12 @@ from phasemark.render.direct.footprints import (
     footprints_of,
     histogram_of,
 )
-from phasemark.render.direct.scene_samples import SceneSamples
+from phasemark.render.direct.scene_samples import FLOOR, SceneSamples
 from phasemark.render.direct.transients import PARTS
 from phasemark.render.kernel import kernel
 from phasemark.render.sensor.sensor import Sensor
 
+_ALL_PARTS = FLOOR + 1
 _STEPS_PER_STD = 64
 _STEPS_PER_SAMPLE = 32
 
@@ -63,7 +64,7 @@ def signal_of_samples(samples: SceneSamples, sensor: Sensor, albedo: ArrayLike =
     Parameters
     ----------
     samples : SceneSamples
-        n poses.
+        n poses, of the landmark alone.
     sensor : Sensor
         With a [histogram] table.
     albedo : float or (parts,)
@@ -74,20 +75,48 @@ def signal_of_samples(samples: SceneSamples, sensor: Sensor, albedo: ArrayLike =
     (n, zones, bins) float64
         What :func:`~phasemark.render.direct.bin_counts.signal_counts` returns of the samples' transients.
     """
+    albedos = np.zeros(_ALL_PARTS)
+    albedos[:PARTS] = albedo
+    return _signals(samples, sensor, albedos, np.zeros(_ALL_PARTS, np.int64), 1)[:, 0]
+
+
+def signal_of_surfaces(samples: SceneSamples, sensor: Sensor, albedo: float = 1.0) -> NDArray[np.float64]:
+    """Return the expected signal counts of landmark, wall and floor, each by itself, without pile-up.
+
+    Parameters
+    ----------
+    samples : SceneSamples
+        n poses.
+    sensor : Sensor
+        With a [histogram] table.
+    albedo : float
+        Of the landmark; samples of wall and floor have theirs in their amplitude.
+
+    Returns
+    -------
+    (n, 3, zones, bins) float64
+        Landmark, wall, floor; their sum is the signal of the scene.
+    """
+    return _signals(samples, sensor, np.array([albedo, albedo, 1.0, 1.0]), np.array([0, 0, 1, 2]), 3)
+
+
+def _signals(
+    samples: SceneSamples, sensor: Sensor, albedos: NDArray[np.float64], place: NDArray[np.int64], n_places: int
+) -> NDArray[np.float64]:
+    """Return signal counts, the light of each part of the scene times its albedo added to the place of the part."""
     histogram, optics = histogram_of(sensor), _optics_of(sensor)
-    albedos = np.ascontiguousarray(np.broadcast_to(np.asarray(albedo, dtype=np.float64), (PARTS,)))
     n_zones = sensor.rows * sensor.cols
-    out = np.zeros((samples.n_views, n_zones, histogram.bins))
+    out = np.zeros((samples.n_views, n_places, n_zones, histogram.bins))
     response = optics.response
     # zones of one response are lit alike by stray light, which is then added to their counts in the end
     alike = len(response.share) == 1 and np.ptp(response.start_m) == 0 and np.ptp(response.width_m) == 0
     _add_samples(
-        samples.start, samples.tangents, samples.range_m, samples.amplitude, samples.part, albedos, optics.zones,
+        samples.start, samples.tangents, samples.range_m, samples.amplitude, samples.part, albedos, place, optics.zones,
         sensor.cols, optics.scale, response.share, response.first_m, response.steps_per_m, response.start_m,
         response.width_m, 0.0 if alike else histogram.stray, out,
     )  # fmt: skip
     if alike and histogram.stray > 0:
-        out += histogram.stray * out.mean(axis=1, keepdims=True)
+        out += histogram.stray * out.mean(axis=2, keepdims=True)
     out *= histogram.cycles * histogram.photons
     return out
 
@@ -142,16 +171,17 @@ def _add_to_bins(light, range_m, table, first, density, start_m, width_m, out): 
 
 @kernel
 def _add_samples(  # type: ignore[no-untyped-def]
-    start, tangents, range_m, amplitude, part, albedo, zones, cols, scale, share, first, density, start_m, width_m,
-    stray, out,
+    start, tangents, range_m, amplitude, part, albedo, place, zones, cols, scale, share, first, density, start_m,
+    width_m, stray, out,
 ):  # fmt: skip
     """Add every sample to the bins of the zones that count its light."""
-    n_zones = out.shape[1]
+    n_zones = out.shape[2]
     own = share.shape[0] > 1
     for view in range(len(start) - 1):
         for k in range(start[view], start[view + 1]):
             y, z = tangents[k, 0], tangents[k, 1]
             light = amplitude[k] * albedo[part[k]]
+            zones_of = out[view, place[part[k]]]
             total = 0.0
             for row in range(0, n_zones, cols):
                 if abs(z - zones.centre[row, 1]) > zones.half[row, 1] + _REACH * zones.blur[1]:
@@ -162,9 +192,9 @@ def _add_samples(  # type: ignore[no-untyped-def]
                         w *= scale[q] * light
                         total += w
                         table = share[q if own else 0]
-                        _add_to_bins(w, range_m[k], table, first, density, start_m[q], width_m[q], out[view, q])
+                        _add_to_bins(w, range_m[k], table, first, density, start_m[q], width_m[q], zones_of[q])
             if stray > 0.0 and total > 0.0:
                 total *= stray / n_zones
                 for q in range(n_zones):
                     table = share[q if own else 0]
-                    _add_to_bins(total, range_m[k], table, first, density, start_m[q], width_m[q], out[view, q])
+                    _add_to_bins(total, range_m[k], table, first, density, start_m[q], width_m[q], zones_of[q])

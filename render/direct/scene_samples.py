@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phasemark.render.background import Background, background_hit
+from phasemark.render.background import Background, background_hit, nearer_plane
 from phasemark.render.integral.arguments import Camera, Motion, Poses, towards_level
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.intersect import make_intersector
@@ -29,9 +29,10 @@ from phasemark.render.renderer import _Buffers, _poses, _topology
 from phasemark.render.rigid import rigid_transforms
 from phasemark.render.view import Views
 
-LOWER, UPPER, BACKGROUND = 0, 1, 2
-"""Parts of a scene: the landmark's lower and upper part, and what stands behind it."""
+LOWER, UPPER, WALL, FLOOR = 0, 1, 2, 3
+"""Parts of a scene: the landmark's lower and upper part, and the planes behind it."""
 
+_BEFORE_WALL = WALL - 1  # planes are numbered from 1
 _NO_BACKGROUND = np.zeros(4)
 _SAMPLES = 1 << 15
 _MOST_BOXES = 32
@@ -54,7 +55,7 @@ class SceneSamples(NamedTuple):
         cos θ / r² for albedo 1, times the area of tangents that the point stands for; of the background times its
         albedo.
     part : (m,) int8
-        `LOWER` or `UPPER` part of the mesh, or `BACKGROUND`.
+        `LOWER` or `UPPER` part of the mesh, or `WALL` or `FLOOR` behind it.
     """
 
     start: NDArray[np.int64]
@@ -270,7 +271,7 @@ def _hits(n, samples, mesh, poses, camera, background, tangents, range_m, amplit
         else:
             dx, dy, dz = towards_level(poses.level[0], y, z)
             t, rho, facing = background_hit(background, cos_b, sin_b, dx, dy, dz)
-            reflected, seen = rho * facing, BACKGROUND
+            reflected, seen = rho * facing, _BEFORE_WALL + nearer_plane(background, cos_b, sin_b, dx, dy, dz)
         if not t > 0.0:
             continue
         tangents[kept, 0], tangents[kept, 1] = y, z
@@ -342,6 +343,6 @@ def _fill_free(kept, state, poses, camera, background, scale, tangents, range_m,
                     tangents[kept, 0], tangents[kept, 1] = y, z
                     range_m[kept] = t * length
                     amplitude[kept] = rho * facing / length / (t * length * t * length) * weight
-                    part[kept] = BACKGROUND
+                    part[kept] = _BEFORE_WALL + nearer_plane(background, cos_b, sin_b, dx, dy, dz)
                     kept += 1
     return kept
