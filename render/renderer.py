@@ -355,7 +355,11 @@ class Renderer:
 
         Parameters
         ----------
-        distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad, background, workers
+        distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : array_like
+            As for :meth:`render`.
+        background : Background, optional
+            As for :meth:`render`.
+        workers : int
             As for :meth:`render`.
         parameters : sequence of str
             Which derivatives, in this order; "pitch_rad" and "roll_rad" too may be asked for.
@@ -409,7 +413,9 @@ class Renderer:
             n views.
         parameters : sequence of str
             Which derivatives, in this order; "pitch_rad" and "roll_rad" too may be asked for.
-        background, workers
+        background : Background, optional
+            As for :meth:`render`.
+        workers : int
             As for :meth:`render`.
 
         Returns

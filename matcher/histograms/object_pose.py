@@ -68,7 +68,9 @@ class ObjectPose:
     support : float
         Albedo of the support over that of the object.
     chi2 : float
+        Whitened squared residual.
     dof : int
+        Its degrees of freedom.
     accepted : bool
         Whether χ² is one that the object at this pose makes, at the given false-alarm rate.
     steps : int
@@ -115,9 +117,13 @@ class Evidence:
     Parameters
     ----------
     information : (n, zones, p, p) float64
+        Fisher information in the free parameters.
     gradient : (n, zones, p) float64
+        Gradient of the log-likelihood by them.
     chi2 : (n, zones) float64
+        Whitened squared residuals of each histogram.
     dof : (n, zones) int
+        Degrees of freedom of each.
     """
 
     information: NDArray[np.float64]
@@ -145,8 +151,11 @@ def evidence_of(linear: Linearised, measured: NDArray[np.float64], model_error: 
     Parameters
     ----------
     linear : Linearised
+        Expected counts at the pose, and their slopes.
     measured : (n, zones, bins) float64
+        Counts.
     model_error : ModelError
+        Errors of the model beside the noise.
     """
     expected = linear.expected
     peak = expected.max(axis=-1, keepdims=True)

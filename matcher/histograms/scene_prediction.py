@@ -104,6 +104,7 @@ class ObjectScene:
         sensor2world : (n, 4, 4) array_like
             Poses of the optical frame.
         displacement : (6,) array_like
+            In the order of `POSE_PARAMETERS`.
         support : float
             Albedo of the support over that of the object.
         free : sequence of str

@@ -30,8 +30,10 @@ class CameraUnit:
         Mean dark electrons of each tap per phase image, DSNU and hot pixels included.
     delay_rad : (2, rows, cols) float64
         Phase by which each tap sees the light late: pixel's and tap's offset, and the camera's range offset.
-    dead, hot : (rows, cols) bool
-        Pixels that measure nothing, and pixels with a large dark current.
+    dead : (rows, cols) bool
+        Pixels that measure nothing.
+    hot : (rows, cols) bool
+        Pixels with a large dark current.
     """
 
     response: NDArray[np.float64]

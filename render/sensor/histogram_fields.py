@@ -38,16 +38,22 @@ class Histogram(BaseModel):
         Laser pulses of a frame times the detectors of a zone: how many first photons there can be.
     photons : float
         Signal photons per cycle in a zone of `zone_gain` 1 for intensity 1 (albedo 1 facing the camera at 1 m).
-    ambient, dark : float
-        Photons of ambient light and dark counts, per cycle and bin.
+    ambient : float
+        Photons of ambient light, per cycle and bin.
+    dark : float
+        Dark counts, per cycle and bin.
     irf_std_m : float, optional
         Standard deviation of a Gaussian instrument response, metres; the other choice is `irf`.
     irf : tuple of rows of float
         Samples of the instrument response, any unit: one row for all zones, or one row for each zone in image order.
-    irf_start_m, irf_step_m : float
-        Delay of the first sample and distance of samples, metres.
-    crosstalk, crosstalk_range_m : float
-        Counts per frame that the cover glass returns to each zone, and the range of their peak.
+    irf_start_m : float
+        Delay of the first sample, metres.
+    irf_step_m : float
+        Distance of samples, metres.
+    crosstalk : float
+        Counts per frame that the cover glass returns to each zone.
+    crosstalk_range_m : float
+        Range of their peak.
     pile_up : bool
         Whether only the first photon of a cycle is counted.
     zone_scale : (width, height)
