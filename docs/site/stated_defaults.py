@@ -40,7 +40,7 @@ def _mend(thing: griffe.Object) -> None:
 def _state_fields(model: griffe.Class) -> None:
     """Give a model whose ``__init__`` takes any keyword the signature of its fields."""
     takes = [tuple(parameter.name for parameter in init.parameters) for init in _inits(model)]
-    if "__init__" in model.members or ("self", "data") not in takes:
+    if not takes or takes[0] != ("self", "data"):
         return
     fields: dict[str, griffe.Attribute] = {}
     for owner in (*reversed(model.mro()), model):
