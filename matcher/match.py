@@ -66,8 +66,12 @@ class Match:
         Which of these were estimated; the others are assumptions.
     covariance : ndarray or None
         In the order of `free`; None where the method gives none.
-    chi2, dof, p_value : float, int, float
-        Test of the fit: whitened squared residual, its degrees of freedom, and the probability of a larger one.
+    chi2 : float
+        Whitened squared residual.
+    dof : int
+        Its degrees of freedom.
+    p_value : float
+        Probability of a larger χ² if the model is right.
     class_probability : mapping of str to float
         Of each class and of "none".
     alternatives : tuple of Candidate

@@ -57,7 +57,9 @@ _EMPTY_DESCRIPTION = re.compile(r"\s*–\s*(?=(<div[^>]*>\s*</div>\s*)?</li>)")
 def _with_breaks(cell: re.Match[str]) -> str:
     """Let long code in a cell of a table break behind its separators, so that the table fits on a phone."""
     return re.sub(
-        r"(?<=<code>)[^<]+(?=</code>)", lambda code: re.sub(r"(?<=\w)([|_/.,:])(?=\w)", r"\1<wbr>", code[0]), cell[0]
+        r"(?<=<code>)[^<]+(?=</code>)",
+        lambda code: re.sub(r"(?<=\w)(&#124;|[|_/.,:])(?=\w)", r"\1<wbr>", code[0]),
+        cell[0],
     )
 
 

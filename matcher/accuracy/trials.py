@@ -241,8 +241,14 @@ class TrialSummary:
         Mean eᵀP⁻¹e over the number of parameters.
     coverage : Interval
         Share of errors inside the 95 % ellipsoid.
-    outliers, astray, class_errors, accepted : Interval
-        Shares; outliers are beyond 5 σ of the bound or of the match's own covariance, astray beyond those of the bound.
+    outliers : Interval
+        Share of errors beyond 5 σ of the bound or of the match's own covariance.
+    astray : Interval
+        Share of errors beyond 5 σ of the bound.
+    class_errors : Interval
+        Share of frames whose class was wrong.
+    accepted : Interval
+        Share of frames whose answer was accepted.
     """
 
     n: int

@@ -53,16 +53,22 @@ class Calibration:
         In the order of `free`; radians, metres, pixels.
     covariance_from : str
         What it was made of, in words.
-    chi2, dof, p_value : float, int, float
-        Test of the fit.
+    chi2 : float
+        Whitened squared residual.
+    dof : int
+        Its degrees of freedom.
+    p_value : float
+        Probability of a larger χ² if the model is right.
     on : {"ranges", "phasors"}
         What is compared: ranges, or phasors with the albedo unknown.
     poses : KnownPoses
         Known poses of the camera.
     pose_shift : (K, 3) float64
         Estimated errors of the poses in D, δ and b; zero where poses are taken as exact.
-    pose_chi2, pose_residuals : (K,) float64, (K,) int64
-        Share of each pose in χ², and how many residuals it is made of.
+    pose_chi2 : (K,) float64
+        Share of each pose in χ².
+    pose_residuals : (K,) int64
+        Number of residuals that it is made of.
     residual_m, residual_before_m : (K, rows, cols) float64
         Measured less modelled range with the mounting found and with the one assumed; NaN where a pixel does not count.
     range_std_m : (K, rows, cols) float64

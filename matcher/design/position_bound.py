@@ -89,8 +89,10 @@ def range_bound(
         The camera.
     plan : DesignPlan
         Plan of the design.
-    distance_m, delta_rad : (n,), (k,) float64, optional
-        Distances and angles, metres and radians; those of the plan's sampling if left out.
+    distance_m : (n,) float64, optional
+        Distances; those of the plan's sampling if left out.
+    delta_rad : (k,) float64, optional
+        Angles; those of the plan's sampling if left out.
     tolerance_m : float
         Of the tessellation.
     workers : int
