@@ -318,10 +318,13 @@ class TargetMatcher:
         if not len(states):
             return np.empty(0)
         expected = self._expected(self._counts(c, Views(*states.T.copy())))
-        one = [
-            self._cost(frame, ExpectedTargets(*(a[k : k + 1] for a in expected)), _NO_STEPS) for k in range(len(states))
-        ]
-        return np.array([found.cost for found in one]) + (self._weight * states[:, self._columns] ** 2).sum(axis=1)
+        costs = (self._weight * states[:, self._columns] ** 2).sum(axis=1)
+        for k in range(len(states)):
+            own = ExpectedTargets(
+                expected.distance_m[k : k + 1], expected.spread_m[k : k + 1], expected.sure[k : k + 1]
+            )
+            costs[k] += self._cost(frame, own, _NO_STEPS).cost
+        return np.asarray(costs)
 
     def _compared(self, frame: Reported, c: int, view: NDArray[np.float64]) -> _Comparison:
         """Compare the targets with those of a view, and of views to either side."""
