@@ -21,6 +21,7 @@ from scipy import special
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.histograms.background_table import build_table_before, plane_light
+from phasemark.matcher.histograms.cost_shape import lessened, points_about
 from phasemark.matcher.histograms.expected_targets import ExpectedTargets, expected_targets, most_peaks
 from phasemark.matcher.histograms.histogram_matcher import check_histogram_sensor, view_limits
 from phasemark.matcher.histograms.histogram_table import build_table, plan_table
@@ -46,6 +47,9 @@ _WORTH_ANOTHER_TRY = 2 * DISAGREEMENT
 _STEPS = 6
 _DONE = 0.1
 _LEAST_STD_M = 1e-5
+_BETTER_FITS, _BETTER = 2, 0.1
+"""Where a view a few standard deviations aside of the best fit explains the targets better, a fit begins there."""
+_NO_STEPS = np.empty(0)
 _WIDER = 6.0
 """Slopes of targets span this multiple of the steps of counts: estimates jump where the highest bin changes."""
 _LONGEST = {"m": 0.04, "rad": math.radians(4.0)}
@@ -190,6 +194,7 @@ class TargetMatcher:
         fits = [self._fit(frame, c, view) for c, view in self._starts(frame)]
         fits += self._beside(frame, fits)
         best_index = int(np.argmin([comparison.cost for _, _, comparison in fits]))
+        fits[best_index] = self._lessened(frame, *fits[best_index])
         found = [Explanation(c, view, comparison.cost, comparison.information) for c, view, comparison in fits]
         best = fits[best_index][2]
         n = frame.n_frames
@@ -289,6 +294,37 @@ class TargetMatcher:
                     break
             view, here = np.clip(trial, *self._limits), there
         return c, view, here
+
+    def _lessened(
+        self, frame: Reported, c: int, view: NDArray[np.float64], here: _Comparison
+    ) -> tuple[int, NDArray[np.float64], _Comparison]:
+        """Return the best fit, or a better one beside it, with the information that the cost about it shows."""
+        for left in range(_BETTER_FITS, -1, -1):
+            points, axes = points_about(view, self._columns, here.information)
+            inside = (points == np.clip(points, *self._limits)).all(axis=-1)
+            costs = np.full(inside.shape, np.nan)
+            costs[inside] = self._costs(frame, c, points[inside])
+            best = int(np.nanargmin([*costs.ravel(), here.cost]))
+            if left == 0 or best == costs.size:
+                break
+            _, trial, there = self._fit(frame, c, points.reshape(-1, len(VIEW_FIELDS))[best])
+            if there.cost >= here.cost - _BETTER:
+                break
+            view, here = trial, there
+        return c, view, here._replace(information=lessened(here.information, axes, costs - here.cost))
+
+    def _costs(self, frame: Reported, c: int, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what the targets cost at some views, (n,)."""
+        if not len(states):
+            return np.empty(0)
+        expected = self._expected(self._counts(c, Views(*states.T.copy())))
+        costs = (self._weight * states[:, self._columns] ** 2).sum(axis=1)
+        for k in range(len(states)):
+            own = ExpectedTargets(
+                expected.distance_m[k : k + 1], expected.spread_m[k : k + 1], expected.sure[k : k + 1]
+            )
+            costs[k] += self._cost(frame, own, _NO_STEPS).cost
+        return np.asarray(costs)
 
     def _compared(self, frame: Reported, c: int, view: NDArray[np.float64]) -> _Comparison:
         """Compare the targets with those of a view, and of views to either side."""
