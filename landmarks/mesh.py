@@ -33,6 +33,7 @@ silhouette that crosses it on the diagonal is √2 times as long.
 """
 
 MAX_FACES = 2_000_000
+"""Most faces that the mesh of a landmark may have."""
 
 _BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-1.0, 0.0)])
 _BOX_FACES = np.array(

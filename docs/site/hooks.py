@@ -75,6 +75,9 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
     """Drop the marks of Sphinx from docstrings, and let what cites physics.md lead there."""
     html = without_roles(html, code=("<code>", "</code>"))
     html = re.sub(r"(?<=<td>).*?(?=</td>)", _with_breaks, html, flags=re.DOTALL)
+    html = re.sub(
+        r"(?<=>)phasemark\.[\w.]+(?=<a class=.headerlink|</h1>)", lambda name: name[0].replace(".", ".<wbr>"), html
+    )
     html = _EMPTY_DESCRIPTION.sub("", html)
     anchors = _sections_of_physics()
     root = "../" * page.url.count("/")
