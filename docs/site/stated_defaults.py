@@ -33,21 +33,34 @@ def _mend(thing: griffe.Object) -> None:
                 if section.kind is griffe.DocstringSectionKind.parameters:
                     for parameter in section.value:
                         _take_default(member, parameter)
+                        _take_type(member, parameter)
                         if str(parameter.annotation) == "path - like":  # the reader takes the hyphen for a minus
                             parameter.annotation = "path-like"
+
+
+def _take_type(owner: griffe.Function | griffe.Class, parameter: griffe.DocstringParameter) -> None:
+    """Give a parameter without a type of its own that of its signature; the reader gives it that of another one."""
+    own = next((one for one in owner.parameters if one.name == parameter.name), None)
+    if own is None or own.annotation is None or isinstance(parameter.annotation, str):
+        return
+    if any(parameter.annotation is one.annotation for one in owner.parameters if one is not own):
+        parameter.annotation = own.annotation
 
 
 def _state_fields(model: griffe.Class) -> None:
     """Give a model whose ``__init__`` takes any keyword the signature of its fields."""
     takes = [tuple(parameter.name for parameter in init.parameters) for init in _inits(model)]
-    if not takes or takes[0] != ("self", "data"):
+    if ("self", "data") not in takes or ("__init__" in model.members and takes[0] != ("self", "data")):
         return
     fields: dict[str, griffe.Attribute] = {}
     for owner in (*reversed(model.mro()), model):
         for name, member in owner.members.items():
             stated = member.is_attribute and "property" not in member.labels and member.annotation is not None
+            stated = stated and set(member.labels) != {"class-attribute"}
             if stated and not name.startswith("_") and "ClassVar" not in str(member.annotation):
                 fields[name] = member
+    if not fields:  # a base whose models still say that they take any keyword
+        return
     parameters = [griffe.Parameter("self", kind=griffe.ParameterKind.positional_or_keyword)]
     parameters += [
         griffe.Parameter(
