@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 _FOLDERS = {
     "matcher": "pixel_agreement",
     "matcher/filters": "loops",
-    "matcher/histograms": "histogram_table poisson_fit table_search target_matcher",
+    "matcher/histograms": "background_search expected_targets histogram_table poisson_fit table_search target_matcher",
     "matcher/likelihood": "bank_images residuals",
     "matcher/nearest": "bank_minima search templates",
     "render": "background compile_cache kernel unwrapping",
