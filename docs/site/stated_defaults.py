@@ -40,11 +40,12 @@ def _mend(thing: griffe.Object) -> None:
 
 def _take_type(owner: griffe.Function | griffe.Class, parameter: griffe.DocstringParameter) -> None:
     """Give a parameter without a type of its own that of its signature; the reader gives it that of another one."""
-    own = next((one for one in owner.parameters if one.name == parameter.name), None)
-    if own is None or own.annotation is None or isinstance(parameter.annotation, str):
+    in_signature = {stated.name: stated.annotation for stated in owner.parameters}
+    own = in_signature.pop(parameter.name, None)
+    if own is None or isinstance(parameter.annotation, str):
         return
-    if any(parameter.annotation is one.annotation for one in owner.parameters if one is not own):
-        parameter.annotation = own.annotation
+    if any(parameter.annotation is annotation for annotation in in_signature.values()):
+        parameter.annotation = own
 
 
 def _state_fields(model: griffe.Class) -> None:

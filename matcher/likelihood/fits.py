@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render.view import delta_period_rad
 
+BETTER_COST = 1.0
+"""By how much the cost of a look-alike must be lower: below that both views remain, and the answer is ambiguous."""
+
 
 @dataclass(frozen=True, eq=False)
 class Fits:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.likelihood.fits import Fits, best_of_frame, least_of_frame
+from phasemark.matcher.likelihood.fits import BETTER_COST, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import Evidence, range_residuals
@@ -16,8 +16,6 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT
 
 __all__ = ["fit_look_alikes"]
 
-_BETTER = 1.0
-"""By how much a cost must be lower: below that both views remain, and the answer is ambiguous anyway."""
 _Views = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Indices of fits, and as many views to try instead of theirs."""
 _OfClasses = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
@@ -43,7 +41,7 @@ def fit_look_alikes(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) 
     kinds = [_next_face(setup, scene, together, best, turn) for turn in (0.5 * math.pi, -0.5 * math.pi)]
     faces = _refined(setup, scene, evidence, together, kinds)
     ahead = best_of_frame(faces)
-    ahead = ahead[faces.cost[ahead] < least_of_frame(together, len(evidence.weight))[faces.frame[ahead]] - _BETTER]
+    ahead = ahead[faces.cost[ahead] < least_of_frame(together, len(evidence.weight))[faces.frame[ahead]] - BETTER_COST]
     return Fits.joined([found, faces, _rounds(setup, scene, evidence, faces, ahead)])
 
 
@@ -57,7 +55,7 @@ def _rounds(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, best: ND
         least = least_of_frame(fits, len(evidence.weight))
         parts.append(found)
         best = best_of_frame(found)
-        best = best[found.cost[best] < least[found.frame[best]] - _BETTER]
+        best = best[found.cost[best] < least[found.frame[best]] - BETTER_COST]
         fits = found
     return Fits.joined(parts)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels, whole_cost
 from phasemark.matcher.likelihood.descent import descend
-from phasemark.matcher.likelihood.fits import Fits
+from phasemark.matcher.likelihood.fits import BETTER_COST, Fits
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.kinks import look_beside, settle
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, DescentSettings, Problem, State, picked
@@ -32,8 +32,6 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT
 _NEAR_SIGMA = 0.3
 """Within this many standard deviations two fits of one class are one. Other minima may be one deviation away: a fit
 there tells how far the explanations of a frame extend, and keeps its answer from being accepted for too sure."""
-_BETTER = 1.0
-"""By how much a candidate must cost less than the fit it came back to; see :mod:`~.look_alikes`."""
 
 
 def refine(
@@ -122,7 +120,7 @@ def _others(problem: Problem, state: State, look_like: Fits) -> tuple[Problem, S
     away = (state.theta[:, :ALBEDO_COLUMN] - look_like.view)[:, columns]
     squared = np.einsum("mp,mpq,mq->m", away, look_like.information, away)
     came_back = (problem.class_index == look_like.class_index) & (squared < _NEAR_SIGMA**2)
-    came_back &= whole_cost(problem, state)[0] >= look_like.cost - _BETTER
+    came_back &= whole_cost(problem, state)[0] >= look_like.cost - BETTER_COST
     others = np.flatnonzero(~came_back)
     return problem.some(others), picked(state, others), look_like[others]
 
