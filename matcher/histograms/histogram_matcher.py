@@ -153,7 +153,7 @@ class HistogramMatcher:
         found += [
             Explanation(s.class_index, s.state[: len(VIEW_FIELDS)], s.cost + offset, None) for s in starts[n_tried:]
         ]
-        best_class, best = min(fits, key=lambda one: one[1].cost)
+        best_class, best = min(fits, key=lambda pair: pair[1].cost)
         mean, variance = moments_of(best.level)
         free = len(self._free) + self.search.model(best_class).nuisances.shape[1] + 1 + len(best.ambient)
         test = FitTest(*deviance_test(best.deviance, mean, variance, free))

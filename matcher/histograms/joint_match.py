@@ -63,10 +63,11 @@ def match_together(
         if fit is not None:
             moved = start._replace(state=fit.state, bright=fit.bright, ambient=fit.ambient)
             first.append((fit.cost, moved))
-    first.sort(key=lambda one: one[0])
+    first.sort(key=lambda pair: pair[0])
     fits: list[tuple[int, Fit]] = []
     for c in range(len(rules.names)):
-        for _, start in [one for one in first if one[1].class_index == c][:_OF_CLASS]:
+        of_class = [start for _, start in first if start.class_index == c]
+        for start in of_class[:_OF_CLASS]:
             hopeless = min((fit.cost for _, fit in fits), default=math.inf) + _SURE_COST
             known = [fit.view for other, fit in fits if other == c]
             scene = scene_at(models[c], plan.free)
@@ -74,7 +75,7 @@ def match_together(
             if fit is not None:
                 fits.append((c, fit))
     found = [Explanation(c, fit.view, fit.cost, fit.information) for c, fit in fits]
-    best_class, best = min(fits, key=lambda one: one[1].cost)
+    best_class, best = min(fits, key=lambda pair: pair[1].cost)
     free = len(plan.free) + models[best_class].nuisances.shape[1] + 1 + len(joint.counts)
     apart = _best_apart(search, frames, models[best_class], first2camera, best, range(len(rules.names)))
     test = _test(best, joint, free, apart, len(_OWN) * len(frames) - len(plan.free))
@@ -85,8 +86,8 @@ def match_together(
 def joined(frames: Sequence[Counted]) -> Counted:
     """Return several frames of one sensor as one, their zones one after the other."""
     return frames[0]._replace(
-        counts=np.concatenate([one.counts for one in frames]),
-        drift_bins=np.concatenate([one.drift_bins for one in frames]),
+        counts=np.concatenate([frame.counts for frame in frames]),
+        drift_bins=np.concatenate([frame.drift_bins for frame in frames]),
     )
 
 
@@ -103,23 +104,23 @@ def _begin(
         return []
     out: list[Start] = []
     for c in range(n_classes):
-        own = [min(of_frame, key=lambda one: (one.class_index != c, one.cost)) for of_frame in starts]
+        own = [min(of_frame, key=lambda start: (start.class_index != c, start.cost)) for of_frame in starts]
         extra: list[NDArray[np.float64]] = []
-        for k, one in enumerate(own):
-            ratio = [one.bright / own[0].bright] if k else []
-            extra.append(np.array([*ratio, *one.state[len(VIEW_FIELDS) :]]))
-        ambient = np.concatenate([one.ambient for one in own])
+        for k, best in enumerate(own):
+            ratio = [best.bright / own[0].bright] if k else []
+            extra.append(np.array([*ratio, *best.state[len(VIEW_FIELDS) :]]))
+        ambient = np.concatenate([best.ambient for best in own])
         views: list[NDArray[np.float64]] = []
         for k, of_frame in enumerate(starts):
-            for one in of_frame:
-                if one.class_index != c:
+            for start in of_frame:
+                if start.class_index != c:
                     continue
-                view = view_in_first(first2camera[k], one.state[: len(VIEW_FIELDS)], fixed)
+                view = view_in_first(first2camera[k], start.state[: len(VIEW_FIELDS)], fixed)
                 view = np.clip(view, *plan.limits)
                 if any(_same(view, other) for other in views):
                     continue
                 views.append(view)
-                out.append(Start(c, np.concatenate([view, *extra]), one.cost, own[0].bright, ambient))
+                out.append(Start(c, np.concatenate([view, *extra]), start.cost, own[0].bright, ambient))
     return out
 
 

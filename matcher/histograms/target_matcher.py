@@ -258,10 +258,10 @@ class TargetMatcher:
         more = []
         best = min(comparison.cost for _, _, comparison in fits)
         for c in range(len(self.signals)):
-            own = [one for one in fits if one[0] == c]
-            if not own:
+            of_class = [(view, comparison) for class_index, view, comparison in fits if class_index == c]
+            if not of_class:
                 continue
-            _, view, comparison = min(own, key=lambda one: one[2].cost)
+            view, comparison = min(of_class, key=lambda pair: pair[1].cost)
             if comparison.cost > best + _WORTH_ANOTHER_TRY:
                 continue
             for aside in (-_ASIDE_RAD, _ASIDE_RAD):
