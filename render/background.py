@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,19 +71,7 @@ class Background:
         UsageError
             Naming the view and what would be right.
         """
-        farthest, deepest = self._extremes(vertices, views)
-        if self.floor_m is not None and (deepest > self.floor_m + 1e-9).any():
-            i = int(np.argmax(deepest > self.floor_m + 1e-9))
-            raise UsageError(
-                f"the floor {self.floor_m:g} m below the lens is above the landmark's lowest point in view"
-                f" {i}: 'floor_m' must be at least {deepest[i]:.4g}"
-            )
-        if self.wall_m is not None and (farthest > self.wall_m + 1e-9).any():
-            i = int(np.argmax(farthest > self.wall_m + 1e-9))
-            raise UsageError(
-                f"the wall at {self.wall_m:g} m is before the landmark's farthest point in view {i}:"
-                f" 'wall_m' must be at least {farthest[i]:.4g}"
-            )
+        check_behind(parameters_of_views(self, len(views)), vertices, views)
 
     def giving_way(self, vertices: NDArray[np.float64], views: Views) -> Background:
         """Return it with wall and floor moved back to where they touch the landmark, if they would cut it.
@@ -99,26 +89,76 @@ class Background:
         -------
         Background
         """
-        farthest, deepest = self._extremes(vertices, views)
+        farthest, deepest = _extremes(self.wall_m or 0.0, vertices, views)
         return replace(
             self,
             wall_m=None if self.wall_m is None else max(self.wall_m, float(farthest.max(initial=0.0))),
             floor_m=None if self.floor_m is None else max(self.floor_m, float(deepest.max(initial=0.0))),
         )
 
-    def _extremes(self, vertices: NDArray[np.float64], views: Views) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return how far from the lens each view's landmark reaches, if it may reach the wall, and how far below it."""
-        nowhere = np.full(len(views), -np.inf)
-        if not len(vertices):
-            return nowhere, nowhere
-        farthest = nowhere.copy()
-        if self.wall_m is not None:
-            # distance along the horizontal line of sight: D + x' cos δ + y' sin δ
-            reach = np.hypot(vertices[:, 0], vertices[:, 1]).max()
-            for i in np.flatnonzero(views.distance_m + reach > self.wall_m):
-                cos, sin = math.cos(views.delta_rad[i]), math.sin(views.delta_rad[i])
-                farthest[i] = views.distance_m[i] + (vertices[:, 0] * cos + vertices[:, 1] * sin).max()
-        return farthest, -vertices[:, 2].min() - views.height_m
+
+Backgrounds: TypeAlias = Background | Sequence[Background | None] | None
+"""What stands behind the landmark: the same in all views, or in each view; None: nothing."""
+
+
+def parameters_of_views(background: Backgrounds, n: int) -> NDArray[np.float64]:
+    """Return what stands behind the landmark in each of n views, rows as :meth:`Background.parameters`; (n, 4).
+
+    Parameters
+    ----------
+    background : Background or sequence of Background, optional
+    n : int
+        Number of views.
+
+    Raises
+    ------
+    UsageError
+        There are more or fewer backgrounds than views.
+    """
+    if background is None or isinstance(background, Background):
+        return np.tile((background or Background()).parameters(), (n, 1))
+    if len(background) != n:
+        raise UsageError(f"'background' must be one for all {n} views or one for each, got {len(background)}")
+    return np.array([(own or Background()).parameters() for own in background]).reshape(n, 4)
+
+
+def check_behind(parameters: NDArray[np.float64], vertices: NDArray[np.float64], views: Views) -> None:
+    """Refuse what :meth:`Background.check_behind` refuses; each view has its own row of `parameters`, (n, 4)."""
+    wall_m, floor_m = parameters[:, 0], parameters[:, 1]
+    farthest, deepest = _extremes(wall_m, vertices, views)
+    above = (floor_m > 0) & (deepest > floor_m + 1e-9)
+    if above.any():
+        i = int(np.argmax(above))
+        raise UsageError(
+            f"the floor {floor_m[i]:g} m below the lens is above the landmark's lowest point in view"
+            f" {i}: 'floor_m' must be at least {deepest[i]:.4g}"
+        )
+    before = farthest > wall_m + 1e-9
+    if before.any():
+        i = int(np.argmax(before))
+        raise UsageError(
+            f"the wall at {wall_m[i]:g} m is before the landmark's farthest point in view {i}:"
+            f" 'wall_m' must be at least {farthest[i]:.4g}"
+        )
+
+
+def _extremes(
+    wall_m: float | NDArray[np.float64], vertices: NDArray[np.float64], views: Views
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how far from the lens each view's landmark reaches, if it may reach the wall, and how far below it.
+
+    `wall_m`, one or (n,), is 0 where there is no wall.
+    """
+    nowhere = np.full(len(views), -np.inf)
+    if not len(vertices):
+        return nowhere, nowhere
+    farthest = nowhere.copy()
+    # distance along the horizontal line of sight: D + x' cos δ + y' sin δ
+    reach = np.hypot(vertices[:, 0], vertices[:, 1]).max()
+    for i in np.flatnonzero((np.asarray(wall_m) > 0) & (views.distance_m + reach > wall_m)):
+        cos, sin = math.cos(views.delta_rad[i]), math.sin(views.delta_rad[i])
+        farthest[i] = views.distance_m[i] + (vertices[:, 0] * cos + vertices[:, 1] * sin).max()
+    return farthest, -vertices[:, 2].min() - views.height_m
 
 
 @inlined

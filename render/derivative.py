@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +38,12 @@ def check_parameters(parameters: Sequence[str]) -> None:
         raise UsageError(f"'parameters' must name one or more parameters, each once, got {tuple(parameters)!r}")
 
 
+Which: TypeAlias = slice | NDArray[np.integer]
+"""Some of several views."""
+
+
 def differentiate(
-    phasor_of: Callable[[Views], NDArray[np.complex128]], views: Views, parameters: Sequence[str]
+    phasor_of: Callable[[Views, Which], NDArray[np.complex128]], views: Views, parameters: Sequence[str]
 ) -> NDArray[np.complex128]:
     """Return the derivatives of phasors with respect to the view.
 
@@ -50,7 +55,7 @@ def differentiate(
     Parameters
     ----------
     phasor_of : callable
-        From n views to (n, rows, cols) phasors.
+        From k views, moved, and which of all they are, to (k, rows, cols) phasors.
     views : Views
     parameters : sequence of str
         Among :data:`~phasemark.render.view.VIEW_FIELDS`.
@@ -64,12 +69,12 @@ def differentiate(
 
 
 def _derivative(
-    phasor_of: Callable[[Views], NDArray[np.complex128]], views: Views, name: str
+    phasor_of: Callable[[Views, Which], NDArray[np.complex128]], views: Views, name: str
 ) -> NDArray[np.complex128]:
     value: NDArray[np.float64] = getattr(views, name)
 
-    def at(which: slice | NDArray[np.integer], moved: NDArray[np.float64]) -> NDArray[np.complex128]:
-        return phasor_of(replace(views[which], **{name: moved}))
+    def at(which: Which, moved: NDArray[np.float64]) -> NDArray[np.complex128]:
+        return phasor_of(replace(views[which], **{name: moved}), which)
 
     everywhere = slice(None)
     # the width is the difference of the rounded floats, not twice the requested step

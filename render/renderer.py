@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
-from phasemark.render.background import Background
+from phasemark.render.background import Background, Backgrounds, check_behind, parameters_of_views
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
 from phasemark.render.integral.arguments import Borders, Camera, Edges, Light, Motion, Poses, Returns, Samples, Sums
 from phasemark.render.integral.image_rays import trace
@@ -227,7 +227,7 @@ class Renderer:
         pitch_rad: ArrayLike = 0.0,
         roll_rad: ArrayLike = 0.0,
         *,
-        background: Background | None = None,
+        background: Backgrounds = None,
         rows: tuple[int, int] | None = None,
         variant: Variant = "exact",
         workers: int = 1,
@@ -238,8 +238,8 @@ class Renderer:
         ----------
         distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : array_like
             The views, PHYSICS sections 1 and 9.
-        background : Background, optional
-            What stands behind the landmark; None: nothing.
+        background : Background or sequence of Background, optional
+            What stands behind the landmark, in all views or in each one; None: nothing.
         rows : (first, stop), optional
             Render only these image rows.
         variant : {"exact", "hard"}
@@ -256,7 +256,8 @@ class Renderer:
         Raises
         ------
         UsageError
-            A view that is not finite, a lens inside the landmark, a wall before it or a floor above its foot.
+            A view that is not finite, a lens inside the landmark, a wall before it or a floor above its foot, or a
+            sequence of another length than the views.
         """
         views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad)
         return self.render_views(views, background=background, rows=rows, variant=variant, workers=workers)
@@ -265,7 +266,7 @@ class Renderer:
         self,
         views: Views,
         *,
-        background: Background | None = None,
+        background: Backgrounds = None,
         rows: tuple[int, int] | None = None,
         variant: Variant = "exact",
         workers: int = 1,
@@ -277,8 +278,8 @@ class Renderer:
         if variant not in ("exact", "hard"):
             raise UsageError(f"'variant' must be exact or hard, got {variant!r}")
         seen = views.in_camera(self.sensor)
-        self._check(seen, background, workers)
-        return replace(self._render(seen, background, (first, stop), workers, variant), views=views)
+        behind = self._checked(seen, background, workers)
+        return replace(self._render(seen, behind, (first, stop), workers, variant), views=views)
 
     def turned_out_of_view(self, views: Views) -> NDArray[np.intp]:
         """Return which views are tilted so far that none of the landmark's bounding box is in the image.
@@ -343,7 +344,7 @@ class Renderer:
         pitch_rad: ArrayLike = 0.0,
         roll_rad: ArrayLike = 0.0,
         *,
-        background: Background | None = None,
+        background: Backgrounds = None,
         parameters: Sequence[str] = VIEW_PARAMETERS,
         workers: int = 1,
     ) -> NDArray[np.complex128]:
@@ -357,7 +358,7 @@ class Renderer:
         ----------
         distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : array_like
             As for :meth:`render`.
-        background : Background, optional
+        background : Background or sequence of Background, optional
             As for :meth:`render`.
         workers : int
             As for :meth:`render`.
@@ -388,15 +389,15 @@ class Renderer:
         views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad).in_camera(
             self.sensor
         )
-        self._check(views, background, workers)
-        return self._differences(views, background, parameters, workers)
+        behind = self._checked(views, background, workers)
+        return self._differences(views, behind, parameters, workers)
 
     def render_with_slopes(
         self,
         views: Views,
         parameters: Sequence[str] = VIEW_PARAMETERS,
         *,
-        background: Background | None = None,
+        background: Backgrounds = None,
         workers: int = 1,
     ) -> tuple[PhasorImages, NDArray[np.complex128]]:
         """Render views, and how their phasors change with the view, from the same samples.
@@ -413,7 +414,7 @@ class Renderer:
             n views.
         parameters : sequence of str
             Which derivatives, in this order; "pitch_rad" and "roll_rad" too may be asked for.
-        background : Background, optional
+        background : Background or sequence of Background, optional
             As for :meth:`render`.
         workers : int
             As for :meth:`render`.
@@ -432,48 +433,54 @@ class Renderer:
         """
         check_parameters(parameters)
         seen = views.in_camera(self.sensor)
-        self._check(seen, background, workers)
+        behind = self._checked(seen, background, workers)
         whole, p = (0, self.sensor.rows), len(parameters)
         m, shape = len(self.sensor.frequencies_hz), (self.sensor.rows, self.sensor.cols)
         by_pixel = np.zeros((m, len(views) * math.prod(shape), p), np.complex128)
-        images = self._render(seen, background, whole, workers, slope=by_pixel, parameters=parameters)
+        images = self._render(seen, behind, whole, workers, slope=by_pixel, parameters=parameters)
         slope = by_pixel.reshape(m, len(views), *shape, p).transpose(1, 4, 0, 2, 3)
         slope = slope[:, :, 0] if m == 1 else slope
         unknown = np.isnan(slope).any(axis=tuple(range(1, slope.ndim))) | (not self.topology.closed)
         full = np.flatnonzero(unknown)
         if full.size:
-            slope[full] = self._differences(seen[full], background, parameters, workers)
+            slope[full] = self._differences(seen[full], behind[full], parameters, workers)
         return replace(images, views=views), slope
 
     def _differences(
-        self, seen: Views, background: Background | None, parameters: Sequence[str], workers: int
+        self, seen: Views, background: NDArray[np.float64], parameters: Sequence[str], workers: int
     ) -> NDArray[np.complex128]:
         """Return slopes as differences of images; `seen` as the camera itself has the views."""
         # a step may take a landmark that stands on the floor a hair into it
         whole = (0, self.sensor.rows)
         one = len(self.sensor.frequencies_hz) == 1
 
-        def phasor_of(moved: Views) -> NDArray[np.complex128]:
-            images = self._render(moved, background, whole, workers)
+        def phasor_of(moved: Views, which: slice | NDArray[np.integer]) -> NDArray[np.complex128]:
+            images = self._render(moved, background[which], whole, workers)
             return images.phasor if one else images.phasors
 
         return differentiate(phasor_of, seen, parameters)
 
-    def _check(self, views: Views, background: Background | None, workers: int) -> None:
-        """Refuse what cannot be rendered."""
+    def _checked(self, views: Views, background: Backgrounds, workers: int) -> NDArray[np.float64]:
+        """Refuse what cannot be rendered; return what stands behind each view, (n, 4)."""
         if workers < 1:
             raise UsageError(f"'workers' must be at least 1, got {workers!r}")
-        self.check_can_be_seen(views, background)
+        return self.check_can_be_seen(views, background)
 
-    def check_can_be_seen(self, views: Views, background: Background | None) -> None:
+    def check_can_be_seen(self, views: Views, background: Backgrounds) -> NDArray[np.float64]:
         """Refuse a lens inside the landmark, a wall before it and a floor above its foot.
 
         Parameters
         ----------
         views : Views
             As the camera itself has them, :meth:`~phasemark.render.Views.in_camera`.
-        background : Background, optional
-            Wall and floor; nothing stands behind the landmark without it.
+        background : Background or sequence of Background, optional
+            As for :meth:`render`.
+
+        Returns
+        -------
+        (n, 4) float64
+            What stands behind the landmark in each view, rows as
+            :meth:`~phasemark.render.background.Background.parameters`.
 
         Raises
         ------
@@ -481,37 +488,36 @@ class Renderer:
             Naming the view.
         """
         self._check_lens_outside(views)
-        if background is not None:
-            background.check_behind(self.topology.vertices, views)
+        behind = parameters_of_views(background, len(views))
+        check_behind(behind, self.topology.vertices, views)
+        return behind
 
     def _render(
         self,
         views: Views,
-        background: Background | None,
+        background: NDArray[np.float64],
         rows: tuple[int, int],
         workers: int,
         variant: Variant = "exact",
         slope: NDArray[np.complex128] | None = None,
         parameters: Sequence[str] = (),
     ) -> PhasorImages:
-        """Render rows of views that have been checked, as the camera itself has them.
+        """Render rows of views that have been checked, as the camera itself has them, before the rows of `background`.
 
         With `slope`, (m, pixels of all views, p), it is filled with how the phasors at each of the sensor's m
         frequencies change with `parameters`.
         """
         run = self._render_tasks if variant == "exact" else self._cast_centres
         order = self._by_direction(views) if slope is None else slice(None)
-        ordered = views[order]
+        ordered, behind = views[order], background[order]
         if slope is not None:
             run = partial(self._render_tasks, slope=slope, parameters=parameters)
         first, stop = rows
         shape = (len(views), stop - first, self.sensor.cols)
         columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
         sums = _no_light(shape, len(columns_hz))
-        behind = (background or Background()).parameters()
-        camera = _camera(self.sensor, rows, points_a_side(behind))
+        camera = _camera(self.sensor, rows, points_a_side(background))
         light = Light(
-            behind,
             self.albedo,
             1 / self.sensor.metres_per_radian,
             np.array(columns_hz) / columns_hz[0],
@@ -520,11 +526,11 @@ class Renderer:
         )
         tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
         if workers == 1 or len(tasks) <= 1:
-            run(tasks, ordered, camera, light, sums)
+            run(tasks, ordered, behind, camera, light, sums)
         else:
             with ThreadPoolExecutor(workers) as pool:
                 lanes = [tasks[i::workers] for i in range(workers)]
-                list(pool.map(lambda lane: run(lane, ordered, camera, light, sums), lanes))
+                list(pool.map(lambda lane: run(lane, ordered, behind, camera, light, sums), lanes))
         self.untrusted_pixels += int((sums.state == UNTRUSTED).sum())
         phasor, intensity, coverage, upper = (
             _restored(values.reshape(*shape, *values.shape[1:]), order)
@@ -553,6 +559,7 @@ class Renderer:
         self,
         tasks: Iterable[slice],
         views: Views,
+        background: NDArray[np.float64],
         camera: Camera,
         light: Light,
         sums: Sums,
@@ -561,7 +568,7 @@ class Renderer:
     ) -> None:
         """Render slices of the views into `sums`, in one thread; with `slope`, (m, pixels, p), how they change too."""
         mesh = self.topology
-        turns = np.array([name in _TURNING for name in parameters], np.bool_) & light.background[:2].any()
+        turns = np.array([name in _TURNING for name in parameters], np.bool_) & background[:, :2].any()
         buffers = _Buffers(
             len(mesh.creases) + len(mesh.folds),
             (camera.rows, camera.cols),
@@ -569,7 +576,8 @@ class Renderer:
             n_parameters=len(parameters),
         )
         for task in tasks:
-            poses, own = _poses(views[task], camera), _of_views(sums, task)
+            poses, own = _poses(views[task], background[task], camera), _of_views(sums, task)
+            behind = background[task, :2].any()
             motion = _motion(views[task], poses, camera, parameters)
             slopes = None
             if slope is not None:
@@ -579,7 +587,7 @@ class Renderer:
             view = 0
             while view < len(poses.lens):
                 reached, n = plan_rays(
-                    view, mesh, poses, camera, self.splits, light.background, light.fastest, buffers.edges,
+                    view, mesh, poses, camera, self.splits, light.fastest, buffers.edges,
                     buffers.scratch, buffers.samples, own.state, motion, buffers.borders,
                 )  # fmt: skip
                 if reached <= view:
@@ -587,7 +595,7 @@ class Renderer:
                     continue
                 self._find_faces(n, buffers.samples, own.state, poses, camera)
                 sum_samples(n, buffers.samples, mesh, poses, camera, light, own)
-                if light.background[0] or light.background[1]:
+                if behind:
                     add_background(view, reached, poses, camera, light, own)
                 if slopes is not None:
                     slopes.add((view, reached), n, buffers.samples, buffers.borders, mesh, poses, camera, light)
@@ -595,12 +603,15 @@ class Renderer:
             if slopes is not None:
                 slopes.conclude()
 
-    def _cast_centres(self, tasks: Iterable[slice], views: Views, camera: Camera, light: Light, sums: Sums) -> None:
+    def _cast_centres(
+        self, tasks: Iterable[slice], views: Views, background: NDArray[np.float64], camera: Camera, light: Light,
+        sums: Sums,
+    ) -> None:  # fmt: skip
         """Render slices of the views with one ray a pixel into `sums`, in one thread."""
         v, u = np.mgrid[camera.first_row : camera.stop_row, : camera.cols] + 0.5
         centres = np.column_stack([u.ravel(), v.ravel()])
         for task in tasks:
-            poses = _poses(views[task], camera)
+            poses = _poses(views[task], background[task], camera)
             n = len(poses.lens) * len(centres)
             samples = _room_for(n)
             samples.points[:] = np.tile(centres, (len(poses.lens), 1))
@@ -695,8 +706,8 @@ def _topology(mesh: SurfaceMesh) -> MeshTopology:
     return found
 
 
-def _camera(sensor: Sensor, rows: tuple[int, int], rule: int) -> Camera:
-    """Return a camera as the kernels take it, which rows to render, and how a background is integrated over a pixel."""
+def _camera(sensor: Sensor, rows: tuple[int, int], rules: tuple[int, ...]) -> Camera:
+    """Return a camera as the kernels take it, which rows to render, and how backgrounds are integrated over a pixel."""
     tan_h, tan_v = sensor.tan_half_angles
     scale = sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v)
     slope = 2 * tan_h / sensor.cols, 2 * tan_v / sensor.rows
@@ -716,11 +727,11 @@ def _camera(sensor: Sensor, rows: tuple[int, int], rule: int) -> Camera:
         fill_u=float(sensor.fill_factor[0]),
         fill_v=float(sensor.fill_factor[1]),
         level=np.ascontiguousarray(sensor.cam2level),
-        distortion=distortion_of(sensor, rule),
+        distortion=distortion_of(sensor, rules),
     )
 
 
-def _poses(views: Views, camera: Camera) -> Poses:
+def _poses(views: Views, background: NDArray[np.float64], camera: Camera) -> Poses:
     rotation, translation = views.landmark2cam()
     return Poses(
         views.lens_in_landmark(),
@@ -728,6 +739,7 @@ def _poses(views: Views, camera: Camera) -> Poses:
         np.ascontiguousarray(translation @ camera.level),
         views.bearing_rad,
         np.ascontiguousarray(views.tilt2level() @ camera.level),
+        np.ascontiguousarray(background),
     )
 
 
@@ -739,7 +751,8 @@ def _motion(views: Views, poses: Poses, camera: Camera, parameters: Sequence[str
     many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_FIELDS))
     for k, name in enumerate(parameters):
         getattr(many, name)[k + 1 :: 1 + p] += STEP
-    return Motion(_poses(many, camera), np.full(p, STEP), np.empty((1 + p, 4)))
+    background = np.repeat(poses.background, 1 + p, axis=0)
+    return Motion(_poses(many, background, camera), np.full(p, STEP), np.empty((1 + p, 4)))
 
 
 def _no_light(shape: tuple[int, int, int], n_orders: int) -> Sums:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phasemark.render.background import Background, background_hit, nearer_plane
+from phasemark.render.background import Background, background_hit, nearer_plane, parameters_of_views
 from phasemark.render.integral.arguments import Camera, Motion, Poses, towards_level
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.intersect import make_intersector
@@ -33,7 +33,6 @@ LOWER, UPPER, WALL, FLOOR = 0, 1, 2, 3
 """Parts of a scene: the landmark's lower and upper part, and the planes behind it."""
 
 _BEFORE_WALL = WALL - 1  # planes are numbered from 1
-_NO_BACKGROUND = np.zeros(4)
 _SAMPLES = 1 << 15
 _MOST_BOXES = 32
 _RADIANS_PER_SCALE = 1.5
@@ -120,8 +119,9 @@ class SceneMesh:
             np.ascontiguousarray(translation @ grid.level),
             np.zeros(len(transforms)),
             np.repeat(grid.level[None], len(transforms), axis=0),
+            parameters_of_views(None, len(transforms)),
         )
-        return self._of_poses(poses, grid, _NO_BACKGROUND, (1.0, 1.0))
+        return self._of_poses(poses, grid, (1.0, 1.0))
 
     def samples_of_views(
         self,
@@ -151,24 +151,18 @@ class SceneMesh:
         -------
         SceneSamples
         """
-        behind = (background or Background()).parameters()
-        return self._of_poses(_poses(views, grid), grid, behind, (finest_m, farthest_m))
+        behind = parameters_of_views(background, len(views))
+        return self._of_poses(_poses(views, behind, grid), grid, (finest_m, farthest_m))
 
-    def _of_poses(
-        self, poses: Poses, grid: Camera, background: NDArray[np.float64], scale: tuple[float, float]
-    ) -> SceneSamples:
-        found = [
-            self._of_pose(poses._replace(**_only(poses, k)), grid, background, scale) for k in range(len(poses.lens))
-        ]
-        counts = [len(one[1]) for one in found]
+    def _of_poses(self, poses: Poses, grid: Camera, scale: tuple[float, float]) -> SceneSamples:
+        found = [self._of_pose(poses._replace(**_only(poses, k)), grid, scale) for k in range(len(poses.lens))]
+        counts = [len(range_m) for _, range_m, _, _ in found]
         start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        columns = [np.concatenate([one[k] for one in found]) for k in range(4)]
+        columns = [np.concatenate([columns[k] for columns in found]) for k in range(4)]
         return SceneSamples(start, *columns)
 
-    def _of_pose(
-        self, pose: Poses, grid: Camera, background: NDArray[np.float64], scale: tuple[float, float]
-    ) -> tuple[NDArray[np.float64], ...]:
-        mesh = self.topology
+    def _of_pose(self, pose: Poses, grid: Camera, scale: tuple[float, float]) -> tuple[NDArray[np.float64], ...]:
+        mesh, background = self.topology, pose.background[0]
         rows, cols = grid.stop_row - grid.first_row, grid.cols
         state = np.zeros((1, rows, cols), np.uint8)
         buffers = self._buffers(rows, cols)
@@ -177,7 +171,7 @@ class SceneMesh:
         fastest = _RADIANS_PER_SCALE / scale[0] if behind else 0.0
         while True:
             reached, n = plan_rays(
-                0, mesh, pose, grid, 1, background, fastest, buffers.edges, buffers.scratch, buffers.samples, state,
+                0, mesh, pose, grid, 1, fastest, buffers.edges, buffers.scratch, buffers.samples, state,
                 still, buffers.borders,
             )  # fmt: skip
             if reached == 1:

@@ -24,7 +24,7 @@ class Distortion(NamedTuple):
     reach : (rows, cols + 1, 4) float64
         Of each pixel's rays: lowest and highest y, lowest and highest z; in the last column of all rays of the row.
     rule : (rows, cols, n, 2) float64
-        Rays of the points at which a background is integrated over a pixel.
+        Rays of the points at which a background is integrated over a pixel: of 3 × 3, of 4 × 4, or of both.
     low_y, high_y, low_z, high_z, radius : float
         Edges of the mesh are clipped to this rectangle of tangents, which holds the image, and to this circle, within
         which the lens does not fold.
@@ -99,6 +99,8 @@ class Poses(NamedTuple):
     bearing : (n,) float64
     level : (n, 3, 3) float64
         Tilted to level camera frame: mount and view together.
+    background : (n, 4) float64
+        What stands behind the landmark, rows as :meth:`~phasemark.render.background.Background.parameters`.
     """
 
     lens: NDArray[np.float64]
@@ -106,6 +108,7 @@ class Poses(NamedTuple):
     offset: NDArray[np.float64]
     bearing: NDArray[np.float64]
     level: NDArray[np.float64]
+    background: NDArray[np.float64]
 
 
 class Light(NamedTuple):
@@ -113,8 +116,6 @@ class Light(NamedTuple):
 
     Parameters
     ----------
-    background : (4,) float64
-        As :meth:`~phasemark.render.background.Background.parameters` returns them.
     albedo : float
         Of the landmark.
     radians_per_metre : float
@@ -128,7 +129,6 @@ class Light(NamedTuple):
         single frequency behind an ideal lens, whose pixels are not cut.
     """
 
-    background: NDArray[np.float64]
     albedo: float
     radians_per_metre: float
     orders: NDArray[np.float64]

@@ -21,22 +21,22 @@ _STEP = 1e-4
 """Width of a difference of the lens's derivatives (tangent)."""
 
 
-def distortion_of(sensor: Sensor, rule: int) -> Distortion:
+def distortion_of(sensor: Sensor, rules: tuple[int, ...]) -> Distortion:
     """Return the distortion of a sensor as the kernels take it.
 
     Parameters
     ----------
     sensor : Sensor
-    rule : int
-        Gauss points a side at which a background is integrated over a pixel; 0: there is no background.
+    rules : tuple of int
+        Gauss points a side at which backgrounds are integrated over a pixel, fewest first; empty: there is none.
     """
     if sensor.lens is None or not sensor.bends_rays:
         return IDEAL
-    return _tables(sensor.lens, sensor.rows, sensor.cols, sensor.fill_factor if rule else (1.0, 1.0), rule)
+    return _tables(sensor.lens, sensor.rows, sensor.cols, sensor.fill_factor if rules else (1.0, 1.0), rules)
 
 
 @lru_cache(maxsize=16)
-def _tables(lens: Lens, rows: int, cols: int, fill_factor: tuple[float, float], rule: int) -> Distortion:
+def _tables(lens: Lens, rows: int, cols: int, fill_factor: tuple[float, float], rules: tuple[int, ...]) -> Distortion:
     mapped = lens.before(rows, cols)
     u, v = np.arange(2 * cols + 1) / 2, np.arange(2 * rows + 1) / 2
     nodes = np.stack(mapped.rays(*np.meshgrid(u, v)), axis=-1)
@@ -46,10 +46,12 @@ def _tables(lens: Lens, rows: int, cols: int, fill_factor: tuple[float, float], 
     margin = 2 * _MARGIN_PX * pixel.max(axis=0)
     low, high = low - margin, high + margin
     radius = max(mapped.largest_tangent, float(np.hypot(*border.T).max()))
-    at = [gauss_legendre(rule)[0] - 0.5 if rule else np.empty(0)] * 2
-    inside_u, inside_v = np.meshgrid(fill_factor[0] * at[0], fill_factor[1] * at[1])
-    points_u = np.arange(cols)[None, :, None] + 0.5 + inside_u.ravel()
-    points_v = np.arange(rows)[:, None, None] + 0.5 + inside_v.ravel()
+    inside = np.empty((0, 2))
+    for at in (gauss_legendre(rule)[0] - 0.5 for rule in rules):
+        grid_u, grid_v = np.meshgrid(fill_factor[0] * at, fill_factor[1] * at)
+        inside = np.concatenate([inside, np.column_stack([grid_u.ravel(), grid_v.ravel()])])
+    points_u = np.arange(cols)[None, :, None] + 0.5 + inside[:, 0]
+    points_v = np.arange(rows)[:, None, None] + 0.5 + inside[:, 1]
     return Distortion(
         model=mapped.model,
         coefficients=mapped.k,

@@ -51,7 +51,6 @@ def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # typ
     rays, weights, returns = samples.rays, samples.weights, samples.returns
     pixels_per_view = (camera.stop_row - camera.first_row) * camera.cols
     index, view, intensity, coverage, upper = samples.pixel[start], 0, 0.0, 0.0, 0.0
-    has_background = light.background[0] > 0.0 or light.background[1] > 0.0
     for k in range(start, stop):
         if k == start or samples.pixel[k] != index:
             if k > start:
@@ -68,10 +67,10 @@ def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # typ
             coverage += weights[k]
             if mesh.part[face]:
                 upper += weights[k]
-        elif has_background:
+        elif poses.background[view, 0] > 0.0 or poses.background[view, 1] > 0.0:
             dx, dy, dz = towards_level(poses.level[view], y, z)
-            bearing = poses.bearing[view]
-            t, rho, cos_theta = background_hit(light.background, math.cos(bearing), math.sin(bearing), dx, dy, dz)
+            cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
+            t, rho, cos_theta = background_hit(poses.background[view], cos_b, sin_b, dx, dy, dz)
             reflected = rho * cos_theta
         else:
             t, reflected = 0.0, 0.0
@@ -173,28 +172,29 @@ def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _range_of_background(u, v, cos_b, sin_b, level, camera, light):  # type: ignore[no-untyped-def]
+def _range_of_background(u, v, background, cos_b, sin_b, level, camera):  # type: ignore[no-untyped-def]
     """Return the range of what stands behind an image point, 0 for nothing."""
     y, z = ray_of(camera, u, v)
     dx, dy, dz = towards_level(level, y, z)
-    t, _, _ = background_hit(light.background, cos_b, sin_b, dx, dy, dz)
+    t, _, _ = background_hit(background, cos_b, sin_b, dx, dy, dz)
     return t * math.sqrt(1.0 + y * y + z * z)
 
 
 @kernel
-def _boxes(c, r, width, height, cos_b, sin_b, level, camera, light):  # type: ignore[no-untyped-def]
+def _boxes(c, r, width, height, background, cos_b, sin_b, level, camera, fastest):  # type: ignore[no-untyped-def]
     """Return into how many boxes a pixel is cut along its width or height, for its fastest phase to turn little."""
-    near = _range_of_background(c + 0.5 - 0.5 * width, r + 0.5 - 0.5 * height, cos_b, sin_b, level, camera, light)
-    far = _range_of_background(c + 0.5 + 0.5 * width, r + 0.5 + 0.5 * height, cos_b, sin_b, level, camera, light)
+    u, v, half_u, half_v = c + 0.5, r + 0.5, 0.5 * width, 0.5 * height
+    near = _range_of_background(u - half_u, v - half_v, background, cos_b, sin_b, level, camera)
+    far = _range_of_background(u + half_u, v + half_v, background, cos_b, sin_b, level, camera)
     if near == 0.0 and far == 0.0:
         return 1
     if near == 0.0 or far == 0.0:
         return _MOST_BOXES
-    return int(min(max(math.ceil(abs(far - near) * light.fastest / _RADIANS_PER_BOX), 1.0), _MOST_BOXES))
+    return int(min(max(math.ceil(abs(far - near) * fastest / _RADIANS_PER_BOX), 1.0), _MOST_BOXES))
 
 
 @kernel
-def _add_boxes(index, c, r, n_u, n_v, cos_b, sin_b, level, camera, light, sums):  # type: ignore[no-untyped-def]
+def _add_boxes(index, c, r, n_u, n_v, background, cos_b, sin_b, level, camera, light, sums):  # type: ignore[no-untyped-def]
     """Integrate the background over one pixel, cut into boxes."""
     for i in range(4 * n_v):
         v = r + 0.5 + camera.fill_v * ((i // 4 + G4X[i % 4]) / n_v - 0.5)
@@ -203,17 +203,16 @@ def _add_boxes(index, c, r, n_u, n_v, cos_b, sin_b, level, camera, light, sums):
             y, z = ray_of(camera, u, v)
             length = math.sqrt(1.0 + y * y + z * z)
             dx, dy, dz = towards_level(level, y, z)
-            t, rho, cos_theta = background_hit(light.background, cos_b, sin_b, dx, dy, dz)
+            t, rho, cos_theta = background_hit(background, cos_b, sin_b, dx, dy, dz)
             if t != 0.0:
                 weight = G4W[i % 4] * G4W[j % 4] / (n_u * n_v)
                 _add_phasor(index, t * length, rho * cos_theta, length, weight, light, sums)
 
 
-def points_a_side(background: NDArray[np.float64]) -> int:
-    """Return how many Gauss points a side :func:`add_background` takes; 0 where there is nothing to add."""
-    if background[1] > 0.0:
-        return 4
-    return 3 if background[0] > 0.0 else 0
+def points_a_side(background: NDArray[np.float64]) -> tuple[int, ...]:
+    """Return how many Gauss points a side :func:`add_background` takes of some backgrounds, (n, 4); fewest first."""
+    floor = background[:, 1] > 0.0
+    return (3,) * bool((~floor & (background[:, 0] > 0.0)).any()) + (4,) * bool(floor.any())
 
 
 @kernel
@@ -223,22 +222,26 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
     A wall takes 3 × 3 Gauss points a pixel. A floor, whose range changes fast towards the horizon, takes 4 × 4. Where
     the highest of several modulation frequencies turns fast along a pixel, the pixel is cut into boxes of 4 × 4.
     """
-    order = 4 if light.background[1] > 0.0 else 3
     rows, cols = camera.stop_row - camera.first_row, camera.cols
     rule, bent_lens = camera.distortion.rule, camera.distortion.model != 0
     for view in range(start, stop):
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
-        level = poses.level[view]
+        level, background = poses.level[view], poses.background[view]
+        if background[0] == 0.0 and background[1] == 0.0:
+            continue
+        order = 4 if background[1] > 0.0 else 3
+        first = rule.shape[2] - 16 if order == 4 else 0
         for r in range(rows):
             for c in range(cols):
                 if sums.state[view, r, c] != SKIPPED:
                     continue
                 index = (view * rows + r) * cols + c
                 if light.fastest > 0.0:
-                    n_v = _boxes(c, r + camera.first_row, 0.0, camera.fill_v, cos_b, sin_b, level, camera, light)
-                    n_u = _boxes(c, r + camera.first_row, camera.fill_u, 0.0, cos_b, sin_b, level, camera, light)
+                    row, fastest = r + camera.first_row, light.fastest
+                    n_v = _boxes(c, row, 0.0, camera.fill_v, background, cos_b, sin_b, level, camera, fastest)
+                    n_u = _boxes(c, row, camera.fill_u, 0.0, background, cos_b, sin_b, level, camera, fastest)
                     if n_u * n_v > 1:
-                        _add_boxes(index, c, r + camera.first_row, n_u, n_v, cos_b, sin_b, level, camera, light, sums)
+                        _add_boxes(index, c, row, n_u, n_v, background, cos_b, sin_b, level, camera, light, sums)
                         continue
                 for i in range(order):
                     at = G4X[i] if order == 4 else G3X[i]
@@ -247,13 +250,13 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
                         at = G4X[j] if order == 4 else G3X[j]
                         u = c + 0.5 + camera.fill_u * (at - 0.5)
                         if bent_lens:
-                            ray = rule[r + camera.first_row, c, i * order + j]
+                            ray = rule[r + camera.first_row, c, first + i * order + j]
                             y, z = ray[0], ray[1]
                         else:
                             y, z = ray_of(camera, u, v)
                         length = math.sqrt(1.0 + y * y + z * z)
                         dx, dy, dz = towards_level(level, y, z)
-                        t, rho, cos_theta = background_hit(light.background, cos_b, sin_b, dx, dy, dz)
+                        t, rho, cos_theta = background_hit(background, cos_b, sin_b, dx, dy, dz)
                         if t == 0.0:
                             continue
                         weight = G4W[i] * G4W[j] if order == 4 else G3W[i] * G3W[j]

@@ -36,7 +36,7 @@ SHORT_SEGMENTS = -2
 
 @kernel
 def plan_rays(  # type: ignore[no-untyped-def]
-    first, mesh, poses, camera, splits, background, fastest, edges, scratch, samples, state, motion, borders
+    first, mesh, poses, camera, splits, fastest, edges, scratch, samples, state, motion, borders
 ):
     """Place the samples of as many views as fit into the buffers, from view `first` on.
 
@@ -48,7 +48,6 @@ def plan_rays(  # type: ignore[no-untyped-def]
     camera : Camera
     splits : int
         Boxes a side that every pixel is cut into, at least.
-    background : (4,) float64
     fastest : float
         As :class:`~phasemark.render.integral.arguments.Light` has it.
     edges : Edges
@@ -78,6 +77,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
         u_low, u_high, v_low, v_high = _extent(edges, n_edges, False, bent_lens)
         bent_low_u, bent_high_u, bent_low_v, bent_high_v = _extent(edges, n_edges, True, bent_lens)
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
+        background = poses.background[view]
         n_edges = _add_background(background, cos_b, sin_b, poses.level[view], camera, edges, n_edges)
         if n_edges < 0:
             return SHORT_SEGMENTS, n

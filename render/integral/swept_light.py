@@ -82,9 +82,9 @@ def _light_beside(b, which, y, z, view, samples, first_of, mesh, poses, camera, 
     cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
     own_y, own_z = samples.rays[nearest, 0], samples.rays[nearest, 1]
     dx, dy, dz = towards_level(poses.level[view], own_y, own_z)
-    plane = nearer_plane(light.background, cos_b, sin_b, dx, dy, dz)
+    plane = nearer_plane(poses.background[view], cos_b, sin_b, dx, dy, dz)
     dx, dy, dz = towards_level(poses.level[view], y, z)
-    t, rho, cos_theta = hit_of_plane(light.background, plane, cos_b, sin_b, dx, dy, dz)
+    t, rho, cos_theta = hit_of_plane(poses.background[view], plane, cos_b, sin_b, dx, dy, dz)
     if t == 0.0:
         return math.inf, 0j
     return t, phasor_of(t * length, rho * cos_theta, length, light)
