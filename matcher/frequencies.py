@@ -99,9 +99,9 @@ def renderer_of(bank: Bank, mesh: trimesh.Trimesh | None, albedo: float = 0.8) -
     return OneFrequencyRenderer(Renderer(mesh, bank.one.camera, albedo=albedo, harmonics=()), bank.one)
 
 
-def background_of(bank: Bank, background: Background) -> PhasorImages:
-    """Return the image of a background alone, straight ahead, in the form of a bank's images."""
-    return renderer_of(bank, None).render(distance_m=1.0, background=background)
+def background_of(bank: Bank, *backgrounds: Background) -> PhasorImages:
+    """Return images of backgrounds alone, straight ahead, in the form of a bank's images."""
+    return renderer_of(bank, None).render(distance_m=np.ones(len(backgrounds)), background=backgrounds)
 
 
 def pixels_of(bank: Bank, pixels: str) -> NDArray[np.bool_]:

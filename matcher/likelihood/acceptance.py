@@ -28,7 +28,7 @@ def rank(
     frames: FilteredFrames,
     fits: Fits,
     bare: NDArray[np.float64],
-    background: Background | None,
+    backgrounds: Sequence[Background | None],
 ) -> list[Match]:
     """Return the answer for each frame: the best fit, the others as alternatives, and whether it is accepted.
 
@@ -40,8 +40,8 @@ def rank(
     fits : Fits
     bare : (n,) float64
         Cost of a scene without a landmark.
-    background : Background, optional
-        What the fits assume behind the landmark.
+    backgrounds : sequence of Background or None
+        What the fits assume behind the landmark of each frame.
     """
     tolerated = setup.policy.largest_scale**2 if setup.unknown else 1.0
     p_values = p_values_of(fits.tested / tolerated, fits.dof, frames, fits.frame)
@@ -52,7 +52,7 @@ def rank(
     for k in range(len(frames)):
         own = order[first[k] : first[k + 1]]
         own = own[np.isfinite(fits.cost[own])]
-        answers.append(_answer(setup, fits, own, p_values, chi2_at_edge, float(bare[k]), background))
+        answers.append(_answer(setup, fits, own, p_values, chi2_at_edge, float(bare[k]), backgrounds[k]))
     return answers
 
 

@@ -1,14 +1,16 @@
-"""Frames before a wall and floor that are estimated from the frames themselves, one by one."""
+"""Frames before walls and floors that are estimated from the frames themselves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.likelihood.background_estimate import (
+    Surroundings,
     estimate_surroundings,
     fit_background,
     without_background,
@@ -29,7 +31,10 @@ __all__ = ["AutoBackground"]
 
 
 class AutoBackground:
-    """Searches single frames, each before the background that it shows.
+    """Searches frames, each before the background that it shows.
+
+    All frames are searched at the same time before what their far pixels show; those that this leaves in doubt are
+    searched further one by one.
 
     Parameters
     ----------
@@ -37,42 +42,78 @@ class AutoBackground:
     rendered : RenderedModel
         Renders the landmarks before any background.
     scene : callable
-        Returns the scene of a background (None: none). The second argument says whether background and landmark are
-        searched together, over all bearings, since what was taken for background may be landmark.
+        Returns the scene of the backgrounds of some frames, or of one for all (empty: none). The second argument says
+        whether background and landmark are searched together, over all bearings, since what was taken for background
+        may be landmark; there is one background then.
     """
 
     def __init__(
-        self, setup: Setup, rendered: RenderedModel, scene: Callable[[Background | None, bool], Scene]
+        self, setup: Setup, rendered: RenderedModel, scene: Callable[[Sequence[Background], bool], Scene]
     ) -> None:
         self._setup, self._rendered, self._scene = setup, rendered, scene
 
-    def search(self, one: FilteredFrames, evidence: Evidence, bare: np.ndarray) -> tuple[Background | None, Fits]:
-        """Return the background of one frame, and what explains the frame before it.
+    def search(
+        self, frames: FilteredFrames, evidence: Evidence, bare: NDArray[np.float64]
+    ) -> tuple[list[Background | None], Fits]:
+        """Return the background of each frame, and what explains the frames before them.
 
         Parameters
         ----------
-        one : FilteredFrames
+        frames : FilteredFrames
+            n frames.
         evidence : Evidence
-            Of that frame.
-        bare : (1,) float64
+            Of them.
+        bare : (n,) float64
             Cost of a scene without a landmark.
         """
+        around = [self._surroundings(frames, k) for k in range(len(frames))]
+        backgrounds = [own.background for own in around]
+        stands = np.array([background is not None for background in backgrounds])
+        groups = [which for which in (np.flatnonzero(~stands), np.flatnonzero(stands)) if which.size]
+        first = Fits.joined([self._first_fits(evidence, bare, which, [around[k] for k in which]) for which in groups])
+        found = []
+        for k, background in enumerate(backgrounds):
+            own, one = first[np.flatnonzero(first.frame == k)], slice(k, k + 1)
+            backgrounds[k], fits = self._further(background, evidence[one], bare[one], _as_frame(own, 0))
+            found.append(_as_frame(fits, k))
+        return backgrounds, Fits.joined(found)
+
+    def _surroundings(self, frames: FilteredFrames, k: int) -> Surroundings:
+        """Return what one frame shows behind the landmark; nothing where that leaves no room for one."""
         setup = self._setup
         known = not setup.bearing_is_free or setup.bearing_has_prior
-        tilted = bool(set(setup.free) & set(VIEW[4:]))
-        around = estimate_surroundings(one, bearing_known=known, tilt_known=not tilted)
-        background, seen = around.background, evidence.seen
-        if background is not None and not self._leaves_room(background):
-            background = None
-        if background is not None:
+        around = estimate_surroundings(frames, k, bearing_known=known, tilt_known=not self._tilted)
+        if around.background is not None and not self._leaves_room(around.background):
+            return replace(around, background=None)
+        return around
+
+    @property
+    def _tilted(self) -> bool:
+        """Whether pitch or roll is estimated."""
+        return bool(set(self._setup.free) & set(VIEW[4:]))
+
+    def _first_fits(
+        self, evidence: Evidence, bare: NDArray[np.float64], which: NDArray[np.int64], around: Sequence[Surroundings]
+    ) -> Fits:
+        """Return what explains some frames, all before a background of their own or all before none."""
+        some = evidence[which]
+        seen, backgrounds = some.seen, [own.background for own in around if own.background is not None]
+        if backgrounds:
             seen = without_background(seen, around)
-        fits = search_views(setup, self._scene(background, False), evidence, seen, bare)
+        fits = search_views(self._setup, self._scene(backgrounds, False), some, seen, bare[which])
+        return replace(fits, frame=which[fits.frame])
+
+    def _further(
+        self, background: Background | None, evidence: Evidence, bare: NDArray[np.float64], fits: Fits
+    ) -> tuple[Background | None, Fits]:
+        """Fit background and views of one frame further where its first fits leave a doubt."""
+        setup = self._setup
         # the height of a floor, and tilts, are told by pixels that see some of the landmark too
-        entangled = background is not None and (background.floor_m is not None or tilted)
+        entangled = background is not None and (background.floor_m is not None or self._tilted)
         if entangled or is_doubtful(setup, fits):
             background, fits = self._with_better_background(background, evidence, fits)
         if background is not None and is_doubtful(setup, fits):
-            again = search_views(setup, self._scene(background, True), evidence, evidence.seen, bare)
+            again = search_views(setup, self._scene([background], True), evidence, evidence.seen, bare)
             fits = Fits.joined([fits, again])
             if is_doubtful(setup, fits):
                 background, fits = self._with_better_background(background, evidence, fits)
@@ -116,15 +157,8 @@ class AutoBackground:
         view = np.tile(fits.view[best], (len(angles), 1))
         view[:, 1] += angles
         frame, class_index = (np.full(len(angles), values[best]) for values in (fits.frame, fits.class_index))
-        scene = self._scene(background, False)
-        return refine(
-            self._rendered.with_background(background),
-            evidence,
-            frame,
-            class_index,
-            view,
-            scene.settings(self._setup),
-        )
+        scene = self._scene([background], False)
+        return refine(scene.final, evidence, frame, class_index, view, scene.settings(self._setup))
 
     def _background_and_views(self, background: Background, evidence: Evidence, fits: Fits) -> tuple[Background, Fits]:
         """Fit a background behind the best view of one frame, then the views before it, in turn while that helps."""
@@ -144,7 +178,7 @@ class AutoBackground:
             )
             if found == background or not self._leaves_room(found):
                 break
-            scene = self._scene(found, False)
+            scene = self._scene([found], False)
             settings = replace(scene.settings(setup), look_beside_rad=policy.close_by_rad)
             some = fits[best]
             some.view[0] = view
@@ -158,3 +192,8 @@ class AutoBackground:
             if settled:
                 break
         return background, fits
+
+
+def _as_frame(fits: Fits, k: int) -> Fits:
+    """Return fits of one frame as those of frame k."""
+    return replace(fits, frame=np.full(len(fits), k, np.int64))

@@ -228,10 +228,10 @@ def fit_background(
     return moved(place), at
 
 
-def without_background(seen: Observation, surroundings: Surroundings) -> Observation:
-    """Return one frame as it would be with nothing behind: far pixels return nothing, those beside them are missing."""
-    nothing = surroundings.pure[None] & seen.returned
-    unclear = surroundings.behind[None] & ~nothing
+def without_background(seen: Observation, surroundings: Sequence[Surroundings]) -> Observation:
+    """Return frames as they would be with nothing behind: far pixels return nothing, those beside them are missing."""
+    nothing = np.stack([own.pure for own in surroundings]) & seen.returned
+    unclear = np.stack([own.behind for own in surroundings]) & ~nothing
     keep = seen.returned & ~nothing & ~unclear
     return Observation(
         np.where(keep, seen.range_m, 0.0),

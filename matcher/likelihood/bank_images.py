@@ -51,6 +51,7 @@ class BankModel:
         self._sensor = bank.sensor
         self._smooth_only = False
         self._behind = _behind_arrays(None)
+        self._frame: NDArray[np.int64] | None = None
         self._distance, self._delta = bank.distance_m, bank.delta_rad
         self._period = closing_period(bank.delta_rad)
         if bank.full is not None:
@@ -63,9 +64,20 @@ class BankModel:
             self._upper = _Stack.of(_read(bank.upper))
 
     def before(self, behind: PhasorImages | None) -> BankModel:
-        """Return the same model before another background: one image of it is composed with the landmark's."""
+        """Return the same model before another background: an image of it is composed with the landmark's.
+
+        There is one image for all frames, or one for each.
+        """
         other = copy.copy(self)
-        other._behind = _behind_arrays(behind)
+        other._behind, other._frame = _behind_arrays(behind), None
+        return other
+
+    def of_frames(self, frame: NDArray[np.int64]) -> BankModel:
+        """Return the model whose views are those of some frames."""
+        if len(self._behind[0]) == 1:
+            return self
+        other = copy.copy(self)
+        other._frame = frame
         return other
 
     def smooth(self, behind: PhasorImages | None) -> BankModel:
@@ -92,7 +104,10 @@ class BankModel:
         m, pixels = len(view), self._sensor.rows * self._sensor.cols
         phasor, slope = np.zeros((m, pixels), np.complex128), np.zeros((m, 2, pixels), np.complex128)
         shade = np.zeros((m, 2, pixels))
-        _interpolate(class_index, view, *self._grid(), self._upper, self._lower, *self._behind, phasor, slope, shade)
+        frame = np.zeros(m, np.int64) if self._frame is None else self._frame
+        _interpolate(
+            class_index, view, *self._grid(), self._upper, self._lower, *self._behind, frame, phasor, slope, shade
+        )
         order = [VIEW.index(name) for name in free]
         picked = slope if order == [0, 1] else slope[:, order]
         return ModelImages(phasor, picked, shade[:, 0], shade[:, 1])
@@ -206,10 +221,10 @@ def _read(group: BankGroup) -> NDArray[np.float32]:
 
 
 def _behind_arrays(behind: PhasorImages | None) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
-    """Return phasor and intensity of a background by pixel; empty without one."""
+    """Return phasor and intensity of backgrounds, (k, pixels); without one, no pixels."""
     if behind is None:
-        return np.empty(0, np.complex128), np.empty(0)
-    return behind.phasor.reshape(-1), behind.intensity.reshape(-1)
+        return np.empty((1, 0), np.complex128), np.empty((1, 0))
+    return behind.phasor.reshape(len(behind.phasor), -1), behind.intensity.reshape(len(behind.intensity), -1)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -335,10 +350,13 @@ def _straight_cell(t):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _interpolate(  # type: ignore[no-untyped-def]
-    class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, behind, behind_intensity,
+    class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, behind, behind_intensity, frame,
     phasor, slope, shade,
 ):  # fmt: skip
-    """Fill phasor, its slopes by D and δ, and intensity with coverage, of m views; what comes in is 0."""
+    """Fill phasor, its slopes by D and δ, and intensity with coverage, of m views; what comes in is 0.
+
+    `frame` (m,) says which of the backgrounds (k, pixels) each view has.
+    """
     n_d, n_a = lower.values.shape[1], lower.values.shape[2]
     n_up, n_low = upper.values.shape[-1], lower.values.shape[-1]
     wd, dwd, wa, dwa = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
@@ -360,6 +378,7 @@ def _interpolate(  # type: ignore[no-untyped-def]
         dwa /= step_a
         j1, j2, j3, j4 = j0 % n_a, (j0 + 1) % n_a, (j0 + 2) % n_a, (j0 + 3) % n_a
         lit, lit_up = lower.n_lit[i0], upper.n_lit[i0]
+        own, own_intensity = behind[frame[m]], behind_intensity[frame[m]]
         for a in range(4):
             block = lower.values[cl, i0 + a]
             _along_delta(lit, block[j1], block[j2], block[j3], block[j4], wa, dwa, lines[a])
@@ -376,8 +395,8 @@ def _interpolate(  # type: ignore[no-untyped-def]
             _along_distance(lit_up, lines_up, wd, dwd, cubic_up)
             near_up, far_up = upper.values[c, i0 + k], upper.values[c, i0 + k + 1]
             _between(lit_up, near_up, near_up, far_up, far_up, d, 0.0, step_d, step_a, straight_up)
-            _conclude(m, lit_up, upper.pixel, 0, cubic_up, straight_up, behind, behind_intensity, phasor, slope, shade)
-        _conclude(m, lit, lower.pixel, n_up, cubic, straight, behind, behind_intensity, phasor, slope, shade)
+            _conclude(m, lit_up, upper.pixel, 0, cubic_up, straight_up, own, own_intensity, phasor, slope, shade)
+        _conclude(m, lit, lower.pixel, n_up, cubic, straight, own, own_intensity, phasor, slope, shade)
 
 
 @njit(cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""Steps 2 to 4 of the search: descend from minima of the bank, let other classes explain, refine on final images."""
+"""Steps 3 to 5 of the search: descend from minima of the bank, let other classes explain, refine on final images."""
 
 from __future__ import annotations
 

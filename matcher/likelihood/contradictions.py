@@ -25,7 +25,7 @@ def contradicted_pixels(
     def disagree(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
         may, must = high >= MAY_RETURN_COVERAGE, low > MUST_RETURN_COVERAGE
         if settings.returns_behind is not None:
-            may, must = may | settings.returns_behind, state.use
+            may, must = may | problem.for_candidates(settings.returns_behind), state.use
         return disagrees(returned, absent, may, must) & among
 
     low, high = state.images.coverage.copy(), state.images.coverage.copy()
@@ -33,9 +33,8 @@ def contradicted_pixels(
     near = near[wrong[near].any(axis=1)]
     if near.size:
         view = np.ascontiguousarray(state.theta[near, :ALBEDO_COLUMN])
-        around = problem.model.reach(
-            problem.class_index[near], view, problem.settings.free, capped_std(problem, covariance[near])
-        )
+        some = problem.some(near)
+        around = some.model.reach(some.class_index, view, settings.free, capped_std(problem, covariance[near]))
         low[near], high[near] = np.minimum(low[near], around[0]), np.maximum(high[near], around[1])
         wrong = disagree(low, high)
     return wrong

@@ -35,7 +35,7 @@ def descend(problem: Problem, state: State, settled: float) -> State:
             break
         theta = state.theta[active].copy()
         theta[:, problem.columns] += step
-        theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN])
+        theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN], active)
         theta[:, ALBEDO_COLUMN] = np.maximum(theta[:, ALBEDO_COLUMN], 1e-3)
         promises_little = promise < problem.policy.kept_slopes_cost
         goes_on = np.ones(len(active), np.bool_)

@@ -74,6 +74,13 @@ class ImageModel(Protocol):
     def alone(self) -> ImageModel | None:
         """As an attribute."""
 
+    def of_frames(self, frame: NDArray[np.int64]) -> ImageModel:
+        """Return the model whose views are those of some frames (m,), each before what stands behind it there.
+
+        A model with one background for all frames returns itself, and takes any number of views. One with several
+        makes images only after this call, of m views at a time or of parts that are said to it the same way.
+        """
+
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Return the images of views (m, 6), columns :data:`VIEW`, of a class each."""
 
@@ -111,5 +118,5 @@ class ImageModel(Protocol):
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels of its images may be relied on, (m, pixels)."""
 
-    def limits(self) -> tuple[float, float]:
-        """Return the nearest and the farthest distance it can show."""
+    def limits(self) -> tuple[float, float | NDArray[np.float64]]:
+        """Return the nearest and the farthest distance it can show, the latter for all views or for each of m."""

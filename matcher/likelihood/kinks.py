@@ -50,7 +50,7 @@ def look_beside(problem: Problem, state: State) -> State:
     which, at = near[chosen], chosen * len(sides) + best[chosen]
     theta = theta[at]
     theta[:, problem.columns[others]] += step[at] * unit
-    theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN])
+    theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN], which)
     some = problem.some(which)
     found = descend(some, some.state(theta, state.use[which]), problem.policy.settled_cost)
     better = np.flatnonzero(found.sums.cost < state.sums.cost[which])
@@ -74,7 +74,7 @@ def settle(problem: Problem, state: State) -> State:
         source = np.repeat(near, moves.shape[1])
         theta = state.theta[source]
         theta[:, problem.columns] += moves.reshape(len(source), -1)
-        theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN])
+        theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN], source)
         tried = problem.some(source).at(theta)
         total = whole_cost(problem.some(source), tried)[0].reshape(len(near), -1)
         best = total.argmin(axis=1)

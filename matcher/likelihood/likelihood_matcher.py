@@ -99,7 +99,8 @@ class LikelihoodMatcher:
             widest_rad=policy.prior_sigma * bearing_std_rad if has_prior else math.inf,
             policy=policy,
         )
-        behind = None if self._stated is None else background_of(bank, self._stated)
+        stated = () if self._stated is None else (self._stated,)
+        behind = background_of(bank, self._stated) if self._stated is not None else None
         self._exact, self._scout = self._bank_models(behind)
         thinned = ThinnedBank(bank, self._search_stride())
         self._thinned = thinned if self._auto else None  # backgrounds that are estimated ask for other templates
@@ -111,7 +112,7 @@ class LikelihoodMatcher:
         if self._stated is not None and self._stated.floor_m is not None and "height_m" not in self._setup.free:
             self._check_floor(self._stated.floor_m)
         final = self._exact or self._rendered
-        self._scene = Scene(self._stated, behind, final, None if self._exact else self._scout, search, wide)
+        self._scene = Scene(stated, behind, final, None if self._exact else self._scout, search, wide)
 
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Match filtered frames, in threads of their own parts of them; the answers do not depend on their number."""
@@ -134,20 +135,19 @@ class LikelihoodMatcher:
         fits = search_views(self._setup, self._scene, evidence, evidence.seen, bare)
         if self._setup.unknown:
             fits = fit_without_borders(self._setup, self._scene, evidence, fits)
-        answers = rank(self._setup, frames, fits, bare, self._stated)
+        answers = rank(self._setup, frames, fits, bare, [self._stated] * len(frames))
         return self._with_shared_errors(frames, evidence, answers)
 
     def _match_auto(self, frames: FilteredFrames) -> list[Match]:
-        """Match frames one by one, each before what stands behind it."""
+        """Match frames, each before what stands behind it."""
         auto = AutoBackground(self._setup, self._rendered, self._scene_before)
+        evidence = Evidence.from_frames(frames, self._setup.on)
+        bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(evidence))
+        backgrounds, fits = auto.search(frames, evidence, bare)
         answers: list[Match] = []
-        for k in range(len(frames)):
-            one = frames[k : k + 1]
-            evidence = Evidence.from_frames(one, self._setup.on)
-            bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(evidence))
-            background, fits = auto.search(one, evidence, bare)
-            found = rank(self._setup, one, fits, bare, background)
-            answers.extend(self._with_shared_errors(one, evidence, found))
+        for k, found in enumerate(rank(self._setup, frames, fits, bare, backgrounds)):
+            one = slice(k, k + 1)
+            answers.extend(self._with_shared_errors(frames[one], evidence[one], [found]))
         return answers
 
     def _with_shared_errors(self, frames: FilteredFrames, evidence: Evidence, answers: list[Match]) -> list[Match]:
@@ -211,16 +211,16 @@ class LikelihoodMatcher:
         capped = setup.unknown or not setup.is_upright  # edges between rows: no pixel may decide alone where it starts
         return Search(thinned, behind, widest, upward, capped=capped)
 
-    def _scene_before(self, background: Background | None, together: bool) -> Scene:
-        """Return the scene of an estimated background; see :class:`AutoBackground`."""
-        if background is None:
+    def _scene_before(self, backgrounds: Sequence[Background], together: bool) -> Scene:
+        """Return the scene of estimated backgrounds; see :class:`AutoBackground`."""
+        if not backgrounds:
             return self._scene
-        behind = background_of(self._bank, background)
+        behind = background_of(self._bank, *backgrounds)
         scene = replace(
             self._scene,
-            background=background,
+            backgrounds=backgrounds,
             behind=behind,
-            final=self._rendered.with_background(background),
+            final=self._rendered.with_background(*backgrounds),
             scout=None if self._scout is None else self._scout.before(behind),
         )
         if not together or self._thinned is None:
@@ -229,26 +229,31 @@ class LikelihoodMatcher:
         return replace(scene, search=search, wide_search=search)
 
     def _bare_wall_cost(self, evidence: Evidence) -> NDArray[np.float64]:
-        """Return how badly a wall at its best distance explains all of one frame, (1,)."""
-        seen = evidence.seen
-        forward = self._bank.sensor.axis_cosine().ravel() * seen.range_m[0]
-        returned = seen.returned[0]
-        if returned.sum() < self._setup.policy.min_returns:
-            return np.array([np.inf])
-        wall_m = float(np.average(forward[returned], weights=seen.weight[0, returned]))
-        if wall_m < NEAREST_WALL_M:
-            return np.array([np.inf])
-        return bare_cost(seen, background_of(self._bank, Background(wall_m=wall_m)))
+        """Return how badly a wall at its best distance explains all of each frame, (n,)."""
+        seen, cost = evidence.seen, np.full(len(evidence.weight), np.inf)
+        weight = np.where(seen.returned, seen.weight, 0.0)
+        enough = (seen.returned.sum(axis=1) >= self._setup.policy.min_returns) & (weight.sum(axis=1) > 0)
+        which = np.flatnonzero(enough)
+        forward = self._bank.sensor.axis_cosine().ravel() * seen.range_m[which]
+        wall_m = np.average(np.where(seen.returned[which], forward, 0.0), axis=1, weights=weight[which])
+        which, wall_m = which[wall_m >= NEAREST_WALL_M], wall_m[wall_m >= NEAREST_WALL_M]
+        if which.size:
+            walls = [Background(wall_m=float(own)) for own in wall_m]
+            cost[which] = bare_cost(evidence[which].seen, background_of(self._bank, *walls))
+        return cost
 
 
 def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.float64]:
-    """Return the whitened squared distance of frames from a scene without a landmark, (n,)."""
+    """Return the whitened squared distance of frames from a scene without a landmark, (n,).
+
+    `behind` has one image for all frames, or one for each.
+    """
     if behind is None:
         return np.asarray(DISAGREEMENT * seen.returned.sum(axis=1), np.float64)
-    sensor = behind.sensor
-    model = behind.range_m.reshape(-1)
+    sensor, shape = behind.sensor, (len(behind.phasor), -1)
+    model = behind.range_m.reshape(shape)
     lit = np.isfinite(model)
-    sure = counts(behind.phasor, behind.intensity, sensor).reshape(-1)
+    sure = counts(behind.phasor, behind.intensity, sensor).reshape(shape)
     residual = wrap_difference_m(np.where(lit & seen.returned, seen.range_m - np.where(lit, model, 0.0), 0.0), sensor)
     wrong = (seen.returned & ~lit) | (seen.not_returned & sure)
     squared = np.minimum(seen.weight * residual**2, DISAGREEMENT)

@@ -113,9 +113,9 @@ def _most_promising(
     """
     if not source.size:
         return source, class_index, view
-    view = view.copy()
+    view, frame = view.copy(), fits.frame[source]
+    model = model.of_frames(frame)
     view[:, 0] = np.clip(view[:, 0], *model.limits())
-    frame = fits.frame[source]
     images = model.images(class_index, np.ascontiguousarray(view), ())
     residual = range_residuals(images.phasor, evidence, frame)
     weight = evidence.seen.weight[frame] * (evidence.weight[frame] > 0)

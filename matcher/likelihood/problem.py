@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,15 +42,16 @@ class DescentSettings:
         Which pixels place the landmark; all of them tell its class.
     huber : float, optional
         Residual, in σ, from which the loss grows linearly; it stays constant where it has reached 25.
-    phasor_behind : (pixels,) complex128, optional
-        What stands behind, without the landmark; on phasors the albedo does not scale it.
+    phasor_behind : (k, pixels) complex128, optional
+        What stands behind all frames (k = 1), or each of them, without the landmark; on phasors the albedo does not
+        scale it.
     look_beside_rad : tuple of float
         How far to either side of a solution δ is tried once more; there may be a lower minimum behind a kink.
     prior_std : tuple of float
         Standard deviation of each free parameter about 0 before the frame was seen; infinite where nothing is known.
         Empty: nothing is known of any.
-    returns_behind : (pixels,) bool, optional
-        Where the background alone returns light that one frame measures; None without a background.
+    returns_behind : (k, pixels) bool, optional
+        Where that alone returns light that one frame measures; None without a background.
     unknown_around : bool
         Whether unknown things may stand in view: what the landmark does not explain is then left out of the test.
     longest_step : float
@@ -127,7 +129,7 @@ class Problem:
     ) -> None:
         self.limit = limit
         self.rival = np.full(len(frame), np.inf) if rival is None else rival
-        self.model, self.evidence, self.settings = model, evidence, settings
+        self.model, self.evidence, self.settings = model.of_frames(frame), evidence, settings
         self.policy = settings.policy
         self.frame, self.class_index = frame, class_index
         self.with_albedo = evidence.on == "phasors"
@@ -153,7 +155,7 @@ class Problem:
 
     def start(self, view: NDArray[np.float64], at_first_sight: bool) -> State:
         """Evaluate the first views: the pixels that count, and the brightness of the landmark."""
-        theta = np.column_stack([self.clipped(view.copy()), np.ones(len(view))])
+        theta = np.column_stack([self.clipped(view.copy(), np.arange(len(view))), np.ones(len(view))])
         view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
         if at_first_sight and not self.with_albedo and not self.model.slopes_are_cheap:
             images = self._images_at_first_sight(theta)
@@ -171,7 +173,8 @@ class Problem:
         cost = self.summed(theta, self.pixels_at(images, theta), images).sums.cost
         hopeful = np.flatnonzero(cost < self.limit + self.policy.first_sight_cost)
         if hopeful.size:
-            with_slopes = self.model.images(self.class_index[hopeful], np.ascontiguousarray(view[hopeful]), free)
+            some = self.some(hopeful)
+            with_slopes = some.model.images(some.class_index, np.ascontiguousarray(view[hopeful]), free)
             images.slope[hopeful] = with_slopes.slope
         return images
 
@@ -291,8 +294,13 @@ class Problem:
     def _landmark_alone(self, images: ModelImages) -> NDArray[np.complex128]:
         if images.behind is not None:
             return images.phasor - images.behind
-        behind = self.settings.phasor_behind
-        return images.phasor if behind is None else images.phasor - (1 - images.coverage) * behind
+        if self.settings.phasor_behind is None:
+            return images.phasor
+        return images.phasor - (1 - images.coverage) * self.for_candidates(self.settings.phasor_behind)
+
+    def for_candidates(self, behind: NDArray[Any]) -> NDArray[Any]:
+        """Return what stands behind the frames of the candidates, (m, pixels), or (1, pixels) of one for all."""
+        return behind if len(behind) == 1 else behind[self.frame]
 
     def _brightness(self, images: ModelImages) -> NDArray[np.float64]:
         """Return the factor by which frames are brighter than their models, (m,)."""
@@ -304,9 +312,10 @@ class Problem:
         factor = np.divide(along, power, out=np.ones_like(power), where=power > 0)
         return np.asarray(np.clip(factor, 0.01, 100.0))
 
-    def clipped(self, view: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Move views, in place, to distances and tilts that the model can show; return them."""
-        view[:, 0] = np.clip(view[:, 0], *self.model.limits())
+    def clipped(self, view: NDArray[np.float64], which: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Move views of some candidates, in place, to distances and tilts that the model can show; return them."""
+        nearest, farthest = self.model.limits()
+        view[:, 0] = np.clip(view[:, 0], nearest, farthest[which] if isinstance(farthest, np.ndarray) else farthest)
         if self.tilts:
             np.clip(view[:, 4:], -_STEEPEST_RAD, _STEEPEST_RAD, out=view[:, 4:])
         return view

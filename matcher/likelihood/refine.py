@@ -110,7 +110,7 @@ def costs_at(
     problem = Problem(model, evidence, frame, class_index, settings, np.full(len(frame), np.inf))
     if problem.with_albedo:  # the brightness of each has to be found first
         return whole_cost(problem, problem.start(view, False))[0]
-    theta = np.column_stack([problem.clipped(view.copy()), np.ones(len(view))])
+    theta = np.column_stack([problem.clipped(view.copy(), np.arange(len(view))), np.ones(len(view))])
     return whole_cost(problem, problem.at(theta))[0]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
@@ -14,6 +15,7 @@ from phasemark.matcher.frequencies import renderer_of
 from phasemark.matcher.likelihood.images import VIEW, ModelImages
 from phasemark.matcher.likelihood.view_cache import ViewCache
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
+from phasemark.render.background import Backgrounds
 
 STEP = 1e-5
 """Width of a difference, metres or radians: see :meth:`~phasemark.render.Renderer.jacobian`."""
@@ -45,7 +47,6 @@ class RenderedModel:
     ) -> None:
         self._splits_light = splits_light
         self.sensor: Sensor = bank.sensor
-        self.background = background
         self.cache = ViewCache(cache_bytes)
         self._renderers = []
         self._factored = bank.lower is not None
@@ -55,38 +56,51 @@ class RenderedModel:
             self._renderers.append(renderer_of(bank, mesh, float(mesh.metadata["albedo"])))
             self._radius_m = max(self._radius_m, float(np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max()))
         self._bank_end_m = float(bank.distance_m[-1])
-        self._limits = self._limits_before(background)
+        self._stand_before([background])
 
-    def _limits_before(self, background: Background | None) -> tuple[float, float]:
-        """Return the limits of distance: the lens outside the landmark, and the landmark before the wall."""
+    def _stand_before(self, backgrounds: Sequence[Background | None]) -> None:
+        """Take what stands behind all frames, or each of them."""
+        self._backgrounds = tuple(backgrounds)
+        self._frame: NDArray[np.int64] | None = None
+        self._floors = any(background is not None and background.floor_m is not None for background in backgrounds)
+        self._farthest_m = np.array([self._farthest_before(background) for background in backgrounds])
+
+    def _farthest_before(self, background: Background | None) -> float:
+        """Return how far a landmark may be: before the wall."""
         wall = None if background is None else background.wall_m
-        far = _BEYOND_BANK * self._bank_end_m if wall is None else wall - self._radius_m - _BEFORE_WALL_M
-        return self._radius_m + _BEFORE_LENS_M, far
+        return _BEYOND_BANK * self._bank_end_m if wall is None else wall - self._radius_m - _BEFORE_WALL_M
 
     def renderer(self, class_index: int) -> Renderer:
         """Return what renders one class of the bank."""
         return self._renderers[class_index]
 
-    def with_background(self, background: Background | None) -> RenderedModel:
-        """Return the same model before another background."""
-        other = object.__new__(RenderedModel)
-        other.__dict__.update(self.__dict__)
-        other.background = background
-        other._limits = self._limits_before(background)
+    def with_background(self, *backgrounds: Background | None) -> RenderedModel:
+        """Return the same model before another background, or before one for each frame."""
+        other = copy.copy(self)
+        other._stand_before(backgrounds)
+        return other
+
+    def of_frames(self, frame: NDArray[np.int64]) -> RenderedModel:
+        """Return the model whose views are those of some frames."""
+        if len(self._backgrounds) == 1:
+            return self
+        other = copy.copy(self)
+        other._frame = frame
         return other
 
     @property
     def alone(self) -> RenderedModel | None:
         """The same model without a background, over the same distances, where the light is split; None elsewhere."""
-        if not self._splits_light or self.background is None:
+        if not self._splits_light or not any(self._backgrounds):
             return None
-        other = self.with_background(None)
-        other._limits = self._limits
+        other = copy.copy(self)
+        other._backgrounds, other._floors = (None,) * len(self._backgrounds), False
         return other
 
-    def limits(self) -> tuple[float, float]:
-        """Return how near the lens may come, and how far the landmark may be."""
-        return self._limits
+    def limits(self) -> tuple[float, float | NDArray[np.float64]]:
+        """Return how near the lens may come, and how far the landmark may be, in all views or in each of them."""
+        nearest = self._radius_m + _BEFORE_LENS_M
+        return nearest, float(self._farthest_m[0]) if self._frame is None else self._farthest_m[self._frame]
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Render the views, and with them how they change.
@@ -100,7 +114,7 @@ class RenderedModel:
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
             image, slopes = (
-                self._render_with_slopes(c, view[of], smooth) if smooth else (self._render(c, view[of]), None)
+                self._render_with_slopes(c, view[of], of, smooth) if smooth else (self._render(c, view[of], of), None)
             )
             phasor[of] = image.phasor.reshape(len(of), -1)
             intensity[of] = image.intensity.reshape(len(of), -1)
@@ -112,7 +126,7 @@ class RenderedModel:
                 moved = view[of]
                 moved[:, VIEW.index(name)] += STEP
                 width = (moved - view[of])[:, VIEW.index(name)]
-                there = self._render(c, moved).phasor.reshape(len(of), -1)
+                there = self._render(c, moved, of).phasor.reshape(len(of), -1)
                 slope[of, k] = (there - phasor[of]) / width[:, None]
         if self._factored and "delta_rad" in free:  # a body of revolution looks the same from every side
             level, first = ~view[:, 3:].any(axis=1), self.sensor.lower_rows[0] * self.sensor.cols
@@ -127,11 +141,13 @@ class RenderedModel:
         self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
     ) -> ModelImages:
         """Return images as :meth:`images` does, rendered only where no frame before has asked for them."""
-        keys = [(int(c), one.tobytes(), tuple(free), self.background) for c, one in zip(class_index, view, strict=True)]
+        each = zip(class_index, view, self._behind(np.arange(len(view))), strict=True)
+        keys = [(int(c), own.tobytes(), tuple(free), background) for c, own, background in each]
         place = {key: k for k, key in enumerate(keys)}  # of one that asks for it
         found = {key: self.cache.get(key) for key in place}
         missing = [k for key, k in place.items() if found[key] is None]
-        new = self.images(class_index[missing], np.ascontiguousarray(view[missing]), free)
+        model = self if self._frame is None else self.of_frames(self._frame[missing])
+        new = model.images(class_index[missing], np.ascontiguousarray(view[missing]), free)
         held = [values for values in new.arrays() if values is not None]
         for k, *arrays in zip(missing, *held, strict=True):
             own = tuple(values.copy() for values in arrays)  # no view of the whole batch, which would stay too
@@ -148,7 +164,7 @@ class RenderedModel:
         rows, first = self._changing_rows("delta_rad", view)
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
-            image = self._render(c, view[of], rows)
+            image = self._render(c, view[of], of, rows)
             for values, new in ((phasor, image.phasor), (intensity, image.intensity), (coverage, image.coverage)):
                 values[of, first:] = new.reshape(len(of), -1)
         alone = self.alone
@@ -175,8 +191,8 @@ class RenderedModel:
                 for side in (1.0, -1.0):
                     moved = view[of]
                     moved[:, axis] += side * np.maximum(step[of, k], STEP)
-                    moved[:, 0] = np.clip(moved[:, 0], *self._limits)
-                    ends.append((moved[:, axis], self._render(c, moved, rows).phasor.reshape(len(of), -1)))
+                    self._clip(moved, of)
+                    ends.append((moved[:, axis], self._render(c, moved, of, rows).phasor.reshape(len(of), -1)))
                 width = np.maximum(ends[0][0] - ends[1][0], STEP)
                 slope[of, k, first:] = (ends[0][1] - ends[1][1]) / width[:, None]
         return slope
@@ -187,12 +203,12 @@ class RenderedModel:
         """Render both ends."""
         m, k = moves.shape[:2]
         ends = np.concatenate([view[:, None] + moves, view[:, None] - moves], axis=1)
-        ends[..., 0] = np.clip(ends[..., 0], *self._limits)
         phasor = np.empty((m, 2 * k, self.sensor.rows * self.sensor.cols), np.complex128)
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
-            image = self._render(c, ends[of].reshape(-1, len(VIEW)))
-            phasor[of] = image.phasor.reshape(len(of), 2 * k, -1)
+            moved, each = ends[of].reshape(-1, len(VIEW)), np.repeat(of, 2 * k)
+            self._clip(moved, each)
+            phasor[of] = self._render(c, moved, each).phasor.reshape(len(of), 2 * k, -1)
         return np.asarray((phasor[:, :k] - phasor[:, k:]) / 2)
 
     def _changing_rows(self, name: str, view: NDArray[np.float64]) -> tuple[tuple[int, int] | None, int]:
@@ -222,64 +238,52 @@ class RenderedModel:
             for side in (-3.0, 3.0):
                 moved = view.copy()
                 moved[:, VIEW.index(name)] += side * std[:, k]
-                moved[:, 0] = np.clip(moved[:, 0], *self._limits)
+                self._clip(moved, np.arange(len(moved)))
                 for c in np.unique(class_index):
                     of = np.flatnonzero(class_index == c)
-                    coverage = self._render(c, moved[of]).coverage.reshape(len(of), -1)
+                    coverage = self._render(c, moved[of], of).coverage.reshape(len(of), -1)
                     low[of], high[of] = np.minimum(low[of], coverage), np.maximum(high[of], coverage)
         return low, high
 
+    def _clip(self, view: NDArray[np.float64], which: NDArray[np.integer]) -> None:
+        """Move views, in place, to distances at which a landmark may be; `which` of all they are."""
+        nearest, farthest = self.limits()
+        view[:, 0] = np.clip(view[:, 0], nearest, farthest[which] if isinstance(farthest, np.ndarray) else farthest)
+
     def _render_with_slopes(
-        self, class_index: int, view: NDArray[np.float64], free: Sequence[str]
+        self, class_index: int, view: NDArray[np.float64], which: NDArray[np.integer], free: Sequence[str]
     ) -> tuple[PhasorImages, NDArray[np.complex128]]:
-        renderer, parts, slopes = self._renderers[class_index], [], []
-        for which, background in self._backgrounds_of(class_index, view):
-            views = Views(*np.ascontiguousarray(view[which].T))
-            image, slope = renderer.render_with_slopes(views, free, background=background)
-            parts.append((which, image))
-            slopes.append(slope)
-        order = np.argsort(np.concatenate([which for which, _ in parts]), kind="stable")
-        return _joined(parts), np.concatenate(slopes)[order]
+        renderer, views = self._renderers[class_index], Views(*np.ascontiguousarray(view.T))
+        return renderer.render_with_slopes(views, free, background=self._given_way(class_index, views, which))
 
-    def _render(self, class_index: int, view: NDArray[np.float64], rows: tuple[int, int] | None = None) -> PhasorImages:
-        renderer, parts = self._renderers[class_index], []
-        for which, background in self._backgrounds_of(class_index, view):
-            views = Views(*np.ascontiguousarray(view[which].T))
-            parts.append((which, renderer.render_views(views, background=background, rows=rows)))
-        return _joined(parts)
+    def _render(
+        self,
+        class_index: int,
+        view: NDArray[np.float64],
+        which: NDArray[np.integer],
+        rows: tuple[int, int] | None = None,
+    ) -> PhasorImages:
+        renderer, views = self._renderers[class_index], Views(*np.ascontiguousarray(view.T))
+        return renderer.render_views(views, background=self._given_way(class_index, views, which), rows=rows)
 
-    def _backgrounds_of(
-        self, class_index: int, view: NDArray[np.float64]
-    ) -> list[tuple[NDArray[np.intp], Background | None]]:
-        """Return groups of views with the background of each.
+    def _behind(self, which: NDArray[np.integer]) -> list[Background | None]:
+        """Return what stands behind some of the views."""
+        if self._frame is None:
+            return [self._backgrounds[0]] * len(which)
+        return [self._backgrounds[k] for k in self._frame[which]]
 
-        A floor is lowered to where the landmark ends: floors are estimated, and heights are tried.
+    def _given_way(self, class_index: int, views: Views, which: NDArray[np.integer]) -> Backgrounds:
+        """Return what stands behind some views, floors lowered to where the landmark ends.
+
+        Floors are estimated, and heights are tried.
         """
-        everything = np.arange(len(view))
-        if self.background is None or self.background.floor_m is None:
-            return [(everything, self.background)]
+        if not self._floors:
+            return self._backgrounds[0] if self._frame is None else self._behind(which)
         lowest_m = float(self._renderers[class_index].topology.vertices[:, 2].min())
-        height_m = Views(*np.ascontiguousarray(view.T)).in_camera(self.sensor).height_m
-        floor_m = np.maximum(self.background.floor_m, -(lowest_m + height_m))
+        least_m = -(lowest_m + views.in_camera(self.sensor).height_m)
         return [
-            (np.flatnonzero(floor_m == own), replace(self.background, floor_m=float(own))) for own in np.unique(floor_m)
-        ] or [(everything, self.background)]
-
-
-def _joined(parts: list[tuple[NDArray[np.intp], PhasorImages]]) -> PhasorImages:
-    """Return images of groups of views in the order of the views."""
-    if len(parts) == 1:
-        return parts[0][1]
-    order = np.argsort(np.concatenate([which for which, _ in parts]), kind="stable")
-    images = [image for _, image in parts]
-
-    def of(name: str) -> Any:
-        return np.concatenate([getattr(image, name) for image in images])[order]
-
-    return PhasorImages(
-        phasor=of("phasor"),
-        intensity=of("intensity"),
-        coverage=of("coverage"),
-        sensor=images[0].sensor,
-        views=Views(*(np.concatenate([getattr(image.views, name) for image in images])[order] for name in VIEW)),
-    )
+            replace(background, floor_m=float(least))
+            if background is not None and background.floor_m is not None and background.floor_m < least
+            else background
+            for background, least in zip(self._behind(which), least_m, strict=True)
+        ]

@@ -1,4 +1,4 @@
-"""The search for the most likely views of a batch of frames before one background: steps 1 to 6 of docs/matching.md."""
+"""The search for the most likely views of a batch of frames: steps 2 to 7 of docs/matching.md."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     """
     which = _worth_a_search(setup, evidence, bare)
     policy = setup.policy
-    n_modes = setup.n_modes_before(scene.background)
-    sides = () if scene.background is None else policy.beside_rad
-    # 1  start: minima of the bank
+    n_modes = setup.n_modes_before(scene.backgrounds)
+    sides = policy.beside_rad if scene.backgrounds else ()
+    # 2  start: minima of the bank
     starts = scene.search.starts(seen[which], n_modes, all_classes=_all_classes(setup, evidence))
-    # 2 to 4  descend on interpolated images, let other classes explain, refine on final images
+    # 3 to 5  descend on interpolated images, let other classes explain, refine on final images
     fits = fit_starts(setup, scene, evidence, which, starts, sides)
-    # 5  doubt: search more widely where nothing fits; a robust matcher also without what fits worst
+    # 6  doubt: search more widely where nothing fits; a robust matcher also without what fits worst
     fits = _retry_unexplained(setup, scene, evidence, seen, bare, fits)
     if setup.huber is not None and not setup.unknown:
         fits = _retry_trimmed(setup, scene, evidence, seen, bare, fits)
-    # 6  look-alikes of every best fit
+    # 7  look-alikes of every best fit
     return Fits.joined([fits, fit_look_alikes(setup, scene, evidence, fits)])
 
 
@@ -88,7 +88,7 @@ def _unexplained(
     `hopeless_p` where it is smooth. `among` restricts the frames.
     """
     best = best_of_frame(fits)
-    side_peaks = evidence.on == "phasors" or scene.background is not None
+    side_peaks = evidence.on == "phasors" or bool(scene.backgrounds)
     if p is None:
         p = setup.policy.doubtful_p if side_peaks else setup.policy.hopeless_p
     limit = special.chdtri(np.maximum(fits.dof[best], 1), p)
@@ -166,7 +166,7 @@ def _retry_with_prior(
     found = [_fit_turned(setup, direct, evidence, poor, fits)]
     poor = _unexplained(setup, scene, evidence, bare, Fits.joined([fits, *found]))
     if poor.size:
-        n_modes = setup.n_modes_before(scene.background)
+        n_modes = setup.n_modes_before(scene.backgrounds)
         starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=_all_classes(setup, evidence))
         found.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
         poor = _unexplained(
@@ -204,16 +204,16 @@ def _retry_without_prior(
     starts = scene.wide_search.starts(seen[poor], policy.modes_again, all_classes=all_classes)
     found = [fit_starts(setup, scene, evidence, poor, starts, policy.beside_again_rad, patient=True)]
     again = refused(found)
-    if again.size and (scene.scout is not None or scene.background is not None):
+    if again.size and (scene.scout is not None or scene.backgrounds):
         found.append(fit_neighbouring_views(setup, scene, evidence, again, Fits.joined([fits, *found])))
         again = refused(found)
     if not again.size:
         return found
     if scene.scout is not None:
         # too little may be smooth for the scout to see the way
-        n_modes = setup.n_modes_before(scene.background)
+        n_modes = setup.n_modes_before(scene.backgrounds)
         starts = scene.wide_search.starts(seen[again], n_modes, all_classes=all_classes)
-    elif scene.background is not None:
+    elif scene.backgrounds:
         # edges between columns before a bright wall: no pixel may decide alone where the search starts
         starts = scene.wide_search.capped().starts(seen[again], policy.modes_again, all_classes=True)
     else:
@@ -246,8 +246,8 @@ def _retry_trimmed(
 ) -> Fits:
     """Search again without the returns that fit worst, as a robust matcher does where nothing fits."""
     policy = setup.policy
-    n_modes = setup.n_modes_before(scene.background)
-    sides = () if scene.background is None else policy.beside_rad
+    n_modes = setup.n_modes_before(scene.backgrounds)
+    sides = policy.beside_rad if scene.backgrounds else ()
     for _ in range(policy.trimmings):
         poor = _unexplained(setup, scene, evidence, bare, fits, even_beyond_bare=True)
         if not poor.size:
@@ -264,7 +264,8 @@ def _trimmed(
     """Return some frames without the returns that are farthest from their best fits, and from the bulk of them."""
     best = best_of_frame(fits)
     best = best[np.searchsorted(fits.frame[best], which)]
-    phasor = scene.final.images(fits.class_index[best], np.ascontiguousarray(fits.view[best]), ()).phasor
+    model = scene.final.of_frames(fits.frame[best])
+    phasor = model.images(fits.class_index[best], np.ascontiguousarray(fits.view[best]), ()).phasor
     few = seen[which]
     size = np.sqrt(few.weight) * np.abs(
         wrap_difference_m(few.range_m - phasor_to_range_m(phasor, evidence.sensor), evidence.sensor)

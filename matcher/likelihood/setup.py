@@ -125,10 +125,10 @@ class Setup:
         """Whether the camera is level and at the height that was stated."""
         return not set(self.free) & set(VIEW[3:])
 
-    def n_modes_before(self, background: Background | None) -> int:
-        """Return how many minima of the bank each frame is first refined from before a background."""
+    def n_modes_before(self, backgrounds: Sequence[Background]) -> int:
+        """Return how many minima of the bank each frame is first refined from before some backgrounds, or none."""
         policy = self.policy
-        if background is None:
+        if not backgrounds:
             return policy.modes
         return policy.modes_before_background if self.is_upright else policy.modes_again
 
@@ -150,9 +150,10 @@ class Scene:
 
     Parameters
     ----------
-    background : Background, optional
+    backgrounds : sequence of Background
+        One for all frames, or one for each; empty: nothing stands behind the landmark.
     behind : PhasorImages, optional
-        Its image, without a landmark.
+        Their images, without a landmark.
     final : ImageModel
         What the answer is taken from.
     scout : ImageModel, optional
@@ -161,7 +162,7 @@ class Scene:
         Minima of the bank: at the bearings that are likely, and at all that are possible.
     """
 
-    background: Background | None
+    backgrounds: Sequence[Background]
     behind: PhasorImages | None
     final: ImageModel
     scout: ImageModel | None
@@ -169,18 +170,18 @@ class Scene:
     wide_search: Search
 
     def settings(self, setup: Setup) -> DescentSettings:
-        """Return how a descent runs before this background."""
+        """Return how a descent runs before these backgrounds."""
         behind = self.behind
         return DescentSettings(
             setup.free,
             setup.used,
             setup.huber,
-            None if behind is None else behind.phasor.reshape(-1),
+            None if behind is None else behind.phasor.reshape(len(behind.phasor), -1),
             prior_std=setup.prior_std,
             unknown_around=setup.unknown,
             returns_behind=None
             if behind is None
-            else counts(behind.phasor, behind.intensity, behind.sensor).reshape(-1),
+            else counts(behind.phasor, behind.intensity, behind.sensor).reshape(len(behind.phasor), -1),
             longest_step=setup.policy.longest_step,
             policy=setup.policy,
         )

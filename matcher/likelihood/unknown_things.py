@@ -46,7 +46,7 @@ def fit_without_borders(setup: Setup, scene: Scene, evidence: Evidence, fits: Fi
 def _inside(setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits) -> NDArray[np.bool_]:
     """Return which pixels are not beside one that sees something else than some views, (m, pixels)."""
     frame = fits.frame
-    phasor = model.images(fits.class_index, np.ascontiguousarray(fits.view), ()).phasor
+    phasor = model.of_frames(frame).images(fits.class_index, np.ascontiguousarray(fits.view), ()).phasor
     size = np.sqrt(evidence.weight[frame]) * np.abs(range_residuals(phasor, evidence, frame))
     returned = evidence.seen.returned[frame]
     other = returned & ((phasor == 0) | (size > setup.policy.strange_sigma))
@@ -78,6 +78,7 @@ def _scatter_of_columns(setup: Setup, model: ImageModel, evidence: Evidence, fit
     rows, cols = evidence.sensor.rows, evidence.sensor.cols
     m, p = len(fits), len(setup.free)
     strange2 = setup.policy.strange_sigma**2
+    model = model.of_frames(fits.frame)
     image = model.images(fits.class_index, np.ascontiguousarray(fits.view), setup.free)
     turn = np.divide(1.0, image.phasor, out=np.zeros_like(image.phasor), where=image.phasor != 0)
     slope = evidence.sensor.metres_per_radian * (image.slope * turn[:, None]).imag
