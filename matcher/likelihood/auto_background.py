@@ -16,13 +16,13 @@ from phasemark.matcher.likelihood.background_estimate import (
     without_background,
 )
 from phasemark.matcher.likelihood.candidates import fit_other_classes
-from phasemark.matcher.likelihood.fits import Fits
+from phasemark.matcher.likelihood.fits import BETTER_COST, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.look_alikes import fit_look_alikes
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence
-from phasemark.matcher.likelihood.search import is_doubtful, search_views
+from phasemark.matcher.likelihood.search import are_doubtful, search_views
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.render import Background
 from phasemark.render.view import delta_period_rad
@@ -30,11 +30,12 @@ from phasemark.render.view import delta_period_rad
 __all__ = ["AutoBackground"]
 
 
-class AutoBackground:
-    """Searches frames, each before the background that it shows.
+_Standing = tuple[list[Background | None], Fits]
+"""What stands behind the landmark in each of n frames, and their fits before it."""
 
-    All frames are searched at the same time before what their far pixels show; those that this leaves in doubt are
-    searched further one by one.
+
+class AutoBackground:
+    """Searches frames, each before the background that it shows; many frames at the same time.
 
     Parameters
     ----------
@@ -42,9 +43,9 @@ class AutoBackground:
     rendered : RenderedModel
         Renders the landmarks before any background.
     scene : callable
-        Returns the scene of the backgrounds of some frames, or of one for all (empty: none). The second argument says
-        whether background and landmark are searched together, over all bearings, since what was taken for background
-        may be landmark; there is one background then.
+        Returns the scene of the backgrounds of some frames (empty: there is none). The second argument says whether
+        background and landmark are searched together, over all bearings, since what was taken for background may be
+        landmark; there is one background then.
     """
 
     def __init__(
@@ -52,9 +53,7 @@ class AutoBackground:
     ) -> None:
         self._setup, self._rendered, self._scene = setup, rendered, scene
 
-    def search(
-        self, frames: FilteredFrames, evidence: Evidence, bare: NDArray[np.float64]
-    ) -> tuple[list[Background | None], Fits]:
+    def search(self, frames: FilteredFrames, evidence: Evidence, bare: NDArray[np.float64]) -> _Standing:
         """Return the background of each frame, and what explains the frames before them.
 
         Parameters
@@ -66,17 +65,49 @@ class AutoBackground:
         bare : (n,) float64
             Cost of a scene without a landmark.
         """
+        # 1  take what is far for the background, and search without the pixels that see it
+        backgrounds, fits = self._first(frames, evidence, bare)
+        # 2  fit both in turn, where a fit is doubtful, and where pixels that see some of the landmark tell the
+        #    height of a floor, or tilts
+        entangled = [own is not None and (own.floor_m is not None or self._tilted) for own in backgrounds]
+        which = np.flatnonzero(np.array(entangled) | are_doubtful(self._setup, fits, len(frames)))
+        backgrounds, fits = self._with_better_backgrounds(which, backgrounds, evidence, fits)
+        # 3  search all pixels where that leaves a doubt: what was taken for background may be landmark
+        which = self._doubtful(backgrounds, fits)
+        fits = Fits.joined([fits, *(self._searched_together(k, backgrounds, evidence, bare) for k in which)])
+        which = self._doubtful(backgrounds, fits)
+        backgrounds, fits = self._with_better_backgrounds(which, backgrounds, evidence, fits)
+        # 4  try other angles of the landmark
+        which = self._doubtful(backgrounds, fits)
+        fits = Fits.joined([fits, self._other_angles(which, backgrounds, evidence, fits)])
+        return self._with_better_backgrounds(which, backgrounds, evidence, fits)
+
+    @property
+    def _tilted(self) -> bool:
+        """Whether pitch or roll is estimated."""
+        return bool(set(self._setup.free) & set(VIEW[4:]))
+
+    def _doubtful(self, backgrounds: list[Background | None], fits: Fits) -> NDArray[np.int64]:
+        """Return the frames before a background whose fits are doubtful."""
+        stands = np.array([own is not None for own in backgrounds])
+        return np.flatnonzero(stands & are_doubtful(self._setup, fits, len(backgrounds)))
+
+    def _first(self, frames: FilteredFrames, evidence: Evidence, bare: NDArray[np.float64]) -> _Standing:
+        """Return what the far pixels of each frame show, and fits to its other pixels."""
         around = [self._surroundings(frames, k) for k in range(len(frames))]
         backgrounds = [own.background for own in around]
-        stands = np.array([background is not None for background in backgrounds])
-        groups = [which for which in (np.flatnonzero(~stands), np.flatnonzero(stands)) if which.size]
-        first = Fits.joined([self._first_fits(evidence, bare, which, [around[k] for k in which]) for which in groups])
-        found = []
-        for k, background in enumerate(backgrounds):
-            own, one = first[np.flatnonzero(first.frame == k)], slice(k, k + 1)
-            backgrounds[k], fits = self._further(background, evidence[one], bare[one], _as_frame(own, 0))
-            found.append(_as_frame(fits, k))
-        return backgrounds, Fits.joined(found)
+        stands = np.array([own is not None for own in backgrounds])
+        parts = []
+        for which in (np.flatnonzero(~stands), np.flatnonzero(stands)):
+            if not which.size:
+                continue
+            some = evidence[which]
+            seen, behind = some.seen, _standing(backgrounds, which)
+            if behind:
+                seen = without_background(seen, [around[k] for k in which])
+            fits = search_views(self._setup, self._scene(behind, False), some, seen, bare[which])
+            parts.append(_numbered(fits, which))
+        return backgrounds, Fits.joined(parts)
 
     def _surroundings(self, frames: FilteredFrames, k: int) -> Surroundings:
         """Return what one frame shows behind the landmark; nothing where that leaves no room for one."""
@@ -87,113 +118,139 @@ class AutoBackground:
             return replace(around, background=None)
         return around
 
-    @property
-    def _tilted(self) -> bool:
-        """Whether pitch or roll is estimated."""
-        return bool(set(self._setup.free) & set(VIEW[4:]))
-
-    def _first_fits(
-        self, evidence: Evidence, bare: NDArray[np.float64], which: NDArray[np.int64], around: Sequence[Surroundings]
-    ) -> Fits:
-        """Return what explains some frames, all before a background of their own or all before none."""
-        some = evidence[which]
-        seen, backgrounds = some.seen, [own.background for own in around if own.background is not None]
-        if backgrounds:
-            seen = without_background(seen, around)
-        fits = search_views(self._setup, self._scene(backgrounds, False), some, seen, bare[which])
-        return replace(fits, frame=which[fits.frame])
-
-    def _further(
-        self, background: Background | None, evidence: Evidence, bare: NDArray[np.float64], fits: Fits
-    ) -> tuple[Background | None, Fits]:
-        """Fit background and views of one frame further where its first fits leave a doubt."""
-        setup = self._setup
-        # the height of a floor, and tilts, are told by pixels that see some of the landmark too
-        entangled = background is not None and (background.floor_m is not None or self._tilted)
-        if entangled or is_doubtful(setup, fits):
-            background, fits = self._with_better_background(background, evidence, fits)
-        if background is not None and is_doubtful(setup, fits):
-            again = search_views(setup, self._scene([background], True), evidence, evidence.seen, bare)
-            fits = Fits.joined([fits, again])
-            if is_doubtful(setup, fits):
-                background, fits = self._with_better_background(background, evidence, fits)
-        if background is not None and is_doubtful(setup, fits):
-            fits = Fits.joined([fits, self._other_angles(background, evidence, fits)])
-            background, fits = self._with_better_background(background, evidence, fits)
-        return background, fits
-
-    def _with_better_background(
-        self, background: Background | None, evidence: Evidence, fits: Fits
-    ) -> tuple[Background | None, Fits]:
-        """Fit the background behind the best view of one frame, then the views before it, in turn while that helps.
-
-        Where no pixel sees a background alone, walls at some distances behind the landmark are tried.
-        """
-        if background is not None:
-            return self._background_and_views(background, evidence, fits)
-        best = fits.view[fits.cost.argmin()]
-        found: tuple[Background | None, Fits] = (None, fits)
-        for beyond in self._setup.policy.walls_beyond_m:
-            there = self._background_and_views(Background(wall_m=float(best[0]) + beyond), evidence, fits)
-            if there[1].cost.min() < found[1].cost.min():
-                found = there
-            if not is_doubtful(self._setup, found[1]):
-                break
-        return found
-
     def _leaves_room(self, background: Background) -> bool:
         """Return True if a landmark has a place between the lens and a wall."""
         nearest, farthest = self._rendered.with_background(background).limits()
-        return nearest < farthest
+        return bool(nearest < farthest)
 
-    def _other_angles(self, background: Background, evidence: Evidence, fits: Fits) -> Fits:
-        """Fit one frame from its best view turned to other angles; distance and bearing are found more easily."""
-        if not np.isfinite(fits.cost).any():
+    def _searched_together(
+        self, k: int, backgrounds: list[Background | None], evidence: Evidence, bare: NDArray[np.float64]
+    ) -> Fits:
+        """Search one frame with its background in the images of the bank."""
+        which = np.array([k])
+        some = evidence[which]
+        scene = self._scene(_standing(backgrounds, which), True)
+        return _numbered(search_views(self._setup, scene, some, some.seen, bare[which]), which)
+
+    def _other_angles(
+        self, which: NDArray[np.int64], backgrounds: list[Background | None], evidence: Evidence, fits: Fits
+    ) -> Fits:
+        """Fit frames from their best views turned to other angles; distance and bearing are found more easily."""
+        if not which.size:
             return fits[:0]
-        best = int(fits.cost.argmin())
+        own = _of_frames(fits, which)
+        best = best_of_frame(own)
         n = self._setup.policy.other_angles
-        period = delta_period_rad(self._setup.shapes.symmetry[fits.class_index[best]])
-        angles = np.arange(1, n) * period / n
-        view = np.tile(fits.view[best], (len(angles), 1))
-        view[:, 1] += angles
-        frame, class_index = (np.full(len(angles), values[best]) for values in (fits.frame, fits.class_index))
-        scene = self._scene([background], False)
-        return refine(scene.final, evidence, frame, class_index, view, scene.settings(self._setup))
+        source = np.repeat(best, n - 1)
+        period = np.array([delta_period_rad(self._setup.shapes.symmetry[c]) for c in own.class_index[source]])
+        view = own.view[source]
+        view[:, 1] += np.tile(np.arange(1, n), len(best)) * period / n
+        scene = self._scene(_standing(backgrounds, which), False)
+        settings = scene.settings(self._setup)
+        found = refine(scene.final, evidence[which], own.frame[source], own.class_index[source], view, settings)
+        return _numbered(found, which)
 
-    def _background_and_views(self, background: Background, evidence: Evidence, fits: Fits) -> tuple[Background, Fits]:
-        """Fit a background behind the best view of one frame, then the views before it, in turn while that helps."""
-        setup, policy = self._setup, self._setup.policy
-        for _ in range(policy.background_rounds):
-            finite = np.flatnonzero(np.isfinite(fits.cost))
-            if not finite.size:
+    def _with_better_backgrounds(
+        self, which: NDArray[np.int64], backgrounds: list[Background | None], evidence: Evidence, fits: Fits
+    ) -> _Standing:
+        """Fit the backgrounds of some frames and the views before them in turn while that helps.
+
+        Where no pixel sees a background alone, walls at some distances behind the landmark are tried.
+        """
+        stands = np.array([own is not None for own in backgrounds])
+        found = self._in_turn(which[stands[which]], backgrounds, evidence, fits)
+        without = which[~stands[which]]
+        best = best_of_frame(fits)
+        nearest_m = np.zeros(len(backgrounds))
+        nearest_m[fits.frame[best]] = fits.view[best, 0]
+        for beyond_m in self._setup.policy.walls_beyond_m:
+            if not without.size:
                 break
-            best = finite[np.argsort(fits.cost[finite], kind="stable")][: policy.most_refined]
+            tried = list(backgrounds)
+            for k in without:
+                tried[k] = Background(wall_m=float(nearest_m[k]) + beyond_m)
+            there = self._in_turn(without, tried, evidence, fits)
+            least, news = (least_of_frame(standing[1], len(backgrounds))[without] for standing in (found, there))
+            found = _taken(found, there, without[news < least])
+            without = without[are_doubtful(self._setup, found[1], len(backgrounds))[without]]
+        return found
+
+    def _in_turn(
+        self, which: NDArray[np.int64], backgrounds: list[Background | None], evidence: Evidence, fits: Fits
+    ) -> _Standing:
+        """Fit the background of each frame behind its best view, then the views before it, while that helps."""
+        setup, policy = self._setup, self._setup.policy
+        found: _Standing = backgrounds, fits
+        for _ in range(policy.background_rounds):
+            which, moved, starts = self._moved_backgrounds(which, *found, evidence)
+            if not which.size:
+                break
+            some, scene = evidence[which], self._scene(_standing(moved, which), False)
+            settings = replace(scene.settings(setup), look_beside_rad=policy.close_by_rad)
+            again = refine(scene.final, some, starts.frame, starts.class_index, starts.view, settings)
+            others = fit_other_classes(setup, scene.final, some, again, settings)
+            again = Fits.joined([again, others, fit_look_alikes(setup, scene, some, again)])
+            before = least_of_frame(found[1], len(backgrounds))[which]
+            now = least_of_frame(again, len(which))
+            found = _taken(found, (moved, _numbered(again, which)), which[now < before])
+            which = which[now <= before - BETTER_COST]
+        return found
+
+    def _moved_backgrounds(
+        self, which: NDArray[np.int64], backgrounds: list[Background | None], fits: Fits, evidence: Evidence
+    ) -> tuple[NDArray[np.int64], list[Background | None], Fits]:
+        """Fit the backgrounds behind the best views of some frames.
+
+        Returns
+        -------
+        moved : (k,) int64
+            The frames whose backgrounds moved.
+        backgrounds : list
+            Of all frames.
+        starts : Fits
+            The best views of the moved frames, numbered by their places among these; the first of each is the one that
+            was fitted with the background.
+        """
+        moved, kept, starts = list(backgrounds), [], []
+        for k in which:
+            own = np.flatnonzero((fits.frame == k) & np.isfinite(fits.cost))
+            background = backgrounds[k]
+            if not own.size or background is None:
+                continue
+            best = fits[own[np.argsort(fits.cost[own], kind="stable")][: self._setup.policy.most_refined]]
+            class_index, free = int(best.class_index[0]), self._setup.free
             found, view = fit_background(
-                self._rendered,
-                evidence,
-                int(fits.class_index[best[0]]),
-                fits.view[best[0]],
-                setup.free,
-                background,
+                self._rendered, evidence[k : k + 1], class_index, best.view[0], free, background
             )
             if found == background or not self._leaves_room(found):
-                break
-            scene = self._scene([found], False)
-            settings = replace(scene.settings(setup), look_beside_rad=policy.close_by_rad)
-            some = fits[best]
-            some.view[0] = view
-            again = refine(scene.final, evidence, some.frame, some.class_index, some.view, settings)
-            others = fit_other_classes(setup, scene.final, evidence, again, settings)
-            again = Fits.joined([again, others, fit_look_alikes(setup, scene, evidence, again)])
-            if not again.cost.min() < fits.cost[best[0]]:
-                break
-            settled = again.cost.min() > fits.cost[best[0]] - 1
-            background, fits = found, again
-            if settled:
-                break
-        return background, fits
+                continue
+            best.view[0] = view
+            moved[k] = found
+            starts.append(_numbered(best, np.full(k + 1, len(kept))))
+            kept.append(k)
+        return np.array(kept, np.int64), moved, Fits.joined(starts) if starts else fits[:0]
 
 
-def _as_frame(fits: Fits, k: int) -> Fits:
-    """Return fits of one frame as those of frame k."""
-    return replace(fits, frame=np.full(len(fits), k, np.int64))
+def _standing(backgrounds: list[Background | None], which: NDArray[np.int64]) -> list[Background]:
+    """Return the backgrounds of those of some frames that have one."""
+    return [own for own in (backgrounds[k] for k in which) if own is not None]
+
+
+def _of_frames(fits: Fits, which: NDArray[np.int64]) -> Fits:
+    """Return the fits of some frames, numbered by their places among these."""
+    own = fits[np.flatnonzero(np.isin(fits.frame, which))]
+    return replace(own, frame=np.searchsorted(which, own.frame))
+
+
+def _numbered(fits: Fits, which: NDArray[np.int64]) -> Fits:
+    """Return fits whose frames k are the frames which[k]."""
+    return replace(fits, frame=which[fits.frame])
+
+
+def _taken(standing: _Standing, other: _Standing, which: NDArray[np.int64]) -> _Standing:
+    """Return backgrounds and fits with those of some frames taken from others."""
+    backgrounds, fits = standing
+    taken = set(which.tolist())
+    mixed = [other[0][k] if k in taken else own for k, own in enumerate(backgrounds)]
+    of_others = other[1][np.flatnonzero(np.isin(other[1].frame, which))]
+    return mixed, Fits.joined([fits[np.flatnonzero(~np.isin(fits.frame, which))], of_others])

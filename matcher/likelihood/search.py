@@ -19,7 +19,7 @@ from phasemark.matcher.nearest.templates import Observation
 from phasemark.render import phasor_to_range_m
 from phasemark.render.phasor_images import wrap_difference_m
 
-__all__ = ["is_doubtful", "search_views"]
+__all__ = ["are_doubtful", "search_views"]
 
 
 def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observation, bare: NDArray[np.float64]) -> Fits:
@@ -53,12 +53,14 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     return Fits.joined([fits, fit_look_alikes(setup, scene, evidence, fits)])
 
 
-def is_doubtful(setup: Setup, fits: Fits) -> bool:
-    """Return whether the best fit of one frame is worse than good ones are."""
-    if not np.isfinite(fits.cost).any():
-        return False
-    best = fits.cost.argmin()
-    return bool(fits.tested[best] > special.chdtri(max(int(fits.dof[best]), 1), setup.policy.doubtful_p))
+def are_doubtful(setup: Setup, fits: Fits, n: int) -> NDArray[np.bool_]:
+    """Return of which of n frames the best fit is worse than good ones are; not of those without a fit."""
+    best = best_of_frame(fits)
+    best = best[np.isfinite(fits.cost[best])]
+    limit = special.chdtri(np.maximum(fits.dof[best], 1), setup.policy.doubtful_p)
+    doubtful = np.zeros(n, np.bool_)
+    doubtful[fits.frame[best]] = fits.tested[best] > limit
+    return doubtful
 
 
 def _worth_a_search(setup: Setup, evidence: Evidence, bare: NDArray[np.float64]) -> NDArray[np.int64]:
