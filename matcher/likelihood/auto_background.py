@@ -15,7 +15,7 @@ from phasemark.matcher.likelihood.background_estimate import (
     fit_background,
     without_background,
 )
-from phasemark.matcher.likelihood.candidates import fit_other_classes
+from phasemark.matcher.likelihood.candidates import fit_modes, fit_other_classes
 from phasemark.matcher.likelihood.fits import BETTER_COST, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.look_alikes import fit_look_alikes
@@ -146,8 +146,9 @@ class AutoBackground:
         view = own.view[source]
         view[:, 1] += np.tile(np.arange(1, n), len(best)) * period / n
         scene = self._scene(_standing(backgrounds, which), False)
-        settings = scene.settings(self._setup)
-        found = refine(scene.final, evidence[which], own.frame[source], own.class_index[source], view, settings)
+        settings, margin = scene.settings(self._setup), self._setup.policy.margin_cost
+        frame, class_index = own.frame[source], own.class_index[source]
+        found = fit_modes(self._setup, scene.final, evidence[which], frame, class_index, view, settings, margin)
         return _numbered(found, which)
 
     def _with_better_backgrounds(
