@@ -30,6 +30,8 @@ from phasemark.render.view import delta_period_rad
 __all__ = ["AutoBackground"]
 
 
+_TOGETHER = 8
+"""Frames whose backgrounds are in images of the bank at the same time: these take some megabytes each."""
 _Standing = tuple[list[Background | None], Fits]
 """What stands behind the landmark in each of n frames, and their fits before it."""
 
@@ -45,7 +47,7 @@ class AutoBackground:
     scene : callable
         Returns the scene of the backgrounds of some frames (empty: there is none). The second argument says whether
         background and landmark are searched together, over all bearings, since what was taken for background may be
-        landmark; there is one background then.
+        landmark; the images of the bank are then made anew before each.
     """
 
     def __init__(
@@ -74,7 +76,8 @@ class AutoBackground:
         backgrounds, fits = self._with_better_backgrounds(which, backgrounds, evidence, fits)
         # 3  search all pixels where that leaves a doubt: what was taken for background may be landmark
         which = self._doubtful(backgrounds, fits)
-        fits = Fits.joined([fits, *(self._searched_together(k, backgrounds, evidence, bare) for k in which)])
+        few = [which[start : start + _TOGETHER] for start in range(0, len(which), _TOGETHER)]
+        fits = Fits.joined([fits, *(self._searched_together(some, backgrounds, evidence, bare) for some in few)])
         which = self._doubtful(backgrounds, fits)
         backgrounds, fits = self._with_better_backgrounds(which, backgrounds, evidence, fits)
         # 4  try other angles of the landmark
@@ -124,10 +127,13 @@ class AutoBackground:
         return bool(nearest < farthest)
 
     def _searched_together(
-        self, k: int, backgrounds: list[Background | None], evidence: Evidence, bare: NDArray[np.float64]
+        self,
+        which: NDArray[np.int64],
+        backgrounds: list[Background | None],
+        evidence: Evidence,
+        bare: NDArray[np.float64],
     ) -> Fits:
-        """Search one frame with its background in the images of the bank."""
-        which = np.array([k])
+        """Search frames with their backgrounds in the images of the bank."""
         some = evidence[which]
         scene = self._scene(_standing(backgrounds, which), True)
         return _numbered(search_views(self._setup, scene, some, some.seen, bare[which]), which)

@@ -31,7 +31,7 @@ from phasemark.matcher.likelihood.shared_errors import with_motion, with_shared_
 from phasemark.matcher.likelihood.systematic import Systematic
 from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
-from phasemark.matcher.nearest.bank_minima import Search, Upward
+from phasemark.matcher.nearest.bank_minima import Search, SearchOfFrames, Upward
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.nearest.thinned_bank import ThinnedBank
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
@@ -225,7 +225,8 @@ class LikelihoodMatcher:
         )
         if not together or self._thinned is None:
             return scene
-        search = self._new_search(self._thinned, behind)
+        searches = [self._new_search(self._thinned, background_of(self._bank, own)) for own in backgrounds]
+        search = SearchOfFrames(searches, scene.search.column_rad)
         return replace(scene, search=search, wide_search=search)
 
     def _bare_wall_cost(self, evidence: Evidence) -> NDArray[np.float64]:

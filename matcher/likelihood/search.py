@@ -42,7 +42,7 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     n_modes = setup.n_modes_before(scene.backgrounds)
     sides = policy.beside_rad if scene.backgrounds else ()
     # 2  start: minima of the bank
-    starts = scene.search.starts(seen[which], n_modes, all_classes=_all_classes(setup, evidence))
+    starts = scene.search.of_frames(which).starts(seen[which], n_modes, all_classes=_all_classes(setup, evidence))
     # 3 to 5  descend on interpolated images, let other classes explain, refine on final images
     fits = fit_starts(setup, scene, evidence, which, starts, sides)
     # 6  doubt: search more widely where nothing fits; a robust matcher also without what fits worst
@@ -169,7 +169,9 @@ def _retry_with_prior(
     poor = _unexplained(setup, scene, evidence, bare, Fits.joined([fits, *found]))
     if poor.size:
         n_modes = setup.n_modes_before(scene.backgrounds)
-        starts = scene.wide_search.starts(seen[poor], n_modes, all_classes=_all_classes(setup, evidence))
+        starts = scene.wide_search.of_frames(poor).starts(
+            seen[poor], n_modes, all_classes=_all_classes(setup, evidence)
+        )
         found.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
         poor = _unexplained(
             setup,
@@ -183,7 +185,7 @@ def _retry_with_prior(
         )
     if poor.size:
         # edges between columns: no pixel may decide alone where the search starts
-        starts = scene.wide_search.capped().starts(seen[poor], policy.modes_again, all_classes=True)
+        starts = scene.wide_search.of_frames(poor).capped().starts(seen[poor], policy.modes_again, all_classes=True)
         found.append(fit_starts(setup, direct, evidence, poor, starts, policy.beside_rad))
     return found
 
@@ -203,7 +205,7 @@ def _retry_without_prior(
     def refused(found: list[Fits]) -> NDArray[np.int64]:
         return _unexplained(setup, scene, evidence, bare, Fits.joined([fits, *found]), p=policy.refused_p, among=poor)
 
-    starts = scene.wide_search.starts(seen[poor], policy.modes_again, all_classes=all_classes)
+    starts = scene.wide_search.of_frames(poor).starts(seen[poor], policy.modes_again, all_classes=all_classes)
     found = [fit_starts(setup, scene, evidence, poor, starts, policy.beside_again_rad, patient=True)]
     again = refused(found)
     if again.size and (scene.scout is not None or scene.backgrounds):
@@ -214,10 +216,10 @@ def _retry_without_prior(
     if scene.scout is not None:
         # too little may be smooth for the scout to see the way
         n_modes = setup.n_modes_before(scene.backgrounds)
-        starts = scene.wide_search.starts(seen[again], n_modes, all_classes=all_classes)
+        starts = scene.wide_search.of_frames(again).starts(seen[again], n_modes, all_classes=all_classes)
     elif scene.backgrounds:
         # edges between columns before a bright wall: no pixel may decide alone where the search starts
-        starts = scene.wide_search.capped().starts(seen[again], policy.modes_again, all_classes=True)
+        starts = scene.wide_search.of_frames(again).capped().starts(seen[again], policy.modes_again, all_classes=True)
     else:
         return found
     found.append(fit_starts(setup, replace(scene, scout=None), evidence, again, starts, policy.beside_rad))
@@ -255,7 +257,7 @@ def _retry_trimmed(
         if not poor.size:
             break
         kept = _trimmed(setup, scene, evidence, fits, poor, seen)
-        starts = scene.search.starts(kept, n_modes, all_classes=_all_classes(setup, evidence))
+        starts = scene.search.of_frames(poor).starts(kept, n_modes, all_classes=_all_classes(setup, evidence))
         fits = Fits.joined([fits, fit_starts(setup, scene, evidence, poor, starts, sides)])
     return fits
 

@@ -16,7 +16,7 @@ from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import SearchPolicy
-from phasemark.matcher.nearest.bank_minima import Search
+from phasemark.matcher.nearest.bank_minima import Search, SearchOfFrames
 from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Background, PhasorImages
 
@@ -166,8 +166,8 @@ class Scene:
     behind: PhasorImages | None
     final: ImageModel
     scout: ImageModel | None
-    search: Search
-    wide_search: Search
+    search: Search | SearchOfFrames
+    wide_search: Search | SearchOfFrames
 
     def settings(self, setup: Setup) -> DescentSettings:
         """Return how a descent runs before these backgrounds."""

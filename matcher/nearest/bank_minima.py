@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -59,6 +60,9 @@ class Starts:
     class_index: NDArray[np.int64]
     view: NDArray[np.float64]
     cost: NDArray[np.float64]
+
+
+_NO_STARTS = Starts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, len(VIEW_FIELDS))), np.empty(0))
 
 
 class Upward(NamedTuple):
@@ -151,6 +155,10 @@ class Search:
         other._capped = True
         return other
 
+    def of_frames(self, frame: NDArray[np.int64]) -> Search:
+        """Return the search for some frames: it is the same for all."""
+        return self
+
     def starts(self, seen: Observation, n_modes: int, *, all_classes: bool = False) -> Starts:
         """Return the best modes of every frame.
 
@@ -165,15 +173,12 @@ class Search:
         """
         n, n_bearing = len(seen.range_m), len(self._shifts)
         if not n:
-            return Starts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, len(VIEW_FIELDS))), np.empty(0))
+            return _NO_STARTS
         at_once = max(_FRAMES_TIMES_SHIFTS // n_bearing, 1)
         if n > at_once:
             groups = [slice(start, start + at_once) for start in range(0, n, at_once)]
             found_in = [self.starts(seen[group], n_modes, all_classes=all_classes) for group in groups]
-            return Starts(
-                np.concatenate([own.frame + group.start for own, group in zip(found_in, groups, strict=True)]),
-                *(np.concatenate([getattr(own, name) for own in found_in]) for name in ("class_index", "view", "cost")),
-            )
+            return _joined(found_in, (group.start for group in groups))
         shape = (len(self._distance), len(self._delta))
         best = np.empty((n, n_bearing, *shape), np.float32)
         by_class = []
@@ -279,6 +284,44 @@ class Search:
             return least + out[:, None, None], pose - least[:, None]
         least = upper.min(axis=1)
         return pose[:, 0] + least[:, :, None] + out[:, None, None], (upper - least[:, None])[..., None]
+
+
+class SearchOfFrames:
+    """A first look at a bank before what stands behind each of n frames.
+
+    Parameters
+    ----------
+    searches : sequence of Search
+        One for each frame.
+    column_rad : float
+        Width of a column of the image.
+    """
+
+    def __init__(self, searches: Sequence[Search], column_rad: float) -> None:
+        self._searches, self.column_rad = searches, column_rad
+
+    def capped(self) -> SearchOfFrames:
+        """Return the same search, in which no pixel costs more than a disagreement."""
+        return SearchOfFrames([search.capped() for search in self._searches], self.column_rad)
+
+    def of_frames(self, frame: NDArray[np.int64]) -> SearchOfFrames:
+        """Return the search for some of the frames."""
+        return SearchOfFrames([self._searches[k] for k in frame], self.column_rad)
+
+    def starts(self, seen: Observation, n_modes: int, *, all_classes: bool = False) -> Starts:
+        """Return the best modes of every frame; see :meth:`Search.starts`."""
+        found = [
+            search.starts(seen[k : k + 1], n_modes, all_classes=all_classes) for k, search in enumerate(self._searches)
+        ]
+        return _joined(found, range(len(found))) if found else _NO_STARTS
+
+
+def _joined(parts: Sequence[Starts], first: Iterable[int]) -> Starts:
+    """Return the starts of groups of frames, of which each begins with some frame of all."""
+    return Starts(
+        np.concatenate([own.frame + k for own, k in zip(parts, first, strict=True)]),
+        *(np.concatenate([getattr(own, name) for own in parts]) for name in ("class_index", "view", "cost")),
+    )
 
 
 @njit(cache=True, nogil=True)
