@@ -78,7 +78,7 @@ def test_the_kernels_trace_the_same_rays_back(name):
     from phasemark.render.renderer import _camera
 
     sensor = SENSORS[name]
-    kernels = _camera(sensor, (0, sensor.rows), 0)
+    kernels = _camera(sensor, (0, sensor.rows), ())
     rng = np.random.default_rng(4)
     for u, v in rng.uniform(0, [sensor.cols, sensor.rows], (200, 2)):
         np.testing.assert_allclose(ray_of(kernels, u, v), np.ravel(sensor.tangents(u, v)), atol=1e-12)

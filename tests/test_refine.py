@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -227,6 +228,30 @@ def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, ren
         assert match.delta_rad == pytest.approx(delta, abs=math.radians(0.3))
 
 
+@pytest.mark.parametrize("free", [VIEW[:2], VIEW[:3]])
+def test_frames_before_several_backgrounds_are_matched_together_as_one_by_one(bank, renderers, free):
+    behind = [Background(wall_m=2.6), None, Background(wall_m=3.4, floor_m=0.45), Background(wall_m=3.0)] * 2
+    rng = np.random.default_rng(7)
+    frames: list[FilteredFrames] = []
+    for k, own in enumerate(behind):
+        view = Views.broadcast(rng.uniform(0.8, 1.5), rng.uniform(0, 6))
+        setup = TrialSetup() if own is None else TrialSetup(background=own)
+        frames.append(noisy_frames(renderers[NAMES[k % len(NAMES)]], SENSOR, view, setup, rng))
+    matcher = Matcher(bank, "refine", free=free, background="auto", workers=1)
+    names = ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
+    arrays: list[Any] = [np.concatenate([getattr(one, name) for one in frames]) for name in names]
+    together = matcher.match(FilteredFrames(*arrays, SENSOR))
+    alone = [matcher.match(one)[0] for one in frames]
+    assert [match.accepted for match in together] == [match.accepted for match in alone]
+    assert [match.class_name for match in together] == [match.class_name for match in alone]
+    for match, expected in zip(together, alone, strict=True):  # sums over a batch round otherwise
+        assert match.distance_m == pytest.approx(expected.distance_m, abs=1e-6)
+        assert match.delta_rad == pytest.approx(expected.delta_rad, abs=1e-5)
+        assert match.chi2 == pytest.approx(expected.chi2, rel=1e-6)
+        assert (match.background is None) == (expected.background is None)
+    assert sum(match.accepted for match in together) >= 6
+
+
 def test_a_wall_that_leaves_no_room_for_a_landmark_is_not_taken(bank, renderers, monkeypatch):
     """Frames with damaged pixels led the fit there: the view then lay inside the landmark."""
 
@@ -352,7 +377,7 @@ def test_rendering_only_the_rows_that_turn_gives_the_whole_image(bank, on):
         dim, SENSOR, Views.broadcast(1.0, [0.6, 1.1]), TrialSetup(on=on, background=WALL), np.random.default_rng(4)
     )
     behind = Renderer(None, SENSOR).render(1.0, background=WALL).phasor.reshape(-1)
-    settings = DescentSettings(VIEW[:2], np.ones(256, bool), phasor_behind=behind)
+    settings = DescentSettings(VIEW[:2], np.ones(256, bool), phasor_behind=behind[None])
     cone, evidence = np.full(2, bank.classes.index("cone")), Evidence.from_frames(frames, on)
     problem = Problem(RenderedModel(bank, WALL), evidence, np.arange(2), cone, settings, np.full(2, np.inf))
     state = problem.start(np.array([[1.0, 0.6, 0, 0, 0, 0], [1.0, 1.1, 0, 0, 0, 0]]), False)

@@ -22,7 +22,7 @@ from oracles.images import (
 
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.render import Background, Renderer, Sensor, preset
+from phasemark.render import Background, Renderer, Sensor, Views, preset
 from phasemark.render.integral.intersect import make_intersector
 
 PMD = preset("pmd-16x16")
@@ -231,6 +231,43 @@ def test_what_stands_behind_does_not_change_the_landmark():
     # a wall is nearly constant over a pixel: the composition of the physics page, section 3
     composed = bare.phasor + (1 - bare.coverage) * wall.phasor
     assert epsilon(composed, walled.phasor) < 4e-4
+
+
+LENS = Sensor.from_opencv(
+    [[41.0, 0.0, 7.5], [0.0, 41.0, 7.5], [0.0, 0.0, 1.0]], (-0.31, 0.12, 0.0012, -0.0008, -0.02), size=(16, 16)
+)
+
+
+@pytest.mark.parametrize("sensor", [PMD, LENS, PMD.with_(modulation_hz=[20e6, 100e6])], ids=["ideal", "lens", "two"])
+def test_views_before_backgrounds_of_their_own_are_those_rendered_alone_bit_for_bit(sensor):
+    """Walls take other points than floors do, and a batch has both."""
+    behind = [None, Background(wall_m=3.0), Background(floor_m=0.4), Background(wall_m=2.5, floor_m=0.45), None]
+    views = Views.broadcast([0.9, 1.1, 1.3, 1.2, 1.0], [0.3, 1.0, 2.0, 4.0, 5.0], [0.0, 0.05, -0.05, 0.02, 0.0])
+    renderer = Renderer(MESHES["cone"], sensor, albedo=0.8)
+    parameters = ("distance_m", "bearing_rad", "pitch_rad")
+    together = renderer.render_views(views, background=behind, workers=2)
+    image, slope = renderer.render_with_slopes(views, parameters, background=behind)
+    numbers = (views.distance_m, views.delta_rad, views.bearing_rad)
+    jacobian = renderer.jacobian(*numbers, background=behind, parameters=("height_m",))
+    for k, own in enumerate(behind):
+        one = views[k : k + 1]
+        alone = renderer.render_views(one, background=own)
+        np.testing.assert_array_equal(together.phasors[k], alone.phasors[0])
+        np.testing.assert_array_equal(together.intensity[k], alone.intensity[0])
+        alone, expected_slope = renderer.render_with_slopes(one, parameters, background=own)
+        np.testing.assert_array_equal(image.phasors[k], alone.phasors[0])
+        np.testing.assert_array_equal(slope[k], expected_slope[0])
+        of_one = [values[k] for values in numbers]
+        expected = renderer.jacobian(*of_one, background=own, parameters=("height_m",))
+        np.testing.assert_array_equal(jacobian[k], expected[0])
+
+
+def test_backgrounds_are_one_for_all_views_or_one_for_each():
+    renderer = Renderer(CYLINDER, PMD)
+    with pytest.raises(UsageError, match="'background' must be one for all 3 views or one for each, got 2"):
+        renderer.render([1.0, 1.2, 1.4], background=[None, Background(wall_m=3.0)])
+    with pytest.raises(UsageError, match=r"the wall at 1\.3 m is before the landmark's farthest point in view 1"):
+        renderer.render([1.0, 1.25], background=[Background(wall_m=3.0), Background(wall_m=1.3)])
 
 
 def test_a_background_before_the_landmark_is_refused():

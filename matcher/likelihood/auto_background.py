@@ -218,7 +218,8 @@ class AutoBackground:
             The best views of the moved frames, numbered by their places among these; the first of each is the one that
             was fitted with the background.
         """
-        moved, kept, starts = list(backgrounds), [], []
+        moved, starts = list(backgrounds), []
+        kept: list[int] = []
         for k in which:
             own = np.flatnonzero((fits.frame == k) & np.isfinite(fits.cost))
             background = backgrounds[k]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ ALBEDO_COLUMN = len(VIEW)
 """Its column in arrays of parameters, behind those of the view."""
 SCALE = {**NATURAL_UNITS, ALBEDO: 0.1}
 """Natural units of the parameters: 1 cm, 1°. Condition numbers and the longest step are stated in them."""
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 
 _STEEPEST_RAD = 1.2
 """Largest pitch and roll that a descent tries: at ± 90° of pitch, roll and bearing are one."""
@@ -298,7 +300,7 @@ class Problem:
             return images.phasor
         return images.phasor - (1 - images.coverage) * self.for_candidates(self.settings.phasor_behind)
 
-    def for_candidates(self, behind: NDArray[Any]) -> NDArray[Any]:
+    def for_candidates(self, behind: NDArray[_Scalar]) -> NDArray[_Scalar]:
         """Return what stands behind the frames of the candidates, (m, pixels), or (1, pixels) of one for all."""
         return behind if len(behind) == 1 else behind[self.frame]
 
