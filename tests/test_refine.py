@@ -17,7 +17,9 @@ from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, phasor_mean
 from phasemark.matcher.accuracy.trials import TrialSetup, noisy_frames, run_trials
 from phasemark.matcher.filters import noise_free
+from phasemark.matcher.filters.filtered_frames import PixelState
 from phasemark.matcher.likelihood.bank_images import BankModel
+from phasemark.matcher.likelihood.contradictions import whole_cost
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher
 from phasemark.matcher.likelihood.look_alikes import _most_promising
@@ -26,6 +28,7 @@ from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import std_without_one_pixel, view_covariance
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE
 from phasemark.render import Background, Frames, Renderer, Views, capture, predicted_range_std, preset
 
 SENSOR = preset("pmd-16x16")
@@ -211,6 +214,34 @@ def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, render
         without.append(variance(use))
     expected = np.sqrt(np.diag(covariance[0]) * np.max(without, axis=0) / whole)
     np.testing.assert_allclose(found[0], expected, rtol=1e-6)
+
+
+def test_the_whole_cost_counts_each_contradicted_and_each_undecided_pixel_once(bank, renderers):
+    """A pixel without a return that must have one leaves all returns that are not compared as they are."""
+    image = renderers["cone"].render(1.02, 0.5)
+    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(2), n_frames=10))
+    middle = np.unravel_index(np.argmax(image.coverage[0] * (image.amplitude[0] > 0)), image.coverage[0].shape)
+    state = frames.state.copy()
+    state[0][middle] = PixelState.NO_RETURN
+    evidence = Evidence.from_frames(replace(frames, state=state), "ranges")
+    class_index = np.array([bank.classes.index("cone")])
+    settings = DescentSettings(VIEW[:2], np.ones(256, bool))
+    problem = Problem(RenderedModel(bank), evidence, np.zeros(1, np.int64), class_index, settings, np.full(1, np.inf))
+    at = problem.start(np.array([[1.02, 0.5, 0.0, 0.0, 0.0, 0.0]]), False)
+    use = at.use.copy()
+    use[0, np.flatnonzero(at.use[0] & evidence.seen.returned[0] & (at.images.coverage[0] < 0.9))[:5]] = False
+    compared = use & (evidence.weight > 0)
+    coverage, returned = at.images.coverage, evidence.seen.returned
+    dark = returned & ~compared & (coverage < MAY_RETURN_COVERAGE)
+    absent = evidence.seen.not_returned & ~compared & (coverage > MUST_RETURN_COVERAGE)
+    undecided = returned & ~compared & ~dark
+    assert absent.sum() >= 1
+    assert undecided.sum() >= 5
+    state_there = problem.summed(at.theta, use, at.images)
+    expected = state_there.sums.cost + DISAGREEMENT * (dark.sum() + absent.sum()) + undecided.sum()
+    cost, contradicted = whole_cost(problem, state_there)
+    assert cost == pytest.approx(expected, rel=1e-12)
+    assert contradicted.all()
 
 
 def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, renderers):

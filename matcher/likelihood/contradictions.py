@@ -52,8 +52,8 @@ def outlying_pixels(problem: Problem, state: State) -> NDArray[np.bool_]:
 def whole_cost(problem: Problem, state: State) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the cost of states with all their disagreements, and whether there are any; (m,) each."""
     compared = state.use & (problem.evidence.weight[problem.frame] > 0)
-    wrong = contradicted_pixels(problem, state, np.empty(0, np.intp), np.empty((0, 0, 0)), ~compared).sum(axis=1)
-    n_open = (problem.evidence.seen.returned[problem.frame] & ~compared).sum(axis=1) - wrong
-    total = state.sums.cost + DISAGREEMENT * wrong + np.maximum(n_open, 0)
+    wrong = contradicted_pixels(problem, state, np.empty(0, np.intp), np.empty((0, 0, 0)), ~compared)
+    undecided = problem.evidence.seen.returned[problem.frame] & ~compared & ~wrong
+    total = state.sums.cost + DISAGREEMENT * wrong.sum(axis=1) + undecided.sum(axis=1)
     dark = (compared & (state.images.phasor == 0)).any(axis=1)
-    return np.asarray(total), np.asarray((wrong > 0) | dark, np.bool_)
+    return np.asarray(total), np.asarray(wrong.any(axis=1) | dark, np.bool_)

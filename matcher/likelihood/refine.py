@@ -1,7 +1,8 @@
 """From candidates to the nearest maxima of the likelihood, with their uncertainty.
 
 Levenberg–Marquardt with the pixels that count at the start; where the solution would decide otherwise which pixels
-count, it is decided again there, once, and the view moves again. Then lower minima behind kinks are looked for.
+count, it is decided again there, once, and the view moves again. Before that, lower minima behind kinks in δ are looked
+for; after it, views that contradict pixels are left for better ones nearby.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The numbers that steer the search for the most likely view: how wide, how long, and when it is enough.
 
-None of them changes what the likelihood is. They decide which of its minima are found, and at what cost.
+Most decide which minima of the likelihood are found, and at what cost. ``slope_width``, ``axis_rounds`` and
+``strange_sigma`` enter the covariance, and the numbers of the last group decide what is accepted.
 ``python benchmarks/run.py policy`` halves and doubles each of them and tells how answers and rendered views change.
 """
 
