@@ -84,7 +84,7 @@ def _answer(
         return Match(class_name=None, accepted=False, free=setup.free, class_probability=nothing, reason="no landmark")
     kept = distinct(fits, own, setup.shapes.symmetry, setup.policy.same_m, setup.policy.same_rad)
     best = kept[0]
-    # "none" weighs as a fit that just fails the test, or as a scene without a landmark
+    # "none" weighs as a fit that just fails a χ² test with the noise as stated, or as a scene without a landmark
     cost_of_unknown = DISAGREEMENT * float(fits.unexplained[best])
     weight = _weights(np.append(fits.cost[kept], min(bare, float(chi2_at_edge[best]) + cost_of_unknown)))
     reason = _reason(setup, fits, kept, weight[:-1], float(p_values[best]), bare)

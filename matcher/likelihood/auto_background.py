@@ -32,6 +32,7 @@ __all__ = ["AutoBackground"]
 
 _TOGETHER = 8
 """Frames whose backgrounds are in images of the bank at the same time: these take some megabytes each."""
+_SceneOf = Callable[[Sequence[Background]], Scene]
 _Standing = tuple[list[Background | None], Fits]
 """What stands behind the landmark in each of n frames, and their fits before it."""
 
@@ -45,15 +46,16 @@ class AutoBackground:
     rendered : RenderedModel
         Renders the landmarks before any background.
     scene : callable
-        Returns the scene of the backgrounds of some frames (empty: there is none). The second argument says whether
-        background and landmark are searched together, over all bearings, since what was taken for background may be
-        landmark; the images of the bank are then made anew before each.
+        Returns the scene of the backgrounds of some frames (empty: there is none), whose search leaves out what sees
+        the background.
+    whole_scene : callable
+        Returns one whose search compares all pixels, over all bearings, since what was taken for background may be
+        landmark: images of the bank are made anew before each background.
     """
 
-    def __init__(
-        self, setup: Setup, rendered: RenderedModel, scene: Callable[[Sequence[Background], bool], Scene]
-    ) -> None:
-        self._setup, self._rendered, self._scene = setup, rendered, scene
+    def __init__(self, setup: Setup, rendered: RenderedModel, scene: _SceneOf, whole_scene: _SceneOf) -> None:
+        self._setup, self._rendered = setup, rendered
+        self._scene, self._whole_scene = scene, whole_scene
 
     def search(self, frames: FilteredFrames, evidence: Evidence, bare: NDArray[np.float64]) -> _Standing:
         """Return the background of each frame, and what explains the frames before them.
@@ -108,7 +110,7 @@ class AutoBackground:
             seen, behind = some.seen, _standing(backgrounds, which)
             if behind:
                 seen = without_background(seen, [around[k] for k in which])
-            fits = search_views(self._setup, self._scene(behind, False), some, seen, bare[which])
+            fits = search_views(self._setup, self._scene(behind), some, seen, bare[which])
             parts.append(_numbered(fits, which))
         return backgrounds, Fits.joined(parts)
 
@@ -135,7 +137,7 @@ class AutoBackground:
     ) -> Fits:
         """Search frames with their backgrounds in the images of the bank."""
         some = evidence[which]
-        scene = self._scene(_standing(backgrounds, which), True)
+        scene = self._whole_scene(_standing(backgrounds, which))
         return _numbered(search_views(self._setup, scene, some, some.seen, bare[which]), which)
 
     def _other_angles(
@@ -151,7 +153,7 @@ class AutoBackground:
         period = np.array([delta_period_rad(self._setup.shapes.symmetry[c]) for c in own.class_index[source]])
         view = own.view[source]
         view[:, 1] += np.tile(np.arange(1, n), len(best)) * period / n
-        scene = self._scene(_standing(backgrounds, which), False)
+        scene = self._scene(_standing(backgrounds, which))
         settings, margin = scene.settings(self._setup), self._setup.policy.margin_cost
         frame, class_index = own.frame[source], own.class_index[source]
         found = fit_modes(self._setup, scene.final, evidence[which], frame, class_index, view, settings, margin)
@@ -192,7 +194,7 @@ class AutoBackground:
             which, moved, starts = self._moved_backgrounds(which, *found, evidence)
             if not which.size:
                 break
-            some, scene = evidence[which], self._scene(_standing(moved, which), False)
+            some, scene = evidence[which], self._scene(_standing(moved, which))
             settings = replace(scene.settings(setup), look_beside_rad=policy.close_by_rad)
             again = refine(scene.final, some, starts.frame, starts.class_index, starts.view, settings)
             others = fit_other_classes(setup, scene.final, some, again, settings)

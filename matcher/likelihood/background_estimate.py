@@ -37,7 +37,10 @@ _BACKGROUND_SETTLED = 0.1
 """A step that promises to lower the whitened squared residual by less than this is not taken."""
 _LONGEST_STEP = 3.0
 _VIEW_SCALE = tuple(NATURAL_UNITS[name] for name in VIEW)
-"""Natural units of the view; those of wall and floor are 0.1 m."""
+"""Natural units of the view."""
+_PLACE_SCALE_M = 0.1
+"""Natural unit of the places of wall and floor."""
+_FIRST_DAMPING, _LEAST_DAMPING, _HOPELESS_DAMPING = 1e-3, 1e-9, 1e5
 _USUAL_ALBEDO = 0.5
 
 
@@ -176,34 +179,17 @@ def fit_background(
     """
     names = [name for name in ("wall_m", "floor_m") if getattr(background, name) is not None]
     columns = [VIEW.index(name) for name in free]
-    scale = np.array([*(_VIEW_SCALE[k] for k in columns), *([0.1] * len(names))])
-    frame, which = np.zeros(1, np.int64), np.array([class_index])
+    scale = np.array([*(_VIEW_SCALE[k] for k in columns), *([_PLACE_SCALE_M] * len(names))])
 
     def moved(place: NDArray[np.float64]) -> Background:
         return replace(background, **dict(zip(names, place.tolist(), strict=True)))
 
     def sums_at(at: NDArray[np.float64], place: NDArray[np.float64]) -> Sums | None:
-        views = at[None]
-        before = model.with_background(moved(place))
-        nearest, farthest = before.limits()
-        if not nearest <= at[0] <= farthest:
-            return None
-        try:
-            image = before.images(which, views, free)
-            beside = [
-                model.with_background(moved(place + step)).images(which, views, ()).phasor
-                for step in np.eye(len(place)) * _BACKGROUND_STEP_M
-            ]
-        except UsageError:  # the landmark does not stand before this wall, or on this floor
-            return None
-        by_place = [(phasor - image.phasor) / _BACKGROUND_STEP_M for phasor in beside]
-        slope = np.concatenate([image.slope, np.stack(by_place, axis=1)], axis=1)
-        return gauss_newton_sums(
-            image.phasor, slope, evidence, frame, counts(image.phasor, image.intensity, evidence.sensor), None
-        )
+        beside = [moved(place + step) for step in np.eye(len(place)) * _BACKGROUND_STEP_M]
+        return _sums_before(model, evidence, class_index, at, free, moved(place), beside)
 
     at, place = view.copy(), np.array([getattr(background, name) for name in names], np.float64)
-    sums, damping = sums_at(at, place), 1e-3
+    sums, damping = sums_at(at, place), _FIRST_DAMPING
     for _ in range(_BACKGROUND_STEPS):
         if sums is None:
             break
@@ -220,12 +206,40 @@ def fit_background(
         placed = place + (step * scale)[len(columns) :]
         tried = sums_at(there, placed) if (placed > 0).all() else None
         if tried is not None and tried.cost[0] < sums.cost[0]:
-            at, place, sums, damping = there, placed, tried, max(damping * 0.1, 1e-9)
+            at, place, sums, damping = there, placed, tried, max(damping * 0.1, _LEAST_DAMPING)
         else:
             damping *= 8
-            if damping > 1e5:
+            if damping > _HOPELESS_DAMPING:
                 break
     return moved(place), at
+
+
+def _sums_before(
+    model: RenderedModel,
+    evidence: Evidence,
+    class_index: int,
+    view: NDArray[np.float64],
+    free: Sequence[str],
+    background: Background,
+    beside: Sequence[Background],
+) -> Sums | None:
+    """Return the sums of one frame with the slopes by the view and by wall and floor; None where a view is impossible.
+
+    Each background in `beside` has one of these moved by a small step.
+    """
+    before, which = model.with_background(background), np.array([class_index])
+    nearest, farthest = before.limits()
+    if not nearest <= view[0] <= farthest:
+        return None
+    try:
+        image = before.images(which, view[None], free)
+        moved = [model.with_background(own).images(which, view[None], ()).phasor for own in beside]
+    except UsageError:  # the landmark does not stand before this wall, or on this floor
+        return None
+    by_place = [(phasor - image.phasor) / _BACKGROUND_STEP_M for phasor in moved]
+    slope = np.concatenate([image.slope, np.stack(by_place, axis=1)], axis=1)
+    use = counts(image.phasor, image.intensity, evidence.sensor)
+    return gauss_newton_sums(image.phasor, slope, evidence, np.zeros(1, np.int64), use, None)
 
 
 def without_background(seen: Observation, surroundings: Sequence[Surroundings]) -> Observation:

@@ -67,24 +67,24 @@ def fit_modes(
     class_index: NDArray[np.int64],
     view: NDArray[np.float64],
     settings: DescentSettings,
-    margin: float,
+    start_margin: float,
 ) -> Fits:
     """Refine the first candidate of every frame, the others while they can still win, and at last what is likely.
 
-    A candidate can win while its cost promises to fall to `margin` above that of the first one. Of likely fits that end
-    at one place the best is kept; unlikely ones keep their rough fit.
+    A candidate can win while its cost promises to fall to `start_margin` above that of the first one. Of likely fits
+    that end at one place the best is kept; unlikely ones keep their rough fit.
     """
     n = len(evidence.weight)
     first = np.isin(np.arange(len(frame)), np.unique(frame, return_index=True)[1])
     fits = refine(model, evidence, frame[first], class_index[first], view[first], settings, roughly=True)
-    limit = least_of_frame(fits, n)[frame[~first]] + margin
+    limit = least_of_frame(fits, n)[frame[~first]] + start_margin
     more = refine(model, evidence, frame[~first], class_index[~first], view[~first], settings, limit, roughly=True)
     fits = Fits.joined([fits, more])
     policy = setup.policy
-    likely = fits.cost < least_of_frame(fits, n)[fits.frame] + policy.margin_cost
-    better = distinct_of_frames(fits, np.flatnonzero(likely), setup.shapes.symmetry, policy.same_m, policy.same_rad)
+    may_win = fits.cost < least_of_frame(fits, n)[fits.frame] + policy.margin_cost
+    better = distinct_of_frames(fits, np.flatnonzero(may_win), setup.shapes.symmetry, policy.same_m, policy.same_rad)
     again = fits[better]
-    return Fits.joined([refine(model, evidence, again.frame, again.class_index, again.view, settings), fits[~likely]])
+    return Fits.joined([refine(model, evidence, again.frame, again.class_index, again.view, settings), fits[~may_win]])
 
 
 def fit_other_classes(
@@ -134,8 +134,8 @@ def fit_neighbouring_views(
         Of these frames and others, on the final images.
     """
     order = np.lexsort((fits.cost, fits.frame))
-    likely = [k for k in order if fits.frame[k] in which and np.isfinite(fits.covariance[k]).all()]
-    around = _surrounded(setup, fits[_most_likely(setup, fits, likely)])
+    observed = [k for k in order if fits.frame[k] in which and np.isfinite(fits.covariance[k]).all()]
+    around = _surrounded(setup, fits[_most_likely(setup, fits, observed)])
     close = _close_settings(setup, scene, evidence)
     cost = costs_at(scene.final, evidence, around.frame, around.class_index, around.view, close)
     order = np.lexsort((cost, around.frame))
@@ -178,11 +178,11 @@ def _polished(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fit
     return Fits.joined([final, others.with_free(len(setup.free))])
 
 
-def _most_likely(setup: Setup, fits: Fits, likely: list[int]) -> NDArray[np.int64]:
+def _most_likely(setup: Setup, fits: Fits, ordered: list[int]) -> NDArray[np.int64]:
     """Return the few fits of each frame that are refined again: of places of their own, best first."""
     policy = setup.policy
     chosen: list[int] = []
-    for k in likely:
+    for k in ordered:
         same = [j for j in chosen if fits.frame[j] == fits.frame[k]]
         if len(same) < policy.most_refined:
             own = distinct(fits, np.array([*same, k]), setup.shapes.symmetry, policy.same_m, policy.same_rad)

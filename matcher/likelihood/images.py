@@ -99,7 +99,10 @@ class ImageModel(Protocol):
         free: Sequence[str],
         std: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the least and the greatest coverage nearby, (m, pixels) each: within three `std` (m, p) at least."""
+        """Return the least and the greatest coverage nearby, (m, pixels) each.
+
+        Nearby is within three `std` (m, p), or among the neighbours on a grid.
+        """
 
     def wide_slopes(
         self,

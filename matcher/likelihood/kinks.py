@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import whole_cost
 from phasemark.matcher.likelihood.descent import descend
+from phasemark.matcher.likelihood.fits import BETTER_COST
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Sums
@@ -78,7 +79,7 @@ def settle(problem: Problem, state: State) -> State:
         tried = problem.some(source).at(theta)
         total = whole_cost(problem.some(source), tried)[0].reshape(len(near), -1)
         best = total.argmin(axis=1)
-        chosen = np.flatnonzero(total[np.arange(len(near)), best] < cost[near] - 1)
+        chosen = np.flatnonzero(total[np.arange(len(near)), best] < cost[near] - BETTER_COST)
         if not chosen.size:
             break
         at = chosen * moves.shape[1] + best[chosen]

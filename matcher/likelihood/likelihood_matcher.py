@@ -116,7 +116,7 @@ class LikelihoodMatcher:
 
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Match filtered frames, in threads of their own parts of them; the answers do not depend on their number."""
-        match = self._match_auto if self._auto else self._match_before
+        match = self._match_auto if self._auto else self._match_stated
         share = max(math.ceil(len(frames) / self._workers), 1)
         share = min(share, self._setup.policy.frames_at_once)
         parts = [frames[start : start + share] for start in range(0, len(frames), share)]
@@ -128,7 +128,7 @@ class LikelihoodMatcher:
         answers = [answer for some in found for answer in some]
         return with_motion(self._setup, self._systematic, frames, answers)
 
-    def _match_before(self, frames: FilteredFrames) -> list[Match]:
+    def _match_stated(self, frames: FilteredFrames) -> list[Match]:
         """Match frames before the background that was stated, or none."""
         evidence = Evidence.from_frames(frames, self._setup.on)
         bare = bare_cost(evidence.seen, self._scene.behind)
@@ -140,7 +140,7 @@ class LikelihoodMatcher:
 
     def _match_auto(self, frames: FilteredFrames) -> list[Match]:
         """Match frames, each before what stands behind it."""
-        auto = AutoBackground(self._setup, self._rendered, self._scene_before)
+        auto = AutoBackground(self._setup, self._rendered, self._scene_before, self._whole_scene_before)
         evidence = Evidence.from_frames(frames, self._setup.on)
         bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(evidence))
         backgrounds, fits = auto.search(frames, evidence, bare)
@@ -195,7 +195,7 @@ class LikelihoodMatcher:
     def _search_stride(self) -> tuple[int, int]:
         """Return every how many distances and angles of the bank are searched."""
         setup = self._setup
-        few = self._stated is not None and not setup.bearing_is_free and setup.is_upright
+        few = self._stated is not None and not setup.bearing_is_free and setup.height_and_tilt_are_known
         fine = (1, 1) if few else (2, 3)
         along, around = (
             max(1, min(step, (len(grid) - 1) // 4))
@@ -208,26 +208,30 @@ class LikelihoodMatcher:
         setup = self._setup
         widest = setup.widest_rad if setup.bearing_is_free else 0.0
         upward = Upward(setup.prior_std_of("height_m"), setup.prior_std_of("pitch_rad"), setup.policy.prior_sigma)
-        capped = setup.unknown or not setup.is_upright  # edges between rows: no pixel may decide alone where it starts
+        capped = (
+            setup.unknown or not setup.height_and_tilt_are_known
+        )  # edges between rows: no pixel may decide alone where it starts
         return Search(thinned, behind, widest, upward, capped=capped)
 
-    def _scene_before(self, backgrounds: Sequence[Background], together: bool) -> Scene:
+    def _scene_before(self, backgrounds: Sequence[Background]) -> Scene:
         """Return the scene of estimated backgrounds; see :class:`AutoBackground`."""
         if not backgrounds:
             return self._scene
         behind = background_of(self._bank, *backgrounds)
-        scene = replace(
+        return replace(
             self._scene,
             backgrounds=backgrounds,
             behind=behind,
             final=self._rendered.with_background(*backgrounds),
             scout=None if self._scout is None else self._scout.before(behind),
         )
-        if not together or self._thinned is None:
-            return scene
+
+    def _whole_scene_before(self, backgrounds: Sequence[Background]) -> Scene:
+        """Return the same, searched in images of the bank before each background."""
+        assert self._thinned is not None
         searches = [self._new_search(self._thinned, background_of(self._bank, own)) for own in backgrounds]
-        search = SearchOfFrames(searches, scene.search.column_rad)
-        return replace(scene, search=search, wide_search=search)
+        search = SearchOfFrames(searches, self._scene.search.column_rad)
+        return replace(self._scene_before(backgrounds), search=search, wide_search=search)
 
     def _bare_wall_cost(self, evidence: Evidence) -> NDArray[np.float64]:
         """Return how badly a wall at its best distance explains all of each frame, (n,)."""

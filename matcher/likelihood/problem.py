@@ -138,7 +138,7 @@ class Problem:
         names = (*settings.free, ALBEDO) if self.with_albedo else settings.free
         self.columns = np.array([(*VIEW, ALBEDO).index(name) for name in names])
         self.scale = np.array([SCALE[name] for name in names])
-        self.lifts = bool(set(names) & set(VIEW[3:]))
+        self.height_or_tilt_is_free = bool(set(names) & set(VIEW[3:]))
         self.tilts = bool(set(names) & set(VIEW[4:]))
         known = np.array(settings.prior_std) if settings.prior_std else np.full(len(settings.free), np.inf)
         self.prior_weight = np.concatenate([known**-2.0, np.zeros(len(names) - len(known))])

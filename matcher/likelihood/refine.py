@@ -221,8 +221,8 @@ def _uncertainty(
     without_one = np.full((len(state.theta), len(problem.settings.free)), np.inf)
     if near.size:
         there = problem.some(near)
-        for _ in range(problem.policy.axis_rounds if problem.lifts else 1):
-            if problem.lifts:
+        for _ in range(problem.policy.axis_rounds if problem.height_or_tilt_is_free else 1):
+            if problem.height_or_tilt_is_free:
                 wide: NDArray[np.complex128] | None = slopes_along_axes(there, state, near, covariance[near])
             else:
                 wide = slopes_around(there, state, near, capped_std(problem, covariance[near]))

@@ -39,7 +39,7 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     """
     which = _worth_a_search(setup, evidence, bare)
     policy = setup.policy
-    n_modes = setup.n_modes_before(scene.backgrounds)
+    n_modes = setup.modes_of_frame(scene.backgrounds)
     sides = policy.beside_rad if scene.backgrounds else ()
     # 2  start: minima of the bank
     starts = scene.search.of_frames(which).starts(seen[which], n_modes, all_classes=_all_classes(setup, evidence))
@@ -110,7 +110,7 @@ def _retry_unexplained(
         return fits
     retry = _retry_with_prior if setup.bearing_has_prior else _retry_without_prior
     fits = Fits.joined([fits, *retry(setup, scene, evidence, seen, bare, fits, poor)])
-    if setup.is_upright:
+    if setup.height_and_tilt_are_known:
         return fits
     poor = _unexplained(setup, scene, evidence, bare, fits, p=setup.policy.refused_p, even_beyond_bare=True)
     return Fits.joined([fits, _fit_swayed(setup, scene, evidence, poor, fits)]) if poor.size else fits
@@ -119,9 +119,10 @@ def _retry_unexplained(
 def _all_classes(setup: Setup, evidence: Evidence) -> bool:
     """Return whether classes that are hardly worse than the best of a minimum start there too.
 
-    They do where the images of a bank are not those of the frames: of another albedo, or of a camera upright.
+    They do where the images of a bank are not those of the frames: of another albedo, or of a camera that may be
+    tilted or raised.
     """
-    return evidence.on == "phasors" or not setup.is_upright
+    return evidence.on == "phasors" or not setup.height_and_tilt_are_known
 
 
 def _fit_swayed(setup: Setup, scene: Scene, evidence: Evidence, which: NDArray[np.int64], fits: Fits) -> Fits:
@@ -168,7 +169,7 @@ def _retry_with_prior(
     found = [_fit_turned(setup, direct, evidence, poor, fits)]
     poor = _unexplained(setup, scene, evidence, bare, Fits.joined([fits, *found]))
     if poor.size:
-        n_modes = setup.n_modes_before(scene.backgrounds)
+        n_modes = setup.modes_of_frame(scene.backgrounds)
         starts = scene.wide_search.of_frames(poor).starts(
             seen[poor], n_modes, all_classes=_all_classes(setup, evidence)
         )
@@ -215,7 +216,7 @@ def _retry_without_prior(
         return found
     if scene.scout is not None:
         # too little may be smooth for the scout to see the way
-        n_modes = setup.n_modes_before(scene.backgrounds)
+        n_modes = setup.modes_of_frame(scene.backgrounds)
         starts = scene.wide_search.of_frames(again).starts(seen[again], n_modes, all_classes=all_classes)
     elif scene.backgrounds:
         # edges between columns before a bright wall: no pixel may decide alone where the search starts
@@ -250,7 +251,7 @@ def _retry_trimmed(
 ) -> Fits:
     """Search again without the returns that fit worst, as a robust matcher does where nothing fits."""
     policy = setup.policy
-    n_modes = setup.n_modes_before(scene.backgrounds)
+    n_modes = setup.modes_of_frame(scene.backgrounds)
     sides = policy.beside_rad if scene.backgrounds else ()
     for _ in range(policy.trimmings):
         poor = _unexplained(setup, scene, evidence, bare, fits, even_beyond_bare=True)

@@ -121,16 +121,16 @@ class Setup:
         return "bearing_rad" in self.free
 
     @property
-    def is_upright(self) -> bool:
-        """Whether the camera is level and at the height that was stated."""
+    def height_and_tilt_are_known(self) -> bool:
+        """Whether height, pitch and roll are those that were stated: none of them is estimated."""
         return not set(self.free) & set(VIEW[3:])
 
-    def n_modes_before(self, backgrounds: Sequence[Background]) -> int:
+    def modes_of_frame(self, backgrounds: Sequence[Background]) -> int:
         """Return how many minima of the bank each frame is first refined from before some backgrounds, or none."""
         policy = self.policy
         if not backgrounds:
             return policy.modes
-        return policy.modes_before_background if self.is_upright else policy.modes_again
+        return policy.modes_before_background if self.height_and_tilt_are_known else policy.modes_again
 
     def prior_std_of(self, name: str) -> float:
         """Return the standard deviation of a parameter before a frame is seen; 0 of one that is not estimated."""
