@@ -102,13 +102,17 @@ Backgrounds: TypeAlias = Background | Sequence[Background | None] | None
 
 
 def parameters_of_views(background: Backgrounds, n: int) -> NDArray[np.float64]:
-    """Return what stands behind the landmark in each of n views, rows as :meth:`Background.parameters`; (n, 4).
+    """Return the parameters of the background of each of n views, rows as :meth:`Background.parameters` returns them.
 
     Parameters
     ----------
     background : Background or sequence of Background, optional
     n : int
         Number of views.
+
+    Returns
+    -------
+    (n, 4) float64
 
     Raises
     ------

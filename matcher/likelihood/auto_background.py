@@ -50,7 +50,7 @@ class AutoBackground:
         the background.
     whole_scene : callable
         Returns one whose search compares all pixels, over all bearings, since what was taken for background may be
-        landmark: images of the bank are made anew before each background.
+        landmark: images of the bank are made before each background.
     """
 
     def __init__(self, setup: Setup, rendered: RenderedModel, scene: _SceneOf, whole_scene: _SceneOf) -> None:

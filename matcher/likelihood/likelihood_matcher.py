@@ -208,9 +208,8 @@ class LikelihoodMatcher:
         setup = self._setup
         widest = setup.widest_rad if setup.bearing_is_free else 0.0
         upward = Upward(setup.prior_std_of("height_m"), setup.prior_std_of("pitch_rad"), setup.policy.prior_sigma)
-        capped = (
-            setup.unknown or not setup.height_and_tilt_are_known
-        )  # edges between rows: no pixel may decide alone where it starts
+        # edges between rows: no pixel may decide alone where it starts
+        capped = setup.unknown or not setup.height_and_tilt_are_known
         return Search(thinned, behind, widest, upward, capped=capped)
 
     def _scene_before(self, backgrounds: Sequence[Background]) -> Scene:

@@ -301,7 +301,7 @@ class Problem:
         return images.phasor - (1 - images.coverage) * self.for_candidates(self.settings.phasor_behind)
 
     def for_candidates(self, behind: NDArray[_Scalar]) -> NDArray[_Scalar]:
-        """Return what stands behind the frames of the candidates, (m, pixels), or (1, pixels) of one for all."""
+        """Return the values of the frames of the candidates, (m, pixels), or (1, pixels) of one for all."""
         return behind if len(behind) == 1 else behind[self.frame]
 
     def _brightness(self, images: ModelImages) -> NDArray[np.float64]:

@@ -267,13 +267,13 @@ class RenderedModel:
         return renderer.render_views(views, background=self._given_way(class_index, views, which), rows=rows)
 
     def _behind(self, which: NDArray[np.integer]) -> list[Background | None]:
-        """Return what stands behind some of the views."""
+        """Return the backgrounds of some of the views."""
         if self._frame is None:
             return [self._backgrounds[0]] * len(which)
         return [self._backgrounds[k] for k in self._frame[which]]
 
     def _given_way(self, class_index: int, views: Views, which: NDArray[np.integer]) -> Backgrounds:
-        """Return what stands behind some views, floors lowered to where the landmark ends.
+        """Return the backgrounds of some views, floors lowered to where the landmark ends.
 
         Floors are estimated, and heights are tried.
         """
