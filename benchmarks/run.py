@@ -324,7 +324,7 @@ def chain() -> Table:
                 ("and bearing, on ranges", Matcher(opened, "refine", free=free), several[:100]),
                 ("D, δ before a wall", Matcher(opened, "refine", free=fixed, background=wall), many[:100]),
                 ("and bearing, before a wall", Matcher(opened, "refine", free=free, background=wall), many[:100]),
-                ("D, δ and the wall", Matcher(opened, "refine", free=fixed, background="auto"), many[:50]),
+                ("D, δ and the wall", Matcher(opened, "refine", free=fixed, background="auto"), many),
             ]
             rows += [(name, len(some), partial(likeliest.match, some)) for name, likeliest, some in likely]
             measured = [(name, n / median_seconds(work), n / processor_seconds(work)) for name, n, work in rows]
