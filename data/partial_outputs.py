@@ -71,7 +71,10 @@ def parse_part(text: str) -> tuple[int, int]:
 
     Returns
     -------
-    i, n : int
+    i : int
+        Which part.
+    n : int
+        How many parts there are.
 
     Raises
     ------

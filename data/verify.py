@@ -43,7 +43,7 @@ def verify_bank(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0
     sample : int
         How many random images to render again.
     seed : int
-        Which.
+        Which of them: the same seed takes the same ones.
 
     Returns
     -------
@@ -71,7 +71,7 @@ def verify_frames(path: str | os.PathLike[str], *, sample: int = 16, seed: int =
     sample : int
         How many random views to make again, with all frames of each.
     seed : int
-        Which.
+        Which of them: the same seed takes the same ones.
 
     Returns
     -------

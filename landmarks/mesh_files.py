@@ -50,16 +50,22 @@ class MeshReport:
 
     Parameters
     ----------
-    faces, vertices, bodies : int
-        Triangles, distinct points, and pieces that hang together.
+    faces : int
+        Triangles.
+    vertices : int
+        Distinct points.
+    bodies : int
+        Pieces that hang together.
     watertight : bool
         Whether every edge joins exactly two faces.
     outward : bool
         Whether the surface is wound outward throughout (only asked of a watertight mesh).
     extents_m : tuple of float
         Size of the bounding box.
-    area_m2, volume_m3 : float
-        Volume is that of a watertight mesh, negative if it is inside out; None of an open one.
+    area_m2 : float
+        Area of all triangles.
+    volume_m3 : float or None
+        Volume of a watertight mesh, negative if it is inside out; None of an open one.
     symmetry : int
         How many turns about z' leave the mesh as it is (:func:`phasemark.landmarks.mesh_symmetry`); 360 for a body of
         revolution.

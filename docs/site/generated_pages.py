@@ -72,7 +72,7 @@ def reference_page(*, linked: bool) -> str:
 def _described(module: ModuleType, name: str) -> str:
     """Return the first sentence of what a public name is; a constant has it in the text below its assignment."""
     value = getattr(module, name)
-    if callable(value):
+    if inspect.isroutine(value) or inspect.isclass(value):
         return first_line(value)
     for path in (ROOT / room for room in _sources(module)):
         body = ast.parse(path.read_text(encoding="utf-8")).body
@@ -265,7 +265,8 @@ def _template(node: ast.expr) -> str | None:
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if isinstance(node, ast.JoinedStr):
-        return "".join(part.value if isinstance(part, ast.Constant) else "…" for part in node.values)
+        text = "".join(part.value if isinstance(part, ast.Constant) else "…" for part in node.values)
+        return re.sub("…+", "…", text)  # two values beside each other
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
         left, right = _template(node.left), _template(node.right)
         return None if left is None or right is None else left + right
@@ -281,7 +282,7 @@ def messages() -> dict[str, set[str]]:
                 if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in found):
                     continue
                 text = _template(node.args[0]) if node.args else None
-                if text and re.search(r"[a-z]{3}", text):
+                if text and len(re.findall(r"[a-z]{3}", text)) > 1:
                     found[node.func.id].add(" ".join(text.split()))
     return found
 

@@ -34,8 +34,8 @@ def _mend(thing: griffe.Object) -> None:
                     for parameter in section.value:
                         _take_default(member, parameter)
                         _take_type(member, parameter)
-                        if str(parameter.annotation) == "path - like":  # the reader takes the hyphen for a minus
-                            parameter.annotation = "path-like"
+                        if "path - like" in str(parameter.annotation):  # the reader takes the hyphen for a minus
+                            parameter.annotation = str(parameter.annotation).replace("path - like", "path-like")
 
 
 def _take_type(owner: griffe.Function | griffe.Class, parameter: griffe.DocstringParameter) -> None:

@@ -115,7 +115,7 @@ def grid_loss(bank: Bank, n: int, *, seed: int = 0, workers: int | None = None) 
     n : int
         How many views: classes in turn, distance and angle uniform over the bank's, bearing and height 0.
     seed : int
-        Which.
+        Which views: the same seed takes the same ones.
     workers : int, optional
         Threads that render (None: one for each processor); the answer does not depend on it.
 

@@ -337,7 +337,7 @@ def run_trials(
     Raises
     ------
     UsageError
-        The matcher estimates other parameters than the setup say.
+        The matcher estimates other parameters than the setup says.
     """
     period = delta_period_rad(symmetry)
     sensor = renderer.sensor

@@ -194,8 +194,10 @@ def read_poses(
         the lens. In both cases optionally ``height_m`` (of the landmark above where it usually stands), ``wall_m``,
         ``frames``, and ``t_s`` or ``t_ms``, the time stamp in the clock of the frames. Lines that start with ``#`` and
         empty ones are skipped.
-    landmark_xy_m, landmark_yaw_rad : optional
-        Where the landmark stands, for the second form.
+    landmark_xy_m : (float, float)
+        Where the landmark stands on the map, for the second form.
+    landmark_yaw_rad : float
+        Which way its front looks there.
 
     Returns
     -------

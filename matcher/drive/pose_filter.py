@@ -81,6 +81,7 @@ class PoseFilter:
         Returns
         -------
         used : Placement or None
+            The one of the placements that was used; None: all are too far away.
         distance_squared : float
             Squared Mahalanobis distance of the nearest one, ~ χ²(3); infinite without any.
         """

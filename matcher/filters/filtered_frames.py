@@ -295,7 +295,9 @@ def kalman_step(
     Returns
     -------
     x : (s,) ndarray
+        State after the measurement.
     P : (s, s) ndarray
+        Its covariance.
 
     Raises
     ------

@@ -61,7 +61,7 @@ def expected_targets(counts: NDArray[np.float64], sensor: Sensor) -> ExpectedTar
     counts : (n, zones, bins) float64
         Expected counts of one frame, pile-up included.
     sensor : Sensor
-        With a [histogram] table.
+        With a table ``[histogram]``.
     """
     histogram, k = histogram_of(sensor), most_peaks(sensor)
     n, zones, bins = counts.shape

@@ -181,6 +181,7 @@ def solve_jointly(
     Parameters
     ----------
     evidence : Evidence
+        The recorded histograms.
     scales : (p,) float64, optional
         Size of a step of each parameter; None: 1.
     robust : bool

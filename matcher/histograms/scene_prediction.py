@@ -55,7 +55,7 @@ class ObjectScene:
         Object and support in the world frame, where they are supposed to be; the face attribute "part" is 1 on the
         object, 0 on the support.
     sensor : Sensor
-        With a [histogram] table.
+        With a table ``[histogram]``.
     centre_m : (3,) array_like
         Point of the mesh about which it is turned; None: the middle of the object's faces.
     """

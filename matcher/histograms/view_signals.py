@@ -55,7 +55,7 @@ class ViewSignals:
     mesh : trimesh.Trimesh or None
         Landmark frame, metres. None: there is nothing but what stands behind.
     sensor : Sensor
-        With a [histogram] table.
+        With a table ``[histogram]``.
     albedo : float
     """
 

@@ -76,8 +76,9 @@ def estimate_surroundings(
     Parameters
     ----------
     frames : FilteredFrames
+        Filtered frames.
     index : int
-        Which of them.
+        Which of them is looked at.
     landmark_scale : float
         How much brighter the landmark is than its model: albedos count relative to it.
     bearing_known : bool

@@ -62,11 +62,11 @@ def motion_test(frames: Frames) -> MotionTest:
     """Test whether camera and scene stood still while the frames at each position were taken.
 
     *Order.* With the centred ranks a of the n valid ranges of a pixel, in the order of time,
-    C = 1 − Σ(a_i − a_{i+1})² / (2 Σ a_i²). If all orders are equally probable, C has mean 0 and variance
+    C = 1 − Σ(aᵢ − aᵢ₊₁)² / (2 Σ aᵢ²). If all orders are equally probable, C has mean 0 and variance
     1/n − k/2n − (1 + k) / (2n(n − 1)) with k = Σa⁴ / (Σa²)², whatever the distribution of the noise and its ties
     (without ties it is that of Bartels 1982). The pixels are independent, so Σ C/var(C) over √(Σ 1/var(C)) is normal.
 
-    *Scatter.* The variance of a pixel over that of the law is χ²_ν/ν. The number of pixels that exceed
+    *Scatter.* The variance of a pixel over that of the law is χ²(ν)/ν. The number of pixels that exceed
     `EXCESS_VARIANCE` is binomial; half of the pixels have to.
 
     The p-value is twice the smaller of the two, and 1 for the order where the mean of C is below `LEAST_CORRELATION`.

@@ -60,10 +60,20 @@ class SweepTrials:
         NaN where there is none.
     bound, covariance : (n, m, p, p) float64
         NaN where a parameter is not estimated, and where a method has no covariance.
-    chi2, p_value, p_none, seconds : (n, m) float64
-        χ², p-value, probability of "no landmark", and time of a match in seconds.
-    dof, found, modes : (n, m) int64
-        `found` is the class's number, −1 for none.
+    chi2 : (n, m) float64
+        χ² of the best fit.
+    p_value : (n, m) float64
+        Its p-value.
+    p_none : (n, m) float64
+        Probability that there is no landmark.
+    seconds : (n, m) float64
+        Time of a match.
+    dof : (n, m) int64
+        Degrees of freedom of χ².
+    found : (n, m) int64
+        Number of the class, −1 for none.
+    modes : (n, m) int64
+        Explanations kept, the best included.
     accepted : (n, m) bool
         Whether the method accepted its match.
     """

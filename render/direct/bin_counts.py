@@ -147,8 +147,14 @@ def expected_counts(
 
     Parameters
     ----------
-    transients, sensor, axis, albedo
-        As for :func:`signal_counts`.
+    transients : (n, parts, zones, nodes) float64
+        From :func:`~phasemark.render.direct.transients.zone_transients`.
+    sensor : Sensor
+        The direct sensor.
+    axis : RangeAxis
+        Ranges of the nodes.
+    albedo : float or (parts,)
+        Of each part.
 
     Returns
     -------
@@ -185,8 +191,8 @@ def detected_counts(signal: NDArray[np.float64], sensor: Sensor) -> NDArray[np.f
 def piled_up(counts: NDArray[np.float64], cycles: float) -> NDArray[np.float64]:
     """Return the counts of first photons, from counts without pile-up.
 
-    p_j = (1 − Σ_{i<j} p_i)(1 − e^{−λ_j / cycles}), the share of cycles whose first photon falls into bin j; that is
-    e^{−Σ_{i<j} λ_i / cycles} − e^{−Σ_{i≤j} λ_i / cycles}.
+    pⱼ = (1 − Σ pᵢ)(1 − exp(−λⱼ / cycles)), the sum over all i < j, is the share of cycles whose first photon falls into
+    bin j. With Λⱼ = Σ λᵢ / cycles over all i ≤ j it is exp(−Λⱼ₋₁) − exp(−Λⱼ).
 
     Parameters
     ----------

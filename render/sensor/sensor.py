@@ -57,8 +57,10 @@ class Sensor(SensorQuantities):
     whole_image_px : (width, height), optional
         Size of the image of which this camera reads a part, in its own pixels: its principal point may lie as far
         outside the part as it lies in that image. None: this is the whole image.
-    pitch_deg, roll_deg : float
-        How the camera is mounted; pitch is positive looking down.
+    pitch_deg : float
+        How far the mounted camera looks down.
+    roll_deg : float
+        How far it is turned about its optical axis, clockwise as it looks.
     bearing_offset_deg : float
         Added to every bearing: the azimuth at which the camera sees what its mount points at.
     height_offset_m : float

@@ -29,12 +29,22 @@ class Comparison:
 
     Parameters
     ----------
-    figure, label : str
-        Which figure the points belong to, and which of its series they are.
-    x_name, y_name : str
-        What the numbers are, unit at the end.
-    x, predicted, simulated, std_error : (n,) float64
-        `std_error` is that of a simulated point about the prediction.
+    figure : str
+        Which figure the points belong to.
+    label : str
+        Which of its series they are.
+    x_name : str
+        Quantity along x, unit at the end.
+    y_name : str
+        Quantity along y, unit at the end.
+    x : (n,) float64
+        Where the points lie.
+    predicted : (n,) float64
+        What the law says there.
+    simulated : (n,) float64
+        What the simulated readings give.
+    std_error : (n,) float64
+        Standard error of a simulated point about the prediction.
     samples : (n,) int64
         Readings that a point is made of.
     compared : (n,) bool
