@@ -94,7 +94,7 @@ def _set_in_type(html: str) -> str:
     )
 
 
-_SUBSCRIPT = re.compile(r"(?<![\w.])([A-Za-zα-ωΣ])_([A-Za-zα-ω0-9]{1,4})(?!\w)")
+_SUBSCRIPT = re.compile(r"(?<![\w.])(?![xyz]_m\b)([A-Za-zα-ωΣ])_([A-Za-zα-ω0-9]{1,4})(?!\w)")
 """A letter with a short subscript; names of columns and fields stand in code."""
 _NUMBER = re.compile(r"\d+(?: \d{3})+(?!\d)|\d[\d.]*e-\d+")
 """A number with thin groups of thousands or a negative exponent."""
