@@ -47,6 +47,10 @@ BEARING_STD_RAD, TILT_STD_RAD = math.radians(1.5), math.radians(3.0)
 """Standard deviations of the bearing, and of pitch and roll, before a frame is seen, unless the matcher is told."""
 
 
+_PIXELS_AT_ONCE = 1 << 20
+"""Of all frames that are matched together. Each takes up to a kilobyte, for every candidate has an image of it."""
+
+
 class LikelihoodMatcher:
     """Estimates class and continuous view of a landmark; see :class:`~phasemark.matcher.Matcher` for the parameters."""
 
@@ -118,7 +122,7 @@ class LikelihoodMatcher:
         """Match filtered frames, in threads of their own parts of them; the answers do not depend on their number."""
         match = self._match_auto if self._auto else self._match_stated
         share = max(math.ceil(len(frames) / self._workers), 1)
-        share = min(share, self._setup.policy.frames_at_once)
+        share = min(share, self._setup.policy.frames_at_once, max(_PIXELS_AT_ONCE // self._setup.used.size, 1))
         parts = [frames[start : start + share] for start in range(0, len(frames), share)]
         if len(parts) < 2 or self._workers == 1:
             found = [match(part) for part in parts]

@@ -36,7 +36,8 @@ class SearchPolicy:
     min_returns : int
         Returns that a frame needs to be searched at all.
     frames_at_once : int
-        Frames that are matched together; memory grows with it.
+        Frames that are matched together at most; memory grows with it. Of images of more than 4096 pixels there are
+        fewer.
     cache_bytes : int
         Room for rendered images that other frames may start from too; frames taken at one place do. 0 keeps none.
     fine_grid, coarse_grid : (float, float)
