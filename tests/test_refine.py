@@ -28,6 +28,7 @@ from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import std_without_one_pixel, view_covariance
+from phasemark.matcher.nearest.bank_minima import SearchOfFrames, Starts
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE
 from phasemark.render import Background, Frames, Renderer, Views, capture, predicted_range_std, preset
 
@@ -281,6 +282,34 @@ def test_frames_before_several_backgrounds_are_matched_together_as_one_by_one(ba
         assert match.chi2 == pytest.approx(expected.chi2, rel=1e-6)
         assert (match.background is None) == (expected.background is None)
     assert sum(match.accepted for match in together) >= 6
+
+
+def test_each_candidate_has_the_wall_the_limits_and_the_search_of_its_frame(bank, renderers):
+    walls = [Background(wall_m=2.0), Background(wall_m=1.4)]
+    image = renderers["cone"].render([0.9, 0.9], background=walls)
+    evidence = Evidence.from_frames(kalman_filter(capture(image, SENSOR, rng=np.random.default_rng(2))), "ranges")
+    behind = Renderer(None, SENSOR).render([1.0, 1.0], background=walls).phasor.reshape(2, -1)
+    frame, class_index = np.array([1, 0, 1]), np.full(3, bank.classes.index("cone"))
+    settings = DescentSettings(VIEW[:2], np.ones(256, bool), phasor_behind=behind)
+    model = RenderedModel(bank).with_background(*walls)
+    problem = Problem(model, evidence, frame, class_index, settings, np.full(3, np.inf))
+    np.testing.assert_array_equal(problem.for_candidates(behind), behind[frame])
+    farthest = np.array([RenderedModel(bank, wall).limits()[1] for wall in walls])
+    far = np.array([[5.0, 0, 0, 0, 0, 0]])
+    np.testing.assert_array_equal(problem.clipped(np.repeat(far, 3, axis=0), np.arange(3))[:, 0], farthest[frame])
+    assert problem.some(np.array([1])).clipped(far.copy(), np.arange(1))[0, 0] == farthest[0]
+
+    class Only:
+        def __init__(self, k):
+            self.k = k
+
+        def starts(self, seen, n_modes, *, all_classes):
+            return Starts(np.zeros(1, np.int64), np.full(1, self.k), np.zeros((1, 6)), np.zeros(1))
+
+    searches: Any = [Only(0), Only(1)]
+    found = SearchOfFrames(searches, 0.1).of_frames(frame).starts(evidence.seen[frame], 2)
+    np.testing.assert_array_equal(found.class_index, frame)
+    np.testing.assert_array_equal(found.frame, [0, 1, 2])
 
 
 def test_a_wall_that_leaves_no_room_for_a_landmark_is_not_taken(bank, renderers, monkeypatch):
