@@ -312,6 +312,23 @@ def test_each_candidate_has_the_wall_the_limits_and_the_search_of_its_frame(bank
     np.testing.assert_array_equal(found.frame, [0, 1, 2])
 
 
+def test_fewer_frames_are_matched_together_where_images_are_large(bank, renderers, monkeypatch):
+    frames = noisy_frames(
+        renderers["cone"],
+        SENSOR,
+        Views.broadcast([0.9, 1.0, 1.1, 1.2, 1.3], 0.5),
+        TrialSetup(),
+        np.random.default_rng(3),
+    )
+    matcher = LikelihoodMatcher(bank, free=VIEW[:2], workers=1)
+    expected, sizes, match = matcher.match(frames), [], matcher._match_stated
+    monkeypatch.setattr(matcher, "_match_stated", lambda part: sizes.append(len(part)) or match(part))
+    monkeypatch.setattr("phasemark.matcher.likelihood.likelihood_matcher._PIXELS_AT_ONCE", 2 * 256 + 1)
+    found = matcher.match(frames)
+    assert sizes == [2, 2, 1]
+    assert [match.distance_m for match in found] == pytest.approx([match.distance_m for match in expected], abs=1e-9)
+
+
 def test_a_wall_that_leaves_no_room_for_a_landmark_is_not_taken(bank, renderers, monkeypatch):
     """Frames with damaged pixels led the fit there: the view then lay inside the landmark."""
 
