@@ -19,7 +19,7 @@ _FOLDERS = {
     "matcher/filters": "loops",
     "matcher/histograms": "background_search expected_targets histogram_table poisson_fit table_search target_matcher",
     "matcher/likelihood": "bank_images residuals",
-    "matcher/nearest": "bank_minima search templates",
+    "matcher/nearest": "bank_minima cells search templates",
     "render": "background compile_cache kernel unwrapping",
     "render/direct": "bin_counts fit_model footprints photon_counts sample_counts scene_samples targets transients",
     "render/exposure": "capture photoelectrons random_streams taps",

@@ -32,6 +32,7 @@ from phasemark.render.integral.slopes import STEP, SlopeSums
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.rigid import product
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import VIEW_FIELDS, Views
@@ -635,14 +636,17 @@ class Renderer:
         samples.face[samples.chosen[:rest]] = cast(rest)
 
     def _check_lens_outside(self, views: Views) -> None:
-        """Refuse views whose lens lies inside the landmark, or within a millimetre of its axis-aligned box."""
+        """Refuse views whose lens is inside the landmark's box and no farther from the axis than its vertices."""
         if not len(self.topology.faces):
             return
         low, high = self.topology.low, self.topology.high
         lens = views.lens_in_landmark()
-        near = np.flatnonzero(((lens > low - 1e-3) & (lens < high + 1e-3)).all(axis=1))
+        inside = ((lens > low - 1e-3) & (lens < high + 1e-3)).all(axis=1)
+        if inside.any():
+            radius = float(np.hypot(*self.topology.vertices[:, :2].T).max())
+            inside &= np.hypot(lens[:, 0], lens[:, 1]) < radius + 1e-3
+        near = np.flatnonzero(inside)
         if near.size:
-            radius = math.hypot(*np.abs([low[:2], high[:2]]).max(axis=0))
             raise UsageError(
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
@@ -735,10 +739,10 @@ def _poses(views: Views, background: NDArray[np.float64], camera: Camera) -> Pos
     rotation, translation = views.landmark2cam()
     return Poses(
         views.lens_in_landmark(),
-        np.ascontiguousarray(camera.level.T @ rotation),
-        np.ascontiguousarray(translation @ camera.level),
+        product(camera.level.T, rotation),
+        product(translation[:, None], camera.level)[:, 0],
         views.bearing_rad,
-        np.ascontiguousarray(views.tilt2level() @ camera.level),
+        product(views.tilt2level(), camera.level),
         np.ascontiguousarray(background),
     )
 

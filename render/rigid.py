@@ -8,6 +8,21 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 
 
+def product(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return matrix products (…, i, j) of stacks of (…, i, 3) and (…, 3, j) matrices, each summed in the same order.
+
+    A BLAS library sums in an order that depends on the processor and on how many matrices there are. One bit of a pose
+    moves an image by up to 1e-10 of its light, because pieces of a pixel narrower than that are not sampled.
+
+    Parameters
+    ----------
+    left, right : (…, i, 3) and (…, 3, j) float64
+        The leading axes broadcast.
+    """
+    first, second, third = (left[..., k, None] * right[..., k, None, :] for k in range(3))
+    return np.asarray((first + second) + third)
+
+
 def tilt2level(pitch_rad: NDArray[np.float64], roll_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotations Ry(pitch) · Rx(roll) from a tilted to the level frame, (n, 3, 3).
 

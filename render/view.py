@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
-from phasemark.render.rigid import rigid_transforms, tilt2level
+from phasemark.render.rigid import product, rigid_transforms, tilt2level
 
 if TYPE_CHECKING:
     from phasemark.render.sensor.sensor import Sensor
@@ -225,8 +225,8 @@ class Views:
         )
         if not self.are_tilted:
             return rotation, translation
-        tilt = self.tilt2level()
-        return np.einsum("nji,njk->nik", tilt, rotation), np.einsum("nji,nj->ni", tilt, translation)
+        level2tilt = self.tilt2level().transpose(0, 2, 1)
+        return product(level2tilt, rotation), product(level2tilt, translation[..., None])[..., 0]
 
     @classmethod
     def from_landmark2cam(cls, landmark2cam: ArrayLike) -> Views:

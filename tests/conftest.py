@@ -2,6 +2,9 @@
 
 import os
 import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +16,17 @@ os.environ.setdefault("MPLBACKEND", "agg")
 
 # A shell starts background jobs with SIGINT ignored, and programs inherit that: interrupted ones would not notice.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile once for all test processes: this runs in the one that starts them, too."""
+    if not config.getoption("numprocesses", None) or config.option.collectonly:
+        return
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    command = [sys.executable, "-m", "programs.compile_kernels"]
+    running = [subprocess.Popen([*command, *parts], env=environment) for parts in (["rendering", "matching"], ["rest"])]
+    if any([process.wait() for process in running]):
+        raise pytest.UsageError("compiling what the tests share failed")
 
 
 @pytest.fixture

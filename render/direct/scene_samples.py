@@ -26,7 +26,7 @@ from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.kernel import kernel
 from phasemark.render.renderer import _Buffers, _poses, _topology
-from phasemark.render.rigid import rigid_transforms
+from phasemark.render.rigid import product, rigid_transforms
 from phasemark.render.view import Views
 
 LOWER, UPPER, WALL, FLOOR = 0, 1, 2, 3
@@ -114,9 +114,9 @@ class SceneMesh:
         transforms = rigid_transforms(landmark2cam)
         rotation, translation = transforms[:, :3, :3], transforms[:, :3, 3]
         poses = Poses(
-            np.ascontiguousarray(-np.einsum("nji,nj->ni", rotation, translation)),
-            np.ascontiguousarray(grid.level.T @ rotation),
-            np.ascontiguousarray(translation @ grid.level),
+            -product(translation[:, None], rotation)[:, 0],
+            product(grid.level.T, rotation),
+            product(translation[:, None], grid.level)[:, 0],
             np.zeros(len(transforms)),
             np.repeat(grid.level[None], len(transforms), axis=0),
             parameters_of_views(None, len(transforms)),

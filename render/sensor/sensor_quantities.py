@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.render.rigid import tilt2level
 from phasemark.render.sensor.correlation import Harmonic, pulse_harmonics, square_harmonics
 from phasemark.render.sensor.frequencies import common_divisor_hz
 from phasemark.render.sensor.sensor_fields import SensorFields
@@ -22,6 +23,16 @@ class SensorQuantities(SensorFields):
     def tan_half_angles(self) -> tuple[float, float]:
         """Tangents of the horizontal and vertical half angle; with a lens, half the width and height as tangents."""
         return math.tan(math.radians(self.half_angle_h_deg)), math.tan(math.radians(self.half_angle_v_deg))
+
+    @property
+    def columns_per_tangent(self) -> float:
+        """Columns in a unit of the tangent of a horizontal angle."""
+        return self.cols / (2 * self.tan_half_angles[0])
+
+    @property
+    def pixel_rad(self) -> float:
+        """Horizontal angle that a pixel in the middle of the image sees."""
+        return math.atan(1 / self.columns_per_tangent)
 
     @property
     def bends_rays(self) -> bool:
@@ -46,10 +57,7 @@ class SensorQuantities(SensorFields):
     @property
     def cam2level(self) -> NDArray[np.float64]:
         """Rotation Ry(pitch) · Rx(roll) from the tilted camera to the level one, (3, 3)."""
-        pitch, roll = math.radians(self.pitch_deg), math.radians(self.roll_deg)
-        ry = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]])
-        rx = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
-        return np.asarray(ry @ rx)
+        return np.asarray(tilt2level(*np.radians([[self.pitch_deg], [self.roll_deg]]))[0])
 
     @property
     def zone_offsets(self) -> NDArray[np.float64]:

@@ -1,0 +1,52 @@
+"""Compile what many tests call, before the processes that share them start.
+
+``python -m programs.compile_kernels PART …``. Processes that start together would each compile all of it.
+"""
+
+import sys
+
+import numpy as np
+from builders import pure_image
+from oracles.exact_pixels import exact_pixels
+
+from phasemark.data import BankPlan, build_bank
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.matcher import Matcher, kalman_filter, phasor_mean
+from phasemark.render import Background, Renderer, Sensor, Views, capture, preset
+
+PMD = preset("pmd-16x16")
+LENS = Sensor.from_opencv([[40.0, 0.0, 7.5], [0.0, 40.0, 7.5], [0.0, 0.0, 1.0]], [-0.3, 0.1, 0, 0], size=(16, 16))
+BEHIND = Background(wall_m=3.0, floor_m=0.5)
+MESH = build_mesh(catalog()["cylinder"])
+
+
+def rendering() -> None:
+    """Images and their slopes, through a plain camera and a lens."""
+    for sensor in (PMD, LENS):
+        renderer = Renderer(MESH, sensor)
+        renderer.render(1.0, 0.3, background=BEHIND)
+        renderer.jacobian(1.0, 0.3, background=BEHIND)
+    Renderer(MESH, PMD, intersector="float64").render(1.0)
+
+
+def the_rest() -> None:
+    """Frames, their filters, and the oracle of exact pixels."""
+    frames = capture(pure_image(np.full((2, 16, 16), 1.0), PMD), PMD, rng=np.random.default_rng(0), n_frames=3)
+    kalman_filter(frames)
+    phasor_mean(frames)
+    exact_pixels("cylinder", PMD, Views.broadcast(1.0, 0.3), np.array([[8, 8]]), background=BEHIND)
+
+
+def matching() -> None:
+    """Matching of ranges and phasors, with and without a background."""
+    bank = build_bank(BankPlan(classes=("cylinder", "cone"), distance_m="0.9:1.1:0.02", delta_deg="0:180:4"))
+    for behind in (None, BEHIND):
+        image = Renderer(MESH, PMD).render(1.0, 0.3, background=behind)
+        filtered = kalman_filter(capture(image, PMD, rng=np.random.default_rng(0), n_frames=50))
+        for on in ("ranges", "phasors"):
+            Matcher(bank, method="refine", on=on, background=behind).match(filtered)
+
+
+if __name__ == "__main__":
+    for part in sys.argv[1:]:
+        {"rendering": rendering, "matching": matching, "rest": the_rest}[part]()
