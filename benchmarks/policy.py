@@ -26,7 +26,6 @@ NO_SEARCH = (
     "cache_bytes",
     "same_m",
     "same_rad",
-    "largest_scale",
     "tolerated_sigma",
     "ambiguity",
 )

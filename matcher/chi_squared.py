@@ -9,22 +9,30 @@ from scipy import special
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 
 
-def p_values_of(
-    cost: NDArray[np.float64], dof: NDArray[np.int64], frames: FilteredFrames, frame: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return the probability of a larger χ² for every fit; 0 where nothing is left to test.
-
-    Where the variances were estimated from the scatter of ν + 1 frames, each squared residual follows F(1, ν); their
-    sum is given a scaled χ² of the same mean and variance.
-    """
-    freedom = np.maximum(dof, 1).astype(np.float64)
+def scatter_freedom(frames: FilteredFrames) -> NDArray[np.float64]:
+    """Return ν of each frame whose variances were estimated from the scatter of ν + 1 exposures; infinite elsewhere."""
     if not frames.std_from_scatter:
-        p = special.chdtrc(freedom, cost)
-    else:
-        n = np.where(frames.n_effective > 0, frames.n_effective, np.nan).reshape(len(frames), -1)
-        nu = np.array([np.nanmedian(row) if np.isfinite(row).any() else 0.0 for row in n])[frame] - 1
-        nu = np.maximum(nu, 5.0)  # the variance of F(1, ν) exists above 4
-        mean = freedom * nu / (nu - 2)
-        variance = freedom * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
-        p = special.chdtrc(2 * mean**2 / variance, cost * 2 * mean / variance)
-    return np.where(dof > 0, p, 0.0)
+        return np.full(len(frames), np.inf)
+    n = np.where(frames.n_effective > 0, frames.n_effective, np.nan).reshape(len(frames), -1)
+    nu = np.array([np.nanmedian(row) if np.isfinite(row).any() else 0.0 for row in n]) - 1
+    return np.asarray(np.maximum(nu, 5.0))  # the variance of F(1, ν) exists above 4
+
+
+def p_values_of(
+    cost: NDArray[np.float64], dof: NDArray[np.integer] | NDArray[np.float64], nu: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the probability of a larger χ² for every fit, (m,); 0 where nothing is left to test.
+
+    Where the variances were estimated from the scatter of ν + 1 frames (`nu`, (m,)), each squared residual follows
+    F(1, ν); their sum is given a scaled χ² of the same mean and variance.
+    """
+    freedom, nu = np.maximum(dof, 1.0), np.minimum(nu, 1e9)
+    mean = freedom * nu / (nu - 2)
+    variance = freedom * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
+    p = special.chdtrc(2 * mean**2 / variance, cost * 2 * mean / variance)
+    return np.asarray(np.where(dof > 0, p, 0.0))
+
+
+def worse_of_two(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the p-value of the smaller of two independent ones (Šidák)."""
+    return np.asarray(1 - (1 - np.minimum(first, second)) ** 2)

@@ -90,6 +90,11 @@ class Match:
     systematic : mapping of str to ndarray
         What of `covariance` all frames of the camera share, by its cause: "calibration" and "declared". The rest is
         noise.
+    may_be_mirrored : bool or None
+        Of an accepted answer of the method `refine`, whether the frame mirrored left to right may be a frame of the
+        bank too: then nothing in it shows whether the image is mirrored, as reading it the wrong way leaves it, and δ
+        and bearing may have the wrong sign. A landmark with a plane of symmetry through its axis, as all of the
+        catalogue, never shows it. None where it was not tested.
     reason : {"", "no landmark", "poor fit", "undetermined", "ambiguous"}
         Why the answer is refused; empty if it is accepted. "poor fit": χ² fails its test. "undetermined": the frame
         leaves some free parameter open by more than the matcher tolerates. "ambiguous": another class or a view
@@ -113,6 +118,7 @@ class Match:
     condition_number: float = math.nan
     weak_direction: Mapping[str, float] = field(default_factory=dict)
     background: Background | None = None
+    may_be_mirrored: bool | None = None
     reason: Reason = ""
     systematic: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     pitch_rad: float = 0.0
@@ -156,6 +162,7 @@ class Match:
             ],
             "condition_number": plain(self.condition_number),
             "weak_direction": dict(self.weak_direction),
+            "may_be_mirrored": self.may_be_mirrored,
             "wall_m": None if self.background is None else self.background.wall_m,
         }
 

@@ -25,6 +25,8 @@ MUST_RETURN_COVERAGE = 0.3
 """A pixel that sees this much of the landmark must return something."""
 MAY_RETURN_COVERAGE = 0.005
 """A pixel that sees less of the landmark than this returns nothing, unless a background does."""
+FILLED_COVERAGE = 0.995
+"""A pixel that sees this much of the landmark shows nothing of what stands behind it."""
 MIN_RETURNS = 3
 """A frame with fewer returns decides nothing: two numbers are sought."""
 _USUAL_LIMIT_RAD = 0.1

@@ -212,11 +212,12 @@ def test_all_six_numbers_are_found_on_phasors_of_two_frequencies(bank, backgroun
         roll_std_rad=0.1,
     )  # fmt: skip
     matches = matcher.match(frames)
-    assert set(matches.class_name) == {"cone"}
-    assert matches.accepted.sum() >= n - 1
+    found = matches.accepted
+    assert found.sum() >= n - 1  # a frame may end in another minimum, and is refused
+    assert {match.class_name for match in matches if match.accepted} == {"cone"}
     error = np.column_stack([getattr(matches, name) - getattr(views, name) for name in VIEW])
     error[:, 1] -= math.pi * np.round(error[:, 1] / math.pi)
-    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(matches.covariance), error)
+    nees = np.einsum("ni,nij,nj->n", error[found], np.linalg.inv(matches.covariance[found]), error[found])
     # covariances are local beside edges before a wall: no error may be far beyond them; 99.9 % of the median of 8
     assert np.median(nees) < 2.3 * stats.chi2.median(6)
     assert nees.max() < 60
@@ -388,6 +389,6 @@ def test_a_refused_frame_of_two_frequencies_is_diagnosed(bank):
     for on in ("ranges", "phasors"):
         matcher = Matcher(bank, "refine", free=VIEW[:2], on=on)
         found = diagnose(matcher, frames, seconds=30)
-        assert [change.parameter for change in found.changes] == ["bearing_offset_deg"]
-        assert found.changes[0].value == pytest.approx(6.0, abs=0.2)
+        assert [change.parameter for change in found.changes] == ["free"]
+        assert math.degrees(found.match.bearing_rad) == pytest.approx(6.0, abs=0.2)
         assert found.match.class_name == "cone"

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import FilteredFrames, Matcher, kalman_filter, phasor_mean
+from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
 from phasemark.matcher.accuracy.trials import TrialSetup, noisy_frames, run_trials
 from phasemark.matcher.filters import noise_free
 from phasemark.matcher.filters.filtered_frames import PixelState
@@ -22,9 +22,7 @@ from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.contradictions import whole_cost
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher
-from phasemark.matcher.likelihood.look_alikes import _most_promising
 from phasemark.matcher.likelihood.problem import DescentSettings, Problem
-from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import std_without_one_pixel, view_covariance
@@ -195,7 +193,7 @@ def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, render
         RenderedModel(bank), evidence, np.zeros(1, np.int64), np.array([bank.classes.index("cone")]),
         DescentSettings(free, used, huber), np.full(1, np.inf),
     )  # fmt: skip
-    state = problem.start(np.array([[1.02, 0.5, 0.0, 0.0, 0.0, 0.0]]), False)
+    state = problem.start(np.array([[1.02, 0.5, 0.0, 0.0, 0.0, 0.0]]))
     p = len(problem.columns)
     covariance = view_covariance(problem, state.sums)
     found = std_without_one_pixel(problem, state, np.array([0]), state.images.slope, state.sums.information, covariance)
@@ -228,7 +226,7 @@ def test_the_whole_cost_counts_each_contradicted_and_each_undecided_pixel_once(b
     class_index = np.array([bank.classes.index("cone")])
     settings = DescentSettings(VIEW[:2], np.ones(256, bool))
     problem = Problem(RenderedModel(bank), evidence, np.zeros(1, np.int64), class_index, settings, np.full(1, np.inf))
-    at = problem.start(np.array([[1.02, 0.5, 0.0, 0.0, 0.0, 0.0]]), False)
+    at = problem.start(np.array([[1.02, 0.5, 0.0, 0.0, 0.0, 0.0]]))
     use = at.use.copy()
     use[0, np.flatnonzero(at.use[0] & evidence.seen.returned[0] & (at.images.coverage[0] < 0.9))[:5]] = False
     compared = use & (evidence.weight > 0)
@@ -303,11 +301,11 @@ def test_each_candidate_has_the_wall_the_limits_and_the_search_of_its_frame(bank
         def __init__(self, k):
             self.k = k
 
-        def starts(self, seen, n_modes, *, all_classes):
+        def starts(self, seen, limit):
             return Starts(np.zeros(1, np.int64), np.full(1, self.k), np.zeros((1, 6)), np.zeros(1))
 
     searches: Any = [Only(0), Only(1)]
-    found = SearchOfFrames(searches, 0.1).of_frames(frame).starts(evidence.seen[frame], 2)
+    found = SearchOfFrames(searches, 0.1).of_frames(frame).starts(evidence.seen[frame], np.full(len(frame), 300.0))
     np.testing.assert_array_equal(found.class_index, frame)
     np.testing.assert_array_equal(found.frame, [0, 1, 2])
 
@@ -457,7 +455,7 @@ def test_rendering_only_the_rows_that_turn_gives_the_whole_image(bank, on):
     settings = DescentSettings(VIEW[:2], np.ones(256, bool), phasor_behind=behind[None])
     cone, evidence = np.full(2, bank.classes.index("cone")), Evidence.from_frames(frames, on)
     problem = Problem(RenderedModel(bank, WALL), evidence, np.arange(2), cone, settings, np.full(2, np.inf))
-    state = problem.start(np.array([[1.0, 0.6, 0, 0, 0, 0], [1.0, 1.1, 0, 0, 0, 0]]), False)
+    state = problem.start(np.array([[1.0, 0.6, 0, 0, 0, 0], [1.0, 1.1, 0, 0, 0, 0]]))
     theta = state.theta.copy()
     theta[:, 1] += 0.01
     if on == "phasors":
@@ -538,23 +536,3 @@ def two_matchers():
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damaged_frames_get_an_answer_and_never_a_view_that_is_not_a_number(two_matchers, renderers, **damage):
     check_damaged(two_matchers, renderers["post"], **damage)
-
-
-def test_look_alikes_are_chosen_by_how_well_ranges_agree_on_phasors_too(bank, renderers):
-    image = renderers["cone"].render(distance_m=1.1, delta_rad=0.5, bearing_rad=0.05)
-    frames = phasor_mean(capture(image, SENSOR, rng=np.random.default_rng(5), n_frames=50))
-    c = bank.classes.index("cone")
-    true = np.array([[1.1, 0.5, 0.05, 0.0, 0.0, 0.0]])
-    rng = np.random.default_rng(6)
-    views = np.repeat(true, 60, axis=0)
-    views[:, 1:3] += np.column_stack([rng.uniform(-0.3, 0.3, 60), rng.uniform(-0.02, 0.02, 60)])
-    kept = []
-    for on in ("ranges", "phasors"):
-        matcher = LikelihoodMatcher(bank, free=VIEW[:3], on=on)
-        scene, evidence = matcher._scene, Evidence.from_frames(frames, on)
-        first, of_class = np.zeros(1, np.int64), np.full(60, c)
-        fits = refine(scene.final, evidence, first, of_class[:1], true, scene.settings(matcher._setup))
-        kept.append(_most_promising(matcher._setup, scene.final, evidence, fits, np.repeat(first, 60), of_class, views))
-    assert len(kept[0][2]) == matcher._setup.policy.slides_refined
-    np.testing.assert_array_equal(kept[0][2][:, 1:], kept[1][2][:, 1:])
-    np.testing.assert_allclose(kept[0][2][:, 0], kept[1][2][:, 0], rtol=1e-15)  # moved to the measured distance

@@ -15,7 +15,7 @@ def test_a_value_out_of_range_names_its_field(field):
             replace(SearchPolicy(), **{field: bad})  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("field", ["doubtful_p", "hopeless_p", "ambiguity"])
+@pytest.mark.parametrize("field", ["doubtful_p", "ambiguity"])
 def test_a_probability_of_one_is_refused(field):
     with pytest.raises(UsageError, match=rf"'policy': '{field}' must be in \(0, 1\), got 1.0"):
         replace(SearchPolicy(), **{field: 1.0})  # type: ignore[arg-type]
@@ -30,4 +30,4 @@ def test_a_grid_takes_two_positive_steps():
 
 def test_a_policy_is_frozen():
     with pytest.raises(AttributeError):
-        SearchPolicy().modes = 3
+        SearchPolicy().max_iterations = 3

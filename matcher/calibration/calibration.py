@@ -36,7 +36,7 @@ from phasemark.matcher.calibration.pose_errors import estimate_pose_std
 from phasemark.matcher.calibration.pose_track import LONGEST_GAP_S, PoseTrack
 from phasemark.matcher.calibration.recording_fit import Recorded, Recording, prior_std
 from phasemark.matcher.calibration.result import Calibration
-from phasemark.matcher.chi_squared import p_values_of
+from phasemark.matcher.chi_squared import p_values_of, scatter_freedom
 from phasemark.matcher.filters.filtered_frames import (
     FilteredFrames,
     PixelState,
@@ -868,7 +868,7 @@ def _degrees_of_freedom(fit: Fit, place: Place) -> int:
 def _fit_probability(fit: Fit, place: Place, frames: FilteredFrames, *, less: float = 0.0) -> float:
     """Return the chance of a χ² as large as that of a place less something."""
     dof = np.array([_degrees_of_freedom(fit, place)])
-    return float(p_values_of(np.array([max(place.cost - less, 0.0)]), dof, frames, np.array([0]))[0])
+    return float(p_values_of(np.array([max(place.cost - less, 0.0)]), dof, scatter_freedom(frames)[:1])[0])
 
 
 def _concluded(

@@ -78,6 +78,7 @@ def match_frames(
             _note_motion(measured, frames)
         printed = _Answers(search, place, results, landmarks, plots, moving)
         printed.match_all(matcher, positions)
+        printed.note_mirrored()
         printed.diagnose(matcher, reading)
         if results.as_json:
             echo_json({"bank": str(bank), "frames": str(frames), "matches": printed.answers})
@@ -161,7 +162,7 @@ class _Answers:
         self.answers: list[dict[str, Any]] = []  # all of them only for --json, whose answers are one list
         self.drawn: dict[int, tuple[FilteredFrames, Match]] = {}
         self._refused: tuple[int, FilteredFrames] | None = None
-        self._n_accepted = 0
+        self._n_accepted = self._n_mirrored = 0
 
     def match_all(self, matcher: Matcher, positions: Frames | DirectPositions) -> None:
         """Match all positions, and print each batch as soon as it is known."""
@@ -194,6 +195,7 @@ class _Answers:
         if self._landmarks is not None:
             answer["poses"] = self._place.poses(match, self._landmarks)
         self._n_accepted += match.accepted
+        self._n_mirrored += bool(match.may_be_mirrored)
         if isinstance(batch, DirectBatch):
             return answer
         if index in self._plots:
@@ -212,6 +214,14 @@ class _Answers:
             rows = match_rows(answers, start, self._moving)
             self._table = self._table or Table(list(rows[0]))
             self._table.echo([list(row.values()) for row in rows])
+
+    def note_mirrored(self) -> None:
+        """Say where nothing shows whether images are mirrored."""
+        if self._n_mirrored:
+            tell(
+                f"note: {self._n_mirrored} of {self._n_accepted} accepted answers may be those of images mirrored left"
+                " to right, which their landmarks do not show: check it once with something held to one side (--flip-h)"
+            )
 
     def diagnose(self, matcher: Matcher, reading: FrameReading) -> None:
         """Name the setting that would make the first refused position fit."""

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from phasemark.matcher.chi_squared import p_values_of
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.information import weak_direction
 from phasemark.matcher.likelihood.fits import Fits, distinct
@@ -20,7 +19,7 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import Background
 from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
 
-__all__ = ["is_determined", "rank"]
+__all__ = ["is_acceptable", "is_determined", "rank"]
 
 
 def rank(
@@ -43,8 +42,6 @@ def rank(
     backgrounds : sequence of Background or None
         What the fits assume behind the landmark of each frame.
     """
-    tolerated = setup.policy.largest_scale**2 if setup.unknown else 1.0
-    p_values = p_values_of(fits.tested / tolerated, fits.dof, frames, fits.frame)
     order = np.lexsort((fits.cost, fits.frame))
     first = np.searchsorted(fits.frame[order], np.arange(len(frames) + 1))
     chi2_at_edge = np.asarray(special.chdtri(np.maximum(fits.dof, 1), setup.false_alarm), np.float64)
@@ -52,7 +49,7 @@ def rank(
     for k in range(len(frames)):
         own = order[first[k] : first[k + 1]]
         own = own[np.isfinite(fits.cost[own])]
-        answers.append(_answer(setup, fits, own, p_values, chi2_at_edge, float(bare[k]), backgrounds[k]))
+        answers.append(_answer(setup, fits, own, chi2_at_edge, float(bare[k]), backgrounds[k]))
     return answers
 
 
@@ -68,11 +65,17 @@ def is_determined(setup: Setup, std: NDArray[np.float64], symmetry: int) -> bool
     return bool((error <= tolerance).all())
 
 
+def is_acceptable(setup: Setup, fits: Fits, k: int) -> bool:
+    """Return whether a fit would be accepted if nothing else explained its frame."""
+    if not fits.stands_out[k] or not fits.p_value[k] >= setup.false_alarm:
+        return False
+    return is_determined(setup, fits.std_without_one[k], setup.shapes.symmetry[fits.class_index[k]])
+
+
 def _answer(
     setup: Setup,
     fits: Fits,
     own: NDArray[np.int64],
-    p_values: NDArray[np.float64],
     chi2_at_edge: NDArray[np.float64],
     bare: float,
     background: Background | None,
@@ -87,7 +90,7 @@ def _answer(
     # "none" weighs as a fit that just fails a χ² test with the noise as stated, or as a scene without a landmark
     cost_of_unknown = DISAGREEMENT * float(fits.unexplained[best])
     weight = _weights(np.append(fits.cost[kept], min(bare, float(chi2_at_edge[best]) + cost_of_unknown)))
-    reason = _reason(setup, fits, kept, weight[:-1], float(p_values[best]), bare)
+    reason = _reason(setup, fits, kept, weight[:-1], bare)
     candidates = _candidates(setup, fits, kept, weight)
     condition, weak = weak_direction(setup.free, information=fits.information[best])
     covariance = fits.covariance[best]
@@ -105,7 +108,7 @@ def _answer(
         covariance=covariance.copy() if np.isfinite(covariance).all() else None,
         chi2=float(fits.tested[best]),
         dof=int(fits.dof[best]),
-        p_value=float(p_values[best]),
+        p_value=float(fits.p_value[best]),
         class_probability=_class_probability(names, candidates, float(weight[-1])),
         alternatives=candidates[1:] if is_landmark else candidates,
         symmetry=setup.shapes.symmetry[fits.class_index[best]],
@@ -142,14 +145,12 @@ def _class_probability(names: Sequence[str], candidates: Sequence[Candidate], no
     return {**dict.fromkeys(names, 0.0), **of_class, "none": none}
 
 
-def _reason(
-    setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float64], p_value: float, bare: float
-) -> Reason:
+def _reason(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float64], bare: float) -> Reason:
     """Return why the best fit of a frame is refused; empty where it is accepted."""
     best = kept[0]
     if not fits.capped[best] < bare:
         return "no landmark"
-    if p_value < setup.false_alarm or (setup.unknown and fits.agreeing[best] < fits.elsewhere[best]):
+    if fits.p_value[best] < setup.false_alarm or not fits.stands_out[best]:
         return "poor fit"
     if setup.unknown and fits.explained[best] < setup.fewest_explained:
         return "undetermined"
@@ -166,16 +167,15 @@ def _is_ambiguous(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.
     if weight[other].sum() > policy.ambiguity * weight.sum():
         return True
     # where a landmark looks alike from two sides, a single pixel at an edge must not decide between them
-    enough = DISAGREEMENT * (policy.pixels_against_far_view if setup.unknown else 1)
-    alike = np.flatnonzero(~other & (fits.cost[kept] < fits.cost[best] + enough))
+    alike = np.flatnonzero(~other & (fits.cost[kept] < fits.cost[best] + setup.rival_cost))
     if len(alike) < 2:
         return False
     near = np.array(kept)[alike]
     apart = np.abs(fits.view[near] - fits.view[best])
-    apart[:, 1] = np.abs(
-        wrap_delta_difference_rad(apart[:, 1], delta_period_rad(setup.shapes.symmetry[fits.class_index[best]]))
-    )
+    period = delta_period_rad(setup.shapes.symmetry[fits.class_index[best]])
+    apart[:, 1] = np.abs(wrap_delta_difference_rad(apart[:, 1], period))
     own = [VIEW.index(name) for name in setup.free]
     std = np.sqrt(np.nan_to_num(np.einsum("kpp->kp", fits.covariance[near]), posinf=0.0))
     apart[1:, own] += policy.tolerated_sigma * std[1:]  # the truth may be on the far side of the other view
+    apart[:, 1] = np.minimum(apart[:, 1], period / 2)
     return bool((apart > [setup.tolerance[name] for name in VIEW]).any())

@@ -15,10 +15,9 @@ from phasemark.matcher.likelihood.background_estimate import (
     fit_background,
     without_background,
 )
-from phasemark.matcher.likelihood.candidates import fit_modes, fit_other_classes
+from phasemark.matcher.likelihood.candidates import fit_views
 from phasemark.matcher.likelihood.fits import BETTER_COST, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.look_alikes import fit_look_alikes
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence
@@ -154,10 +153,7 @@ class AutoBackground:
         view = own.view[source]
         view[:, 1] += np.tile(np.arange(1, n), len(best)) * period / n
         scene = self._scene(_standing(backgrounds, which))
-        settings, margin = scene.settings(self._setup), self._setup.policy.margin_cost
-        frame, class_index = own.frame[source], own.class_index[source]
-        found = fit_modes(self._setup, scene.final, evidence[which], frame, class_index, view, settings, margin)
-        return _numbered(found, which)
+        return _numbered(fit_views(self._setup, scene, evidence[which], replace(own[source], view=view)), which)
 
     def _with_better_backgrounds(
         self, which: NDArray[np.int64], backgrounds: list[Background | None], evidence: Evidence, fits: Fits
@@ -197,8 +193,6 @@ class AutoBackground:
             some, scene = evidence[which], self._scene(_standing(moved, which))
             settings = replace(scene.settings(setup), look_beside_rad=policy.close_by_rad)
             again = refine(scene.final, some, starts.frame, starts.class_index, starts.view, settings)
-            others = fit_other_classes(setup, scene.final, some, again, settings)
-            again = Fits.joined([again, others, fit_look_alikes(setup, scene, some, again)])
             before = least_of_frame(found[1], len(backgrounds))[which]
             now = least_of_frame(again, len(which))
             found = _taken(found, (moved, _numbered(again, which)), which[now < before])

@@ -29,8 +29,8 @@ from phasemark.render import PhasorImages
 _FAINT = 1e-5
 """Coverages this close to 0 or 1 count as 0 or 1."""
 _STRAIGHT = 2e-3
-"""Second difference of a pixel's brightness, over the brightest, that a smooth change may have: from the inverse square
-of the distance it is 3e-4 at 1 m; an edge that comes in changes it by some hundredths."""
+"""Second difference of a pixel's brightness, over the brightest, that a smooth change may have, the inverse square of
+the distance taken out; an edge that comes in changes it by some hundredths."""
 _DIM = 0.05
 """Where a neighbour is dimmer than this share of the brightest one, interpolate linearly."""
 
@@ -100,7 +100,7 @@ class BankModel:
         )
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
-        """Interpolate; only distance and δ can be free."""
+        """Interpolate; distance and δ can be free, and without a background the bearing too."""
         m, pixels = len(view), self._sensor.rows * self._sensor.cols
         phasor, slope = np.zeros((m, pixels), np.complex128), np.zeros((m, 2, pixels), np.complex128)
         shade = np.zeros((m, 2, pixels))
@@ -108,9 +108,31 @@ class BankModel:
         _interpolate(
             class_index, view, *self._grid(), self._upper, self._lower, *self._behind, frame, phasor, slope, shade
         )
+        if "bearing_rad" in free or view[:, VIEW.index("bearing_rad")].any():
+            phasor, slope, shade = self._aside(view[:, VIEW.index("bearing_rad")], phasor, slope, shade)
         order = [VIEW.index(name) for name in free]
         picked = slope if order == [0, 1] else slope[:, order]
         return ModelImages(phasor, picked, shade[:, 0], shade[:, 1])
+
+    def _aside(
+        self,
+        bearing_rad: NDArray[np.float64],
+        phasor: NDArray[np.complex128],
+        slope: NDArray[np.complex128],
+        shade: NDArray[np.float64],
+    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128], NDArray[np.float64]]:
+        """Return images moved aside, by parts of columns mixed from two, with the slope by the bearing as the third.
+
+        A turn of the camera moves the image by tan b / (2 tan α / columns), but for what it does to rows and to columns
+        far from the middle, and a pixel's light comes from two pixels in the shares of their areas. At edges that is an
+        approximation: a true view costs up to some hundreds more (PHYSICS section 7), in the median 50.
+        """
+        m, _, pixels = slope.shape
+        tangent, per_column = np.tan(bearing_rad), self._sensor.columns_per_tangent
+        moved, slopes, shades = np.empty_like(phasor), np.empty((m, 3, pixels), np.complex128), np.empty_like(shade)
+        shift, turn = -tangent * per_column, (1 + tangent**2) * per_column
+        _move_aside(shift, turn, self._sensor.cols, phasor, slope, shade, moved, slopes, shades)
+        return moved, slopes, shades
 
     def first_images(
         self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
@@ -155,9 +177,12 @@ class BankModel:
         return replace(self.images(class_index, view, ()), slope=like.slope)
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which pixels are smooth enough."""
+        """Return which pixels are smooth enough, and of views at a bearing those that come from within the image."""
         if not self._smooth_only:
-            return np.ones((len(view), self._sensor.rows * self._sensor.cols), np.bool_)
+            shift = -np.tan(view[:, VIEW.index("bearing_rad")]) * self._sensor.columns_per_tangent
+            come_from = np.arange(self._sensor.cols) - shift[:, None]
+            inside = (come_from >= 0) & (come_from <= self._sensor.cols - 1)
+            return np.tile(inside, (1, self._sensor.rows))
         low, high = self.reach(class_index, view, (), np.empty((len(view), 0)))
         bend = np.empty(low.shape)
         _bends(class_index, view, *self._grid(), self._upper, self._lower, bend)
@@ -400,6 +425,29 @@ def _interpolate(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _move_aside(shift, turn, cols, phasor, slope, shade, moved, slopes, shades):  # type: ignore[no-untyped-def]
+    """Move m images some columns to the right; the slope by the bearing is the rise from column to column by `turn`."""
+    pixels = phasor.shape[1]
+    for m in range(len(phasor)):
+        whole = int(np.floor(-shift[m]))
+        share = -shift[m] - whole
+        for q in range(pixels):
+            first = q % cols + whole
+            has_left, has_right = 0 <= first < cols, -1 <= first < cols - 1
+            at = q + whole
+            left, right = 1.0 - share if has_left else 0.0, share if has_right else 0.0
+            a, b = at if has_left else q, at + 1 if has_right else q
+            moved[m, q] = left * phasor[m, a] + right * phasor[m, b]
+            for k in range(2):
+                slopes[m, k, q] = left * slope[m, k, a] + right * slope[m, k, b]
+                shades[m, k, q] = left * shade[m, k, a] + right * shade[m, k, b]
+            rise = phasor[m, b] if has_right else 0j
+            if has_left:
+                rise -= phasor[m, a]
+            slopes[m, 2, q] = turn[m] * rise
+
+
+@njit(cache=True, nogil=True)
 def _extremes(  # type: ignore[no-untyped-def]
     class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, low, high
 ):
@@ -436,10 +484,14 @@ def _extremes(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _bends(class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, bend):  # type: ignore[no-untyped-def]
-    """Fill the largest second difference of the intensity among the neighbours of m views, over the brightest pixel."""
+    """Fill the largest second difference of the intensity among the neighbours of m views, over the brightest pixel.
+
+    Along D the intensity times D² is differenced, D in steps, over the D² of the middle.
+    """
     n_d, n_a = lower.values.shape[1], lower.values.shape[2]
     n_up = upper.values.shape[-1]
     js, low, up = np.empty(4, np.int64), lower.values, upper.values
+    nearer, farther = np.empty(3), np.empty(3)
     for m in range(len(class_index)):
         c = class_index[m]
         cl = c if lower.values.shape[0] > 1 else 0
@@ -448,6 +500,9 @@ def _bends(class_index, view, first_d, step_d, first_a, step_a, closes, upper, l
         if closes:
             x -= n_a * np.floor(x / n_a)
         j0, _ = _cell(x, n_a, closes)
+        for a in range(1, 3):
+            middle_d = first_d / step_d + i0 + a
+            nearer[a], farther[a] = (1 - 1 / middle_d) ** 2, (1 + 1 / middle_d) ** 2
         for b in range(4):
             js[b] = (j0 + b) % n_a if closes else j0 + b
         brightest = 1e-30
@@ -457,7 +512,7 @@ def _bends(class_index, view, first_d, step_d, first_a, step_a, closes, upper, l
             for a in range(1, 3):
                 before, middle, after = up[c, i0 + a - 1, 2, q], up[c, i0 + a, 2, q], up[c, i0 + a + 1, 2, q]
                 brightest = max(brightest, middle)
-                most = max(most, abs(before - 2 * middle + after))
+                most = max(most, abs(nearer[a] * before - 2 * middle + farther[a] * after))
             bend[m, upper.pixel[q]] = most
         for q in range(lower.n_lit[i0]):
             most = 0.0
@@ -466,7 +521,8 @@ def _bends(class_index, view, first_d, step_d, first_a, step_a, closes, upper, l
                     middle = low[cl, i0 + a, js[b], 2, q]
                     brightest = max(brightest, middle)
                     if 0 < a < 3:
-                        ends = low[cl, i0 + a - 1, js[b], 2, q] + low[cl, i0 + a + 1, js[b], 2, q]
+                        ends = nearer[a] * low[cl, i0 + a - 1, js[b], 2, q]
+                        ends += farther[a] * low[cl, i0 + a + 1, js[b], 2, q]
                         most = max(most, abs(ends - 2 * middle))
                     if 0 < b < 3:
                         ends = low[cl, i0 + a, js[b - 1], 2, q] + low[cl, i0 + a, js[b + 1], 2, q]

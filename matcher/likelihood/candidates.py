@@ -1,21 +1,29 @@
-"""Steps 3 to 5 of the search: descend from minima of the bank, let other classes explain, refine on final images."""
+"""Steps 3 and 4 of the search: descend from the starts, and refine what is likely on the final images."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.likelihood.fits import Fits, best_of_frame, distinct, distinct_of_frames, least_of_frame
-from phasemark.matcher.likelihood.images import VIEW, ImageModel
+from phasemark.matcher.likelihood.fits import Fits, distinct, distinct_of_frames, least_of_frame
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.refine import costs_at, refine
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.nearest.bank_minima import Starts
 
-__all__ = ["fit_modes", "fit_neighbouring_views", "fit_other_classes", "fit_starts"]
+__all__ = ["fit_neighbouring_views", "fit_starts", "fit_views"]
+
+_SOFT_M = 0.01
+"""Standard deviation of ranges that is added for the first steps of a robust descent: half a cell."""
+_BEST_BESIDE = 2
+"""Views around a side minimum that are refined."""
+_ASIDE_RAD = tuple(math.radians(angle) for angle in (0.12, 0.3, 0.7, 1.5, 3.0))
+"""How far to either side of a side minimum in δ views are tried."""
 
 
 def fit_starts(
@@ -24,98 +32,126 @@ def fit_starts(
     evidence: Evidence,
     which: NDArray[np.int64],
     starts: Starts,
-    sides_rad: tuple[float, ...],
+    limit: NDArray[np.float64],
     *,
-    patient: bool = False,
+    thorough: bool = False,
 ) -> Fits:
-    """Refine the minima of some frames, then let the other classes explain each frame from its best view.
+    """Refine the starts of some frames.
 
     Parameters
     ----------
     setup : Setup
     scene : Scene
-        Its scout, if there is one, refines first; what is likely then is refined again on the final images.
+        Its scout, if there is one, refines first.
     evidence : Evidence
     which : (k,) int64
         The frames that `starts` counts.
     starts : Starts
-        Minima of the bank.
-    sides_rad : tuple of float
-        Offsets of δ at which the best minimum of each frame is tried too.
-    patient : bool
-        Whether to refine minima however bad they look at first.
+        Views in the cells that may hold an explanation.
+    limit : (k,) float64
+        Cost up to which a view explains a frame.
+    thorough : bool
+        Whether to look around all side minima; otherwise only while nothing explains their frame.
     """
-    policy, settings = setup.policy, scene.settings(setup)
-    frame, class_index, view = _with_sides(which[starts.frame], starts, sides_rad)
-    leading = settings
-    if scene.scout is not None and setup.bearing_has_prior:  # a scout knows no bearing
-        leading = replace(settings, free=VIEW[:2], prior_std=())
-    lead = scene.scout or scene.final
-    margin = np.inf if patient else policy.margin_cost
-    fits = fit_modes(setup, lead, evidence, frame, class_index, view, leading, margin)
-    fits = Fits.joined([fits, fit_other_classes(setup, lead, evidence, fits, leading)])
-    if scene.scout is None:
-        return fits
-    return _polished(setup, scene, evidence, fits)
-
-
-def fit_modes(
-    setup: Setup,
-    model: ImageModel,
-    evidence: Evidence,
-    frame: NDArray[np.int64],
-    class_index: NDArray[np.int64],
-    view: NDArray[np.float64],
-    settings: DescentSettings,
-    start_margin: float,
-) -> Fits:
-    """Refine the first candidate of every frame, the others while they can still win, and at last what is likely.
-
-    A candidate can win while its cost promises to fall to `start_margin` above that of the first one. Of likely fits
-    that end at one place the best is kept; unlikely ones keep their rough fit.
-    """
+    settings, model = scene.settings(setup), scene.scout or scene.final
     n = len(evidence.weight)
-    first = np.isin(np.arange(len(frame)), np.unique(frame, return_index=True)[1])
-    fits = refine(model, evidence, frame[first], class_index[first], view[first], settings, roughly=True)
-    limit = least_of_frame(fits, n)[frame[~first]] + start_margin
-    more = refine(model, evidence, frame[~first], class_index[~first], view[~first], settings, limit, roughly=True)
-    fits = Fits.joined([fits, more])
-    policy = setup.policy
-    may_win = fits.cost < least_of_frame(fits, n)[fits.frame] + policy.margin_cost
-    better = distinct_of_frames(fits, np.flatnonzero(may_win), setup.shapes.symmetry, policy.same_m, policy.same_rad)
-    again = fits[better]
-    return Fits.joined([refine(model, evidence, again.frame, again.class_index, again.view, settings), fits[~may_win]])
+    explains = np.full(n, np.inf)
+    explains[which] = limit
+    frame, class_index, view = which[starts.frame], starts.class_index, starts.view
+    if setup.huber is not None:
+        # a loss that stays constant for outliers has no slope a cell away: the first steps have more noise
+        soft = evidence.with_further_noise(_SOFT_M)
+        view = refine(model, soft, frame, class_index, view, settings, roughly=True).view
+    fits = refine(model, evidence, frame, class_index, view, settings, roughly=True)
+    if scene.scout is not None and not setup.bearing_is_free:
+        fits = _finished(setup, scene, evidence, fits)
+        return Fits.joined([fits, _beside_stuck(setup, scene, evidence, fits, explains, thorough)])
+    fits = Fits.joined([fits, _beside_stuck(setup, scene, evidence, fits, explains, thorough, roughly=True)])
+    if scene.scout is None:
+        return _finished(setup, scene, evidence, fits)
+    # at a bearing a scout is good to some hundreds at edges
+    most = (explains if thorough else least_of_frame(fits, n)) + setup.policy.margin_cost
+    likely = fits.cost < most[fits.frame]
+    found = fit_views(setup, scene, evidence, _of_own_places(setup, fits, likely))
+    return found if thorough else Fits.joined([found, fits[~likely]])
 
 
-def fit_other_classes(
-    setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits, settings: DescentSettings
+def _beside_stuck(
+    setup: Setup,
+    scene: Scene,
+    evidence: Evidence,
+    fits: Fits,
+    explains: NDArray[np.float64],
+    thorough: bool,
+    *,
+    roughly: bool = False,
 ) -> Fits:
-    """Fit every other class to each frame, from the view of the best class."""
-    best = best_of_frame(fits)
-    n_class = len(setup.shapes.names)
-    others = np.array([(k, c) for k in best for c in range(n_class) if c != fits.class_index[k]], np.int64)
-    others = others.reshape(-1, 2)
-    source = others[:, 0]
-    rival = fits.cost[source]
-    limit = rival + setup.policy.likely_cost
-    frame, view = fits.frame[source], fits.view[source]
-    return refine(model, evidence, frame, others[:, 1], view, settings, limit, rival, at_first_sight=True)
+    """Refine from around those fits that ended above the limit: their cells may still hold an explanation.
 
-
-def _with_sides(
-    frame: NDArray[np.int64], starts: Starts, sides_rad: tuple[float, ...]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return frames, classes and views of starts, and of the best one of each frame with δ moved to some sides."""
-    class_index, view = starts.class_index, starts.view
-    if not sides_rad:
-        return frame, class_index, view
-    first = np.flatnonzero(np.diff(starts.frame, prepend=-1))
-    beside = [view[first] + side * np.eye(len(VIEW))[1] for side in sides_rad]
-    return (
-        np.concatenate([frame, np.tile(frame[first], len(sides_rad))]),
-        np.concatenate([class_index, np.tile(class_index[first], len(sides_rad))]),
-        np.concatenate([view, *beside]),
+    A descent stops at side minima, where an edge of the landmark has left a pixel.
+    """
+    settings = scene.settings(setup) if roughly else _close_settings(setup, scene, evidence)
+    model = (scene.scout or scene.final) if roughly else scene.final
+    least = least_of_frame(fits, len(evidence.weight))
+    stuck = fits.cost > np.minimum(explains, least + setup.rival_cost)[fits.frame]
+    stuck &= fits.cost < np.maximum(least, explains)[fits.frame] + setup.policy.margin_cost
+    if not thorough:
+        stuck &= (least > explains)[fits.frame]
+    which = distinct_of_frames(
+        fits, np.flatnonzero(stuck), setup.shapes.symmetry, setup.policy.same_m, setup.policy.same_rad
     )
+    if not which.size:
+        return fits[:0]
+    views = _around(setup, scene, fits.view[which])
+    k = views.shape[1]
+    frame, class_index = np.repeat(fits.frame[which], k), np.repeat(fits.class_index[which], k)
+    views = views.reshape(-1, len(VIEW))
+    cost = costs_at(model, evidence, frame, class_index, views, settings).reshape(-1, k)
+    best = np.argsort(cost, axis=1)[:, :_BEST_BESIDE]
+    best = (best + k * np.arange(len(cost))[:, None]).ravel()
+    return refine(model, evidence, frame[best], class_index[best], views[best], settings, roughly=roughly)
+
+
+def _of_own_places(setup: Setup, fits: Fits, which: NDArray[np.bool_]) -> Fits:
+    """Return those of some fits that came to places of their own, the best at each."""
+    policy = setup.policy
+    return fits[distinct_of_frames(fits, np.flatnonzero(which), setup.shapes.symmetry, policy.same_m, policy.same_rad)]
+
+
+def fit_views(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
+    """Refine the views of some fits: each roughly, and what is likely then to the end."""
+    settings = scene.settings(setup)
+    rough = refine(scene.final, evidence, fits.frame, fits.class_index, fits.view, settings, roughly=True)
+    return _finished(setup, replace(scene, scout=None), evidence, rough)
+
+
+def _finished(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
+    """Refine on the final images those rough fits that are likely; of fits that came to one place, the best.
+
+    The others keep their cost. That of a scout is shifted by the change of the best fit of the frame.
+    """
+    policy, n = setup.policy, len(evidence.weight)
+    likely = np.flatnonzero(fits.cost < least_of_frame(fits, n)[fits.frame] + policy.likely_cost)
+    again = fits[distinct_of_frames(fits, likely, setup.shapes.symmetry, policy.same_m, policy.same_rad)]
+    settings = scene.settings(setup) if scene.scout is None else _close_settings(setup, scene, evidence)
+    final = refine(scene.final, evidence, again.frame, again.class_index, again.view, settings)
+    others = fits[np.setdiff1d(np.arange(len(fits)), likely)]
+    if scene.scout is not None:
+        others.cost[:] += least_of_frame(final, n)[others.frame] - least_of_frame(fits, n)[others.frame]
+    return Fits.joined([final, others.with_free(len(setup.free))])
+
+
+def _around(setup: Setup, scene: Scene, view: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return views around some, (m, k, 6): turned, and at other bearings, with and without the heading kept."""
+    turns = (*(-angle for angle in _ASIDE_RAD), *_ASIDE_RAD)
+    moves = [(turn, 0.0) for turn in turns]
+    if setup.bearing_is_free:
+        half = scene.search.column_rad / 2
+        bearings = (-half, -half / 2, half / 2, half)
+        moves += [(turn, b) for b in bearings for turn in (0.0, *(b + off for off in (0.0, *turns[1::2])))]
+    steps = np.zeros((len(moves), len(VIEW)))
+    steps[:, 1:3] = moves
+    return np.asarray(view[:, None] + steps)
 
 
 def fit_neighbouring_views(
@@ -157,25 +193,6 @@ def _close_settings(setup: Setup, scene: Scene, evidence: Evidence) -> DescentSe
         else policy.step_after_scout_aside,
         look_beside_rad=policy.close_by_rad if side_peaks else (),
     )
-
-
-def _polished(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
-    """Refine on the final images what is likely after the scout.
-
-    The other fits keep the scout's cost, shifted by the change of the best one of their frame. Likely fits beyond
-    `most_refined` are dropped.
-    """
-    policy, n = setup.policy, len(evidence.weight)
-    order = np.lexsort((fits.cost, fits.frame))
-    least = least_of_frame(fits, n)
-    likely = [k for k in order if fits.cost[k] < least[fits.frame[k]] + policy.likely_cost]
-    again = fits[_most_likely(setup, fits, likely)]
-    close = _close_settings(setup, scene, evidence)
-    final = refine(scene.final, evidence, again.frame, again.class_index, again.view, close)
-    others = fits[np.setdiff1d(order, likely)]
-    gap = others.cost - least[others.frame]
-    others.cost[:] = least_of_frame(final, n)[others.frame] + gap
-    return Fits.joined([final, others.with_free(len(setup.free))])
 
 
 def _most_likely(setup: Setup, fits: Fits, ordered: list[int]) -> NDArray[np.int64]:

@@ -36,13 +36,15 @@ class Fits:
         The same with no residual adding more than that: what to compare with a scene that explains nothing.
     dof : int64
         Residuals in it, less the parameters fitted.
+    p_value : float64
+        Of two χ² tests, of the pixels at edges of the landmark and of those inside, the worse one.
     unexplained : int64
         Returns that are left to unknown things in view; in `cost` each is a disagreement, in `dof` it is none.
     explained : int64
         Returns that are compared and not left to unknown things.
-    agreeing, elsewhere : int64
-        Returns where the landmark stands in the model: those that agree with it, compared or not, and those that see
-        something else.
+    stands_out : bool
+        Among unknown things, whether the landmark stands where the model has it
+        (:func:`~phasemark.matcher.likelihood.outline.stands_out`); True elsewhere.
     prior : float64
         What the prior adds to the cost; no test of the fit counts it.
     covariance : (m, p, p) float64
@@ -61,10 +63,10 @@ class Fits:
     cost: NDArray[np.float64]
     capped: NDArray[np.float64]
     dof: NDArray[np.int64]
+    p_value: NDArray[np.float64]
     unexplained: NDArray[np.int64]
     explained: NDArray[np.int64]
-    agreeing: NDArray[np.int64]
-    elsewhere: NDArray[np.int64]
+    stands_out: NDArray[np.bool_]
     prior: NDArray[np.float64]
     covariance: NDArray[np.float64]
     information: NDArray[np.float64]

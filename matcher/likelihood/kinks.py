@@ -24,7 +24,7 @@ def look_beside(problem: Problem, state: State) -> State:
     The other parameters follow by one Gauss–Newton step.
     """
     sides = np.array(problem.settings.look_beside_rad)
-    near = problem.best_of_frames(state)
+    near = np.flatnonzero(state.sums.cost <= problem.limit)
     if not near.size:
         return state
     source = np.repeat(near, len(sides))

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from phasemark import UsageError
 from phasemark.data import Bank
@@ -32,8 +33,8 @@ from phasemark.matcher.likelihood.systematic import Systematic
 from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
 from phasemark.matcher.nearest.bank_minima import Search, SearchOfFrames, Upward
+from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD, CellBounds, Turned
 from phasemark.matcher.nearest.templates import Observation
-from phasemark.matcher.nearest.thinned_bank import ThinnedBank
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
 from phasemark.render import Background, PhasorImages, Views
 from phasemark.render.phasor_images import wrap_difference_m
@@ -47,6 +48,9 @@ BEARING_STD_RAD, TILT_STD_RAD = math.radians(1.5), math.radians(3.0)
 """Standard deviations of the bearing, and of pitch and roll, before a frame is seen, unless the matcher is told."""
 
 
+CELL_M, CELL_RAD = 0.02, math.radians(2.0)
+"""Cells of the search: as large as they may be for most of what a pixel shows to change little within them."""
+_SHARES_OF_COLUMN = -0.5, -0.25, 0.25, 0.5
 _PIXELS_AT_ONCE = 1 << 20
 """Of all frames that are matched together. Each takes up to a kilobyte, for every candidate has an image of it."""
 
@@ -106,17 +110,13 @@ class LikelihoodMatcher:
         stated = () if self._stated is None else (self._stated,)
         behind = background_of(bank, self._stated) if self._stated is not None else None
         self._exact, self._scout = self._bank_models(behind)
-        thinned = ThinnedBank(bank, self._search_stride())
-        self._thinned = thinned if self._auto else None  # backgrounds that are estimated ask for other templates
-        wide = self._new_search(thinned, behind)
-        # with a prior the first search takes the bearing for 0, and repeated ones shift the frame
-        search = wide.over(0.0) if has_prior else wide
+        self._search = self._new_search(behind)
         if self._auto or self._exact is None:
             self._check_distances()
         if self._stated is not None and self._stated.floor_m is not None and "height_m" not in self._setup.free:
             self._check_floor(self._stated.floor_m)
         final = self._exact or self._rendered
-        self._scene = Scene(stated, behind, final, None if self._exact else self._scout, search, wide)
+        self._scene = Scene(stated, behind, final, None if self._exact else self._scout, self._search)
 
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Match filtered frames, in threads of their own parts of them; the answers do not depend on their number."""
@@ -140,6 +140,7 @@ class LikelihoodMatcher:
         if self._setup.unknown:
             fits = fit_without_borders(self._setup, self._scene, evidence, fits)
         answers = rank(self._setup, frames, fits, bare, [self._stated] * len(frames))
+        answers = self._with_mirror(evidence, answers)
         return self._with_shared_errors(frames, evidence, answers)
 
     def _match_auto(self, frames: FilteredFrames) -> list[Match]:
@@ -149,9 +150,23 @@ class LikelihoodMatcher:
         bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(evidence))
         backgrounds, fits = auto.search(frames, evidence, bare)
         answers: list[Match] = []
-        for k, found in enumerate(rank(self._setup, frames, fits, bare, backgrounds)):
+        found_all = self._with_mirror(evidence, rank(self._setup, frames, fits, bare, backgrounds))
+        for k, found in enumerate(found_all):
             one = slice(k, k + 1)
             answers.extend(self._with_shared_errors(frames[one], evidence[one], [found]))
+        return answers
+
+    def _with_mirror(self, evidence: Evidence, answers: list[Match]) -> list[Match]:
+        """Say of accepted answers whether their frames may be mirrored left to right, by the bounds of the cells."""
+        accepted = np.array([k for k, answer in enumerate(answers) if answer.accepted], np.int64)
+        some, seen = [answers[k] for k in accepted], evidence.seen[accepted]
+        dof = np.array([answer.dof for answer in some])
+        # what an answer leaves to unknown things costs the other view, too
+        left = np.maximum(seen.returned.sum(axis=1) - dof - len(self._setup.free), 0)
+        limit = special.chdtri(np.maximum(dof, 1), self._setup.false_alarm) + DISAGREEMENT * left
+        found = self._search.may_explain(seen.mirrored(self._bank.sensor.cols), limit)
+        for k, answer, mirrored in zip(accepted, some, found, strict=True):
+            answers[k] = replace(answer, may_be_mirrored=bool(mirrored))
         return answers
 
     def _with_shared_errors(self, frames: FilteredFrames, evidence: Evidence, answers: list[Match]) -> list[Match]:
@@ -167,17 +182,39 @@ class LikelihoodMatcher:
         splits = self._setup.on == "phasors" and (self._auto or self._stated is not None) and bool(moves)
         return RenderedModel(self._bank, self._stated, self._setup.policy.cache_bytes, splits_light=splits)
 
+    @cached_property
+    def _turned(self) -> Turned | None:
+        """What renders views of the bank at bearings within half a column, where pixels are wide.
+
+        Before backgrounds that are estimated cells are made for every frame: then the views are kept.
+        """
+        known: dict[tuple[int, float, int], list[PhasorImages]] = {}
+
+        def turned(class_index: int, distance_m: float, delta_rad: NDArray[np.float64]) -> list[PhasorImages]:
+            key = class_index, distance_m, len(delta_rad)
+            if key in known:
+                return known[key]
+            renderer, width_rad = self._rendered.renderer(class_index), self._bank.sensor.pixel_rad
+            images = [renderer.render(distance_m, delta_rad, share * width_rad) for share in _SHARES_OF_COLUMN]
+            if self._auto:
+                known[key] = images
+            return images
+
+        return turned if self._bank.sensor.pixel_rad > WIDE_PIXEL_RAD else None
+
     def _bank_models(self, behind: PhasorImages | None) -> tuple[BankModel | None, BankModel | None]:
         """Return the interpolated images that the answer is taken from, and those of a scout; None where unfit."""
         setup, policy = self._setup, self._setup.policy
         fixed = setup.free == VIEW[:2]
         is_exact = fixed and setup.on == "ranges" and self._stated is None
         is_exact = is_exact and BankModel.grid_is_fine_enough(self._bank, *policy.fine_grid)
-        scouts = (fixed or setup.bearing_has_prior) and BankModel.grid_is_fine_enough(self._bank, *policy.coarse_grid)
+        aside = setup.free == VIEW[:3] and setup.on == "ranges" and self._stated is None and not self._auto
+        scouts = (fixed or aside) and BankModel.grid_is_fine_enough(self._bank, *policy.coarse_grid)
         if not (is_exact or scouts):
             return None, None
         model = BankModel(self._bank)
-        return model if is_exact else None, model.smooth(behind) if scouts else None
+        # at a bearing the edges tell, which a smooth model leaves out
+        return model if is_exact else None, (model if aside else model.smooth(behind)) if scouts else None
 
     def _check_distances(self) -> None:
         """Check that the bank has distances at which views are rendered."""
@@ -196,25 +233,30 @@ class LikelihoodMatcher:
         for c in range(len(self._setup.shapes.names)):
             Background(floor_m=floor_m).check_behind(self._rendered.renderer(c).topology.vertices, view)
 
-    def _search_stride(self) -> tuple[int, int]:
-        """Return every how many distances and angles of the bank are searched."""
-        setup = self._setup
-        few = self._stated is not None and not setup.bearing_is_free and setup.height_and_tilt_are_known
-        fine = (1, 1) if few else (2, 3)
-        along, around = (
-            max(1, min(step, (len(grid) - 1) // 4))
-            for step, grid in zip(fine, (self._bank.distance_m, self._bank.delta_rad), strict=True)
-        )
-        return along, around
-
-    def _new_search(self, thinned: ThinnedBank, behind: PhasorImages | None) -> Search:
+    def _new_search(self, behind: PhasorImages | None) -> Search:
         """Return a search before some background, over all bearings that are looked for where they are free."""
-        setup = self._setup
-        widest = setup.widest_rad if setup.bearing_is_free else 0.0
+        setup, bank = self._setup, self._bank
+        stride = (max(1, round(CELL_M / _step(bank.distance_m))), max(1, round(CELL_RAD / _step(bank.delta_rad))))
+        known = setup.height_and_tilt_are_known
+        cells = CellBounds(
+            bank,
+            stride,
+            behind,
+            aside=setup.bearing_is_free,
+            upward=not known,
+            open_edges=self._auto and behind is None,
+            turned=self._turned if setup.bearing_is_free else None,
+        )
+        layers = layers_of(bank)
         upward = Upward(setup.prior_std_of("height_m"), setup.prior_std_of("pitch_rad"), setup.policy.prior_sigma)
-        # edges between rows: no pixel may decide alone where it starts
-        capped = setup.unknown or not setup.height_and_tilt_are_known
-        return Search(thinned, behind, widest, upward, capped=capped)
+        return Search(
+            cells,
+            bank.sensor if layers is None else layers.camera,
+            layers,
+            setup.widest_rad if setup.bearing_is_free else 0.0,
+            upward,
+            setup.prior_std_of("bearing_rad") or math.inf,
+        )
 
     def _scene_before(self, backgrounds: Sequence[Background]) -> Scene:
         """Return the scene of estimated backgrounds; see :class:`AutoBackground`."""
@@ -231,10 +273,8 @@ class LikelihoodMatcher:
 
     def _whole_scene_before(self, backgrounds: Sequence[Background]) -> Scene:
         """Return the same, searched in images of the bank before each background."""
-        assert self._thinned is not None
-        searches = [self._new_search(self._thinned, background_of(self._bank, own)) for own in backgrounds]
-        search = SearchOfFrames(searches, self._scene.search.column_rad)
-        return replace(self._scene_before(backgrounds), search=search, wide_search=search)
+        searches = [self._new_search(background_of(self._bank, own)) for own in backgrounds]
+        return replace(self._scene_before(backgrounds), search=SearchOfFrames(searches, self._scene.search.column_rad))
 
     def _bare_wall_cost(self, evidence: Evidence) -> NDArray[np.float64]:
         """Return how badly a wall at its best distance explains all of each frame, (n,)."""
@@ -249,6 +289,11 @@ class LikelihoodMatcher:
             walls = [Background(wall_m=float(own)) for own in wall_m]
             cost[which] = bare_cost(evidence[which].seen, background_of(self._bank, *walls))
         return cost
+
+
+def _step(grid: NDArray[np.float64]) -> float:
+    """Return the step of a grid; infinite of one point."""
+    return float(grid[1] - grid[0]) if len(grid) > 1 else math.inf
 
 
 def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.float64]:

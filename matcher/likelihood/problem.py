@@ -155,30 +155,14 @@ class Problem:
             self.rival[which],
         )
 
-    def start(self, view: NDArray[np.float64], at_first_sight: bool) -> State:
+    def start(self, view: NDArray[np.float64]) -> State:
         """Evaluate the first views: the pixels that count, and the brightness of the landmark."""
         theta = np.column_stack([self.clipped(view.copy(), np.arange(len(view))), np.ones(len(view))])
         view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
-        if at_first_sight and not self.with_albedo and not self.model.slopes_are_cheap:
-            images = self._images_at_first_sight(theta)
-        else:
-            images = self.model.first_images(self.class_index, view, free)
+        images = self.model.first_images(self.class_index, view, free)
         if self.with_albedo:
             theta[:, ALBEDO_COLUMN] = self._brightness(images)
         return self.summed(theta, self.pixels_at(images, theta), self.scaled(images, theta))
-
-    def _images_at_first_sight(self, theta: NDArray[np.float64]) -> ModelImages:
-        """Return first images; slopes are 0 where no step is likely to lead below the limit."""
-        view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
-        images = self.model.images(self.class_index, view, ())
-        images = replace(images, slope=np.zeros((len(view), len(free), images.phasor.shape[1]), np.complex128))
-        cost = self.summed(theta, self.pixels_at(images, theta), images).sums.cost
-        hopeful = np.flatnonzero(cost < self.limit + self.policy.first_sight_cost)
-        if hopeful.size:
-            some = self.some(hopeful)
-            with_slopes = some.model.images(some.class_index, np.ascontiguousarray(view[hopeful]), free)
-            images.slope[hopeful] = with_slopes.slope
-        return images
 
     def state(
         self, theta: NDArray[np.float64], use: NDArray[np.bool_], slope: NDArray[np.complex128] | None = None

@@ -13,12 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.matcher.chi_squared import p_values_of, worse_of_two
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels, whole_cost
 from phasemark.matcher.likelihood.descent import descend
-from phasemark.matcher.likelihood.fits import BETTER_COST, Fits
-from phasemark.matcher.likelihood.images import VIEW, ImageModel
+from phasemark.matcher.likelihood.fits import Fits
+from phasemark.matcher.likelihood.images import ImageModel
 from phasemark.matcher.likelihood.kinks import look_beside, settle
+from phasemark.matcher.likelihood.outline import stands_out
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, DescentSettings, Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import (
@@ -28,11 +30,7 @@ from phasemark.matcher.likelihood.uncertainty import (
     std_without_one_pixel,
     view_covariance,
 )
-from phasemark.matcher.pixel_agreement import DISAGREEMENT
-
-_NEAR_SIGMA = 0.3
-"""Within this many standard deviations two fits of one class are one. Other minima may be one deviation away: a fit
-there tells how far the explanations of a frame extend, and keeps its answer from being accepted for too sure."""
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, FILLED_COVERAGE
 
 
 def refine(
@@ -46,8 +44,6 @@ def refine(
     rival: NDArray[np.float64] | None = None,
     *,
     roughly: bool = False,
-    at_first_sight: bool = False,
-    look_like: Fits | None = None,
 ) -> Fits:
     """Move m candidates to the nearest maximum of the likelihood.
 
@@ -67,12 +63,6 @@ def refine(
         (`SearchPolicy.close_cost`) is refined roughly.
     roughly : bool
         Whether to stop within a fraction of a standard deviation, with the pixels that counted at the start.
-    at_first_sight : bool
-        Whether to give up at the start already, where its cost is far above the limit. Use it only where starts are
-        close to a solution.
-    look_like : Fits, optional
-        The fits that the candidates look like, one each. A candidate that comes back to its fit is left out, unless it
-        costs less.
 
     Returns
     -------
@@ -81,19 +71,14 @@ def refine(
     """
     limit = np.full(len(frame), np.inf) if give_up_above is None else give_up_above
     problem = Problem(model, evidence, frame, class_index, settings, limit, rival)
-    state = problem.start(view, at_first_sight)
+    state = problem.start(view)
     if roughly:
         state = descend(problem, state, settings.policy.rough_cost)
         return conclude(problem, state, look_around=False)
-    if look_like is not None:
-        state = descend(problem, state, settings.policy.rough_cost)
-        problem, state, look_like = _others(problem, state, look_like)
     state = _descend_near(problem, state)
     if settings.look_beside_rad:
         state = look_beside(problem, state)
     state = _recounted(problem, state)
-    if look_like is not None:
-        problem, state, _ = _others(problem, state, look_like)
     if not model.slopes_are_cheap:  # interpolated coverages do not show the step in which an edge enters a pixel
         state = settle(problem, state)
     return conclude(problem, state)
@@ -110,20 +95,9 @@ def costs_at(
     """Return what m candidates cost where they start, disagreements included; arguments as for :func:`refine`."""
     problem = Problem(model, evidence, frame, class_index, settings, np.full(len(frame), np.inf))
     if problem.with_albedo:  # the brightness of each has to be found first
-        return whole_cost(problem, problem.start(view, False))[0]
+        return whole_cost(problem, problem.start(view))[0]
     theta = np.column_stack([problem.clipped(view.copy(), np.arange(len(view))), np.ones(len(view))])
     return whole_cost(problem, problem.at(theta))[0]
-
-
-def _others(problem: Problem, state: State, look_like: Fits) -> tuple[Problem, State, Fits]:
-    """Leave out the candidates that came back to the fits that they look like, and cost no less."""
-    columns = [VIEW.index(name) for name in problem.settings.free]
-    away = (state.theta[:, :ALBEDO_COLUMN] - look_like.view)[:, columns]
-    squared = np.einsum("mp,mpq,mq->m", away, look_like.information, away)
-    came_back = (problem.class_index == look_like.class_index) & (squared < _NEAR_SIGMA**2)
-    came_back &= whole_cost(problem, state)[0] >= look_like.cost - BETTER_COST
-    others = np.flatnonzero(~came_back)
-    return problem.some(others), picked(state, others), look_like[others]
 
 
 def _descend_near(problem: Problem, state: State) -> State:
@@ -175,22 +149,24 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     if competitive.size:
         pixels = _judged_pixels(problem, state, near, covariance)
     further = _further_cost(pixels)
-    n_residuals = pixels.compared * problem.evidence.per_pixel + pixels.wrong + pixels.undecided
-    n_fitted = int((problem.prior_weight == 0).sum())
+    dof = np.maximum(_residuals(problem, pixels) - int((problem.prior_weight == 0).sum()), 0)
+    cost, prior = sums.cost + further, problem.prior_cost(state.theta)
+    unexplained = pixels.unexplained.sum(axis=1)
+    tested = cost - prior - DISAGREEMENT * unexplained
     scale = problem.scale[: len(settings.free)]
     return Fits(
         frame=problem.frame,
         class_index=problem.class_index,
         view=state.theta[:, :ALBEDO_COLUMN],
         albedo=state.theta[:, ALBEDO_COLUMN],
-        cost=sums.cost + further,
+        cost=cost,
         capped=sums.capped + further,
-        dof=np.maximum(n_residuals - pixels.unexplained - n_fitted, 0),
-        unexplained=pixels.unexplained,
-        explained=pixels.explained,
-        agreeing=pixels.agreeing,
-        elsewhere=pixels.elsewhere,
-        prior=problem.prior_cost(state.theta),
+        dof=dof,
+        p_value=_p_values(problem, state, pixels, tested, dof),
+        unexplained=unexplained,
+        explained=pixels.explained.sum(axis=1),
+        stands_out=pixels.stands_out,
+        prior=prior,
         covariance=covariance,
         # the inverse of a covariance is information
         information=covariance_of(covariance / np.outer(scale, scale)) * np.outer(1 / scale, 1 / scale),
@@ -246,48 +222,99 @@ def _sums_of_all_pixels(problem: Problem, state: State) -> Sums:
     return problem.with_prior(sums, state.theta)
 
 
-def _further_cost(pixels: _PixelCounts) -> NDArray[np.float64]:
+class _Pixels(NamedTuple):
+    """Pixels of each solution by what they say, (m, pixels) bool, and whether each stands out, (m,)."""
+
+    compared: NDArray[np.bool_]
+    wrong: NDArray[np.bool_]
+    undecided: NDArray[np.bool_]
+    unexplained: NDArray[np.bool_]
+    explained: NDArray[np.bool_]
+    stands_out: NDArray[np.bool_]
+
+    def among(self, some: NDArray[np.bool_]) -> _Pixels:
+        """Return those among some pixels."""
+        return _Pixels(
+            self.compared & some,
+            self.wrong & some,
+            self.undecided & some,
+            self.unexplained & some,
+            self.explained & some,
+            self.stands_out,
+        )
+
+
+def _further_cost(pixels: _Pixels) -> NDArray[np.float64]:
     """Return what pixels cost that leave no residual, (m,).
 
     A return that is neither compared nor wrong costs what a pixel costs on average: a model that counts fewer pixels is
     not better for it.
     """
-    return np.asarray(DISAGREEMENT * pixels.wrong + pixels.undecided, np.float64)
+    return np.asarray(DISAGREEMENT * pixels.wrong.sum(axis=1) + pixels.undecided.sum(axis=1), np.float64)
 
 
-class _PixelCounts(NamedTuple):
-    """Pixels of each solution by what they say, (m,) int64; see :class:`Fits` for the last four."""
-
-    compared: NDArray[np.int64]
-    wrong: NDArray[np.int64]
-    undecided: NDArray[np.int64]
-    unexplained: NDArray[np.int64]
-    explained: NDArray[np.int64]
-    agreeing: NDArray[np.int64]
-    elsewhere: NDArray[np.int64]
+def _residuals(problem: Problem, pixels: _Pixels) -> NDArray[np.int64]:
+    """Return how many residuals are tested, (m,)."""
+    n = problem.evidence.per_pixel * pixels.compared.sum(axis=1) - pixels.unexplained.sum(axis=1)
+    return np.asarray(n + pixels.wrong.sum(axis=1) + pixels.undecided.sum(axis=1), np.int64)
 
 
-def _judged_pixels(
-    problem: Problem, state: State, near: NDArray[np.intp], covariance: NDArray[np.float64]
-) -> _PixelCounts:
-    """Count the pixels of each solution that are compared, contradicted, or neither."""
+def _p_values(
+    problem: Problem, state: State, pixels: _Pixels, tested: NDArray[np.float64], dof: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the p-values of the fits, (m,): the worse of two χ² tests, of edges and of what lies inside.
+
+    Other shapes differ at their edges, in few pixels, which the noise of all others would hide. What a fit takes of the
+    degrees of freedom of some pixels is their share of its information, tr(C · I): the sum over all is the number of
+    its parameters.
+    """
+    edges = _at_edges(problem, state)
+    use, sensor = state.use & edges, problem.evidence
+    sums = gauss_newton_sums(
+        state.images.phasor, state.images.slope, sensor, problem.frame, use, problem.settings.huber
+    )
+    unit = np.outer(problem.scale, problem.scale)
+    inverse = np.linalg.pinv(state.sums.information * unit, hermitian=True)
+    fitted = np.einsum("mpq,mqp->m", inverse, sums.information * unit)
+    own = pixels.among(edges)
+    cost = sums.cost + _further_cost(own) - DISAGREEMENT * own.unexplained.sum(axis=1)
+    freedom = np.clip(_residuals(problem, own) - fitted, 0, dof)
+    nu = problem.evidence.scatter_freedom[problem.frame]
+    at_edges, inside = p_values_of(cost, freedom, nu), p_values_of(tested - cost, dof - freedom, nu)
+    whole = p_values_of(tested, dof, nu)
+    apart = (freedom >= 1) & (dof - freedom >= 1)
+    return np.where(apart, worse_of_two(at_edges, inside), whole)
+
+
+def _at_edges(problem: Problem, state: State) -> NDArray[np.bool_]:
+    """Return which pixels the landmark does not fill, or not all of their neighbours, (m, pixels)."""
+    sensor, coverage = problem.evidence.sensor, state.images.coverage
+    filled = (coverage >= FILLED_COVERAGE).reshape(-1, sensor.rows, sensor.cols)
+    inside = filled.copy()
+    inside[:, 1:] &= filled[:, :-1]
+    inside[:, :-1] &= filled[:, 1:]
+    inside[:, :, 1:] &= filled[:, :, :-1]
+    inside[:, :, :-1] &= filled[:, :, 1:]
+    return np.asarray(~inside.reshape(coverage.shape))
+
+
+def _judged_pixels(problem: Problem, state: State, near: NDArray[np.intp], covariance: NDArray[np.float64]) -> _Pixels:
+    """Return the pixels of each solution that are compared, contradicted, or neither."""
     evidence = problem.evidence
     returned = evidence.seen.returned[problem.frame]
     fitted = state.use & (evidence.weight[problem.frame] > 0)
     wrong = contradicted_pixels(problem, state, near, covariance, ~fitted)
     undecided = returned & ~fitted & ~wrong
-    n_fitted = fitted.sum(axis=1)
     if not problem.settings.unknown_around:
-        none = np.zeros(len(state.theta), np.int64)
-        return _PixelCounts(n_fitted, wrong.sum(axis=1), undecided.sum(axis=1), none, n_fitted, none, none)
-    outlying, here = outlying_pixels(problem, state), state.use & returned
+        stands = np.ones(len(state.theta), np.bool_)
+        return _Pixels(fitted, wrong, undecided, np.zeros_like(fitted), fitted, stands)
+    outlying = outlying_pixels(problem, state)
     wrong, undecided = wrong | (undecided & outlying), undecided & ~outlying
-    return _PixelCounts(
-        compared=n_fitted,
-        wrong=wrong.sum(axis=1),
-        undecided=undecided.sum(axis=1),
-        unexplained=(fitted & outlying).sum(axis=1) + (wrong & returned).sum(axis=1),
-        explained=(fitted & ~outlying).sum(axis=1),
-        agreeing=(here & ~outlying).sum(axis=1),
-        elsewhere=(here & outlying).sum(axis=1),
+    return _Pixels(
+        compared=fitted,
+        wrong=wrong,
+        undecided=undecided,
+        unexplained=(fitted & outlying) | (wrong & returned),
+        explained=fitted & ~outlying,
+        stands_out=stands_out(problem, state, outlying),
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
+from phasemark.matcher.chi_squared import scatter_freedom
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, one_frame_limit_m
@@ -43,6 +44,8 @@ class Evidence:
         The same frames as the coarse search sees them. What one frame cannot measure to 0.1 rad is no return there,
         whether or not the camera dropped it. Those pixels keep their `weight`: where a model is bright enough, a fit
         compares them.
+    scatter_freedom : (n,) float64
+        ν of frames whose noise was estimated from ν + 1 exposures; infinite elsewhere.
     on : {"ranges", "phasors"}
     sensor : Sensor
     """
@@ -51,6 +54,7 @@ class Evidence:
     weight: NDArray[np.float64]
     one_frame_std_m: NDArray[np.float64]
     seen: Observation
+    scatter_freedom: NDArray[np.float64]
     on: ResidualKind
     sensor: Sensor
 
@@ -72,8 +76,9 @@ class Evidence:
         strong = measured & ~(one_frame_m2 > one_frame_limit_m(sensor) ** 2)
         seen = Observation(whole.range_m, whole.weight, strong, whole.not_returned | (measured & ~strong))
         turn = np.asarray(np.where(measured, np.exp(1j * seen.range_m / sensor.metres_per_radian), 0.0), np.complex128)
+        nu = scatter_freedom(frames)
         if on == "ranges":
-            return cls(turn, whole.weight, one_frame_std_m, seen, on, sensor)
+            return cls(turn, whole.weight, one_frame_std_m, seen, nu, on, sensor)
         if frames.amplitude_e is None or frames.intensity_e is None:
             raise UsageError('on="phasors" needs frames with amplitude and intensity: match on="ranges"')
         shape = seen.range_m.shape
@@ -82,12 +87,17 @@ class Evidence:
         intensity = np.where(measured, frames.intensity_e.reshape(shape), 0.0)
         variance = np.maximum(phase_image_variance(intensity, sensor), 1.0) / (2 * unit**2)
         weight = np.where(measured, n_effective / variance, 0.0)
-        return cls(turn * amplitude, weight, one_frame_std_m, seen, on, sensor)
+        return cls(turn * amplitude, weight, one_frame_std_m, seen, nu, on, sensor)
 
     def __getitem__(self, index: NDArray[np.integer] | slice) -> Evidence:
-        seen = self.seen
-        part = Observation(seen.range_m[index], seen.weight[index], seen.returned[index], seen.not_returned[index])
-        return Evidence(self.value[index], self.weight[index], self.one_frame_std_m[index], part, self.on, self.sensor)
+        return Evidence(
+            self.value[index], self.weight[index], self.one_frame_std_m[index], self.seen[index],
+            self.scatter_freedom[index], self.on, self.sensor,
+        )  # fmt: skip
+
+    def with_further_noise(self, std_m: float) -> Evidence:
+        """Return the same ranges as those of a noisier camera, whose variance is larger by that of `std_m`."""
+        return replace(self, weight=self.weight / (1 + self.weight * std_m**2))
 
     @property
     def per_pixel(self) -> int:

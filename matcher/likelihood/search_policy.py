@@ -20,8 +20,8 @@ def _degrees(*angles: float) -> tuple[float, ...]:
     return tuple(math.radians(angle) for angle in angles)
 
 
-_MAY_BE_ZERO = ("cache_bytes", "settling_rounds", "trimmings", "background_rounds")
-_PROBABILITIES = ("doubtful_p", "hopeless_p", "refused_p", "ambiguity")
+_MAY_BE_ZERO = ("cache_bytes", "settling_rounds", "background_rounds")
+_PROBABILITIES = ("doubtful_p", "refused_p", "ambiguity")
 
 
 @dataclass(frozen=True)
@@ -44,18 +44,8 @@ class SearchPolicy:
         Widest steps of a bank, metres and radians, on which interpolated images are at the bound, and on which they
         lead to the solution.
 
-    modes, modes_before_background, modes_again : int
-        Minima of the bank that are refined for each frame: at first, at first before a background, and once more where
-        nothing fits.
     prior_sigma : float
         Widest bearing that is searched, in standard deviations of its prior.
-    beside_rad : tuple of float
-        Offsets of δ that the best minimum is tried from too, before a background: side peaks of the likelihood are
-        about so far away (PHYSICS section 7).
-    beside_again_rad : tuple of float
-        The same where nothing fits.
-    sways_rad : tuple of float
-        Where height, pitch or roll is free and nothing fits: turns by which the best view is moved to start again.
 
     max_iterations : int
         Steps of one descent.
@@ -70,8 +60,6 @@ class SearchPolicy:
         Where a step promises less than this, slopes rendered before serve again, until a step with them fails.
     optimism : float
         A descent gives up where even this many times the promised decrease would not save it.
-    first_sight_cost : float
-        A first view whose cost is above the limit by more is given up without slopes.
 
     close_by_rad : tuple of float
         Offsets of δ at which a solution before a background or on phasors is compared with a parabola.
@@ -100,38 +88,19 @@ class SearchPolicy:
     likely_cost : float
         An explanation whose cost is larger by this has no probability worth telling.
     most_refined : int
-        Explanations of a frame that are refined again after a scout.
+        Explanations of a frame that are looked around where none fits, and that move with an estimated background.
     same_m, same_rad : float
         Fits of one class nearer to each other than this are one.
 
-    doubtful_p, hopeless_p : float
-        p-values at which the search is repeated more widely: where the likelihood has side peaks, and where
-        it is smooth.
+    doubtful_p : float
+        p-value at which a fit before an estimated background is doubted, and wall, floor and view move together.
     refused_p : float
-        p-value at which a repeated search goes on around the best fits, and from minima of the bank without a scout.
-    trimmings : int
-        How often a robust search starts again without the returns that fit worst.
-    odd_ratio, odd_sigma : float
-        Those returns: residuals beyond this ratio to the median, and beyond this many σ.
-
-    look_alike_rounds : int
-        How often what looks like the best view is tried: again where that found a better one.
-    most_equals : int
-        Sides of one landmark that look the same and are all told.
-    slides, slides_with_prior : tuple of float
-        Bearings, in half columns, under which a flat landmark is compared with itself; the second where a prior holds
-        the bearing.
-    slides_refined : int
-        Of these, how many are refined for each frame, from the front and from the back.
-    sure_bearing : float
-        Share of half a column to which a bearing must be known for other bearings to be out of the question.
+        p-value at which views around the best fits are tried too.
 
     strange_sigma : float
         Among unknown things, a return farther from the model than this sees something else.
     explained_per_parameter : int
         Returns that each free parameter takes among unknown things.
-    largest_scale : float
-        Largest ratio of residuals to their stated noise that is accepted among unknown things.
     pixels_against_far_view : int
         Unexplained pixels that must stand against a far view of the same landmark among unknown things.
 
@@ -159,13 +128,7 @@ class SearchPolicy:
     fine_grid: tuple[float, float] = (0.011, math.radians(1.1))
     coarse_grid: tuple[float, float] = (0.022, math.radians(2.2))
 
-    modes: int = 2
-    modes_before_background: int = 4
-    modes_again: int = 8
     prior_sigma: float = 3.0
-    beside_rad: tuple[float, ...] = _degrees(-1.0, 1.0)
-    beside_again_rad: tuple[float, ...] = _degrees(-3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0)
-    sways_rad: tuple[float, ...] = _degrees(-12.0, -6.0, 6.0, 12.0)
 
     max_iterations: int = 30
     longest_step: float = 3.0
@@ -175,7 +138,6 @@ class SearchPolicy:
     rough_cost: float = 0.1
     kept_slopes_cost: float = 30.0
     optimism: float = 3.0
-    first_sight_cost: float = 1000.0
 
     close_by_rad: tuple[float, ...] = _degrees(-0.7, -0.28, -0.12, 0.12, 0.28, 0.7)
     parabola_share: float = 0.5
@@ -189,27 +151,15 @@ class SearchPolicy:
 
     margin_cost: float = 500.0
     likely_cost: float = 100.0
-    most_refined: int = 3
+    most_refined: int = 12
     same_m: float = 2e-3
     same_rad: float = math.radians(0.2)
 
     doubtful_p: float = 0.05
-    hopeless_p: float = 1e-3
     refused_p: float = 0.01
-    trimmings: int = 3
-    odd_ratio: float = 3.0
-    odd_sigma: float = 5.0
-
-    look_alike_rounds: int = 3
-    most_equals: int = 12
-    slides: tuple[float, ...] = (*range(-8, 0), *range(1, 9))
-    slides_with_prior: tuple[float, ...] = (-1.0, 1.0)
-    slides_refined: int = 3
-    sure_bearing: float = 0.05
 
     strange_sigma: float = 5.0
     explained_per_parameter: int = 6
-    largest_scale: float = 1.5
     pixels_against_far_view: int = 4
 
     walls_beyond_m: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
-from phasemark.landmarks.symmetry import mesh_symmetry
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import SearchPolicy
 from phasemark.matcher.nearest.bank_minima import Search, SearchOfFrames
-from phasemark.matcher.pixel_agreement import counts
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
 from phasemark.render import Background, PhasorImages
 
 __all__ = ["Scene", "Setup", "Shapes", "check_free"]
@@ -49,24 +48,15 @@ class Shapes:
     names : tuple of str
     symmetry : tuple of int
         Rotations within a turn that the bank takes for one.
-    own_symmetry : tuple of int
-        Rotations that look the same: a mesh that is said to have no symmetry may have one all the same.
-    middle_m : (classes, 3) float64
-        Centroids.
     """
 
     names: tuple[str, ...]
     symmetry: tuple[int, ...]
-    own_symmetry: tuple[int, ...]
-    middle_m: NDArray[np.float64]
 
     @classmethod
     def of_bank(cls, bank: Bank) -> Shapes:
-        """Collect symmetry and centre of the meshes of a bank."""
-        meshes = [bank.mesh(name) for name in bank.classes]
-        symmetry = tuple(int(mesh.metadata["symmetry"]) for mesh in meshes)
-        own = tuple(mesh_symmetry(mesh) if n == 1 else n for mesh, n in zip(meshes, symmetry, strict=True))
-        return cls(tuple(bank.classes), symmetry, own, np.array([mesh.centroid for mesh in meshes]))
+        """Collect the symmetries of the meshes of a bank."""
+        return cls(tuple(bank.classes), tuple(int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,18 +115,16 @@ class Setup:
         """Whether height, pitch and roll are those that were stated: none of them is estimated."""
         return not set(self.free) & set(VIEW[3:])
 
-    def modes_of_frame(self, backgrounds: Sequence[Background]) -> int:
-        """Return how many minima of the bank each frame is first refined from before some backgrounds, or none."""
-        policy = self.policy
-        if not backgrounds:
-            return policy.modes
-        return policy.modes_before_background if self.height_and_tilt_are_known else policy.modes_again
-
     def prior_std_of(self, name: str) -> float:
         """Return the standard deviation of a parameter before a frame is seen; 0 of one that is not estimated."""
         if name not in self.free:
             return 0.0
         return self.prior_std[self.free.index(name)] if self.prior_std else math.inf
+
+    @property
+    def rival_cost(self) -> float:
+        """How much more than an answer a view far from it must cost: a single pixel must not decide between them."""
+        return DISAGREEMENT * (self.policy.pixels_against_far_view if self.unknown else 1)
 
     @property
     def fewest_explained(self) -> int:
@@ -158,8 +146,8 @@ class Scene:
         What the answer is taken from.
     scout : ImageModel, optional
         What finds the way to it where that is slow.
-    search, wide_search : Search
-        Minima of the bank: at the bearings that are likely, and at all that are possible.
+    search : Search
+        Minima of the bank.
     """
 
     backgrounds: Sequence[Background]
@@ -167,7 +155,6 @@ class Scene:
     final: ImageModel
     scout: ImageModel | None
     search: Search | SearchOfFrames
-    wide_search: Search | SearchOfFrames
 
     def settings(self, setup: Setup) -> DescentSettings:
         """Return how a descent runs before these backgrounds."""

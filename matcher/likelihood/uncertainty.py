@@ -24,7 +24,7 @@ def capped_std(problem: Problem, covariance: NDArray[np.float64]) -> NDArray[np.
     """Return standard deviations, (m, p), one natural unit where they are larger or unknown."""
     p = covariance.shape[1]
     variance = np.einsum("mpp->mp", covariance)
-    std = np.sqrt(np.where(np.isfinite(variance), variance, np.inf))
+    std = np.sqrt(np.where(np.isfinite(variance) & (variance >= 0), variance, np.inf))
     return np.asarray(np.minimum(std, problem.scale[:p]))
 
 

@@ -1,47 +1,43 @@
-"""Initial guesses: the best views of a thinned bank, several modes of the likelihood, any bearing.
+"""Initial guesses: views in the cells of a bank that may explain a frame, under any bearing.
 
 A bearing moves the image sideways, a height or a pitch up and down. The rays of a turned camera meet the landmark at
 the same ranges, so a frame shifted by whole columns and rows is compared with the bank's images ahead; what is
-shifted in is missing, and a return that is shifted out is one that no model explains.
+shifted in is missing. A return that is shifted out costs 1, the mean of a compared pixel: the bank does not show it.
 """
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from phasemark.matcher.nearest.cells import CellBounds
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Observation
-from phasemark.matcher.nearest.thinned_bank import ThinnedBank
-from phasemark.matcher.pixel_agreement import DISAGREEMENT
-from phasemark.render import PhasorImages
-from phasemark.render.view import VIEW_FIELDS, wrap_delta_difference_rad
+from phasemark.matcher.one_frequency import OneFrequency
+from phasemark.render import Sensor
+from phasemark.render.view import VIEW_FIELDS
 
 _T = TypeVar("_T", bound=np.generic)
+Known = tuple[NDArray[np.int64], NDArray[np.float64]]
+"""Classes and views that explain a frame."""
 
-_UNDECIDED, _SHARE = 300.0, 0.5
-"""Other classes start too where their cost is larger by no more than this, and this share of the best: between the
-grid's points none of them fits."""
-_GRID_STD_M = 0.01
-"""What half a step of the thinned grid changes in a range."""
 _MOST_UP = 4
 """Number of shifts upwards, and downwards, that are compared."""
 _OFF_KINK_M = 0.002
 """Heights start at this in place of 0, where the box's top appears and slopes of one side would hold them."""
-_FRAMES_TIMES_SHIFTS = 1 << 12
-"""Frames are searched in groups of this over the number of shifts: the costs of a group are kept."""
-_MOST_OTHER_SIDES = 2
-_OTHER_SIDE_RAD = math.radians(30.0)
-"""Number of further sides that are tried, and the least angle between them."""
-_OTHER_SIDE_COST, _OTHER_SIDE_SHARE = 100.0, 4.0
-"""Largest cost of a further side on the grid: a constant, plus a multiple of the lowest cost."""
+_N_MODES = 12
+"""Local minima of the cells of one class that are refined, at most."""
+_MOST_UNCOVERED = 48
+_CLOSE = 2, 2, 1
+"""Cells, columns in the last place, within which a descent from one place stands for all: D, δ, bearing."""
+_RAISED = 3.0
+"""Factor by which the limit of a frame is raised that no view explains."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,141 +94,153 @@ class Upward(NamedTuple):
 
 
 class Search:
-    """A first look at a thinned bank.
+    """A first look at the cells of a bank, over the bearings and elevations that are looked for.
 
     Parameters
     ----------
-    bank : ThinnedBank
-    behind : PhasorImages, optional
-        What stands behind the landmark.
+    cells : CellBounds
+    sensor : Sensor
+        The camera, or that of one frequency of several.
+    layers : OneFrequency or None
+        How the images of several frequencies lie above one another; None where there is one image.
     widest_rad : float
         How far the landmark may be off to a side; at most a quarter of the image.
     upward : Upward
         How far it may be off upwards or downwards; at most a quarter of the image too.
-    capped : bool
-        Whether no pixel costs more than a disagreement: other things may stand in view.
+    bearing_std_rad : float
+        Standard deviation of the bearing before a frame is seen.
     """
 
     def __init__(
         self,
-        bank: ThinnedBank,
-        behind: PhasorImages | None,
+        cells: CellBounds,
+        sensor: Sensor,
+        layers: OneFrequency | None,
         widest_rad: float,
         upward: Upward = Upward(),  # noqa: B008 - a constant
-        *,
-        capped: bool = False,
+        bearing_std_rad: float = math.inf,
     ) -> None:
-        self._layers, self._n_class = bank.layers, bank.n_class
-        self._sensor = bank.sensor if bank.layers is None else bank.layers.camera
-        self._capped = capped
-        self._distance, self._delta, self._closes = bank.distance_m, bank.delta_rad, bank.closes
-        self._parts = bank.templates(behind)
-        self._upward = upward
-        self._look(widest_rad)
-
-    def _look(self, widest_rad: float) -> None:
-        """Set the shifts to each side by which the landmark may be off."""
-        sensor, upward = self._sensor, self._upward
-        self.column_rad = 2 * math.atan(sensor.tan_half_angles[0]) / sensor.cols
+        self._cells, self._sensor, self._layers = cells, sensor, layers
+        self._upward, self._bearing_std_rad = upward, bearing_std_rad
+        self.column_rad = sensor.pixel_rad
         most = min(sensor.cols // 4, math.ceil(min(widest_rad / self.column_rad, sensor.cols)))
         self._row_rad = 2 * math.atan(sensor.tan_half_angles[1]) / sensor.rows
-        widest_up = upward.widest_rad(float(self._distance[0]))
+        widest_up = upward.widest_rad(float(cells.distance_m[0]))
         highest = min(sensor.rows // 4, math.ceil(min(widest_up / self._row_rad, sensor.rows)))
         stride_up = max(math.ceil(highest / _MOST_UP), 1)
         highest -= highest % stride_up
         self._n_side = 2 * most + 1
         self._shifts = [(up, side) for up in range(-highest, highest + 1, stride_up) for side in range(-most, most + 1)]
 
-    def over(self, widest_rad: float) -> Search:
-        """Return the same search, with its templates, over other bearings."""
-        other = copy.copy(self)
-        other._look(widest_rad)
-        return other
-
-    def capped(self) -> Search:
-        """Return the same search, in which no pixel costs more than a disagreement."""
-        other = copy.copy(self)
-        other._capped = True
-        return other
-
     def of_frames(self, frame: NDArray[np.int64]) -> Search:
         """Return the search for some frames: it is the same for all."""
         return self
 
-    def starts(self, seen: Observation, n_modes: int, *, all_classes: bool = False) -> Starts:
-        """Return the best modes of every frame.
+    def starts(self, seen: Observation, limit: NDArray[np.float64]) -> Starts:
+        """Return the local minima among the cells of every frame that may hold an explanation, of each class its own.
 
         Parameters
         ----------
         seen : Observation
             Whole frames.
-        n_modes : int
-            How many of each frame, at most.
-        all_classes : bool
-            Whether classes that are hardly worse than the best one of a mode start there too.
+        limit : (n,) float64
+            Cost up to which a view explains a frame. Where no cell is below, the limit of the frame is raised.
         """
-        n, n_bearing = len(seen.range_m), len(self._shifts)
-        if not n:
-            return _NO_STARTS
-        at_once = max(_FRAMES_TIMES_SHIFTS // n_bearing, 1)
-        if n > at_once:
-            groups = [slice(start, start + at_once) for start in range(0, n, at_once)]
-            found_in = [self.starts(seen[group], n_modes, all_classes=all_classes) for group in groups]
-            return _joined(found_in, (group.start for group in groups))
-        shape = (len(self._distance), len(self._delta))
-        best = np.empty((n, n_bearing, *shape), np.float32)
-        by_class = []
-        for k, shift in enumerate(self._shifts):
-            best[:, k], above = self._costs(self._shifted(seen, shift), seen)
-            by_class.append(above)
-        frame, class_index, views, cost = [], [], [], []
-        for f in range(n):
-            found = modes(best[f], n_modes, self._closes, self._n_side)
-            for b, i, j in np.concatenate([found[found[:, 0] >= 0], self._other_sides(best[f], found)]):
-                least = float(best[f, b, i, j])
-                above = by_class[b][f, :, i, min(j, by_class[b].shape[-1] - 1)]
-                for c in np.argsort(above, kind="stable")[: None if all_classes else 1]:
-                    if above[c] > _UNDECIDED + _SHARE * least:
-                        break
-                    frame.append(f)
-                    class_index.append(c)
-                    height, pitch = self._upward.split(self._elevation(b), float(self._distance[i]))
-                    views.append((self._distance[i], self._delta[j], self._bearing(b), height, pitch, 0.0))
-                    cost.append(least + float(above[c]))
-        return Starts(
-            np.array(frame, np.int64),
-            np.array(class_index, np.int64),
-            np.array(views, np.float64).reshape(-1, len(VIEW_FIELDS)),
-            np.array(cost, np.float64),
+        found = [
+            self._best_of(*self._costs(moved, limit[f], raised=True), _N_MODES)
+            for f, moved in enumerate(self._moved(seen))
+        ]
+        return _joined(found)
+
+    def uncovered(self, seen: Observation, limit: NDArray[np.float64], known: Sequence[Known]) -> Starts:
+        """Return views in all cells of every frame that may hold an explanation but are not close to a known one.
+
+        Parameters
+        ----------
+        seen : Observation
+        limit : (n,) float64
+        known : sequence of (classes, views)
+            What explains each frame, (k,) int64 and (k, 6) float64.
+        """
+        found = []
+        for f, moved in enumerate(self._moved(seen)):
+            cost, _ = self._costs(moved, limit[f], raised=False)
+            for c, view in zip(*known[f], strict=True):
+                cost[self._close_to(int(c), view)] = np.inf
+            found.append(self._best_of(cost, None, _MOST_UNCOVERED))
+        return _joined(found)
+
+    def may_explain(self, seen: Observation, limit: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether any cell may hold an explanation of each frame, (n,); arguments as for :meth:`starts`."""
+        return np.array(
+            [
+                np.isfinite(self._costs(moved, limit[f], raised=False)[0]).any()
+                for f, moved in enumerate(self._moved(seen))
+            ],
+            np.bool_,
         )
 
-    def _other_sides(self, cost: NDArray[np.float32], found: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the best views from sides far from those found already, where they cost little more; (k, 3).
+    def _moved(self, seen: Observation) -> Iterator[list[tuple[Observation, int]]]:
+        """Yield each frame under all shifts, and how many returns each shift leaves out."""
+        for f in range(len(seen.range_m)):
+            one = seen[f : f + 1]
+            moved = [self._shifted(one, shift) for shift in self._shifts]
+            yield [(own, int(one.returned.sum() - own.returned.sum())) for own in moved]
 
-        A thin landmark looks nearly the same from the front and from the back. Without these views the neighbours of
-        one side alone would be compared, and the answer would not know that it is ambiguous.
-        """
-        profile = cost.min(axis=(0, 1))
-        least = float(profile.min())
-        taken = found[found[:, 0] >= 0, 2]
-        period = closing_period(self._delta) or 4 * math.pi
-        others = []
-        for _ in range(_MOST_OTHER_SIDES):
-            away = np.abs(wrap_delta_difference_rad(self._delta[:, None] - self._delta[None, taken], period)).min(
-                axis=1
+    def _costs(
+        self, moved: list[tuple[Observation, int]], limit: float, *, raised: bool
+    ) -> tuple[NDArray[np.float32], float]:
+        """Return what a frame costs about the middle of each cell, (class, shift, D, δ), infinite above the limit."""
+        while True:
+            cost = np.stack(
+                [
+                    self._cells.costs(own, 0, self._prior(b), limit) + np.float32(lost)
+                    for b, (own, lost) in enumerate(moved)
+                ],
+                axis=1,
             )
-            open_ = np.where(away > _OTHER_SIDE_RAD, profile, np.inf)
-            j = int(open_.argmin())
-            if not open_[j] <= _OTHER_SIDE_COST + _OTHER_SIDE_SHARE * least:
-                break
-            b, i = np.unravel_index(int(cost[:, :, j].argmin()), cost.shape[:2])
-            others.append((b, i, j))
-            taken = np.append(taken, j)
-        return np.array(others, np.int64).reshape(-1, 3)
+            if not raised or np.isfinite(cost).any():
+                return cost, limit
+            limit *= _RAISED
+
+    def _best_of(self, cost: NDArray[np.float32], limit: float | None, most: int) -> Starts:
+        """Return the local minima of one frame, or with no limit views that cover all its cells; best first."""
+        closes, n_side = self._cells.closes, self._n_side
+        class_index, views, costs = [], [], []
+        for c, own in enumerate(cost):
+            places = (
+                cover(own.copy(), most, closes, n_side, *_CLOSE) if limit is None else modes(own, most, closes, n_side)
+            )
+            for b, i, j in places[places[:, 0] >= 0]:
+                distance = float(self._cells.distance_m[i])
+                height, pitch = self._upward.split(self._elevation(b), distance)
+                class_index.append(c)
+                views.append((distance, self._cells.delta_rad[j], self._bearing(b), height, pitch, 0.0))
+                costs.append(float(own[b, i, j]))
+        order = np.argsort(costs, kind="stable")
+        return Starts(
+            np.zeros(len(order), np.int64), np.array(class_index, np.int64)[order],
+            np.array(views, np.float64).reshape(-1, len(VIEW_FIELDS))[order], np.array(costs)[order],
+        )  # fmt: skip
+
+    def _close_to(self, c: int, view: NDArray[np.float64]) -> tuple[Any, ...]:
+        """Return which cells of a class are close to a view, as an index of costs; whatever the elevation."""
+        cells, bearings = self._cells, np.array([self._bearing(b) for b in range(len(self._shifts))])
+        along = np.flatnonzero(np.abs(cells.distance_m - view[0]) <= _CLOSE[0] * _step(cells.distance_m))
+        period = closing_period(cells.delta_rad) or 2 * math.pi
+        off = (cells.delta_rad - view[1] + period / 2) % period - period / 2
+        around = np.flatnonzero(np.abs(off) <= _CLOSE[1] * _step(cells.delta_rad))
+        beside = np.flatnonzero(np.abs(bearings - view[2]) <= _CLOSE[2] * self.column_rad)
+        return np.ix_(np.array([c]), beside, along, around)
+
+    def _prior(self, index: int) -> float:
+        """Return what the prior adds to the cost of the most likely bearing within half a column."""
+        off = max(abs(self._bearing(index)) - self.column_rad / 2, 0.0)
+        return (off / self._bearing_std_rad) ** 2
 
     def _bearing(self, index: int) -> float:
         """Return the bearing whose image is shifted by whole columns: left is positive, and a smaller column."""
-        return -self._shifts[index][1] * self.column_rad
+        return -math.atan(self._shifts[index][1] / self._sensor.columns_per_tangent)
 
     def _elevation(self, index: int) -> float:
         """Return the elevation whose image is shifted by whole rows."""
@@ -257,34 +265,6 @@ class Search:
 
         return Observation(move(seen.range_m), move(seen.weight), move(seen.returned), move(seen.not_returned))
 
-    def _costs(self, moved: Observation, seen: Observation) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the cost of the best class at every view of the grid, (n, D, δ), and how far above it each class is.
-
-        The latter is (n, class, D, δ), or (n, class, D, 1) where it does not depend on δ.
-        """
-        n, cols = len(moved.range_m), self._sensor.cols
-        n_class, shape = self._n_class, (len(self._distance), len(self._delta))
-        out = DISAGREEMENT * (seen.returned.sum(axis=1) - moved.returned.sum(axis=1)).astype(np.float32)
-        pose: NDArray[np.float32] | None = None
-        upper: NDArray[np.float32] | None = None
-        for templates, (first, stop), is_upper in self._parts:
-            picked = slice(first * cols, stop * cols)
-            part = Observation(
-                moved.range_m[:, picked], moved.weight[:, picked],
-                moved.returned[:, picked], moved.not_returned[:, picked],
-            )  # fmt: skip
-            costs = templates.capped_costs(part, _GRID_STD_M) if self._capped else templates.costs(part)
-            if is_upper:
-                upper = costs.reshape(n, n_class, shape[0])
-            else:
-                pose = costs.reshape(n, -1, *shape)
-        assert pose is not None
-        if upper is None:
-            least = pose.min(axis=1)
-            return least + out[:, None, None], pose - least[:, None]
-        least = upper.min(axis=1)
-        return pose[:, 0] + least[:, :, None] + out[:, None, None], (upper - least[:, None])[..., None]
-
 
 class SearchOfFrames:
     """A first look at a bank before what stands behind each of n frames.
@@ -300,28 +280,60 @@ class SearchOfFrames:
     def __init__(self, searches: Sequence[Search], column_rad: float) -> None:
         self._searches, self.column_rad = searches, column_rad
 
-    def capped(self) -> SearchOfFrames:
-        """Return the same search, in which no pixel costs more than a disagreement."""
-        return SearchOfFrames([search.capped() for search in self._searches], self.column_rad)
-
     def of_frames(self, frame: NDArray[np.int64]) -> SearchOfFrames:
         """Return the search for some of the frames."""
         return SearchOfFrames([self._searches[k] for k in frame], self.column_rad)
 
-    def starts(self, seen: Observation, n_modes: int, *, all_classes: bool = False) -> Starts:
+    def starts(self, seen: Observation, limit: NDArray[np.float64]) -> Starts:
         """Return the best modes of every frame; see :meth:`Search.starts`."""
-        found = [
-            search.starts(seen[k : k + 1], n_modes, all_classes=all_classes) for k, search in enumerate(self._searches)
-        ]
-        return _joined(found, range(len(found))) if found else _NO_STARTS
+        return _joined([own.starts(seen[k : k + 1], limit[k : k + 1]) for k, own in enumerate(self._searches)])
+
+    def uncovered(self, seen: Observation, limit: NDArray[np.float64], known: Sequence[Known]) -> Starts:
+        """Return views in the cells that are left; see :meth:`Search.uncovered`."""
+        return _joined(
+            [own.uncovered(seen[k : k + 1], limit[k : k + 1], known[k : k + 1]) for k, own in enumerate(self._searches)]
+        )
 
 
-def _joined(parts: Sequence[Starts], first: Iterable[int]) -> Starts:
-    """Return the starts of groups of frames, of which each begins with some frame of all."""
+def _joined(parts: Sequence[Starts]) -> Starts:
+    """Return the starts of single frames as those of all."""
+    if not parts:
+        return _NO_STARTS
+    frame = np.repeat(np.arange(len(parts)), [len(own.frame) for own in parts])
     return Starts(
-        np.concatenate([own.frame + k for own, k in zip(parts, first, strict=True)]),
-        *(np.concatenate([getattr(own, name) for own in parts]) for name in ("class_index", "view", "cost")),
+        frame, *(np.concatenate([getattr(own, name) for own in parts]) for name in ("class_index", "view", "cost"))
     )
+
+
+def _step(grid: NDArray[np.float64]) -> float:
+    """Return the first step of a grid; infinite of one point."""
+    return float(grid[1] - grid[0]) if len(grid) > 1 else math.inf
+
+
+@njit(cache=True, nogil=True)
+def cover(cost, most, closes, n_side, reach_d, reach_a, reach_side):  # type: ignore[no-untyped-def]
+    """Return places of finite cost, lowest first, such that each is within reach of one of them; −1 behind the last.
+
+    `cost` is (shift, D, δ), and becomes infinite where it is covered.
+    """
+    n_b, n_d, n_a = cost.shape
+    found = np.full((most, 3), -1, np.int64)
+    for k in range(most):
+        at = cost.argmin()
+        b, i, j = at // (n_d * n_a), at // n_a % n_d, at % n_a
+        if not cost[b, i, j] < np.inf:
+            break
+        found[k] = b, i, j
+        up, side = b // n_side, b % n_side
+        for uu in range(max(up - 1, 0), min(up + 2, n_b // n_side)):
+            for ss in range(max(side - reach_side, 0), min(side + reach_side + 1, n_side)):
+                for ii in range(max(i - reach_d, 0), min(i + reach_d + 1, n_d)):
+                    for jj in range(j - reach_a, j + reach_a + 1):
+                        if closes:
+                            jj %= n_a
+                        if 0 <= jj < n_a:
+                            cost[uu * n_side + ss, ii, jj] = np.inf
+    return found
 
 
 @njit(cache=True, nogil=True)

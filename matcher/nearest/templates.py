@@ -21,6 +21,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numba import njit
@@ -32,6 +33,7 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE,
 from phasemark.render import PhasorImages, Sensor, phasor_to_range_m, predicted_range_std
 from phasemark.render.phasor_images import wrap_difference_m
 
+_T = TypeVar("_T", bound=np.generic)
 _RECHECKED = 64
 _PIXELS_AT_ONCE = 1 << 20
 
@@ -76,6 +78,14 @@ class Observation:
         weight = np.zeros(ranges.shape)
         weight[returned] = 1 / std[returned] ** 2
         return cls(ranges, weight, returned, state == PixelState.NO_RETURN)
+
+    def mirrored(self, cols: int) -> Observation:
+        """Return the frames mirrored left to right; their images have `cols` columns."""
+
+        def flip(values: NDArray[_T]) -> NDArray[_T]:
+            return values.reshape(len(values), values.shape[1] // cols, cols)[..., ::-1].reshape(values.shape)
+
+        return Observation(flip(self.range_m), flip(self.weight), flip(self.returned), flip(self.not_returned))
 
     def __getitem__(self, index: NDArray[np.integer] | slice) -> Observation:
         return Observation(self.range_m[index], self.weight[index], self.returned[index], self.not_returned[index])
@@ -163,7 +173,7 @@ class Templates:
 
         The answer does not depend on how many come together.
         """
-        found = [_seen(*part, sensor, background, rows) for part in parts]
+        found = [seen_by_images(*part, sensor, background, rows) for part in parts]
         # the circular mean, so that a pixel whose ranges straddle the wrap has its mean there
         total: NDArray[np.complex128] | None = None
         for ranges, may, _ in found:
@@ -206,7 +216,7 @@ class Templates:
         if self.wraps:
             picked = slice(None) if subset is None else subset
             models = (self.range_m[picked], self.may_return[picked], self.must_return[picked])
-            return self._wrapped_costs(models, about, seen.weight, seen, np.inf)
+            return self._wrapped_costs(models, about, seen)
         query = np.concatenate(
             [
                 seen.weight * about**2 - DISAGREEMENT * seen.returned,
@@ -220,33 +230,16 @@ class Templates:
         constant = DISAGREEMENT * seen.returned.sum(axis=1)
         return np.asarray(query.astype(np.float32) @ matrix.T + constant[:, None].astype(np.float32))
 
-    def capped_costs(self, seen: Observation, grid_std_m: float) -> NDArray[np.float32]:
-        """Return the distances of n frames from all templates, (n, t), where no pixel costs more than a disagreement.
-
-        Parameters
-        ----------
-        seen : Observation
-        grid_std_m : float
-            What half a step of the grid changes in a range; added to the noise.
-        """
-        variance = np.divide(1.0, seen.weight, out=np.zeros_like(seen.weight), where=seen.weight > 0)
-        weight = np.where(seen.returned, 1 / (variance + grid_std_m**2), 0.0)
-        models = (self.range_m, self.may_return, self.must_return)
-        return self._wrapped_costs(models, self.about(seen), weight, seen, DISAGREEMENT)
-
     def _wrapped_costs(
         self,
         models: tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]],
         about: NDArray[np.float64],
-        weight: NDArray[np.float64],
         seen: Observation,
-        most: float,
     ) -> NDArray[np.float32]:
-        """Return the distances of n frames from t templates, (n, t), where no return costs more than `most`."""
+        """Return the distances of n frames from t templates whose ranges may differ by more than half a period."""
         out = np.empty((len(about), len(models[0])), np.float32)
-        _capped_costs(
-            *models, about, weight, seen.returned, seen.not_returned, self.sensor.unambiguous_range_m, most, out
-        )
+        period_m = self.sensor.unambiguous_range_m
+        _costs_on_a_circle(*models, about, seen.weight, seen.returned, seen.not_returned, period_m, out)
         return out
 
     def exact_costs(self, seen: Observation, frame: int, index: NDArray[np.integer]) -> NDArray[np.float64]:
@@ -288,14 +281,14 @@ class Templates:
         return np.where(seen.returned, wrap_difference_m(seen.range_m - self.mean_m, self.sensor), 0.0)
 
 
-def _seen(
+def seen_by_images(
     phasor: NDArray[np.complexfloating],
     coverage: NDArray[np.floating],
     sensor: Sensor,
     background: PhasorImages | None,
     rows: tuple[int, int],
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return ranges of some images, 0 where they may not return, and which pixels may and must return."""
+    """Return ranges of some images, 0 where they may not return, and which pixels may and must return; (n, pixels)."""
     pixels = math.prod(phasor.shape[-2:])
     s = phasor.reshape(-1, pixels)
     cover = np.asarray(coverage).reshape(-1, pixels)
@@ -316,8 +309,8 @@ def _seen(
 
 
 @njit(cache=True, nogil=True)
-def _capped_costs(model, may, must, about, weight, returned, absent, period, most, out):  # type: ignore[no-untyped-def]
-    """Fill the costs of every frame at every template, no residual above `most`."""
+def _costs_on_a_circle(model, may, must, about, weight, returned, absent, period, out):  # type: ignore[no-untyped-def]
+    """Fill the costs of every frame at every template."""
     for f in range(out.shape[0]):
         for t in range(out.shape[1]):
             total = 0.0
@@ -326,7 +319,7 @@ def _capped_costs(model, may, must, about, weight, returned, absent, period, mos
                     if may[t, q]:
                         difference = abs(about[f, q] - model[t, q])
                         difference = min(difference, abs(period - difference))
-                        total += min(weight[f, q] * difference * difference, most)
+                        total += weight[f, q] * difference * difference
                     else:
                         total += DISAGREEMENT
                 elif absent[f, q] and must[t, q]:

@@ -1,0 +1,153 @@
+"""Cells of a bank: their bounds are bounds, and no answer is accepted beside a rival on parts with many faces."""
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from thin_landmarks import GROSS_M, GROSS_RAD
+
+from phasemark.data import BankPlan, build_bank
+from phasemark.data.plans import MeshPlan
+from phasemark.landmarks import export_mesh
+from phasemark.matcher import Matcher, kalman_filter
+from phasemark.matcher.likelihood.bank_images import BankModel
+from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher
+from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.nearest.cells import CellBounds
+from phasemark.render import Background, Renderer, Views, capture, preset
+from phasemark.render.phasor_images import wrap_difference_m
+
+GRID = {"distance_m": "0.6:1.5:0.02", "delta_deg": "0:358:2", "layout": "full"}
+WALL = Background(wall_m=2.5)
+
+
+def prism(sides, radius=0.1, height=0.25):
+    """Return a prism with a small rib in the middle of one face."""
+    mesh = trimesh.creation.cylinder(radius, height, sections=sides)
+    rib = trimesh.creation.box((0.03, 0.02, 0.9 * height))
+    rib.apply_translation((radius * math.cos(math.pi / sides) + 0.005, 0.01, 0))
+    rib.apply_transform(trimesh.transformations.rotation_matrix(math.pi / sides, (0, 0, 1)))
+    return trimesh.boolean.union([mesh, rib], engine="manifold")
+
+
+@pytest.fixture(scope="module")
+def prisms(tmp_path_factory):
+    banks, folder = {}, tmp_path_factory.mktemp("prisms")
+    for sides in (5, 6):
+        path = folder / f"{sides}.ply"
+        path.write_bytes(export_mesh(prism(sides), "ply"))
+        mesh = MeshPlan(name="prism", path=str(path), unit="m", symmetry=1)
+        banks[sides] = build_bank(BankPlan(meshes=(mesh,), **GRID))
+    yield banks
+    for bank in banks.values():
+        bank.close()
+
+
+def drawn(n, seed):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0.65, 1.45, n), rng.uniform(0, 2 * math.pi, n), rng
+
+
+@pytest.mark.parametrize("background", [None, WALL], ids=["alone", "wall"])
+@pytest.mark.parametrize("turned", [False, True], ids=["ahead", "half a column aside"])
+def test_no_view_of_a_cell_costs_less_than_its_bound(prisms, background, turned):
+    bank, n = prisms[6], 200
+    distance, delta, rng = drawn(n, 11)
+    bearing = rng.uniform(-0.5, 0.5, n) * math.radians(22 / 16) if turned else np.zeros(n)
+    behind = Renderer(None, bank.sensor).render(1.0, background=background) if background else None
+    cells = CellBounds(bank, (1, 1), behind, aside=turned)
+    renderer = Renderer(bank.mesh("prism"), bank.sensor, albedo=0.8)
+    image = renderer.render(distance, delta, bearing, background=background)
+    seen = Evidence.from_frames(kalman_filter(capture(image, bank.sensor, rng=rng, n_frames=50)), "ranges").seen
+    i = np.abs(distance[:, None] - cells.distance_m).argmin(axis=1)
+    j = np.abs(wrap_turn(delta[:, None] - cells.delta_rad)).argmin(axis=1)
+    # the true view costs one a return, on average; its bound is far below that but for a few mixed pixels
+    limit = seen.returned.sum(axis=1) + 25.0
+    assert all(np.isfinite(cells.costs(seen, k, 0.0, limit[k])[0, i[k], j[k]]) for k in range(n))
+
+
+def test_bounds_of_wide_pixels_hold_at_any_bearing_within_half_a_column(tmp_path):
+    path, n = tmp_path / "prism.ply", 150
+    path.write_bytes(export_mesh(prism(5), "ply"))
+    mesh = MeshPlan(name="prism", path=str(path), unit="m", symmetry=1)
+    distance, delta, rng = drawn(n, 4)
+    with build_bank(BankPlan(meshes=(mesh,), sensor="vl53l5cx-8x8", **GRID)) as bank:
+        bearing = rng.uniform(-0.5, 0.5, n) * bank.sensor.pixel_rad
+        cells = LikelihoodMatcher(bank)._search._cells
+        image = Renderer(bank.mesh("prism"), bank.sensor, albedo=0.8).render(distance, delta, bearing)
+    seen = Evidence.from_frames(kalman_filter(capture(image, image.sensor, rng=rng, n_frames=50)), "ranges").seen
+    i = np.abs(distance[:, None] - cells.distance_m).argmin(axis=1)
+    j = np.abs(wrap_turn(delta[:, None] - cells.delta_rad)).argmin(axis=1)
+    limit = seen.returned.sum(axis=1) + 25.0
+    held = [np.isfinite(cells.costs(seen, k, 0.0, limit[k])[0, i[k], j[k]]) for k in range(n)]
+    assert np.mean(held) >= 0.9  # ranges are good to half a millimetre: edges within a cell leave some above
+
+
+@pytest.mark.parametrize("bearing_deg", [-2.2, -0.4, 0.1, 1.0])
+def test_images_moved_aside_are_near_rendered_ones_and_their_slopes_are_their_differences(prisms, bearing_deg):
+    bank, n = prisms[6], 40
+    distance, delta, _ = drawn(n, 9)
+    view = np.column_stack([distance, delta, np.full(n, math.radians(bearing_deg)), np.zeros((n, 3))])
+    model, which, free = BankModel(bank), np.zeros(n, np.int64), ("distance_m", "delta_rad", "bearing_rad")
+    images = model.images(which, view, free)
+    rendered = Renderer(bank.mesh("prism"), bank.sensor, albedo=0.8).render_views(Views(*np.ascontiguousarray(view.T)))
+    lit = rendered.coverage.reshape(n, -1) > 0.5
+    off_m = bank.sensor.metres_per_radian * np.angle(rendered.phasor.reshape(n, -1)[lit] * images.phasor[lit].conj())
+    assert np.median(np.abs(off_m)) < 2e-3  # the noise of 50 exposures is 3 mm
+    step = 1e-6
+    ends = [model.images(which, view + side * step * np.eye(6)[2], ()).phasor for side in (1, -1)]
+    np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), images.slope[:, 2], atol=1e-4)
+
+
+def wrap_turn(angle):
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def test_a_limit_leaves_out_the_cells_above_it_and_no_other(prisms):
+    bank = prisms[6]
+    cells = CellBounds(bank, (1, 1), None)
+    image = Renderer(bank.mesh("prism"), bank.sensor, albedo=0.8).render(1.03, 2.2)
+    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(3), n_frames=50))
+    seen = Evidence.from_frames(frames, "ranges").seen
+    wide, narrow = (cells.costs(seen, 0, 0.0, limit) for limit in (1e6, 200.0))
+    kept = np.isfinite(narrow)
+    assert 10 < kept.sum() < 0.1 * kept.size
+    np.testing.assert_allclose(narrow[kept], wide[kept], rtol=1e-5)  # float32
+    # the bound of each cell, by NumPy: the sum over pixels of the distance from the interval
+    part, pixels = cells._pose
+    y, weight = seen.range_m[0, pixels], np.where(seen.returned[0, pixels], seen.weight[0, pixels], 0.0)
+    off = np.abs(wrap_difference_m(y - part.middle_m.astype(float), bank.sensor)) - part.half_m
+    bound = np.minimum(weight * np.maximum(off, 0.0) ** 2, 25.0).sum(axis=1)
+    bound += (25.0 * seen.not_returned[0, pixels] * part.must_return).sum(axis=1)
+    clear = np.abs(bound - 200.0) > 0.01
+    np.testing.assert_array_equal(kept.ravel()[clear], (bound <= 200.0)[clear])
+
+
+@pytest.mark.parametrize("sides", [5, 6])
+@pytest.mark.parametrize("setting", ["fixed", "bearing", "wall"])
+def test_a_prism_is_never_accepted_a_face_off(prisms, sides, setting):
+    bank = prisms[sides]
+    distance, delta, rng = drawn(40, sides)
+    bearing = rng.uniform(-1, 1, 40) * math.radians(1.7) if setting == "bearing" else np.zeros(40)
+    free = ("distance_m", "delta_rad", "bearing_rad")[: 3 if setting == "bearing" else 2]
+    background = WALL if setting == "wall" else None
+    views = Views.broadcast(distance, delta, bearing)
+    image = Renderer(bank.mesh("prism"), bank.sensor, albedo=0.8).render_views(views, background=background)
+    frames = kalman_filter(capture(image, bank.sensor, rng=rng, n_frames=50))
+    matches = Matcher(bank, free=free, method="refine", background=background).match(frames)
+    off = np.abs(wrap_turn(matches.delta_rad - delta))
+    right = (np.abs(matches.distance_m - distance) <= GROSS_M) & (off <= GROSS_RAD)
+    assert right[matches.accepted].all()
+    assert matches.accepted.sum() >= 10
+    ambiguous = [k for k, match in enumerate(matches) if match.reason == "ambiguous"]
+    # the true view is the answer or among the alternatives
+    for k in ambiguous:
+        told = [matches[k].delta_rad, *(one.delta_rad for one in matches[k].alternatives)]
+        assert np.abs(wrap_turn(np.array(told) - delta[k])).min() <= GROSS_RAD
+
+
+def test_a_lens_in_a_corner_of_the_box_of_a_round_part_is_outside_it():
+    can = Renderer(trimesh.creation.cylinder(0.15, 0.2), preset("pmd-16x16"))
+    image = can.render(0.2, math.radians(45))  # the corner of the bounding box is at 0.212 m
+    assert image.range_m[0, 7, 7] == pytest.approx(0.05, abs=1e-3)
