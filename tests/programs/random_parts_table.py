@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from random_parts import KINDS, random_part
 
 from phasemark.data import Bank, BankPlan, build_bank
@@ -147,29 +148,35 @@ def draw_cases(bank: Bank, like: dict[str, Any], n: int) -> list[Case]:
             for k, (c, d, a, b) in enumerate(drawn)]  # fmt: skip
 
 
+def moved(part: trimesh.Trimesh, turn_rad: float, offset_m: tuple[float, float, float]) -> trimesh.Trimesh:
+    """Return a copy of a mesh, turned about its axis and then moved."""
+    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return trimesh.Trimesh(part.vertices @ turn.T + offset_m, part.faces, process=False)
+
+
 def things_in_view(kind: str, case: Case, bank: Bank, rng: np.random.Generator) -> trimesh.Trimesh:
     """Return unknown things in the camera's frame: x ahead, y to the left, z up."""
     far, side = case.distance_m, rng.choice([-1.0, 1.0])
     if kind == "post":
         at = rng.uniform(0.5, 1.2) * far
         post = trimesh.creation.cylinder(rng.uniform(0.015, 0.04), 1.0, sections=16)
-        return post.apply_translation((at, at * math.tan(side * math.radians(rng.uniform(2.0, 10.0))), 0.0))
+        return moved(post, 0.0, (at, at * math.tan(side * math.radians(rng.uniform(2.0, 10.0))), 0.0))
     if kind == "second":
         other = bank.mesh(str(rng.choice([name for name in bank.classes if name != case.class_name])))
-        part = trimesh.Trimesh(other.vertices, other.faces, process=False)
-        part.apply_transform(trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * math.pi), (0, 0, 1)))
-        return part.apply_translation((far + rng.uniform(-0.1, 0.3), side * rng.uniform(0.3, 0.45), 0.0))
-    board = trimesh.creation.box((0.02, 0.8, 1.2)).apply_translation((0.0, side * 0.4, 0.0))
-    board.apply_transform(trimesh.transformations.rotation_matrix(rng.uniform(-0.2, 0.2), (0, 0, 1)))
+        turn = rng.uniform(0, 2 * math.pi)
+        return moved(other, turn, (far + rng.uniform(-0.1, 0.3), side * rng.uniform(0.3, 0.45), 0.0))
+    board = moved(trimesh.creation.box((0.02, 0.8, 1.2)), 0.0, (0.0, side * 0.4, 0.0))
+    turn = rng.uniform(-0.2, 0.2)
     at = far + rng.uniform(0.3, 0.6) if kind == "behind" else far * rng.uniform(0.5, 0.8)
-    return board.apply_translation((at, rng.uniform(-0.06, 0.06) * at / far, 0.0))
+    return moved(board, turn, (at, rng.uniform(-0.06, 0.06) * at / far, 0.0))
 
 
 def rendered_with_things(bank: Bank, case: Case, renderer: Renderer) -> PhasorImages:
     """Render a landmark, or nothing, among unknown things."""
     kind = case.setting.removeprefix("unknown-")
     things = things_in_view(kind, case, bank, np.random.default_rng((*case.frame_seed, case.number)))
-    bodies = [things.vertices], [things.faces]
+    bodies: tuple[list[NDArray[np.float64]], list[NDArray[np.int64]]] = [things.vertices], [things.faces]
     if kind != "board":
         landmark = bank.mesh(case.class_name)
         rotation, translation = (one[0] for one in Views.broadcast(*case.view).landmark2cam())
@@ -200,13 +207,13 @@ def frames_of(bank: Bank, renderers: dict[str, Renderer], cases: Sequence[Case])
     if things in THINGS or kind == "stranger":
         rendered = rendered_stranger if kind == "stranger" else rendered_with_things
         alone = [rendered(bank, case, renderer) for case in cases]
-        image = replace(
-            alone[0], views=views, **{part: np.concatenate([getattr(one, part) for one in alone]) for part in IMAGES}
-        )
+        parts: dict[str, Any] = {part: np.concatenate([getattr(one, part) for one in alone]) for part in IMAGES}
+        image = replace(alone[0], views=views, **parts)
     else:
         image = renderer.render_views(views, background=SCENES.get(first.setting))
     if kind == "mirrored":
-        image = replace(image, **{part: getattr(image, part)[..., ::-1] for part in IMAGES})
+        mirrored: dict[str, Any] = {part: getattr(image, part)[..., ::-1] for part in IMAGES}
+        image = replace(image, **mirrored)
     phasors = SETTINGS[first.setting].get("on") == "phasors"
     sensor = renderer.sensor.with_(max_phase_std_rad=None) if phasors else renderer.sensor
     rng = np.random.default_rng(first.frame_seed)
