@@ -26,11 +26,24 @@ def p_values_of(
     Where the variances were estimated from the scatter of ν + 1 frames (`nu`, (m,)), each squared residual follows
     F(1, ν); their sum is given a scaled χ² of the same mean and variance.
     """
-    freedom, nu = np.maximum(dof, 1.0), np.minimum(nu, 1e9)
-    mean = freedom * nu / (nu - 2)
-    variance = freedom * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
-    p = special.chdtrc(2 * mean**2 / variance, cost * 2 * mean / variance)
-    return np.asarray(np.where(dof > 0, p, 0.0))
+    freedom, scale = _scaled(dof, nu)
+    return np.asarray(np.where(dof > 0, special.chdtrc(freedom, cost / scale), 0.0))
+
+
+def largest_costs(p: float, dof: NDArray[np.integer], nu: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the χ² whose p-value is p for every fit, (m,); arguments as for :func:`p_values_of`."""
+    freedom, scale = _scaled(dof, nu)
+    return np.asarray(scale * special.chdtri(freedom, p))
+
+
+def _scaled(
+    dof: NDArray[np.integer] | NDArray[np.float64], nu: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return degrees of freedom and factor of the scaled χ² of sums of `dof` squared residuals."""
+    n, nu = np.maximum(dof, 1.0), np.minimum(nu, 1e9)
+    mean = n * nu / (nu - 2)
+    variance = n * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
+    return 2 * mean**2 / variance, variance / (2 * mean)
 
 
 def worse_of_two(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:

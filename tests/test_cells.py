@@ -64,7 +64,7 @@ def test_no_view_of_a_cell_costs_less_than_its_bound(prisms, background, turned)
     j = np.abs(wrap_turn(delta[:, None] - cells.delta_rad)).argmin(axis=1)
     # the true view costs one a return, on average; its bound is far below that but for a few mixed pixels
     limit = seen.returned.sum(axis=1) + 25.0
-    assert all(np.isfinite(cells.costs(seen, k, 0.0, limit[k])[0, i[k], j[k]]) for k in range(n))
+    assert all(np.isfinite(costs(cells, seen, k, limit[k])[0, i[k], j[k]]) for k in range(n))
 
 
 def test_bounds_of_wide_pixels_hold_at_any_bearing_within_half_a_column(tmp_path):
@@ -74,13 +74,13 @@ def test_bounds_of_wide_pixels_hold_at_any_bearing_within_half_a_column(tmp_path
     distance, delta, rng = drawn(n, 4)
     with build_bank(BankPlan(meshes=(mesh,), sensor="vl53l5cx-8x8", **GRID)) as bank:
         bearing = rng.uniform(-0.5, 0.5, n) * bank.sensor.pixel_rad
-        cells = LikelihoodMatcher(bank)._search._cells
+        cells = LikelihoodMatcher(bank)._search.cells
         image = Renderer(bank.mesh("prism"), bank.sensor, albedo=0.8).render(distance, delta, bearing)
     seen = Evidence.from_frames(kalman_filter(capture(image, image.sensor, rng=rng, n_frames=50)), "ranges").seen
     i = np.abs(distance[:, None] - cells.distance_m).argmin(axis=1)
     j = np.abs(wrap_turn(delta[:, None] - cells.delta_rad)).argmin(axis=1)
     limit = seen.returned.sum(axis=1) + 25.0
-    held = [np.isfinite(cells.costs(seen, k, 0.0, limit[k])[0, i[k], j[k]]) for k in range(n)]
+    held = [np.isfinite(costs(cells, seen, k, limit[k])[0, i[k], j[k]]) for k in range(n)]
     assert np.mean(held) >= 0.9  # ranges are good to half a millimetre: edges within a cell leave some above
 
 
@@ -100,6 +100,12 @@ def test_images_moved_aside_are_near_rendered_ones_and_their_slopes_are_their_di
     np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), images.slope[:, 2], atol=1e-4)
 
 
+def costs(cells, seen, k, limit):
+    found = np.empty(cells.shape, np.float32)
+    cells.fill_costs(found, cells.prepared(seen), k, 0.0, limit)
+    return found
+
+
 def wrap_turn(angle):
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
@@ -110,7 +116,7 @@ def test_a_limit_leaves_out_the_cells_above_it_and_no_other(prisms):
     image = Renderer(bank.mesh("prism"), bank.sensor, albedo=0.8).render(1.03, 2.2)
     frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(3), n_frames=50))
     seen = Evidence.from_frames(frames, "ranges").seen
-    wide, narrow = (cells.costs(seen, 0, 0.0, limit) for limit in (1e6, 200.0))
+    wide, narrow = (costs(cells, seen, 0, limit) for limit in (1e6, 200.0))
     kept = np.isfinite(narrow)
     assert 10 < kept.sum() < 0.1 * kept.size
     np.testing.assert_allclose(narrow[kept], wide[kept], rtol=1e-5)  # float32

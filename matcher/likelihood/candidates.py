@@ -20,6 +20,8 @@ __all__ = ["fit_neighbouring_views", "fit_starts", "fit_views"]
 
 _SOFT_M = 0.01
 """Standard deviation of ranges that is added for the first steps of a robust descent: half a cell."""
+_APART = 0.01, math.radians(2.0)
+"""Distance and angle within which minima of a scout lead to one: its images are not smooth."""
 _BEST_BESIDE = 2
 """Views around a side minimum that are refined."""
 _ASIDE_RAD = tuple(math.radians(angle) for angle in (0.12, 0.3, 0.7, 1.5, 3.0))
@@ -33,8 +35,7 @@ def fit_starts(
     which: NDArray[np.int64],
     starts: Starts,
     limit: NDArray[np.float64],
-    *,
-    thorough: bool = False,
+    known: Fits | None = None,
 ) -> Fits:
     """Refine the starts of some frames.
 
@@ -50,53 +51,75 @@ def fit_starts(
         Views in the cells that may hold an explanation.
     limit : (k,) float64
         Cost up to which a view explains a frame.
-    thorough : bool
-        Whether to look around all side minima; otherwise only while nothing explains their frame.
+    known : Fits, optional
+        What is known to explain these frames: only what is not there is refined and returned, and all side minima are
+        looked around. Otherwise they are only while nothing explains their frame.
     """
     settings, model = scene.settings(setup), scene.scout or scene.final
-    n = len(evidence.weight)
-    explains = np.full(n, np.inf)
+    explains = np.full(len(evidence.weight), np.inf)
     explains[which] = limit
+    most = None if known is None else explains
+    apart = (setup.policy.same_m, setup.policy.same_rad) if scene.scout is None else _APART
     frame, class_index, view = which[starts.frame], starts.class_index, starts.view
     if setup.huber is not None:
         # a loss that stays constant for outliers has no slope a cell away: the first steps have more noise
         soft = evidence.with_further_noise(_SOFT_M)
         view = refine(model, soft, frame, class_index, view, settings, roughly=True).view
     fits = refine(model, evidence, frame, class_index, view, settings, roughly=True)
+    if known is not None:
+        if scene.scout is not None:  # which has its own minimum there
+            known = refine(model, evidence, known.frame, known.class_index, known.view, settings, roughly=True)
+        fits = _elsewhere(setup, fits, known, apart)
     if scene.scout is not None and not setup.bearing_is_free:
-        fits = _finished(setup, scene, evidence, fits)
-        return Fits.joined([fits, _beside_stuck(setup, scene, evidence, fits, explains, thorough)])
-    fits = Fits.joined([fits, _beside_stuck(setup, scene, evidence, fits, explains, thorough, roughly=True)])
+        fits = _finished(setup, scene, evidence, fits, most)
+        stuck = _are_stuck(setup, fits, explains, most)
+        return Fits.joined([fits, _beside(setup, scene.without_scout(), evidence, fits, stuck, most, roughly=False)])
+    stuck = _are_stuck(setup, fits, explains, most)
+    fits = Fits.joined([fits, _beside(setup, scene, evidence, fits, stuck, most)])
     if scene.scout is None:
-        return _finished(setup, scene, evidence, fits)
+        return _finished(setup, scene, evidence, fits, most)
     # at a bearing a scout is good to some hundreds at edges
-    most = (explains if thorough else least_of_frame(fits, n)) + setup.policy.margin_cost
-    likely = fits.cost < most[fits.frame]
-    found = fit_views(setup, scene, evidence, _of_own_places(setup, fits, likely))
-    return found if thorough else Fits.joined([found, fits[~likely]])
+    likely = fits.cost < (_near(fits, explains, most) + setup.policy.margin_cost)[fits.frame]
+    own = _of_own_places(setup, fits, likely, apart)
+    rough = _rough(setup, scene, evidence, own, most)
+    # where the scout explains a frame, an edge has left a pixel on the way
+    stuck = (own.cost <= explains[own.frame]) & (rough.cost > explains[own.frame])
+    stuck &= (_near(rough, explains, most) >= explains)[own.frame]
+    rough = Fits.joined([rough, _beside(setup, scene.without_scout(), evidence, own, stuck, most)])
+    found = _finished(setup, scene.without_scout(), evidence, rough, most)
+    return found if most is not None else Fits.joined([found, fits[~likely]])
 
 
-def _beside_stuck(
+def _near(fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Return the cost near which fits of each frame are followed: the least, or that of a rival of what is known."""
+    return least_of_frame(fits, len(explains)) if most is None else most
+
+
+def _are_stuck(
+    setup: Setup, fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] | None
+) -> NDArray[np.bool_]:
+    """Return which fits ended not far above what explains their frame: their cells may still hold an explanation."""
+    near = _near(fits, explains, most)
+    stuck = (fits.cost > explains[fits.frame]) & (fits.cost < near[fits.frame] + setup.policy.margin_cost)
+    return np.asarray(stuck & (near >= explains)[fits.frame])
+
+
+def _beside(
     setup: Setup,
     scene: Scene,
     evidence: Evidence,
     fits: Fits,
-    explains: NDArray[np.float64],
-    thorough: bool,
+    stuck: NDArray[np.bool_],
+    most: NDArray[np.float64] | None,
     *,
-    roughly: bool = False,
+    roughly: bool = True,
 ) -> Fits:
-    """Refine from around those fits that ended above the limit: their cells may still hold an explanation.
+    """Refine from around those fits that are stuck, on the scout if there is one.
 
     A descent stops at side minima, where an edge of the landmark has left a pixel.
     """
     settings = scene.settings(setup) if roughly else _close_settings(setup, scene, evidence)
-    model = (scene.scout or scene.final) if roughly else scene.final
-    least = least_of_frame(fits, len(evidence.weight))
-    stuck = fits.cost > np.minimum(explains, least + setup.rival_cost)[fits.frame]
-    stuck &= fits.cost < np.maximum(least, explains)[fits.frame] + setup.policy.margin_cost
-    if not thorough:
-        stuck &= (least > explains)[fits.frame]
+    model = scene.scout or scene.final
     which = distinct_of_frames(
         fits, np.flatnonzero(stuck), setup.shapes.symmetry, setup.policy.same_m, setup.policy.same_rad
     )
@@ -109,34 +132,52 @@ def _beside_stuck(
     cost = costs_at(model, evidence, frame, class_index, views, settings).reshape(-1, k)
     best = np.argsort(cost, axis=1)[:, :_BEST_BESIDE]
     best = (best + k * np.arange(len(cost))[:, None]).ravel()
-    return refine(model, evidence, frame[best], class_index[best], views[best], settings, roughly=roughly)
+    rival = None if most is None else most[frame[best]]
+    return refine(model, evidence, frame[best], class_index[best], views[best], settings, rival=rival, roughly=roughly)
 
 
-def _of_own_places(setup: Setup, fits: Fits, which: NDArray[np.bool_]) -> Fits:
-    """Return those of some fits that came to places of their own, the best at each."""
-    policy = setup.policy
-    return fits[distinct_of_frames(fits, np.flatnonzero(which), setup.shapes.symmetry, policy.same_m, policy.same_rad)]
+def _elsewhere(setup: Setup, fits: Fits, known: Fits, apart: tuple[float, float]) -> Fits:
+    """Return those of some fits that came to other places than known ones."""
+    whole = Fits.joined([replace(known, cost=np.full(len(known), -np.inf)).with_free(fits.covariance.shape[1]), fits])
+    own = _of_own_places(setup, whole, np.ones(len(whole), np.bool_), apart)
+    return own[own.cost > -np.inf]
+
+
+def _of_own_places(setup: Setup, fits: Fits, which: NDArray[np.bool_], apart: tuple[float, float]) -> Fits:
+    """Return those of some fits that came to places apart from each other, the best at each."""
+    return fits[distinct_of_frames(fits, np.flatnonzero(which), setup.shapes.symmetry, *apart)]
 
 
 def fit_views(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     """Refine the views of some fits: each roughly, and what is likely then to the end."""
+    rough = _rough(setup, scene, evidence, fits)
+    return _finished(setup, scene.without_scout(), evidence, rough)
+
+
+def _rough(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, most: NDArray[np.float64] | None = None) -> Fits:
+    """Refine the views of some fits roughly on the final images, as far as they promise to come near `most`."""
     settings = scene.settings(setup)
-    rough = refine(scene.final, evidence, fits.frame, fits.class_index, fits.view, settings, roughly=True)
-    return _finished(setup, replace(scene, scout=None), evidence, rough)
+    give_up = None if most is None else most[fits.frame] + setup.policy.likely_cost
+    return refine(scene.final, evidence, fits.frame, fits.class_index, fits.view, settings, give_up, roughly=True)
 
 
-def _finished(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
+def _finished(
+    setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, most: NDArray[np.float64] | None = None
+) -> Fits:
     """Refine on the final images those rough fits that are likely; of fits that came to one place, the best.
 
-    The others keep their cost. That of a scout is shifted by the change of the best fit of the frame.
+    A fit is likely that is near the best of its frame, or near a cost `most` of each frame. The others keep their cost.
+    That of a scout is shifted by the change of the best fit of the frame.
     """
     policy, n = setup.policy, len(evidence.weight)
-    likely = np.flatnonzero(fits.cost < least_of_frame(fits, n)[fits.frame] + policy.likely_cost)
+    near = least_of_frame(fits, n) if most is None else most
+    likely = np.flatnonzero(fits.cost < near[fits.frame] + policy.likely_cost)
     again = fits[distinct_of_frames(fits, likely, setup.shapes.symmetry, policy.same_m, policy.same_rad)]
     settings = scene.settings(setup) if scene.scout is None else _close_settings(setup, scene, evidence)
-    final = refine(scene.final, evidence, again.frame, again.class_index, again.view, settings)
+    rival = None if most is None else most[again.frame]
+    final = refine(scene.final, evidence, again.frame, again.class_index, again.view, settings, rival=rival)
     others = fits[np.setdiff1d(np.arange(len(fits)), likely)]
-    if scene.scout is not None:
+    if scene.scout is not None and most is None:
         others.cost[:] += least_of_frame(final, n)[others.frame] - least_of_frame(fits, n)[others.frame]
     return Fits.joined([final, others.with_free(len(setup.free))])
 

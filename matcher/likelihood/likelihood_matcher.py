@@ -12,10 +12,10 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from phasemark import UsageError
 from phasemark.data import Bank
+from phasemark.matcher.chi_squared import largest_costs
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.frequencies import background_of, layers_of, pixels_of
 from phasemark.matcher.likelihood.acceptance import rank
@@ -163,7 +163,7 @@ class LikelihoodMatcher:
         dof = np.array([answer.dof for answer in some])
         # what an answer leaves to unknown things costs the other view, too
         left = np.maximum(seen.returned.sum(axis=1) - dof - len(self._setup.free), 0)
-        limit = special.chdtri(np.maximum(dof, 1), self._setup.false_alarm) + DISAGREEMENT * left
+        limit = largest_costs(self._setup.false_alarm, dof, evidence.scatter_freedom[accepted]) + DISAGREEMENT * left
         found = self._search.may_explain(seen.mirrored(self._bank.sensor.cols), limit)
         for k, answer, mirrored in zip(accepted, some, found, strict=True):
             answers[k] = replace(answer, may_be_mirrored=bool(mirrored))

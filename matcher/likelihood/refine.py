@@ -73,7 +73,11 @@ def refine(
     problem = Problem(model, evidence, frame, class_index, settings, limit, rival)
     state = problem.start(view)
     if roughly:
+        start = picked(state, np.arange(len(frame)))
         state = descend(problem, state, settings.policy.rough_cost)
+        # pixels that did not count at the start may be contradicted at the end
+        worse = np.flatnonzero(whole_cost(problem, state)[0] > whole_cost(problem, start)[0])
+        state.update(worse, picked(start, worse))
         return conclude(problem, state, look_around=False)
     state = _descend_near(problem, state)
     if settings.look_beside_rad:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from phasemark.matcher.chi_squared import largest_costs
 from phasemark.matcher.likelihood.acceptance import is_acceptable
 from phasemark.matcher.likelihood.candidates import fit_neighbouring_views, fit_starts
 from phasemark.matcher.likelihood.fits import BETTER_COST, Fits, best_of_frame, least_of_frame
@@ -35,12 +36,11 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     bare : (n,) float64
         Cost of a scene without a landmark.
     """
-    which = _worth_a_search(setup, evidence, bare)
+    which, nu = _worth_a_search(setup, evidence, bare), evidence.scatter_freedom
     # 1, 2  bound the cost in every cell of the bank, and start in those that may hold an explanation
-    limit = _limit(setup, seen[which])
-    starts = scene.search.of_frames(which).starts(seen[which], limit)
+    starts = scene.search.of_frames(which).starts(seen[which], _limit(setup, seen[which], nu[which]))
     # 3, 4  descend from there, and refine on final images
-    fits = fit_starts(setup, scene, evidence, which, starts, limit)
+    fits = fit_starts(setup, scene, evidence, which, starts, _most(setup, evidence[which]))
     # 5  where nothing fits, look around the best fits
     poor = np.flatnonzero(are_doubtful(setup, fits, len(evidence.weight), setup.policy.refused_p))
     if poor.size:
@@ -64,27 +64,32 @@ def _with_rivals(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
         if not best.size:
             break
         which = fits.frame[best]
-        limit = _limit(setup, seen[which])
+        limit, most = _limit(setup, seen[which], evidence.scatter_freedom[which]), _most(setup, evidence[which])
+        if setup.huber is None:
+            most = np.minimum(most, fits.cost[best] + setup.rival_cost)
         if seen is evidence.seen and evidence.on == "ranges" and setup.huber is None:
-            limit = np.minimum(limit, fits.cost[best] + setup.rival_cost)
+            limit = np.minimum(limit, most)
         near = fits.cost <= least_of_frame(fits, len(evidence.weight))[fits.frame] + setup.rival_cost
-        known = []
-        for k in which:
-            own = np.flatnonzero(near & (fits.frame == k))
-            known.append((fits.class_index[own], fits.view[own]))
-        starts = scene.search.of_frames(which).uncovered(seen[which], limit, known)
+        known = fits[near & np.isin(fits.frame, which)]
+        places = [(known.class_index[own], known.view[own]) for own in (known.frame == k for k in which)]
+        starts = scene.search.of_frames(which).uncovered(seen[which], limit, places)
         if not starts.frame.size:
             break
-        parts.append(fit_starts(setup, scene, evidence, which, starts, limit, thorough=True))
+        parts.append(fit_starts(setup, scene, evidence, which, starts, most, known))
         before, after = least_of_frame(fits, len(evidence.weight)), least_of_frame(parts[-1], len(evidence.weight))
         which = np.flatnonzero(after < before - BETTER_COST)
     return Fits.joined(parts)
 
 
-def _limit(setup: Setup, seen: Observation) -> NDArray[np.float64]:
-    """Return the cost up to which a view of a frame is refined: a rival of the worst fit that is accepted."""
-    n = seen.returned.sum(axis=1)
-    return np.asarray(special.chdtri(np.maximum(n, 1), setup.false_alarm) + setup.rival_cost, np.float64)
+def _limit(setup: Setup, seen: Observation, nu: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the bound up to which a cell may hold an explanation: a rival of the worst fit that is accepted."""
+    return largest_costs(setup.false_alarm, seen.returned.sum(axis=1), nu) + setup.rival_cost
+
+
+def _most(setup: Setup, evidence: Evidence) -> NDArray[np.float64]:
+    """Return the cost up to which a view explains a frame."""
+    residuals = evidence.per_pixel * np.count_nonzero(evidence.weight, axis=1)
+    return largest_costs(setup.false_alarm, residuals, evidence.scatter_freedom) + setup.rival_cost
 
 
 def are_doubtful(setup: Setup, fits: Fits, n: int, p: float | None = None) -> NDArray[np.bool_]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,6 +155,10 @@ class Scene:
     final: ImageModel
     scout: ImageModel | None
     search: Search | SearchOfFrames
+
+    def without_scout(self) -> Scene:
+        """Return the scene with images alone that the answer is taken from."""
+        return replace(self, scout=None)
 
     def settings(self, setup: Setup) -> DescentSettings:
         """Return how a descent runs before these backgrounds."""

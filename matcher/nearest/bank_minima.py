@@ -8,7 +8,7 @@ shifted in is missing. A return that is shifted out costs 1, the mean of a compa
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
@@ -120,7 +120,7 @@ class Search:
         upward: Upward = Upward(),  # noqa: B008 - a constant
         bearing_std_rad: float = math.inf,
     ) -> None:
-        self._cells, self._sensor, self._layers = cells, sensor, layers
+        self.cells, self._sensor, self._layers = cells, sensor, layers
         self._upward, self._bearing_std_rad = upward, bearing_std_rad
         self.column_rad = sensor.pixel_rad
         most = min(sensor.cols // 4, math.ceil(min(widest_rad / self.column_rad, sensor.cols)))
@@ -129,8 +129,11 @@ class Search:
         highest = min(sensor.rows // 4, math.ceil(min(widest_up / self._row_rad, sensor.rows)))
         stride_up = max(math.ceil(highest / _MOST_UP), 1)
         highest -= highest % stride_up
-        self._n_side = 2 * most + 1
-        self._shifts = [(up, side) for up in range(-highest, highest + 1, stride_up) for side in range(-most, most + 1)]
+        self._classes = range(cells.shape[0])
+        self._neighbours = cells.closes, 2 * most + 1
+        self.shifts = [(up, side) for up in range(-highest, highest + 1, stride_up) for side in range(-most, most + 1)]
+        # of the image that is shifted by whole columns: left is positive, and a smaller column
+        self._bearing_rad = -np.arctan(np.array(self.shifts)[:, 1] / sensor.columns_per_tangent)
 
     def of_frames(self, frame: NDArray[np.int64]) -> Search:
         """Return the search for some frames: it is the same for all."""
@@ -146,10 +149,12 @@ class Search:
         limit : (n,) float64
             Cost up to which a view explains a frame. Where no cell is below, the limit of the frame is raised.
         """
-        found = [
-            self._best_of(*self._costs(moved, limit[f], raised=True), _N_MODES)
-            for f, moved in enumerate(self._moved(seen))
-        ]
+        frames, found = _Moved(self, seen), []
+        for f in range(len(limit)):
+            own = limit[f]
+            while not np.isfinite(cost := frames.costs(f, own)).any():
+                own *= _RAISED
+            found.append(self._views(cost, [modes(cost, c, _N_MODES, *self._neighbours) for c in self._classes]))
         return _joined(found)
 
     def uncovered(self, seen: Observation, limit: NDArray[np.float64], known: Sequence[Known]) -> Starts:
@@ -162,61 +167,30 @@ class Search:
         known : sequence of (classes, views)
             What explains each frame, (k,) int64 and (k, 6) float64.
         """
-        found = []
-        for f, moved in enumerate(self._moved(seen)):
-            cost, _ = self._costs(moved, limit[f], raised=False)
+        frames, found = _Moved(self, seen), []
+        for f in range(len(limit)):
+            cost = frames.costs(f, limit[f])
             for c, view in zip(*known[f], strict=True):
                 cost[self._close_to(int(c), view)] = np.inf
-            found.append(self._best_of(cost, None, _MOST_UNCOVERED))
+            places = [cover(cost, c, _MOST_UNCOVERED, *self._neighbours, *_CLOSE) for c in self._classes]
+            found.append(self._views(cost, places))
         return _joined(found)
 
     def may_explain(self, seen: Observation, limit: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether any cell may hold an explanation of each frame, (n,); arguments as for :meth:`starts`."""
-        return np.array(
-            [
-                np.isfinite(self._costs(moved, limit[f], raised=False)[0]).any()
-                for f, moved in enumerate(self._moved(seen))
-            ],
-            np.bool_,
-        )
+        frames = _Moved(self, seen)
+        return np.array([frames.has_cell(f, own) for f, own in enumerate(limit)], np.bool_)
 
-    def _moved(self, seen: Observation) -> Iterator[list[tuple[Observation, int]]]:
-        """Yield each frame under all shifts, and how many returns each shift leaves out."""
-        for f in range(len(seen.range_m)):
-            one = seen[f : f + 1]
-            moved = [self._shifted(one, shift) for shift in self._shifts]
-            yield [(own, int(one.returned.sum() - own.returned.sum())) for own in moved]
-
-    def _costs(
-        self, moved: list[tuple[Observation, int]], limit: float, *, raised: bool
-    ) -> tuple[NDArray[np.float32], float]:
-        """Return what a frame costs about the middle of each cell, (class, shift, D, δ), infinite above the limit."""
-        while True:
-            cost = np.stack(
-                [
-                    self._cells.costs(own, 0, self._prior(b), limit) + np.float32(lost)
-                    for b, (own, lost) in enumerate(moved)
-                ],
-                axis=1,
-            )
-            if not raised or np.isfinite(cost).any():
-                return cost, limit
-            limit *= _RAISED
-
-    def _best_of(self, cost: NDArray[np.float32], limit: float | None, most: int) -> Starts:
-        """Return the local minima of one frame, or with no limit views that cover all its cells; best first."""
-        closes, n_side = self._cells.closes, self._n_side
+    def _views(self, cost: NDArray[np.float32], places: Sequence[NDArray[np.int64]]) -> Starts:
+        """Return the views in some cells of one frame, (k, 3) of each class; best first."""
         class_index, views, costs = [], [], []
-        for c, own in enumerate(cost):
-            places = (
-                cover(own.copy(), most, closes, n_side, *_CLOSE) if limit is None else modes(own, most, closes, n_side)
-            )
-            for b, i, j in places[places[:, 0] >= 0]:
-                distance = float(self._cells.distance_m[i])
+        for c, own in enumerate(places):
+            for b, i, j in own[own[:, 0] >= 0]:
+                distance = float(self.cells.distance_m[i])
                 height, pitch = self._upward.split(self._elevation(b), distance)
                 class_index.append(c)
-                views.append((distance, self._cells.delta_rad[j], self._bearing(b), height, pitch, 0.0))
-                costs.append(float(own[b, i, j]))
+                views.append((distance, self.cells.delta_rad[j], self._bearing_rad[b], height, pitch, 0.0))
+                costs.append(float(cost[b, c, i, j]))
         order = np.argsort(costs, kind="stable")
         return Starts(
             np.zeros(len(order), np.int64), np.array(class_index, np.int64)[order],
@@ -225,28 +199,24 @@ class Search:
 
     def _close_to(self, c: int, view: NDArray[np.float64]) -> tuple[Any, ...]:
         """Return which cells of a class are close to a view, as an index of costs; whatever the elevation."""
-        cells, bearings = self._cells, np.array([self._bearing(b) for b in range(len(self._shifts))])
+        cells = self.cells
         along = np.flatnonzero(np.abs(cells.distance_m - view[0]) <= _CLOSE[0] * _step(cells.distance_m))
         period = closing_period(cells.delta_rad) or 2 * math.pi
         off = (cells.delta_rad - view[1] + period / 2) % period - period / 2
         around = np.flatnonzero(np.abs(off) <= _CLOSE[1] * _step(cells.delta_rad))
-        beside = np.flatnonzero(np.abs(bearings - view[2]) <= _CLOSE[2] * self.column_rad)
-        return np.ix_(np.array([c]), beside, along, around)
+        beside = np.flatnonzero(np.abs(self._bearing_rad - view[2]) <= _CLOSE[2] * self.column_rad)
+        return np.ix_(beside, np.array([c]), along, around)
 
-    def _prior(self, index: int) -> float:
+    def prior(self, index: int) -> float:
         """Return what the prior adds to the cost of the most likely bearing within half a column."""
-        off = max(abs(self._bearing(index)) - self.column_rad / 2, 0.0)
+        off = max(abs(float(self._bearing_rad[index])) - self.column_rad / 2, 0.0)
         return (off / self._bearing_std_rad) ** 2
-
-    def _bearing(self, index: int) -> float:
-        """Return the bearing whose image is shifted by whole columns: left is positive, and a smaller column."""
-        return -math.atan(self._shifts[index][1] / self._sensor.columns_per_tangent)
 
     def _elevation(self, index: int) -> float:
         """Return the elevation whose image is shifted by whole rows."""
-        return self._shifts[index][0] * self._row_rad
+        return self.shifts[index][0] * self._row_rad
 
-    def _shifted(self, seen: Observation, shift: tuple[int, int]) -> Observation:
+    def shifted(self, seen: Observation, shift: tuple[int, int]) -> Observation:
         """Move frames by a shift (rows up, columns right), so that the shifted point comes to the middle."""
         up, side = shift
         if up == 0 and side == 0:
@@ -254,7 +224,7 @@ class Search:
         rows, cols, layers = self._sensor.rows, self._sensor.cols, self._layers
 
         def move(values: NDArray[_T]) -> NDArray[_T]:
-            grid = values.reshape(len(values), -1, cols)
+            grid = values.reshape(len(values), values.shape[1] // cols, cols)
             if layers is not None:
                 grid = layers.layers(grid)
             out = np.zeros_like(grid)
@@ -264,6 +234,37 @@ class Search:
             return (out if layers is None else layers.stack(out)).reshape(values.shape)
 
         return Observation(move(seen.range_m), move(seen.weight), move(seen.returned), move(seen.not_returned))
+
+
+class _Moved:
+    """Frames under all shifts of a search, and what they cost in its cells."""
+
+    def __init__(self, search: Search, seen: Observation) -> None:
+        self._search = search
+        moved = [search.shifted(seen, shift) for shift in search.shifts]
+        self._lost = [(seen.returned.sum(axis=1) - own.returned.sum(axis=1)).astype(np.float32) for own in moved]
+        self._prepared = [search.cells.prepared(own) for own in moved]
+
+    def costs(self, f: int, limit: float) -> NDArray[np.float32]:
+        """Return what a frame costs about the middle of each cell, (shift, class, D, δ), infinite above the limit."""
+        cells = self._search.cells
+        cost = np.empty((len(self._prepared), *cells.shape), np.float32)
+        for b in range(len(cost)):
+            self._fill(cost[b], f, b, limit)
+        return cost
+
+    def has_cell(self, f: int, limit: float) -> bool:
+        """Return whether any cell may hold an explanation of a frame; the likeliest shifts are tried first."""
+        cost = np.empty(self._search.cells.shape, np.float32)
+        for b in np.argsort(np.abs(np.arange(len(self._prepared)) - len(self._prepared) // 2), kind="stable"):
+            self._fill(cost, f, int(b), limit)
+            if np.isfinite(cost).any():
+                return True
+        return False
+
+    def _fill(self, cost: NDArray[np.float32], f: int, b: int, limit: float) -> None:
+        self._search.cells.fill_costs(cost, self._prepared[b], f, self._search.prior(b), limit)
+        cost += self._lost[b][f]
 
 
 class SearchOfFrames:
@@ -311,45 +312,60 @@ def _step(grid: NDArray[np.float64]) -> float:
 
 
 @njit(cache=True, nogil=True)
-def cover(cost, most, closes, n_side, reach_d, reach_a, reach_side):  # type: ignore[no-untyped-def]
+def cover(cost, c, most, closes, n_side, reach_d, reach_a, reach_side):  # type: ignore[no-untyped-def]
     """Return places of finite cost, lowest first, such that each is within reach of one of them; −1 behind the last.
 
-    `cost` is (shift, D, δ), and becomes infinite where it is covered.
+    `cost` is (shift, class, D, δ), of which class `c` counts.
     """
-    n_b, n_d, n_a = cost.shape
-    found = np.full((most, 3), -1, np.int64)
-    for k in range(most):
-        at = cost.argmin()
-        b, i, j = at // (n_d * n_a), at // n_a % n_d, at % n_a
-        if not cost[b, i, j] < np.inf:
+    n_b, n_d, n_a = cost.shape[0], cost.shape[2], cost.shape[3]
+    n = 0
+    for b in range(n_b):
+        for i in range(n_d):
+            for j in range(n_a):
+                n += cost[b, c, i, j] < np.inf
+    place, value = np.empty((n, 3), np.int64), np.empty(n, cost.dtype)
+    n = 0
+    for b in range(n_b):
+        for i in range(n_d):
+            for j in range(n_a):
+                if cost[b, c, i, j] < np.inf:
+                    place[n, 0], place[n, 1], place[n, 2] = b, i, j
+                    value[n] = cost[b, c, i, j]
+                    n += 1
+    found, k = np.full((most, 3), -1, np.int64), 0
+    for at in np.argsort(value, kind="mergesort"):
+        if k == most:
             break
-        found[k] = b, i, j
-        up, side = b // n_side, b % n_side
-        for uu in range(max(up - 1, 0), min(up + 2, n_b // n_side)):
-            for ss in range(max(side - reach_side, 0), min(side + reach_side + 1, n_side)):
-                for ii in range(max(i - reach_d, 0), min(i + reach_d + 1, n_d)):
-                    for jj in range(j - reach_a, j + reach_a + 1):
-                        if closes:
-                            jj %= n_a
-                        if 0 <= jj < n_a:
-                            cost[uu * n_side + ss, ii, jj] = np.inf
+        b, i, j = place[at]
+        covered = False
+        for m in range(k):
+            around = abs(found[m, 2] - j)
+            if closes:
+                around = min(around, n_a - around)
+            sideways, upwards = abs(found[m, 0] % n_side - b % n_side), abs(found[m, 0] // n_side - b // n_side)
+            if upwards <= 1 and sideways <= reach_side and abs(found[m, 1] - i) <= reach_d and around <= reach_a:
+                covered = True
+                break
+        if not covered:
+            found[k] = place[at]
+            k += 1
     return found
 
 
 @njit(cache=True, nogil=True)
-def modes(cost, n_modes, closes, n_side):  # type: ignore[no-untyped-def]
-    """Return the lowest local minima of cost (shift, D, δ), best first; −1 behind the last.
+def modes(cost, c, n_modes, closes, n_side):  # type: ignore[no-untyped-def]
+    """Return the lowest local minima of class `c` of cost (shift, class, D, δ), best first; −1 behind the last.
 
     Of the shifts, `n_side` sideways follow one another for each upwards.
     """
-    n_b, n_d, n_a = cost.shape
+    n_b, n_d, n_a = cost.shape[0], cost.shape[2], cost.shape[3]
     n_up = n_b // n_side
     found = np.full((n_modes, 3), -1, np.int64)
     lowest = np.full(n_modes, np.inf, cost.dtype)
     for b in range(n_b):
         for i in range(n_d):
             for j in range(n_a):
-                own = cost[b, i, j]
+                own = cost[b, c, i, j]
                 if not own < lowest[-1]:
                     continue
                 least = True
@@ -360,7 +376,7 @@ def modes(cost, n_modes, closes, n_side):  # type: ignore[no-untyped-def]
                             for jj in range(j - 1, j + 2):
                                 if closes:
                                     jj %= n_a
-                                if 0 <= jj < n_a and cost[uu * n_side + ss, ii, jj] < own:
+                                if 0 <= jj < n_a and cost[uu * n_side + ss, c, ii, jj] < own:
                                     least = False
                 if not least:
                     continue

@@ -41,6 +41,7 @@ _WIDER = 1.25
 """Factor on the intervals: within a cell, ranges bend."""
 
 
+_Frames = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 Turned = Callable[[int, float, NDArray[np.float64]], Sequence[PhasorImages]]
 """Returns images of views at some bearings: of a class, at a distance, from angles."""
 
@@ -85,7 +86,8 @@ class CellBounds:
         Centres of the cells.
     closes : bool
         Whether the last angle is next to the first.
-    n_class : int
+    shape : (int, int, int)
+        Number of classes, distances and angles.
     """
 
     def __init__(
@@ -100,7 +102,6 @@ class CellBounds:
         turned: Turned | None = None,
     ) -> None:
         self.closes = closing_period(bank.delta_rad) is not None
-        self.n_class = len(bank.classes)
         centres = (
             _centres(len(bank.distance_m), stride[0], False),
             _centres(len(bank.delta_rad), stride[1], self.closes),
@@ -125,48 +126,53 @@ class CellBounds:
             parts[name] = found, pixels
         self._pose = parts["full"] if "full" in parts else parts["lower"]
         self._upper = parts.get("upper")
-        shape = (-1, len(self.distance_m), len(self.delta_rad))
-        self._blocks = _blocks_of(self._pose[0], shape, self._period_m)
+        self.shape = len(bank.classes), len(self.distance_m), len(self.delta_rad)
+        self._blocks = _blocks_of(self._pose[0], (-1, *self.shape[1:]), self._period_m)
 
-    def costs(self, seen: Observation, frame: int, before: float, limit: float) -> NDArray[np.float32]:
-        """Return what one frame costs about the middle of each cell, (class, D, δ); infinite where the bound is above.
+    def prepared(self, seen: Observation) -> list[_Frames]:
+        """Return frames as the kernels take them, of each group of the bank that is compared."""
+        groups = [self._pose] if self._upper is None else [self._pose, self._upper]
+        return [_prepared(seen, pixels) for _, pixels in groups]
+
+    def fill_costs(
+        self, out: NDArray[np.float32], frames: Sequence[_Frames], frame: int, before: float, limit: float
+    ) -> None:
+        """Fill what one frame costs about the middle of each cell, (class, D, δ); infinite where the bound is above.
 
         The intervals count as uniform errors there, so that cells near the best view cost least.
 
         Parameters
         ----------
-        seen : Observation
+        out : float32
+        frames : sequence of _Frames
+            Of :meth:`prepared`.
         frame : int
         before : float
             What is known to be added to the cost.
         limit : float
             Cost up to which a cell may hold an explanation.
         """
-        n_d, n_a = len(self.distance_m), len(self.delta_rad)
-        out = np.full((self.n_class, n_d, n_a), np.inf, np.float32)
-        rest = np.zeros((2, self.n_class, n_d), np.float32)
+        out.fill(np.inf)
+        rest, period = np.zeros((2, *self.shape[:2]), np.float32), np.float32(self._period_m)
         if self._upper is not None:
-            cells, pixels = self._upper
+            cells = self._upper[0]
             everywhere = np.zeros((len(cells.middle_m), 2), np.float32)
-            _everywhere(
-                cells, *_of_frame(seen, frame, pixels), np.float32(self._period_m), np.float32(limit), everywhere
-            )
-            rest[:] = everywhere.T.reshape(2, self.n_class, n_d)
-        cells, pixels = self._pose
-        own = _of_frame(seen, frame, pixels)
-        _scan(self._blocks, cells, *own, np.float32(self._period_m), rest, np.float32(before), np.float32(limit), out)
-        return out
+            y, weight, absent = (part[frame] for part in frames[1])
+            _everywhere(cells, y, weight, absent, period, np.float32(limit), everywhere)
+            rest[:] = everywhere.T.reshape(rest.shape)
+        y, weight, absent = (part[frame] for part in frames[0])
+        cells, start, highest = self._pose[0], np.float32(before), np.float32(limit)
+        _scan(self._blocks, cells, y, weight, absent, period, rest, start, highest, out)
 
 
-def _of_frame(
-    seen: Observation, frame: int, pixels: NDArray[np.int64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return ranges, weights, and what pixels without a return cost where one must be."""
-    return (
-        seen.range_m[frame, pixels].astype(np.float32),
-        np.where(seen.returned[frame, pixels], np.maximum(seen.weight[frame, pixels], 1e-3), 0.0).astype(np.float32),
-        np.where(seen.not_returned[frame, pixels], DISAGREEMENT, 0.0).astype(np.float32),
+def _prepared(seen: Observation, pixels: NDArray[np.int64]) -> _Frames:
+    """Return ranges, weights, and what pixels without a return cost where one must be, (frames, pixels)."""
+    weight = np.where(seen.returned[:, pixels], np.maximum(seen.weight[:, pixels], 1e-3), 0.0)
+    absent = np.where(seen.not_returned[:, pixels], DISAGREEMENT, 0.0)
+    ranges, weights, absents = (
+        np.ascontiguousarray(own, np.float32) for own in (seen.range_m[:, pixels], weight, absent)
     )
+    return ranges, weights, absents
 
 
 def _centres(n: int, stride: int, closes: bool) -> NDArray[np.int64]:

@@ -202,7 +202,7 @@ def _descend(thin, n_starts, thin_i, thin_j, n_a, closes, reach, seen, model, pe
     cost = np.empty(n_points)
     known_to = np.full(n_points, -1, np.int32)
     for k in range(n):
-        starts = modes(thin[k], n_starts, closes, thin.shape[1])
+        starts = modes(thin[k : k + 1], 0, n_starts, closes, 1)
         for s in range(n_starts):
             _, i0, j0 = starts[s]
             if i0 < 0:
@@ -240,7 +240,7 @@ def _minima(costs, n_minima, closes):  # type: ignore[no-untyped-def]
     found = np.zeros((n, n_minima), np.int64)
     lowest = np.full((n, n_minima), np.inf)
     for k in range(n):
-        starts = modes(costs[k], n_minima, closes, costs.shape[1])
+        starts = modes(costs[k : k + 1], 0, n_minima, closes, 1)
         for s in range(n_minima):
             _, i, j = starts[s]
             if i < 0:
