@@ -93,6 +93,20 @@ def has_symmetry(mesh: trimesh.Trimesh, n: int) -> bool:
     return n == 1 or _Surface(mesh).repeats(n)
 
 
+def is_same_shape(first: trimesh.Trimesh, second: trimesh.Trimesh) -> bool:
+    """Return True if two meshes are one within :func:`symmetry_tolerance_m`, as they lie.
+
+    Parameters
+    ----------
+    first, second : trimesh.Trimesh
+        Metres, landmark frame.
+    """
+    if np.abs(first.bounds - second.bounds).max() > symmetry_tolerance_m(first):
+        return False
+    one, other = _Surface(first), _Surface(second)
+    return one.holds(other.points) and other.holds(one.points)
+
+
 class _Surface:
     """A mesh with points on it, and a tree of boxes about its faces that tells what lies within the tolerance."""
 
@@ -115,6 +129,10 @@ class _Surface:
         return self._lies_on_itself(np.full(len(number), step)) and (
             n == 2 or self._lies_on_itself(step * (1 + number % (n - 1)))
         )
+
+    def holds(self, points: _Float) -> bool:
+        """Return True if all points lie on the surface; stop at the first that does not."""
+        return self._near(points[:_FIRST_POINTS]) and self._near(points[_FIRST_POINTS:])
 
     def _over_the_area(self) -> _Float:
         """Return points spread evenly over the area, (n, 3)."""

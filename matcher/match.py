@@ -14,7 +14,7 @@ from phasemark.data.pages.notebook import table_html
 from phasemark.render import Background
 from phasemark.render.integral.rounding import with_error
 
-Reason = Literal["", "no landmark", "poor fit", "undetermined", "ambiguous"]
+Reason = Literal["", "no landmark", "poor fit", "undetermined", "outside the bank", "ambiguous"]
 """Why an answer is refused; empty if it is accepted."""
 TOLERANCE_M, TOLERANCE_RAD = 0.03, math.radians(6.0)
 """How far off an accepted answer may be, unless the matcher is told."""
@@ -95,10 +95,11 @@ class Match:
         bank too: then nothing in it shows whether the image is mirrored, as reading it the wrong way leaves it, and δ
         and bearing may have the wrong sign. A landmark with a plane of symmetry through its axis, as all of the
         catalogue, never shows it. None where it was not tested.
-    reason : {"", "no landmark", "poor fit", "undetermined", "ambiguous"}
+    reason : {"", "no landmark", "poor fit", "undetermined", "outside the bank", "ambiguous"}
         Why the answer is refused; empty if it is accepted. "poor fit": χ² fails its test. "undetermined": the frame
-        leaves some free parameter open by more than the matcher tolerates. "ambiguous": another class or a view
-        far away explains the frame too.
+        leaves some free parameter open by more than the matcher tolerates. "outside the bank": the view is beyond
+        the distances and angles of the bank, where no other explanation was looked for. "ambiguous": another class or
+        a view far away explains the frame too.
     """
 
     class_name: str | None

@@ -175,7 +175,11 @@ def test_a_body_of_revolution_is_matched_at_its_only_angle(files, method):
 def test_a_symmetry_that_the_mesh_has_not_is_doubted(files):
     with pytest.warns(MeshWarning, match=r"symmetry 3 is stated for 'table', but turned by 120° .* found: 4"):
         build_bank(plan_of(files, "table", symmetry=3).model_copy(update={"delta_deg": (0.0,)})).close()
-    build_bank(plan_of(files, "table", symmetry=2).model_copy(update={"delta_deg": (0.0,)})).close()  # part of 4
+
+
+def test_a_symmetry_that_is_less_than_the_mesh_has_is_doubted(files):
+    with pytest.warns(MeshWarning, match=r"symmetry 2 is stated for 'table', but turned by 90° it is the same: .*: 4"):
+        build_bank(plan_of(files, "table", symmetry=2).model_copy(update={"delta_deg": (0.0,)})).close()
 
 
 def test_the_commands_say_what_was_found(files, tmp_path, capsys):

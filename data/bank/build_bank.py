@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import warnings
@@ -40,7 +41,7 @@ from phasemark.data.shards.run import produce, refuse_unwritable_output
 from phasemark.landmarks import LandmarkSpec, build_mesh, mesh_symmetry, read_mesh
 from phasemark.landmarks.mesh_files import MeshWarning
 from phasemark.landmarks.spec import Revolution
-from phasemark.landmarks.symmetry import has_symmetry, symmetry_tolerance_m
+from phasemark.landmarks.symmetry import has_symmetry, is_same_shape, symmetry_tolerance_m
 from phasemark.render import PhasorImages, Renderer, Sensor, Views
 from phasemark.render.planar import PlanarLandmark, planar_images
 from phasemark.render.renderer import Variant
@@ -326,19 +327,42 @@ def read_landmarks(
         else:
             mesh = stored_mesh(part.name)
         found.append(Landmark(part.name, mesh, part.symmetry or 1, part.albedo))
+    if stored_mesh is None:
+        _doubt_classes(found)
     return found
 
 
 def _doubt_symmetry(part: MeshPlan, mesh: trimesh.Trimesh) -> None:
-    """Warn of a stated symmetry that the mesh has not."""
-    if part.symmetry is not None and not has_symmetry(mesh, part.symmetry):
+    """Warn of a stated symmetry that the mesh has not, or of one that it has more of."""
+    if part.symmetry is None:
+        return
+    stated, found = f"{part.path}: symmetry {part.symmetry} is stated for '{part.name}'", mesh_symmetry(mesh)
+    if not has_symmetry(mesh, part.symmetry):
         warnings.warn(
-            f"{part.path}: symmetry {part.symmetry} is stated for '{part.name}', but turned by"
-            f" {360 / part.symmetry:g}° it differs from itself by more than {1e3 * symmetry_tolerance_m(mesh):.2g} mm;"
-            f" found: {mesh_symmetry(mesh)}",
+            f"{stated}, but turned by {360 / part.symmetry:g}° it differs from itself by more than"
+            f" {1e3 * symmetry_tolerance_m(mesh):.2g} mm; found: {found}",
             MeshWarning,
             stacklevel=2,
         )
+    elif found > part.symmetry:
+        warnings.warn(
+            f"{stated}, but turned by {360 / found:g}° it is the same: views that far apart look alike, and no answer"
+            f" about it can be accepted; found: {found}",
+            MeshWarning,
+            stacklevel=2,
+        )
+
+
+def _doubt_classes(landmarks: Sequence[Landmark]) -> None:
+    """Warn of classes that are the same part."""
+    for first, second in itertools.combinations(landmarks, 2):
+        if is_same_shape(first.mesh, second.mesh):
+            warnings.warn(
+                f"'{first.name}' and '{second.name}' look alike from everywhere, and no answer"
+                " about them can be accepted; leave one out",
+                MeshWarning,
+                stacklevel=2,
+            )
 
 
 def _images_of(

@@ -78,7 +78,7 @@ def match_frames(
             _note_motion(measured, frames)
         printed = _Answers(search, place, results, landmarks, plots, moving)
         printed.match_all(matcher, positions)
-        printed.note_mirrored()
+        printed.note_what_is_open()
         printed.diagnose(matcher, reading)
         if results.as_json:
             echo_json({"bank": str(bank), "frames": str(frames), "matches": printed.answers})
@@ -162,7 +162,7 @@ class _Answers:
         self.answers: list[dict[str, Any]] = []  # all of them only for --json, whose answers are one list
         self.drawn: dict[int, tuple[FilteredFrames, Match]] = {}
         self._refused: tuple[int, FilteredFrames] | None = None
-        self._n_accepted = self._n_mirrored = 0
+        self._n_accepted = self._n_mirrored = self._n_outside = 0
 
     def match_all(self, matcher: Matcher, positions: Frames | DirectPositions) -> None:
         """Match all positions, and print each batch as soon as it is known."""
@@ -196,6 +196,7 @@ class _Answers:
             answer["poses"] = self._place.poses(match, self._landmarks)
         self._n_accepted += match.accepted
         self._n_mirrored += bool(match.may_be_mirrored)
+        self._n_outside += match.reason == "outside the bank"
         if isinstance(batch, DirectBatch):
             return answer
         if index in self._plots:
@@ -215,8 +216,13 @@ class _Answers:
             self._table = self._table or Table(list(rows[0]))
             self._table.echo([list(row.values()) for row in rows])
 
-    def note_mirrored(self) -> None:
-        """Say where nothing shows whether images are mirrored."""
+    def note_what_is_open(self) -> None:
+        """Say where the bank ends too early, and where nothing shows whether images are mirrored."""
+        if self._n_outside:
+            tell(
+                f"note: {self._n_outside} frames are explained by views outside the bank, where no other explanation was"
+                " looked for: build it over a wider range (bank info shows the range)"
+            )
         if self._n_mirrored:
             tell(
                 f"note: {self._n_mirrored} of {self._n_accepted} accepted answers may be those of images mirrored left"

@@ -15,6 +15,7 @@ from phasemark.matcher.likelihood.fits import Fits, distinct
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.setup import Setup
 from phasemark.matcher.match import Candidate, Match, Reason
+from phasemark.matcher.nearest.grid import is_in_range
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import Background
 from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
@@ -67,9 +68,15 @@ def is_determined(setup: Setup, std: NDArray[np.float64], symmetry: int) -> bool
 
 def is_acceptable(setup: Setup, fits: Fits, k: int) -> bool:
     """Return whether a fit would be accepted if nothing else explained its frame."""
-    if not fits.stands_out[k] or not fits.p_value[k] >= setup.false_alarm:
+    if not fits.stands_out[k] or not fits.p_value[k] >= setup.false_alarm or not _is_in_bank(setup, fits, k):
         return False
     return is_determined(setup, fits.std_without_one[k], setup.shapes.symmetry[fits.class_index[k]])
+
+
+def _is_in_bank(setup: Setup, fits: Fits, k: int) -> bool:
+    """Return whether the view of a fit is in the range of the bank: beyond it no rival is looked for."""
+    period = delta_period_rad(setup.shapes.symmetry[fits.class_index[k]])
+    return is_in_range(setup.bank.distance_m, setup.bank.delta_rad, fits.view[k], period)
 
 
 def _answer(
@@ -157,6 +164,8 @@ def _reason(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float6
     symmetry = setup.shapes.symmetry[fits.class_index[best]]
     if not is_determined(setup, fits.std_without_one[best], symmetry):
         return "undetermined"
+    if not _is_in_bank(setup, fits, best):
+        return "outside the bank"
     return "ambiguous" if _is_ambiguous(setup, fits, kept, weight) else ""
 
 

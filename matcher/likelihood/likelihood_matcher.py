@@ -34,6 +34,7 @@ from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
 from phasemark.matcher.nearest.bank_minima import Search, SearchOfFrames, Upward
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD, CellBounds, Turned
+from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
 from phasemark.render import Background, PhasorImages, Views
@@ -48,8 +49,6 @@ BEARING_STD_RAD, TILT_STD_RAD = math.radians(1.5), math.radians(3.0)
 """Standard deviations of the bearing, and of pitch and roll, before a frame is seen, unless the matcher is told."""
 
 
-CELL_M, CELL_RAD = 0.02, math.radians(2.0)
-"""Cells of the search: as large as they may be for most of what a pixel shows to change little within them."""
 _SHARES_OF_COLUMN = -0.5, -0.25, 0.25, 0.5
 _PIXELS_AT_ONCE = 1 << 20
 """Of all frames that are matched together. Each takes up to a kilobyte, for every candidate has an image of it."""

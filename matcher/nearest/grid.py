@@ -1,9 +1,36 @@
-"""The grid of a bank: over which period its angles close."""
+"""The grid of a bank: over which period its angles close, and which views are in its range."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
+
+CELL_M, CELL_RAD = 0.02, math.radians(2.0)
+"""Cells of the search: as large as they may be for most of what a pixel shows to change little within them."""
+
+
+def is_in_range(
+    distance_m: NDArray[np.float64], delta_rad: NDArray[np.float64], view: NDArray[np.float64], period_rad: float
+) -> bool:
+    """Return whether a view is in the range of a grid, with half a cell to either side, which the search covers.
+
+    Parameters
+    ----------
+    distance_m, delta_rad : float64
+        Of the grid.
+    view : (≥ 2,) float64
+        Distance and angle.
+    period_rad : float
+        Over which views of the landmark repeat.
+    """
+    if not distance_m[0] - CELL_M / 2 <= view[0] <= distance_m[-1] + CELL_M / 2:
+        return False
+    if closing_period(delta_rad) is not None:
+        return True
+    beyond = (view[1] - delta_rad[0] + CELL_RAD / 2) % period_rad
+    return bool(beyond <= delta_rad[-1] - delta_rad[0] + CELL_RAD)
 
 
 def closing_period(delta_rad: NDArray[np.float64]) -> float | None:
