@@ -220,7 +220,7 @@ class _Answers:
         """Say where the bank ends too early, and where nothing shows whether images are mirrored."""
         if self._n_outside:
             tell(
-                f"note: {self._n_outside} frames are explained by views outside the bank, where no other explanation was"
+                f"note: {self._n_outside} frames show views outside the bank, where no other explanation was"
                 " looked for: build it over a wider range (bank info shows the range)"
             )
         if self._n_mirrored:
