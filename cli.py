@@ -29,6 +29,7 @@ from phasemark.matcher.commands import (
     match,
     plan,
     pose,
+    strangers,
     sweep,
     verify,
 )
@@ -152,6 +153,7 @@ _add_group(
         "build": bank.bank_build,
         "info": bank.bank_info,
         "verify": verify.bank_verify,
+        "strangers": strangers.bank_strangers,
         "merge": bank.bank_merge,
     },
 )

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from phasemark.matcher.accuracy.expected_accuracy import AccuracyCard, accuracy_card, sides_of
     from phasemark.matcher.accuracy.grid_spacing import GridLoss, SpacingLoss, grid_loss
     from phasemark.matcher.accuracy.pose_errors import PoseReport, pose_report
+    from phasemark.matcher.accuracy.strangers import StrangerRate, stranger_rates
     from phasemark.matcher.accuracy.trials import Trials, TrialSetup, TrialSummary, run_trials
 else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)
@@ -19,6 +20,7 @@ __all__ = [
     "GridLoss",
     "PoseReport",
     "SpacingLoss",
+    "StrangerRate",
     "TrialSetup",
     "TrialSummary",
     "Trials",
@@ -28,4 +30,5 @@ __all__ = [
     "pose_report",
     "run_trials",
     "sides_of",
+    "stranger_rates",
 ]
