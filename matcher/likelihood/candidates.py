@@ -20,8 +20,8 @@ __all__ = ["fit_neighbouring_views", "fit_starts", "fit_views"]
 
 _SOFT_M = 0.01
 """Standard deviation of ranges that is added for the first steps of a robust descent: half a cell."""
-_APART = 0.01, math.radians(2.0)
-"""Distance and angle within which minima of a scout lead to one: its images are not smooth."""
+_APART, _APART_COLUMNS = (0.01, math.radians(2.0)), 0.25
+"""Distance and angle, and columns of bearing, within which minima of a scout lead to one: its images are not smooth."""
 _BEST_BESIDE = 2
 """Views around a side minimum that are refined."""
 _ASIDE_RAD = tuple(math.radians(angle) for angle in (0.12, 0.3, 0.7, 1.5, 3.0))
@@ -59,7 +59,9 @@ def fit_starts(
     explains = np.full(len(evidence.weight), np.inf)
     explains[which] = limit
     most = None if known is None else explains
-    apart = (setup.policy.same_m, setup.policy.same_rad) if scene.scout is None else _APART
+    apart: tuple[float, ...] = (setup.policy.same_m, setup.policy.same_rad)
+    if scene.scout is not None:
+        apart = (*_APART, _APART_COLUMNS * scene.search.column_rad)
     frame, class_index, view = which[starts.frame], starts.class_index, starts.view
     if setup.huber is not None:
         # a loss that stays constant for outliers has no slope a cell away: the first steps have more noise
@@ -136,14 +138,14 @@ def _beside(
     return refine(model, evidence, frame[best], class_index[best], views[best], settings, rival=rival, roughly=roughly)
 
 
-def _elsewhere(setup: Setup, fits: Fits, known: Fits, apart: tuple[float, float]) -> Fits:
+def _elsewhere(setup: Setup, fits: Fits, known: Fits, apart: tuple[float, ...]) -> Fits:
     """Return those of some fits that came to other places than known ones."""
     whole = Fits.joined([replace(known, cost=np.full(len(known), -np.inf)).with_free(fits.covariance.shape[1]), fits])
     own = _of_own_places(setup, whole, np.ones(len(whole), np.bool_), apart)
     return own[own.cost > -np.inf]
 
 
-def _of_own_places(setup: Setup, fits: Fits, which: NDArray[np.bool_], apart: tuple[float, float]) -> Fits:
+def _of_own_places(setup: Setup, fits: Fits, which: NDArray[np.bool_], apart: tuple[float, ...]) -> Fits:
     """Return those of some fits that came to places apart from each other, the best at each."""
     return fits[distinct_of_frames(fits, np.flatnonzero(which), setup.shapes.symmetry, *apart)]
 

@@ -123,10 +123,15 @@ def best_of_frame(fits: Fits) -> NDArray[np.int64]:
     return order[first]
 
 
-def distinct(fits: Fits, own: NDArray[np.int64], symmetry: Sequence[int], same_m: float, same_rad: float) -> list[int]:
+def distinct(
+    fits: Fits,
+    own: NDArray[np.int64],
+    symmetry: Sequence[int],
+    same_m: float,
+    same_rad: float,
+    same_bearing_rad: float = math.inf,
+) -> list[int]:
     """Return some fits of one frame, best first, without those that came to the same place.
-
-    The bearing is not compared: a flat landmark has one heading under many bearings, and they are one place.
 
     Parameters
     ----------
@@ -137,13 +142,17 @@ def distinct(fits: Fits, own: NDArray[np.int64], symmetry: Sequence[int], same_m
         Of each class.
     same_m, same_rad : float
         Fits nearer to each other are one.
+    same_bearing_rad : float
+        And of nearer bearings; by default any: a flat landmark has one heading under many bearings.
     """
     kept: list[int] = []
-    places: list[tuple[int, float, float, tuple[float, float, float]]] = []
+    places: list[tuple[int, float, float, float, tuple[float, float, float]]] = []
     views, classes = fits.view[own].tolist(), fits.class_index[own].tolist()
-    for k, (distance, delta, _, *upright), c in zip(own.tolist(), views, classes, strict=True):
+    for k, (distance, delta, bearing, *upright), c in zip(own.tolist(), views, classes, strict=True):
         period = delta_period_rad(symmetry[c])
-        for other, there, angle, (height, pitch, roll) in places:
+        for other, there, angle, aside, (height, pitch, roll) in places:
+            if abs(bearing - aside) >= same_bearing_rad:
+                continue
             if other != c or abs(distance - there) >= same_m or abs(upright[0] - height) >= same_m:
                 continue
             if max(abs(upright[1] - pitch), abs(upright[2] - roll)) >= same_rad:
@@ -152,15 +161,22 @@ def distinct(fits: Fits, own: NDArray[np.int64], symmetry: Sequence[int], same_m
                 break
         else:
             kept.append(k)
-            places.append((c, distance, delta, (upright[0], upright[1], upright[2])))
+            places.append((c, distance, delta, bearing, (upright[0], upright[1], upright[2])))
     return kept
 
 
 def distinct_of_frames(
-    fits: Fits, which: NDArray[np.int64], symmetry: Sequence[int], same_m: float, same_rad: float
+    fits: Fits,
+    which: NDArray[np.int64],
+    symmetry: Sequence[int],
+    same_m: float,
+    same_rad: float,
+    same_bearing_rad: float = math.inf,
 ) -> NDArray[np.int64]:
-    """Return those of some fits that came to places of their own, the best at each."""
+    """Return those of some fits that came to places of their own, the best at each; see :func:`distinct`."""
     which = which[np.lexsort((fits.cost[which], fits.frame[which]))]
     borders = np.flatnonzero(np.diff(fits.frame[which])) + 1
     groups = np.split(which, borders)
-    return np.array([k for own in groups for k in distinct(fits, own, symmetry, same_m, same_rad)], np.int64)
+    return np.array(
+        [k for own in groups for k in distinct(fits, own, symmetry, same_m, same_rad, same_bearing_rad)], np.int64
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
@@ -12,13 +14,14 @@ from phasemark.matcher.likelihood.candidates import fit_neighbouring_views, fit_
 from phasemark.matcher.likelihood.fits import BETTER_COST, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
+from phasemark.matcher.nearest.bank_minima import Starts
 from phasemark.matcher.nearest.templates import Observation
 
 __all__ = ["are_doubtful", "search_views"]
 
 
-_RIVAL_ROUNDS = 3
-"""How often rivals of a better answer are looked for in turn."""
+_STARTS_AT_ONCE = 4096
+"""Starts that are refined together, but for those of one frame: each has an image of it."""
 
 
 def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observation, bare: NDArray[np.float64]) -> Fits:
@@ -52,17 +55,16 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
 def _with_rivals(setup: Setup, scene: Scene, evidence: Evidence, seen: Observation, fits: Fits) -> Fits:
     """Return fits with those of all cells that may hold a rival of an answer that would be accepted.
 
-    Every cell of the bank whose bound allows a rival is descended from, up to `_MOST_UNCOVERED` of a class. A descent
-    may still stop above the lowest point of its cell.
+    Every cell of the bank whose bound allows a rival is descended from, or lies within two cells of one that is; of an
+    answer that was found better on the way, too. A descent may still stop above the lowest point of its cell.
     """
-    parts, which = [fits], np.arange(len(evidence.weight))
-    for _ in range(_RIVAL_ROUNDS):
-        fits = Fits.joined(parts)
+    which = np.arange(len(evidence.weight))
+    while True:
         best = best_of_frame(fits)
         best = best[np.isin(fits.frame[best], which)]
         best = best[[is_acceptable(setup, fits, int(k)) for k in best]]
         if not best.size:
-            break
+            return fits
         which = fits.frame[best]
         limit, most = _limit(setup, seen[which], evidence.scatter_freedom[which]), _most(setup, evidence[which])
         if setup.huber is None:
@@ -73,12 +75,20 @@ def _with_rivals(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
         known = fits[near & np.isin(fits.frame, which)]
         places = [(known.class_index[own], known.view[own]) for own in (known.frame == k for k in which)]
         starts = scene.search.of_frames(which).uncovered(seen[which], limit, places)
-        if not starts.frame.size:
-            break
-        parts.append(fit_starts(setup, scene, evidence, which, starts, most, known))
-        before, after = least_of_frame(fits, len(evidence.weight)), least_of_frame(parts[-1], len(evidence.weight))
-        which = np.flatnonzero(after < before - BETTER_COST)
-    return Fits.joined(parts)
+        parts = [fits]
+        for some in _in_parts(starts, len(which)):
+            own = known[np.isin(known.frame, which[some])]
+            parts.append(fit_starts(setup, scene, evidence, which[some], starts.of_frames(some), most[some], own))
+        before, fits = least_of_frame(fits, len(evidence.weight)), Fits.joined(parts)
+        which = np.flatnonzero(least_of_frame(fits, len(evidence.weight)) < before - BETTER_COST)
+
+
+def _in_parts(starts: Starts, n: int) -> Iterator[NDArray[np.int64]]:
+    """Yield those of n frames that have starts, a few at a time."""
+    count = np.bincount(starts.frame, minlength=n)
+    part = np.cumsum(count) // _STARTS_AT_ONCE
+    for number in np.unique(part[count > 0]):
+        yield np.flatnonzero((part == number) & (count > 0))
 
 
 def _limit(setup: Setup, seen: Observation, nu: NDArray[np.float64]) -> NDArray[np.float64]:

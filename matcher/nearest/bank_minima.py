@@ -33,7 +33,6 @@ _OFF_KINK_M = 0.002
 """Heights start at this in place of 0, where the box's top appears and slopes of one side would hold them."""
 _N_MODES = 12
 """Local minima of the cells of one class that are refined, at most."""
-_MOST_UNCOVERED = 48
 _CLOSE = 2, 2, 1
 """Cells, columns in the last place, within which a descent from one place stands for all: D, δ, bearing."""
 _RAISED = 3.0
@@ -56,6 +55,11 @@ class Starts:
     class_index: NDArray[np.int64]
     view: NDArray[np.float64]
     cost: NDArray[np.float64]
+
+    def of_frames(self, frame: NDArray[np.int64]) -> Starts:
+        """Return the starts of some frames, which are numbered in their order; `frame` rises."""
+        own = np.isin(self.frame, frame)
+        return Starts(np.searchsorted(frame, self.frame[own]), self.class_index[own], self.view[own], self.cost[own])
 
 
 _NO_STARTS = Starts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, len(VIEW_FIELDS))), np.empty(0))
@@ -172,7 +176,7 @@ class Search:
             cost = frames.costs(f, limit[f])
             for c, view in zip(*known[f], strict=True):
                 cost[self._close_to(int(c), view)] = np.inf
-            places = [cover(cost, c, _MOST_UNCOVERED, *self._neighbours, *_CLOSE) for c in self._classes]
+            places = [cover(cost, c, *self._neighbours, *_CLOSE) for c in self._classes]
             found.append(self._views(cost, places))
         return _joined(found)
 
@@ -312,8 +316,8 @@ def _step(grid: NDArray[np.float64]) -> float:
 
 
 @njit(cache=True, nogil=True)
-def cover(cost, c, most, closes, n_side, reach_d, reach_a, reach_side):  # type: ignore[no-untyped-def]
-    """Return places of finite cost, lowest first, such that each is within reach of one of them; −1 behind the last.
+def cover(cost, c, closes, n_side, reach_d, reach_a, reach_side):  # type: ignore[no-untyped-def]
+    """Return places of finite cost, lowest first, such that each is within reach of one of them.
 
     `cost` is (shift, class, D, δ), of which class `c` counts.
     """
@@ -332,10 +336,8 @@ def cover(cost, c, most, closes, n_side, reach_d, reach_a, reach_side):  # type:
                     place[n, 0], place[n, 1], place[n, 2] = b, i, j
                     value[n] = cost[b, c, i, j]
                     n += 1
-    found, k = np.full((most, 3), -1, np.int64), 0
+    found, k = np.empty((n, 3), np.int64), 0
     for at in np.argsort(value, kind="mergesort"):
-        if k == most:
-            break
         b, i, j = place[at]
         covered = False
         for m in range(k):
@@ -349,7 +351,7 @@ def cover(cost, c, most, closes, n_side, reach_d, reach_a, reach_side):  # type:
         if not covered:
             found[k] = place[at]
             k += 1
-    return found
+    return found[:k]
 
 
 @njit(cache=True, nogil=True)

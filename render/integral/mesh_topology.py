@@ -320,13 +320,14 @@ def _corner_shares(corners: NDArray[np.float64]) -> NDArray[np.float32]:
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     d11, d12, d22 = (np.einsum("ij,ij->i", x, y) for x, y in ((first, first), (first, second), (second, second)))
     determinant = (d11 * d22 - d12 * d12)[:, None]
-    gradient = np.stack(
-        [
-            (d22[:, None] * first - d12[:, None] * second) / determinant,
-            (d11[:, None] * second - d12[:, None] * first) / determinant,
-        ],
-        axis=1,
-    )
+    with np.errstate(divide="ignore", invalid="ignore"):  # no ray meets a face without area
+        gradient = np.stack(
+            [
+                (d22[:, None] * first - d12[:, None] * second) / determinant,
+                (d11[:, None] * second - d12[:, None] * first) / determinant,
+            ],
+            axis=1,
+        )
     constant = -np.einsum("fkx,fx->fk", gradient, corners[:, 0])
     return np.ascontiguousarray(np.concatenate([gradient, constant[..., None]], axis=2), dtype=np.float32)
 
