@@ -1,7 +1,7 @@
-"""How well a matcher refuses parts that are in no bank: its own landmarks at another size, or with a piece cut off.
+"""Acceptance of parts that are in no bank: the bank's own landmarks at another size, or with a piece cut off.
 
 A test of the fit refuses a part where it differs from every view of the bank by more than the noise. How much that is
-depends on the sensor, the distance and on what else is free, so it is counted: frames of such parts are matched.
+depends on the sensor, the distance and on what else is free, so frames of these parts are matched and counted.
 """
 
 from __future__ import annotations
