@@ -20,6 +20,8 @@ __all__ = ["fit_neighbouring_views", "fit_starts", "fit_views"]
 
 _SOFT_M = 0.01
 """Standard deviation of ranges that is added for the first steps of a robust descent: half a cell."""
+_SCOUT_M, _SCOUT_PIXELS = 5e-3, 0.1
+"""Standard deviation of the ranges of a scout whose images are moved aside, and in widths of a pixel at 1 m."""
 _APART, _APART_COLUMNS = (0.01, math.radians(2.0)), 0.25
 """Distance and angle, and columns of bearing, within which minima of a scout lead to one: its images are not smooth."""
 _BEST_BESIDE = 2
@@ -63,6 +65,9 @@ def fit_starts(
     if scene.scout is not None:
         apart = (*_APART, _APART_COLUMNS * scene.search.column_rad)
     frame, class_index, view = which[starts.frame], starts.class_index, starts.view
+    full = evidence
+    if scene.scout is not None and setup.bearing_is_free:
+        evidence = full.with_further_noise(max(_SCOUT_M, _SCOUT_PIXELS * setup.bank.sensor.pixel_rad))
     if setup.huber is not None:
         # a loss that stays constant for outliers has no slope a cell away: the first steps have more noise
         soft = evidence.with_further_noise(_SOFT_M)
@@ -80,16 +85,15 @@ def fit_starts(
     fits = Fits.joined([fits, _beside(setup, scene, evidence, fits, stuck, most)])
     if scene.scout is None:
         return _finished(setup, scene, evidence, fits, most)
-    # at a bearing a scout is good to some hundreds at edges
-    likely = fits.cost < (_near(fits, explains, most) + setup.policy.margin_cost)[fits.frame]
+    likely = fits.cost < (_near(fits, explains, most) + setup.policy.likely_cost)[fits.frame]
     own = _of_own_places(setup, fits, likely, apart)
-    rough = _rough(setup, scene, evidence, own, most)
+    rough = _rough(setup, scene, full, own)
     # where the scout explains a frame, an edge has left a pixel on the way
     stuck = (own.cost <= explains[own.frame]) & (rough.cost > explains[own.frame])
     stuck &= (_near(rough, explains, most) >= explains)[own.frame]
-    rough = Fits.joined([rough, _beside(setup, scene.without_scout(), evidence, own, stuck, most)])
-    found = _finished(setup, scene.without_scout(), evidence, rough, most)
-    return found if most is not None else Fits.joined([found, fits[~likely]])
+    rough = Fits.joined([rough, _beside(setup, scene.without_scout(), full, own, stuck, most)])
+    found = _finished(setup, scene.without_scout(), full, rough, most)
+    return found if most is not None else Fits.joined([found, _shifted(fits[~likely], found, fits, len(explains))])
 
 
 def _near(fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] | None) -> NDArray[np.float64]:
@@ -156,11 +160,10 @@ def fit_views(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fit
     return _finished(setup, scene.without_scout(), evidence, rough)
 
 
-def _rough(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, most: NDArray[np.float64] | None = None) -> Fits:
-    """Refine the views of some fits roughly on the final images, as far as they promise to come near `most`."""
+def _rough(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
+    """Refine the views of some fits roughly on the final images."""
     settings = scene.settings(setup)
-    give_up = None if most is None else most[fits.frame] + setup.policy.likely_cost
-    return refine(scene.final, evidence, fits.frame, fits.class_index, fits.view, settings, give_up, roughly=True)
+    return refine(scene.final, evidence, fits.frame, fits.class_index, fits.view, settings, roughly=True)
 
 
 def _finished(
@@ -180,8 +183,14 @@ def _finished(
     final = refine(scene.final, evidence, again.frame, again.class_index, again.view, settings, rival=rival)
     others = fits[np.setdiff1d(np.arange(len(fits)), likely)]
     if scene.scout is not None and most is None:
-        others.cost[:] += least_of_frame(final, n)[others.frame] - least_of_frame(fits, n)[others.frame]
+        others = _shifted(others, final, fits, n)
     return Fits.joined([final, others.with_free(len(setup.free))])
+
+
+def _shifted(others: Fits, final: Fits, scouted: Fits, n: int) -> Fits:
+    """Return fits of a scout with the change of the best fit of their frame, of n, added to their costs."""
+    change = least_of_frame(final, n)[others.frame] - least_of_frame(scouted, n)[others.frame]
+    return replace(others, cost=others.cost + change)
 
 
 def _around(setup: Setup, scene: Scene, view: NDArray[np.float64]) -> NDArray[np.float64]:
