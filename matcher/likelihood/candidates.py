@@ -92,7 +92,9 @@ def fit_starts(
     stuck = (own.cost <= explains[own.frame]) & (rough.cost > explains[own.frame])
     stuck &= (_near(rough, explains, most) >= explains)[own.frame]
     rough = Fits.joined([rough, _beside(setup, scene.without_scout(), full, own, stuck, most)])
-    found = _finished(setup, scene.without_scout(), full, rough, most)
+    left = own[stuck]
+    again = refine(scene.final, full, left.frame, left.class_index, left.view, settings)
+    found = Fits.joined([_finished(setup, scene.without_scout(), full, rough, most), again])
     return found if most is not None else Fits.joined([found, _shifted(fits[~likely], found, fits, len(explains))])
 
 
