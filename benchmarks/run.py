@@ -318,13 +318,13 @@ def chain() -> Table:
             free, wall = ("distance_m", "delta_rad", "bearing_rad"), Background(wall_m=3.0)
             fixed = free[:2]
             likely = [
-                ("most likely D, δ on ranges", Matcher(opened, "refine", free=fixed), several),
+                ("most likely D, δ on ranges", Matcher(opened, "refine", free=fixed), several[:500]),
                 ("on phasors", Matcher(opened, "refine", free=fixed, on="phasors"), several[:100]),
-                ("bearing near 0, the default", Matcher(opened, "refine"), several[:500]),
+                ("bearing near 0, the default", Matcher(opened, "refine"), several[:100]),
                 ("and bearing, on ranges", Matcher(opened, "refine", free=free), several[:100]),
                 ("D, δ before a wall", Matcher(opened, "refine", free=fixed, background=wall), many[:100]),
                 ("and bearing, before a wall", Matcher(opened, "refine", free=free, background=wall), many[:100]),
-                ("D, δ and the wall", Matcher(opened, "refine", free=fixed, background="auto"), many),
+                ("D, δ and the wall", Matcher(opened, "refine", free=fixed, background="auto"), many[:40]),
             ]
             rows += [(name, len(some), partial(likeliest.match, some)) for name, likeliest, some in likely]
             measured = [(name, n / median_seconds(work), n / processor_seconds(work)) for name, n, work in rows]
