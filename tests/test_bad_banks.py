@@ -12,6 +12,7 @@ from phasemark.data.plans import MeshPlan
 from phasemark.landmarks import export_mesh
 from phasemark.landmarks.mesh_files import MeshWarning
 from phasemark.matcher import Matcher, kalman_filter
+from phasemark.matcher.nearest.grid import is_in_range
 from phasemark.render import Renderer, Views, capture
 
 GRID = {"distance_m": "0.6:1.5:0.02", "delta_deg": "0:360:2"}
@@ -89,3 +90,23 @@ def test_what_a_coarse_or_narrow_bank_accepts_is_right(tmp_path, mesh, grid, tur
         symmetry = bank.mesh("part").metadata["symmetry"]
     assert right(matches, views, symmetry)[matches.accepted].all()
     assert matches.accepted.sum() >= least
+
+
+def test_the_range_of_a_bank_ends_half_a_cell_beyond_its_grid_and_angles_repeat_with_the_landmark():
+    near, half = np.array([0.6, 1.5]), np.radians(np.arange(-60.0, 61.0))
+
+    def inside(distance_m, delta_deg, delta_rad=half, period_deg=360.0):
+        return is_in_range(near, delta_rad, np.array([distance_m, math.radians(delta_deg)]), math.radians(period_deg))
+
+    assert [inside(distance, 0.0) for distance in (0.589, 0.591, 1.509, 1.511)] == [False, True, True, False]
+    assert [inside(1.0, delta) for delta in (-61.1, -60.9, 60.9, 61.1, 299.1, 298.9)] == [
+        False,
+        True,
+        True,
+        False,
+        True,
+        False,
+    ]
+    assert [inside(1.0, delta, period_deg=180.0) for delta in (121.0, 115.0, 240.9)] == [True, False, True]
+    assert inside(1.0, 200.0, np.radians(np.arange(0.0, 360.0, 2.0)))  # a whole turn has no end
+    assert inside(1.0, 75.0, np.radians([75.5]), 1.0)

@@ -63,7 +63,7 @@ def test_a_mirrored_image_is_refused_or_named(parts, setting):
 
 def test_a_part_without_a_plane_of_symmetry_shows_that_its_image_is_not_mirrored():
     with bank_of((51, 0), 4, "pmd-16x16") as bank:
-        name = next(one for one in bank.classes if "stone" in one)
+        name = next(part for part in bank.classes if "stone" in part)
         image = renderers_of(bank)[name].render_views(Views.broadcast(1.0, np.linspace(0, 6, 12)))
         frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(2), n_frames=50))
         matches = Matcher(bank, "refine", free=("distance_m", "delta_rad")).match(frames)

@@ -34,7 +34,7 @@ from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
 from phasemark.matcher.nearest.bank_minima import Search, SearchOfFrames, Upward
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD, CellBounds, Turned
-from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD
+from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD, first_step
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
 from phasemark.render import Background, PhasorImages, Views
@@ -235,7 +235,10 @@ class LikelihoodMatcher:
     def _new_search(self, behind: PhasorImages | None) -> Search:
         """Return a search before some background, over all bearings that are looked for where they are free."""
         setup, bank = self._setup, self._bank
-        stride = (max(1, round(CELL_M / _step(bank.distance_m))), max(1, round(CELL_RAD / _step(bank.delta_rad))))
+        stride = (
+            max(1, round(CELL_M / first_step(bank.distance_m))),
+            max(1, round(CELL_RAD / first_step(bank.delta_rad))),
+        )
         known = setup.height_and_tilt_are_known
         cells = CellBounds(
             bank,
@@ -288,11 +291,6 @@ class LikelihoodMatcher:
             walls = [Background(wall_m=float(own)) for own in wall_m]
             cost[which] = bare_cost(evidence[which].seen, background_of(self._bank, *walls))
         return cost
-
-
-def _step(grid: NDArray[np.float64]) -> float:
-    """Return the step of a grid; infinite of one point."""
-    return float(grid[1] - grid[0]) if len(grid) > 1 else math.inf
 
 
 def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark.matcher.nearest.cells import CellBounds
-from phasemark.matcher.nearest.grid import closing_period
+from phasemark.matcher.nearest.grid import closing_period, first_step
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.one_frequency import OneFrequency
 from phasemark.render import Sensor
@@ -204,10 +204,10 @@ class Search:
     def _close_to(self, c: int, view: NDArray[np.float64]) -> tuple[Any, ...]:
         """Return which cells of a class are close to a view, as an index of costs; whatever the elevation."""
         cells = self.cells
-        along = np.flatnonzero(np.abs(cells.distance_m - view[0]) <= _CLOSE[0] * _step(cells.distance_m))
+        along = np.flatnonzero(np.abs(cells.distance_m - view[0]) <= _CLOSE[0] * first_step(cells.distance_m))
         period = closing_period(cells.delta_rad) or 2 * math.pi
         off = (cells.delta_rad - view[1] + period / 2) % period - period / 2
-        around = np.flatnonzero(np.abs(off) <= _CLOSE[1] * _step(cells.delta_rad))
+        around = np.flatnonzero(np.abs(off) <= _CLOSE[1] * first_step(cells.delta_rad))
         beside = np.flatnonzero(np.abs(self._bearing_rad - view[2]) <= _CLOSE[2] * self.column_rad)
         return np.ix_(beside, np.array([c]), along, around)
 
@@ -308,11 +308,6 @@ def _joined(parts: Sequence[Starts]) -> Starts:
     return Starts(
         frame, *(np.concatenate([getattr(own, name) for own in parts]) for name in ("class_index", "view", "cost"))
     )
-
-
-def _step(grid: NDArray[np.float64]) -> float:
-    """Return the first step of a grid; infinite of one point."""
-    return float(grid[1] - grid[0]) if len(grid) > 1 else math.inf
 
 
 @njit(cache=True, nogil=True)

@@ -33,6 +33,11 @@ def is_in_range(
     return bool(beyond <= delta_rad[-1] - delta_rad[0] + CELL_RAD)
 
 
+def first_step(grid: NDArray[np.float64]) -> float:
+    """Return the first step of an axis; infinite of one point."""
+    return float(grid[1] - grid[0]) if len(grid) > 1 else math.inf
+
+
 def closing_period(delta_rad: NDArray[np.float64]) -> float | None:
     """Return the period over which a regular grid of angles closes: 2π / n, one step beyond its end; None if none."""
     if len(delta_rad) < 2:
