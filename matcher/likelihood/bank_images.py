@@ -102,8 +102,8 @@ class BankModel:
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Interpolate; distance and δ can be free, and without a background the bearing too."""
         m, pixels = len(view), self._sensor.rows * self._sensor.cols
-        phasor, slope = np.zeros((m, pixels), np.complex128), np.zeros((m, 2, pixels), np.complex128)
-        shade = np.zeros((m, 2, pixels))
+        phasor, shade = np.zeros((m, pixels), np.complex128), np.zeros((m, 2, pixels))
+        slope = np.zeros((m, 2 if free else 0, pixels), np.complex128)
         frame = np.zeros(m, np.int64) if self._frame is None else self._frame
         _interpolate(
             class_index, view, *self._grid(), self._upper, self._lower, *self._behind, frame, phasor, slope, shade
@@ -111,7 +111,7 @@ class BankModel:
         if "bearing_rad" in free or view[:, VIEW.index("bearing_rad")].any():
             phasor, slope, shade = self._aside(view[:, VIEW.index("bearing_rad")], phasor, slope, shade)
         order = [VIEW.index(name) for name in free]
-        picked = slope if order == [0, 1] else slope[:, order]
+        picked = slope if order == list(range(slope.shape[1])) else slope[:, order]
         return ModelImages(phasor, picked, shade[:, 0], shade[:, 1])
 
     def _aside(
@@ -121,15 +121,16 @@ class BankModel:
         slope: NDArray[np.complex128],
         shade: NDArray[np.float64],
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128], NDArray[np.float64]]:
-        """Return images moved aside, by parts of columns mixed from two, with the slope by the bearing as the third.
+        """Return images moved aside, by parts of columns mixed from two; slopes get that by the bearing as the third.
 
         A turn of the camera moves the image by tan b / (2 tan α / columns), but for what it does to rows and to columns
         far from the middle, and a pixel's light comes from two pixels in the shares of their areas. At edges that is an
         approximation: a true view costs up to some hundreds more (PHYSICS section 7), in the median 50.
         """
-        m, _, pixels = slope.shape
+        m, n, pixels = slope.shape
         tangent, per_column = np.tan(bearing_rad), self._sensor.columns_per_tangent
-        moved, slopes, shades = np.empty_like(phasor), np.empty((m, 3, pixels), np.complex128), np.empty_like(shade)
+        moved, slopes = np.zeros_like(phasor), np.zeros((m, n + 1 if n else 0, pixels), np.complex128)
+        shades = np.zeros_like(shade)
         shift, turn = -tangent * per_column, (1 + tangent**2) * per_column
         _move_aside(shift, turn, self._sensor.cols, phasor, slope, shade, moved, slopes, shades)
         return moved, slopes, shades
@@ -278,7 +279,7 @@ _vectorised = njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 
 
 @_vectorised
-def _along_delta(n, b0, b1, b2, b3, w, dw, out):  # type: ignore[no-untyped-def]
+def _along_delta(n, b0, b1, b2, b3, w, dw, out, with_slopes):  # type: ignore[no-untyped-def]
     """Interpolate the first n pixels of four neighbours in δ, (4, pixels) each, into `out` (8, pixels).
 
     Its rows are value and slope of the real part, of the imaginary part and of the coverage, and the least and greatest
@@ -286,13 +287,13 @@ def _along_delta(n, b0, b1, b2, b3, w, dw, out):  # type: ignore[no-untyped-def]
     """
     w0, w1, w2, w3 = np.float32(w[0]), np.float32(w[1]), np.float32(w[2]), np.float32(w[3])
     d0, d1, d2, d3 = np.float32(dw[0]), np.float32(dw[1]), np.float32(dw[2]), np.float32(dw[3])
-    for q in range(n):
-        out[0, q] = w0 * b0[0, q] + w1 * b1[0, q] + w2 * b2[0, q] + w3 * b3[0, q]
-        out[1, q] = d0 * b0[0, q] + d1 * b1[0, q] + d2 * b2[0, q] + d3 * b3[0, q]
-        out[2, q] = w0 * b0[1, q] + w1 * b1[1, q] + w2 * b2[1, q] + w3 * b3[1, q]
-        out[3, q] = d0 * b0[1, q] + d1 * b1[1, q] + d2 * b2[1, q] + d3 * b3[1, q]
-        out[4, q] = w0 * b0[3, q] + w1 * b1[3, q] + w2 * b2[3, q] + w3 * b3[3, q]
-        out[5, q] = d0 * b0[3, q] + d1 * b1[3, q] + d2 * b2[3, q] + d3 * b3[3, q]
+    for part in range(3):
+        plane = 3 if part == 2 else part
+        for q in range(n):
+            out[2 * part, q] = w0 * b0[plane, q] + w1 * b1[plane, q] + w2 * b2[plane, q] + w3 * b3[plane, q]
+        if with_slopes:
+            for q in range(n):
+                out[2 * part + 1, q] = d0 * b0[plane, q] + d1 * b1[plane, q] + d2 * b2[plane, q] + d3 * b3[plane, q]
     for q in range(n):
         s0, s1 = b0[0, q] * b0[0, q] + b0[1, q] * b0[1, q], b1[0, q] * b1[0, q] + b1[1, q] * b1[1, q]
         s2, s3 = b2[0, q] * b2[0, q] + b2[1, q] * b2[1, q], b3[0, q] * b3[0, q] + b3[1, q] * b3[1, q]
@@ -301,7 +302,7 @@ def _along_delta(n, b0, b1, b2, b3, w, dw, out):  # type: ignore[no-untyped-def]
 
 
 @_vectorised
-def _along_distance(n, lines, w, dw, cubic):  # type: ignore[no-untyped-def]
+def _along_distance(n, lines, w, dw, cubic, with_slopes):  # type: ignore[no-untyped-def]
     """Interpolate n pixels of four lines of :func:`_along_delta` in D, into `cubic` (11, pixels).
 
     Its rows are value, slope by D and slope by δ of the real part, of the imaginary part and of the coverage, and the
@@ -314,17 +315,19 @@ def _along_distance(n, lines, w, dw, cubic):  # type: ignore[no-untyped-def]
         for q in range(n):
             x0, x1, x2, x3 = lines[0, value, q], lines[1, value, q], lines[2, value, q], lines[3, value, q]
             cubic[3 * part, q] = w0 * x0 + w1 * x1 + w2 * x2 + w3 * x3
-            cubic[3 * part + 1, q] = d0 * x0 + d1 * x1 + d2 * x2 + d3 * x3
-            cubic[3 * part + 2, q] = (
-                w0 * lines[0, slope, q] + w1 * lines[1, slope, q] + w2 * lines[2, slope, q] + w3 * lines[3, slope, q]
-            )
+            if with_slopes:
+                cubic[3 * part + 1, q] = d0 * x0 + d1 * x1 + d2 * x2 + d3 * x3
+        if with_slopes:
+            for q in range(n):
+                x0, x1, x2, x3 = lines[0, slope, q], lines[1, slope, q], lines[2, slope, q], lines[3, slope, q]
+                cubic[3 * part + 2, q] = w0 * x0 + w1 * x1 + w2 * x2 + w3 * x3
     for q in range(n):
         cubic[9, q] = min(min(lines[0, 6, q], lines[1, 6, q]), min(lines[2, 6, q], lines[3, 6, q]))
         cubic[10, q] = max(max(lines[0, 7, q], lines[1, 7, q]), max(lines[2, 7, q], lines[3, 7, q]))
 
 
 @_vectorised
-def _between(n, b00, b01, b10, b11, d, a, step_d, step_a, straight):  # type: ignore[no-untyped-def]
+def _between(n, b00, b01, b10, b11, d, a, step_d, step_a, straight, with_slopes):  # type: ignore[no-untyped-def]
     """Interpolate n pixels linearly between two distances and two angles, into `straight` (10, pixels).
 
     Its first nine rows are those of :func:`_along_distance`, the last one is the intensity; `d` and `a` are the places
@@ -339,8 +342,9 @@ def _between(n, b00, b01, b10, b11, d, a, step_d, step_a, straight):  # type: ig
         for q in range(n):
             x00, x01, x10, x11 = b00[plane, q], b01[plane, q], b10[plane, q], b11[plane, q]
             straight[3 * part, q] = w00 * x00 + w01 * x01 + w10 * x10 + w11 * x11
-            straight[3 * part + 1, q] = d0 * (x10 - x00) + d1 * (x11 - x01)
-            straight[3 * part + 2, q] = a0 * (x01 - x00) + a1 * (x11 - x10)
+            if with_slopes:
+                straight[3 * part + 1, q] = d0 * (x10 - x00) + d1 * (x11 - x01)
+                straight[3 * part + 2, q] = a0 * (x01 - x00) + a1 * (x11 - x10)
     for q in range(n):
         straight[9, q] = w00 * b00[2, q] + w01 * b01[2, q] + w10 * b10[2, q] + w11 * b11[2, q]
 
@@ -348,18 +352,20 @@ def _between(n, b00, b01, b10, b11, d, a, step_d, step_a, straight):  # type: ig
 @njit(cache=True, nogil=True)
 def _conclude(m, n, pixel, first, cubic, straight, behind, behind_intensity, phasor, slope, shade):  # type: ignore[no-untyped-def]
     """Choose for each of n pixels between cubic and straight, put the background behind it, and store it."""
+    with_slopes = slope.shape[1] > 0
     for q in range(n):
         at = first + pixel[q]
         chosen = cubic if cubic[9, q] > _DIM * _DIM * cubic[10, q] else straight
         phasor[m, at] = complex(chosen[0, q], chosen[3, q])
-        slope[m, 0, at] = complex(chosen[1, q], chosen[4, q])
-        slope[m, 1, at] = complex(chosen[2, q], chosen[5, q])
         shade[m, 0, at], shade[m, 1, at] = straight[9, q], straight[6, q]
         if len(behind):
             phasor[m, at] += (1 - chosen[6, q]) * behind[at]
-            slope[m, 0, at] -= chosen[7, q] * behind[at]
-            slope[m, 1, at] -= chosen[8, q] * behind[at]
             shade[m, 0, at] += (1 - straight[6, q]) * behind_intensity[at]
+        if with_slopes:
+            for k in range(2):
+                slope[m, k, at] = complex(chosen[1 + k, q], chosen[4 + k, q])
+                if len(behind):
+                    slope[m, k, at] -= chosen[7 + k, q] * behind[at]
     if len(behind):
         for q in range(n, len(pixel)):
             phasor[m, first + pixel[q]] = behind[first + pixel[q]]
@@ -389,6 +395,7 @@ def _interpolate(  # type: ignore[no-untyped-def]
     lines, cubic = np.empty((4, 8, n_low), np.float32), np.empty((11, n_low), np.float32)
     lines_up, cubic_up = np.empty((4, 8, n_up), np.float32), np.empty((11, n_up), np.float32)
     straight, straight_up = np.empty((10, n_low), np.float32), np.empty((10, n_up), np.float32)
+    with_slopes = slope.shape[1] > 0
     for m in range(len(class_index)):
         c = class_index[m]
         cl = c if lower.values.shape[0] > 1 else 0
@@ -406,45 +413,48 @@ def _interpolate(  # type: ignore[no-untyped-def]
         own, own_intensity = behind[frame[m]], behind_intensity[frame[m]]
         for a in range(4):
             block = lower.values[cl, i0 + a]
-            _along_delta(lit, block[j1], block[j2], block[j3], block[j4], wa, dwa, lines[a])
+            _along_delta(lit, block[j1], block[j2], block[j3], block[j4], wa, dwa, lines[a], with_slopes)
             if n_up:
                 one = upper.values[c, i0 + a]
-                _along_delta(lit_up, one, one, one, one, once, never, lines_up[a])
-        _along_distance(lit, lines, wd, dwd, cubic)
+                _along_delta(lit_up, one, one, one, one, once, never, lines_up[a], with_slopes)
+        _along_distance(lit, lines, wd, dwd, cubic, with_slopes)
         k, d = _straight_cell(td)
         kj, a = _straight_cell(ta)
         near, far = lower.values[cl, i0 + k], lower.values[cl, i0 + k + 1]
         ja, jb = (j0 + kj) % n_a, (j0 + kj + 1) % n_a
-        _between(lit, near[ja], near[jb], far[ja], far[jb], d, a, step_d, step_a, straight)
+        _between(lit, near[ja], near[jb], far[ja], far[jb], d, a, step_d, step_a, straight, with_slopes)
         if n_up:
-            _along_distance(lit_up, lines_up, wd, dwd, cubic_up)
+            _along_distance(lit_up, lines_up, wd, dwd, cubic_up, with_slopes)
             near_up, far_up = upper.values[c, i0 + k], upper.values[c, i0 + k + 1]
-            _between(lit_up, near_up, near_up, far_up, far_up, d, 0.0, step_d, step_a, straight_up)
+            _between(lit_up, near_up, near_up, far_up, far_up, d, 0.0, step_d, step_a, straight_up, with_slopes)
             _conclude(m, lit_up, upper.pixel, 0, cubic_up, straight_up, own, own_intensity, phasor, slope, shade)
         _conclude(m, lit, lower.pixel, n_up, cubic, straight, own, own_intensity, phasor, slope, shade)
+
+
+@_vectorised
+def _mixed(whole, left, right, cols, values, out):  # type: ignore[no-untyped-def]
+    """Fill each pixel of an image with a mix of those `whole` and `whole` + 1 columns to its right, if they exist."""
+    for row in range(0, len(values), cols):
+        for q in range(row + max(-whole, 0), row + min(cols - whole, cols)):
+            out[q] = left * values[q + whole]
+        for q in range(row + max(-whole - 1, 0), row + min(cols - whole - 1, cols)):
+            out[q] += right * values[q + whole + 1]
 
 
 @njit(cache=True, nogil=True)
 def _move_aside(shift, turn, cols, phasor, slope, shade, moved, slopes, shades):  # type: ignore[no-untyped-def]
     """Move m images some columns to the right; the slope by the bearing is the rise from column to column by `turn`."""
-    pixels = phasor.shape[1]
+    n_slopes = slope.shape[1]
     for m in range(len(phasor)):
         whole = int(np.floor(-shift[m]))
         share = -shift[m] - whole
-        for q in range(pixels):
-            first = q % cols + whole
-            has_left, has_right = 0 <= first < cols, -1 <= first < cols - 1
-            at = q + whole
-            left, right = 1.0 - share if has_left else 0.0, share if has_right else 0.0
-            a, b = at if has_left else q, at + 1 if has_right else q
-            moved[m, q] = left * phasor[m, a] + right * phasor[m, b]
-            for k in range(2):
-                slopes[m, k, q] = left * slope[m, k, a] + right * slope[m, k, b]
-                shades[m, k, q] = left * shade[m, k, a] + right * shade[m, k, b]
-            rise = phasor[m, b] if has_right else 0j
-            if has_left:
-                rise -= phasor[m, a]
-            slopes[m, 2, q] = turn[m] * rise
+        _mixed(whole, 1.0 - share, share, cols, phasor[m], moved[m])
+        for k in range(2):
+            _mixed(whole, 1.0 - share, share, cols, shade[m, k], shades[m, k])
+        for k in range(n_slopes):
+            _mixed(whole, 1.0 - share, share, cols, slope[m, k], slopes[m, k])
+        if n_slopes:
+            _mixed(whole, -turn[m], turn[m], cols, phasor[m], slopes[m, n_slopes])
 
 
 @njit(cache=True, nogil=True)

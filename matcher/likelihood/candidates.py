@@ -20,8 +20,10 @@ __all__ = ["fit_neighbouring_views", "fit_starts", "fit_views"]
 
 _SOFT_M = 0.01
 """Standard deviation of ranges that is added for the first steps of a robust descent: half a cell."""
-_SCOUT_M, _SCOUT_PIXELS = 5e-3, 0.1
+_SCOUT_M, _SCOUT_PIXELS = 0.015, 0.3
 """Standard deviation of the ranges of a scout whose images are moved aside, and in widths of a pixel at 1 m."""
+_SCOUT_COST = 300.0
+"""What a true view may cost more on that scout than what explains a frame."""
 _APART, _APART_COLUMNS = (0.01, math.radians(2.0)), 0.25
 """Distance and angle, and columns of bearing, within which minima of a scout lead to one: its images are not smooth."""
 _BEST_BESIDE = 2
@@ -57,45 +59,77 @@ def fit_starts(
         What is known to explain these frames: only what is not there is refined and returned, and all side minima are
         looked around. Otherwise they are only while nothing explains their frame.
     """
-    settings, model = scene.settings(setup), scene.scout or scene.final
     explains = np.full(len(evidence.weight), np.inf)
     explains[which] = limit
     most = None if known is None else explains
-    apart: tuple[float, ...] = (setup.policy.same_m, setup.policy.same_rad)
+    aside = scene.scout is not None and setup.bearing_is_free
+    seen = evidence
+    if aside:
+        seen = evidence.with_further_noise(max(_SCOUT_M, _SCOUT_PIXELS * setup.bank.sensor.pixel_rad))
+    fits = _descended(setup, scene, seen, (which[starts.frame], starts.class_index, starts.view), known)
+    if aside:
+        return _fits_aside(setup, scene, evidence, fits, explains, most)
     if scene.scout is not None:
-        apart = (*_APART, _APART_COLUMNS * scene.search.column_rad)
-    frame, class_index, view = which[starts.frame], starts.class_index, starts.view
-    full = evidence
-    if scene.scout is not None and setup.bearing_is_free:
-        evidence = full.with_further_noise(max(_SCOUT_M, _SCOUT_PIXELS * setup.bank.sensor.pixel_rad))
+        fits = _finished(setup, scene, evidence, fits, most)
+    stuck = _are_stuck(setup, fits, explains, most)
+    beside = _beside(setup, scene, evidence, fits, stuck, most, roughly=scene.scout is None)
+    fits = Fits.joined([fits, beside])
+    return fits if scene.scout is not None else _finished(setup, scene, evidence, fits, most)
+
+
+def _descended(
+    setup: Setup,
+    scene: Scene,
+    evidence: Evidence,
+    start: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
+    known: Fits | None,
+) -> Fits:
+    """Refine starts (frame, class, view) roughly, on the scout if there is one; leave out those at known places."""
+    settings, model = scene.settings(setup), scene.scout or scene.final
+    frame, class_index, view = start
     if setup.huber is not None:
         # a loss that stays constant for outliers has no slope a cell away: the first steps have more noise
         soft = evidence.with_further_noise(_SOFT_M)
         view = refine(model, soft, frame, class_index, view, settings, roughly=True).view
     fits = refine(model, evidence, frame, class_index, view, settings, roughly=True)
-    if known is not None:
-        if scene.scout is not None:  # which has its own minimum there
-            known = refine(model, evidence, known.frame, known.class_index, known.view, settings, roughly=True)
-        fits = _elsewhere(setup, fits, known, apart)
-    if scene.scout is not None and not setup.bearing_is_free:
-        fits = _finished(setup, scene, evidence, fits, most)
-        stuck = _are_stuck(setup, fits, explains, most)
-        return Fits.joined([fits, _beside(setup, scene.without_scout(), evidence, fits, stuck, most, roughly=False)])
-    stuck = _are_stuck(setup, fits, explains, most)
-    fits = Fits.joined([fits, _beside(setup, scene, evidence, fits, stuck, most)])
+    if known is None:
+        return fits
     if scene.scout is None:
-        return _finished(setup, scene, evidence, fits, most)
-    likely = fits.cost < (_near(fits, explains, most) + setup.policy.likely_cost)[fits.frame]
-    own = _of_own_places(setup, fits, likely, apart)
-    rough = _rough(setup, scene, full, own)
+        return _elsewhere(setup, fits, known, (setup.policy.same_m, setup.policy.same_rad))
+    # the scout has its own minimum there
+    known = refine(model, evidence, known.frame, known.class_index, known.view, settings, roughly=True)
+    return _elsewhere(setup, fits, known, _apart(scene))
+
+
+def _fits_aside(
+    setup: Setup,
+    scene: Scene,
+    evidence: Evidence,
+    fits: Fits,
+    explains: NDArray[np.float64],
+    most: NDArray[np.float64] | None,
+) -> Fits:
+    """Refine what is likely on a scout whose images are moved aside."""
+    margin = setup.policy.likely_cost if most is None else _SCOUT_COST
+    likely = fits.cost < (_near(fits, explains, most) + margin)[fits.frame]
+    own = _of_own_places(setup, fits, likely, _apart(scene))
+    rough = _rough(setup, scene, evidence, own)
     # where the scout explains a frame, an edge has left a pixel on the way
     stuck = (own.cost <= explains[own.frame]) & (rough.cost > explains[own.frame])
     stuck &= (_near(rough, explains, most) >= explains)[own.frame]
-    rough = Fits.joined([rough, _beside(setup, scene.without_scout(), full, own, stuck, most)])
+    scene = scene.without_scout()
+    rough = Fits.joined([rough, _beside(setup, scene, evidence, own, stuck, most)])
     left = own[stuck]
-    again = refine(scene.final, full, left.frame, left.class_index, left.view, settings)
-    found = Fits.joined([_finished(setup, scene.without_scout(), full, rough, most), again])
+    rival = None if most is None else most[left.frame]
+    settings = scene.settings(setup)
+    again = refine(scene.final, evidence, left.frame, left.class_index, left.view, settings, rival=rival)
+    found = Fits.joined([_finished(setup, scene, evidence, rough, most), again])
     return found if most is not None else Fits.joined([found, _shifted(fits[~likely], found, fits, len(explains))])
+
+
+def _apart(scene: Scene) -> tuple[float, float, float]:
+    """Return how far apart minima of a scout are of their own: distance, angle, bearing."""
+    return *_APART, _APART_COLUMNS * scene.search.column_rad
 
 
 def _near(fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] | None) -> NDArray[np.float64]:
@@ -122,12 +156,11 @@ def _beside(
     *,
     roughly: bool = True,
 ) -> Fits:
-    """Refine from around those fits that are stuck, on the scout if there is one.
+    """Refine from around those fits that are stuck.
 
     A descent stops at side minima, where an edge of the landmark has left a pixel.
     """
     settings = scene.settings(setup) if roughly else _close_settings(setup, scene, evidence)
-    model = scene.scout or scene.final
     which = distinct_of_frames(
         fits, np.flatnonzero(stuck), setup.shapes.symmetry, setup.policy.same_m, setup.policy.same_rad
     )
@@ -137,11 +170,12 @@ def _beside(
     k = views.shape[1]
     frame, class_index = np.repeat(fits.frame[which], k), np.repeat(fits.class_index[which], k)
     views = views.reshape(-1, len(VIEW))
-    cost = costs_at(model, evidence, frame, class_index, views, settings).reshape(-1, k)
+    cost = costs_at(scene.final, evidence, frame, class_index, views, settings).reshape(-1, k)
     best = np.argsort(cost, axis=1)[:, :_BEST_BESIDE]
     best = (best + k * np.arange(len(cost))[:, None]).ravel()
     rival = None if most is None else most[frame[best]]
-    return refine(model, evidence, frame[best], class_index[best], views[best], settings, rival=rival, roughly=roughly)
+    frame, class_index, views = frame[best], class_index[best], views[best]
+    return refine(scene.final, evidence, frame, class_index, views, settings, rival=rival, roughly=roughly)
 
 
 def _elsewhere(setup: Setup, fits: Fits, known: Fits, apart: tuple[float, ...]) -> Fits:

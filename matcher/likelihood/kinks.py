@@ -60,7 +60,7 @@ def look_beside(problem: Problem, state: State) -> State:
 
 
 def settle(problem: Problem, state: State) -> State:
-    """Move from views that contradict some pixels to better ones nearby.
+    """Move to better views nearby from those that contradict some pixels, and those that cost little more than a rival.
 
     Whether a pixel returns changes in a step where an edge enters it, which no slope shows. So views up to five
     standard deviations away along the axes of the covariance are tried, with the whole cost of PHYSICS section 7.
@@ -68,7 +68,7 @@ def settle(problem: Problem, state: State) -> State:
     cost, contradicted = whole_cost(problem, state)
     near = problem.near_best(state, problem.policy.close_cost)
     for _ in range(problem.policy.settling_rounds):
-        near = near[np.flatnonzero(contradicted[near])]
+        near = near[np.flatnonzero(contradicted[near] | (cost[near] > problem.rival[near]))]
         if not near.size:
             break
         moves = _moves(problem, state.sums, near)

@@ -101,7 +101,7 @@ class Problem:
     ========== ======================= ==================== ===========================
     `start`    decided by the images   new, or kept ones    new
     `state`    those that are given    new                  new, or those that are given
-    `at`       decided by the images   new                  new on request, else 0
+    `at`       decided by the images   new                  new on request
     `turned`   as in the source        the rows δ changes   those of the source
     `summed`   those that are given    those that are given those that are given
     ========== ======================= ==================== ===========================
@@ -177,7 +177,7 @@ class Problem:
         """Return states at some parameters, each with the pixels that count there."""
         view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
         images = self.model.images(self.class_index, view, free if with_slopes else ())
-        if not with_slopes:
+        if self.with_albedo and not with_slopes:
             images = replace(images, slope=np.zeros((len(view), len(free), images.phasor.shape[1]), np.complex128))
         scaled = self.scaled(images, theta)
         return self.summed(theta, self.pixels_at(scaled, theta), scaled)

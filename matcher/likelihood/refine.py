@@ -32,6 +32,9 @@ from phasemark.matcher.likelihood.uncertainty import (
 )
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, FILLED_COVERAGE
 
+_VIEWS_AT_ONCE = 512
+"""Views whose costs are told together: their images stay in the processor's cache."""
+
 
 def refine(
     model: ImageModel,
@@ -97,6 +100,19 @@ def costs_at(
     settings: DescentSettings,
 ) -> NDArray[np.float64]:
     """Return what m candidates cost where they start, disagreements included; arguments as for :func:`refine`."""
+    parts = [slice(first, first + _VIEWS_AT_ONCE) for first in range(0, len(frame), _VIEWS_AT_ONCE)]
+    costs = [_costs_of_part(model, evidence, frame[own], class_index[own], view[own], settings) for own in parts]
+    return np.concatenate(costs) if costs else np.empty(0)
+
+
+def _costs_of_part(
+    model: ImageModel,
+    evidence: Evidence,
+    frame: NDArray[np.int64],
+    class_index: NDArray[np.int64],
+    view: NDArray[np.float64],
+    settings: DescentSettings,
+) -> NDArray[np.float64]:
     problem = Problem(model, evidence, frame, class_index, settings, np.full(len(frame), np.inf))
     if problem.with_albedo:  # the brightness of each has to be found first
         return whole_cost(problem, problem.start(view))[0]
