@@ -12,6 +12,7 @@ from thin_landmarks import GROSS_M, GROSS_RAD, PRESETS, SETTINGS, WALL, bank_of,
 from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.matcher import Matcher, kalman_filter
+from phasemark.matcher.filters.filtered_frames import PixelState
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts, disagrees
 from phasemark.render import Background, Frames, Renderer, Views, capture, preset
@@ -172,6 +173,18 @@ def test_few_returns_among_unknown_things_determine_nothing(panel):
     frames = kalman_filter(Frames(ranges, sensor=panel.sensor))
     (match,) = Matcher(panel, "refine", background="unknown", free=("distance_m", "delta_rad")).match(frames)
     assert not match.accepted
+
+
+def test_few_returns_determine_nothing_where_outliers_are_left_out(panel):
+    image = Renderer(panel.mesh("panel"), panel.sensor, albedo=0.8).render(0.6, 0.1)
+    frames = kalman_filter(capture(image, panel.sensor, rng=np.random.default_rng(2), n_frames=50))
+    few = frames.range_m.copy()
+    seen = np.flatnonzero(np.isfinite(few))
+    few.flat[seen[11:]] = np.nan  # six returns for each of D and δ are 12
+    cut = dataclasses.replace(frames, range_m=few, state=np.where(np.isfinite(few), frames.state, PixelState.MISSING))
+    robust = Matcher(panel, "refine", robust=True, free=("distance_m", "delta_rad"))
+    assert robust.match(frames)[0].accepted
+    assert robust.match(cut)[0].reason == "undetermined"
 
 
 def test_a_landmark_beside_the_middle_is_matched_by_default_and_refused_where_the_bearing_is_fixed(thin_bank):

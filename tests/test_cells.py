@@ -11,7 +11,6 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.data.plans import MeshPlan
 from phasemark.landmarks import export_mesh
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.nearest.cells import CellBounds
@@ -82,22 +81,6 @@ def test_bounds_of_wide_pixels_hold_at_any_bearing_within_half_a_column(tmp_path
     limit = seen.returned.sum(axis=1) + 25.0
     held = [np.isfinite(costs(cells, seen, k, limit[k])[0, i[k], j[k]]) for k in range(n)]
     assert np.mean(held) >= 0.9  # ranges are good to half a millimetre: edges within a cell leave some above
-
-
-@pytest.mark.parametrize("bearing_deg", [-2.2, -0.4, 0.1, 1.0])
-def test_images_moved_aside_are_near_rendered_ones_and_their_slopes_are_their_differences(prisms, bearing_deg):
-    bank, n = prisms[6], 40
-    distance, delta, _ = drawn(n, 9)
-    view = np.column_stack([distance, delta, np.full(n, math.radians(bearing_deg)), np.zeros((n, 3))])
-    model, which, free = BankModel(bank), np.zeros(n, np.int64), ("distance_m", "delta_rad", "bearing_rad")
-    images = model.images(which, view, free)
-    rendered = Renderer(bank.mesh("prism"), bank.sensor, albedo=0.8).render_views(Views(*np.ascontiguousarray(view.T)))
-    lit = rendered.coverage.reshape(n, -1) > 0.5
-    off_m = bank.sensor.metres_per_radian * np.angle(rendered.phasor.reshape(n, -1)[lit] * images.phasor[lit].conj())
-    assert np.median(np.abs(off_m)) < 2e-3  # the noise of 50 exposures is 3 mm
-    step = 1e-6
-    ends = [model.images(which, view + side * step * np.eye(6)[2], ()).phasor for side in (1, -1)]
-    np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), images.slope[:, 2], atol=1e-4)
 
 
 def costs(cells, seen, k, limit):

@@ -159,7 +159,7 @@ def _reason(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float6
         return "no landmark"
     if fits.p_value[best] < setup.false_alarm or not fits.stands_out[best]:
         return "poor fit"
-    if setup.unknown and fits.explained[best] < setup.fewest_explained:
+    if (setup.unknown or setup.huber is not None) and fits.explained[best] < setup.fewest_explained:
         return "undetermined"
     symmetry = setup.shapes.symmetry[fits.class_index[best]]
     if not is_determined(setup, fits.std_without_one[best], symmetry):

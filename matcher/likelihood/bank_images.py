@@ -50,18 +50,18 @@ class BankModel:
     def __init__(self, bank: Bank) -> None:
         self._sensor = bank.sensor
         self._smooth_only = False
-        self._behind = _behind_arrays(None)
+        self._behind = behind_arrays(None)
         self._frame: NDArray[np.int64] | None = None
         self._distance, self._delta = bank.distance_m, bank.delta_rad
         self._period = closing_period(bank.delta_rad)
         if bank.full is not None:
-            self._lower = _Stack.of(_read(bank.full))
-            self._upper = _Stack.of(np.zeros((len(bank.classes), len(self._distance), 4, 0), np.float32))
+            self._lower = Stack.of(_read(bank.full))
+            self._upper = Stack.of(np.zeros((len(bank.classes), len(self._distance), 4, 0), np.float32))
         else:
             assert bank.lower is not None
             assert bank.upper is not None
-            self._lower = _Stack.of(_read(bank.lower)[None])
-            self._upper = _Stack.of(_read(bank.upper))
+            self._lower = Stack.of(_read(bank.lower)[None])
+            self._upper = Stack.of(_read(bank.upper))
 
     def before(self, behind: PhasorImages | None) -> BankModel:
         """Return the same model before another background: an image of it is composed with the landmark's.
@@ -69,7 +69,7 @@ class BankModel:
         There is one image for all frames, or one for each.
         """
         other = copy.copy(self)
-        other._behind, other._frame = _behind_arrays(behind), None
+        other._behind, other._frame = behind_arrays(behind), None
         return other
 
     def of_frames(self, frame: NDArray[np.int64]) -> BankModel:
@@ -100,40 +100,17 @@ class BankModel:
         )
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
-        """Interpolate; distance and δ can be free, and without a background the bearing too."""
+        """Interpolate; distance and δ can be free."""
         m, pixels = len(view), self._sensor.rows * self._sensor.cols
         phasor, shade = np.zeros((m, pixels), np.complex128), np.zeros((m, 2, pixels))
         slope = np.zeros((m, 2 if free else 0, pixels), np.complex128)
         frame = np.zeros(m, np.int64) if self._frame is None else self._frame
-        _interpolate(
+        interpolate(
             class_index, view, *self._grid(), self._upper, self._lower, *self._behind, frame, phasor, slope, shade
         )
-        if "bearing_rad" in free or view[:, VIEW.index("bearing_rad")].any():
-            phasor, slope, shade = self._aside(view[:, VIEW.index("bearing_rad")], phasor, slope, shade)
         order = [VIEW.index(name) for name in free]
         picked = slope if order == list(range(slope.shape[1])) else slope[:, order]
         return ModelImages(phasor, picked, shade[:, 0], shade[:, 1])
-
-    def _aside(
-        self,
-        bearing_rad: NDArray[np.float64],
-        phasor: NDArray[np.complex128],
-        slope: NDArray[np.complex128],
-        shade: NDArray[np.float64],
-    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128], NDArray[np.float64]]:
-        """Return images moved aside, by parts of columns mixed from two; slopes get that by the bearing as the third.
-
-        A turn of the camera moves the image by tan b / (2 tan α / columns), but for what it does to rows and to columns
-        far from the middle, and a pixel's light comes from two pixels in the shares of their areas. At edges that is an
-        approximation: a true view costs up to some hundreds more (PHYSICS section 7), in the median 50.
-        """
-        m, n, pixels = slope.shape
-        tangent, per_column = np.tan(bearing_rad), self._sensor.columns_per_tangent
-        moved, slopes = np.zeros_like(phasor), np.zeros((m, n + 1 if n else 0, pixels), np.complex128)
-        shades = np.zeros_like(shade)
-        shift, turn = -tangent * per_column, (1 + tangent**2) * per_column
-        _move_aside(shift, turn, self._sensor.cols, phasor, slope, shade, moved, slopes, shades)
-        return moved, slopes, shades
 
     def first_images(
         self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
@@ -178,12 +155,9 @@ class BankModel:
         return replace(self.images(class_index, view, ()), slope=like.slope)
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which pixels are smooth enough, and of views at a bearing those that come from within the image."""
+        """Return which pixels are smooth enough."""
         if not self._smooth_only:
-            shift = -np.tan(view[:, VIEW.index("bearing_rad")]) * self._sensor.columns_per_tangent
-            come_from = np.arange(self._sensor.cols) - shift[:, None]
-            inside = (come_from >= 0) & (come_from <= self._sensor.cols - 1)
-            return np.tile(inside, (1, self._sensor.rows))
+            return np.ones((len(view), self._sensor.rows * self._sensor.cols), np.bool_)
         low, high = self.reach(class_index, view, (), np.empty((len(view), 0)))
         bend = np.empty(low.shape)
         _bends(class_index, view, *self._grid(), self._upper, self._lower, bend)
@@ -200,7 +174,7 @@ class BankModel:
         return float(self._distance[0]), step_d, float(self._delta[0]), step_a, self._period is not None
 
 
-class _Stack(NamedTuple):
+class Stack(NamedTuple):
     """Images of a bank, whose pixels are ordered so that those that see no landmark come last.
 
     Parameters
@@ -218,7 +192,7 @@ class _Stack(NamedTuple):
     n_lit: NDArray[np.int64]
 
     @classmethod
-    def of(cls, values: NDArray[np.float32]) -> _Stack:
+    def of(cls, values: NDArray[np.float32]) -> Stack:
         """Order the pixels of some images, in place, by the farthest distance at which they see the landmark."""
         n_d = values.shape[1]
         last = np.full(values.shape[-1], -1)
@@ -246,7 +220,7 @@ def _read(group: BankGroup) -> NDArray[np.float32]:
     return stack.reshape(*stack.shape[:-2], -1)
 
 
-def _behind_arrays(behind: PhasorImages | None) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
+def behind_arrays(behind: PhasorImages | None) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
     """Return phasor and intensity of backgrounds, (k, pixels); without one, no pixels."""
     if behind is None:
         return np.empty((1, 0), np.complex128), np.empty((1, 0))
@@ -380,7 +354,7 @@ def _straight_cell(t):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _interpolate(  # type: ignore[no-untyped-def]
+def interpolate(  # type: ignore[no-untyped-def]
     class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, behind, behind_intensity, frame,
     phasor, slope, shade,
 ):  # fmt: skip
@@ -429,32 +403,6 @@ def _interpolate(  # type: ignore[no-untyped-def]
             _between(lit_up, near_up, near_up, far_up, far_up, d, 0.0, step_d, step_a, straight_up, with_slopes)
             _conclude(m, lit_up, upper.pixel, 0, cubic_up, straight_up, own, own_intensity, phasor, slope, shade)
         _conclude(m, lit, lower.pixel, n_up, cubic, straight, own, own_intensity, phasor, slope, shade)
-
-
-@_vectorised
-def _mixed(whole, left, right, cols, values, out):  # type: ignore[no-untyped-def]
-    """Fill each pixel of an image with a mix of those `whole` and `whole` + 1 columns to its right, if they exist."""
-    for row in range(0, len(values), cols):
-        for q in range(row + max(-whole, 0), row + min(cols - whole, cols)):
-            out[q] = left * values[q + whole]
-        for q in range(row + max(-whole - 1, 0), row + min(cols - whole - 1, cols)):
-            out[q] += right * values[q + whole + 1]
-
-
-@njit(cache=True, nogil=True)
-def _move_aside(shift, turn, cols, phasor, slope, shade, moved, slopes, shades):  # type: ignore[no-untyped-def]
-    """Move m images some columns to the right; the slope by the bearing is the rise from column to column by `turn`."""
-    n_slopes = slope.shape[1]
-    for m in range(len(phasor)):
-        whole = int(np.floor(-shift[m]))
-        share = -shift[m] - whole
-        _mixed(whole, 1.0 - share, share, cols, phasor[m], moved[m])
-        for k in range(2):
-            _mixed(whole, 1.0 - share, share, cols, shade[m, k], shades[m, k])
-        for k in range(n_slopes):
-            _mixed(whole, 1.0 - share, share, cols, slope[m, k], slopes[m, k])
-        if n_slopes:
-            _mixed(whole, -turn[m], turn[m], cols, phasor[m], slopes[m, n_slopes])
 
 
 @njit(cache=True, nogil=True)

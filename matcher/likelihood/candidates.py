@@ -15,19 +15,20 @@ from phasemark.matcher.likelihood.refine import costs_at, refine
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.nearest.bank_minima import Starts
+from phasemark.matcher.nearest.grid import CELL_M
 
 __all__ = ["fit_neighbouring_views", "fit_starts", "fit_views"]
 
 _SOFT_M = 0.01
 """Standard deviation of ranges that is added for the first steps of a robust descent: half a cell."""
-_SCOUT_M, _SCOUT_PIXELS = 0.015, 0.3
-"""Standard deviation of the ranges of a scout whose images are moved aside, and in widths of a pixel at 1 m."""
-_SCOUT_COST = 300.0
-"""What a true view may cost more on that scout than what explains a frame."""
+_SCOUT_PIXELS = 0.05
+"""Standard deviation of ranges that is added for a scout at any bearing, in widths of a pixel at 1 m: its own error."""
 _APART, _APART_COLUMNS = (0.01, math.radians(2.0)), 0.25
-"""Distance and angle, and columns of bearing, within which minima of a scout lead to one: its images are not smooth."""
+"""Distance and angle, and columns of bearing, within which minima of such a scout lead to one."""
 _BEST_BESIDE = 2
 """Views around a side minimum that are refined."""
+_Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
+"""Frame, class and view of each."""
 _ASIDE_RAD = tuple(math.radians(angle) for angle in (0.12, 0.3, 0.7, 1.5, 3.0))
 """How far to either side of a side minimum in δ views are tried."""
 
@@ -63,25 +64,50 @@ def fit_starts(
     explains[which] = limit
     most = None if known is None else explains
     aside = scene.scout is not None and setup.bearing_is_free
-    seen = evidence
+    seen = evidence.with_further_noise(_SCOUT_PIXELS * setup.bank.sensor.pixel_rad) if aside else evidence
+    start = which[starts.frame], starts.class_index, starts.view
     if aside:
-        seen = evidence.with_further_noise(max(_SCOUT_M, _SCOUT_PIXELS * setup.bank.sensor.pixel_rad))
-    fits = _descended(setup, scene, seen, (which[starts.frame], starts.class_index, starts.view), known)
-    if aside:
-        return _fits_aside(setup, scene, evidence, fits, explains, most)
+        start = _best_of(setup, scene, seen, *start[:2], _spread(scene, start[2]), 1)
+    fits = _descended(setup, scene, seen, start, known)
     if scene.scout is not None:
         fits = _finished(setup, scene, evidence, fits, most)
-    stuck = _are_stuck(setup, fits, explains, most)
+    stuck = _are_stuck(setup, scene, fits, explains, most)
     beside = _beside(setup, scene, evidence, fits, stuck, most, roughly=scene.scout is None)
     fits = Fits.joined([fits, beside])
     return fits if scene.scout is not None else _finished(setup, scene, evidence, fits, most)
+
+
+def _spread(scene: Scene, view: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return views around some, (m, 9, 6): nearer and farther, and at other bearings of the same headings."""
+    off_m, aside = CELL_M / 2, scene.search.column_rad / 2
+    moves = [(d, b, b, 0.0, 0.0, 0.0) for d in (-off_m, 0.0, off_m) for b in (-aside, 0.0, aside)]
+    return np.asarray(view[:, None] + np.array(moves))
+
+
+def _best_of(
+    setup: Setup,
+    scene: Scene,
+    evidence: Evidence,
+    frame: NDArray[np.int64],
+    class_index: NDArray[np.int64],
+    views: NDArray[np.float64],
+    n: int,
+) -> _Starts:
+    """Return the best n of k views each, (m, k, 6), on the scout at any bearing if there is one."""
+    m, k = views.shape[:2]
+    of_each, settings = np.repeat(np.arange(m), k), scene.settings(setup)
+    views = views.reshape(-1, len(VIEW))
+    model = settings.around or scene.final
+    cost = costs_at(model, evidence, frame[of_each], class_index[of_each], views, settings).reshape(m, k)
+    best = (np.argsort(cost, axis=1)[:, :n] + k * np.arange(m)[:, None]).ravel()
+    return frame[of_each[best]], class_index[of_each[best]], views[best]
 
 
 def _descended(
     setup: Setup,
     scene: Scene,
     evidence: Evidence,
-    start: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
+    start: _Starts,
     known: Fits | None,
 ) -> Fits:
     """Refine starts (frame, class, view) roughly, on the scout if there is one; leave out those at known places."""
@@ -94,41 +120,15 @@ def _descended(
     fits = refine(model, evidence, frame, class_index, view, settings, roughly=True)
     if known is None:
         return fits
-    if scene.scout is None:
-        return _elsewhere(setup, fits, known, (setup.policy.same_m, setup.policy.same_rad))
-    # the scout has its own minimum there
-    known = refine(model, evidence, known.frame, known.class_index, known.view, settings, roughly=True)
-    return _elsewhere(setup, fits, known, _apart(scene))
+    if scene.scout is not None:  # it has its own minimum there
+        known = refine(model, evidence, known.frame, known.class_index, known.view, settings, roughly=True)
+    return _elsewhere(setup, fits, known, _apart(setup, scene))
 
 
-def _fits_aside(
-    setup: Setup,
-    scene: Scene,
-    evidence: Evidence,
-    fits: Fits,
-    explains: NDArray[np.float64],
-    most: NDArray[np.float64] | None,
-) -> Fits:
-    """Refine what is likely on a scout whose images are moved aside."""
-    margin = setup.policy.likely_cost if most is None else _SCOUT_COST
-    likely = fits.cost < (_near(fits, explains, most) + margin)[fits.frame]
-    own = _of_own_places(setup, fits, likely, _apart(scene))
-    rough = _rough(setup, scene, evidence, own)
-    # where the scout explains a frame, an edge has left a pixel on the way
-    stuck = (own.cost <= explains[own.frame]) & (rough.cost > explains[own.frame])
-    stuck &= (_near(rough, explains, most) >= explains)[own.frame]
-    scene = scene.without_scout()
-    rough = Fits.joined([rough, _beside(setup, scene, evidence, own, stuck, most)])
-    left = own[stuck]
-    rival = None if most is None else most[left.frame]
-    settings = scene.settings(setup)
-    again = refine(scene.final, evidence, left.frame, left.class_index, left.view, settings, rival=rival)
-    found = Fits.joined([_finished(setup, scene, evidence, rough, most), again])
-    return found if most is not None else Fits.joined([found, _shifted(fits[~likely], found, fits, len(explains))])
-
-
-def _apart(scene: Scene) -> tuple[float, float, float]:
-    """Return how far apart minima of a scout are of their own: distance, angle, bearing."""
+def _apart(setup: Setup, scene: Scene) -> tuple[float, ...]:
+    """Return how far apart minima are of their own: distance, angle, and bearing on a scout at any."""
+    if scene.scout is None or not setup.bearing_is_free:
+        return setup.policy.same_m, setup.policy.same_rad
     return *_APART, _APART_COLUMNS * scene.search.column_rad
 
 
@@ -138,11 +138,12 @@ def _near(fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] |
 
 
 def _are_stuck(
-    setup: Setup, fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] | None
+    setup: Setup, scene: Scene, fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] | None
 ) -> NDArray[np.bool_]:
     """Return which fits ended not far above what explains their frame: their cells may still hold an explanation."""
     near = _near(fits, explains, most)
-    stuck = (fits.cost > explains[fits.frame]) & (fits.cost < near[fits.frame] + setup.policy.margin_cost)
+    margin = setup.policy.likely_cost if setup.bearing_is_free and scene.scout is not None else setup.policy.margin_cost
+    stuck = (fits.cost > explains[fits.frame]) & (fits.cost < near[fits.frame] + margin)
     return np.asarray(stuck & (near >= explains)[fits.frame])
 
 
@@ -167,27 +168,22 @@ def _beside(
     if not which.size:
         return fits[:0]
     views = _around(setup, scene, fits.view[which])
-    k = views.shape[1]
-    frame, class_index = np.repeat(fits.frame[which], k), np.repeat(fits.class_index[which], k)
-    views = views.reshape(-1, len(VIEW))
-    cost = costs_at(scene.final, evidence, frame, class_index, views, settings).reshape(-1, k)
-    best = np.argsort(cost, axis=1)[:, :_BEST_BESIDE]
-    best = (best + k * np.arange(len(cost))[:, None]).ravel()
-    rival = None if most is None else most[frame[best]]
-    frame, class_index, views = frame[best], class_index[best], views[best]
-    return refine(scene.final, evidence, frame, class_index, views, settings, rival=rival, roughly=roughly)
+    own = fits.frame[which], fits.class_index[which]
+    frame, class_index, view = _best_of(setup, scene, evidence, *own, views, _BEST_BESIDE)
+    rival = None if most is None else most[frame]
+    return refine(scene.final, evidence, frame, class_index, view, settings, rival=rival, roughly=roughly)
 
 
 def _elsewhere(setup: Setup, fits: Fits, known: Fits, apart: tuple[float, ...]) -> Fits:
     """Return those of some fits that came to other places than known ones."""
     whole = Fits.joined([replace(known, cost=np.full(len(known), -np.inf)).with_free(fits.covariance.shape[1]), fits])
-    own = _of_own_places(setup, whole, np.ones(len(whole), np.bool_), apart)
+    own = _of_own_places(setup, whole, np.arange(len(whole)), apart)
     return own[own.cost > -np.inf]
 
 
-def _of_own_places(setup: Setup, fits: Fits, which: NDArray[np.bool_], apart: tuple[float, ...]) -> Fits:
+def _of_own_places(setup: Setup, fits: Fits, which: NDArray[np.int64], apart: tuple[float, ...]) -> Fits:
     """Return those of some fits that came to places apart from each other, the best at each."""
-    return fits[distinct_of_frames(fits, np.flatnonzero(which), setup.shapes.symmetry, *apart)]
+    return fits[distinct_of_frames(fits, which, setup.shapes.symmetry, *apart)]
 
 
 def fit_views(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
@@ -213,7 +209,7 @@ def _finished(
     policy, n = setup.policy, len(evidence.weight)
     near = least_of_frame(fits, n) if most is None else most
     likely = np.flatnonzero(fits.cost < near[fits.frame] + policy.likely_cost)
-    again = fits[distinct_of_frames(fits, likely, setup.shapes.symmetry, policy.same_m, policy.same_rad)]
+    again = _of_own_places(setup, fits, likely, _apart(setup, scene))
     settings = scene.settings(setup) if scene.scout is None else _close_settings(setup, scene, evidence)
     rival = None if most is None else most[again.frame]
     final = refine(scene.final, evidence, again.frame, again.class_index, again.view, settings, rival=rival)

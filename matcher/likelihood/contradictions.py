@@ -33,7 +33,7 @@ def contradicted_pixels(
     near = near[wrong[near].any(axis=1)]
     if near.size:
         view = np.ascontiguousarray(state.theta[near, :ALBEDO_COLUMN])
-        some = problem.some(near)
+        some = problem.around(near)
         around = some.model.reach(some.class_index, view, settings.free, capped_std(problem, covariance[near]))
         low[near], high[near] = np.minimum(low[near], around[0]), np.maximum(high[near], around[1])
         wrong = disagree(low, high)

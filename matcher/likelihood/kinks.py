@@ -76,8 +76,11 @@ def settle(problem: Problem, state: State) -> State:
         theta = state.theta[source]
         theta[:, problem.columns] += moves.reshape(len(source), -1)
         theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN], source)
-        tried = problem.some(source).at(theta)
-        total = whole_cost(problem.some(source), tried)[0].reshape(len(near), -1)
+        around = problem.around(source)
+        total = whole_cost(around, around.at(theta))[0].reshape(len(near), -1)
+        if problem.settings.around is not None:  # its images cost more by their own error
+            here = problem.around(near)
+            total += (cost[near] - whole_cost(here, here.at(state.theta[near]))[0])[:, None]
         best = total.argmin(axis=1)
         chosen = np.flatnonzero(total[np.arange(len(near)), best] < cost[near] - BETTER_COST)
         if not chosen.size:

@@ -29,6 +29,7 @@ from phasemark.matcher.likelihood.search import search_views
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.likelihood.setup import Scene, Setup, Shapes, check_free
 from phasemark.matcher.likelihood.shared_errors import with_motion, with_shared_errors
+from phasemark.matcher.likelihood.strip_images import StripModel
 from phasemark.matcher.likelihood.systematic import Systematic
 from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
@@ -108,8 +109,8 @@ class LikelihoodMatcher:
         )
         stated = () if self._stated is None else (self._stated,)
         behind = background_of(bank, self._stated) if self._stated is not None else None
-        self._exact, self._scout = self._bank_models(behind)
         self._search = self._new_search(behind)
+        self._exact, self._scout = self._bank_models(behind)
         if self._auto or self._exact is None:
             self._check_distances()
         if self._stated is not None and self._stated.floor_m is not None and "height_m" not in self._setup.free:
@@ -201,19 +202,20 @@ class LikelihoodMatcher:
 
         return turned if self._bank.sensor.pixel_rad > WIDE_PIXEL_RAD else None
 
-    def _bank_models(self, behind: PhasorImages | None) -> tuple[BankModel | None, BankModel | None]:
+    def _bank_models(self, behind: PhasorImages | None) -> tuple[BankModel | None, BankModel | StripModel | None]:
         """Return the interpolated images that the answer is taken from, and those of a scout; None where unfit."""
         setup, policy = self._setup, self._setup.policy
         fixed = setup.free == VIEW[:2]
         is_exact = fixed and setup.on == "ranges" and self._stated is None
         is_exact = is_exact and BankModel.grid_is_fine_enough(self._bank, *policy.fine_grid)
         aside = setup.free == VIEW[:3] and setup.on == "ranges" and self._stated is None and not self._auto
-        scouts = (fixed or aside) and BankModel.grid_is_fine_enough(self._bank, *policy.coarse_grid)
+        if aside and StripModel.suits(self._bank, self._search.widest_columns):
+            return None, StripModel(self._bank, self._search.widest_columns)
+        scouts = fixed and BankModel.grid_is_fine_enough(self._bank, *policy.coarse_grid)
         if not (is_exact or scouts):
             return None, None
         model = BankModel(self._bank)
-        # at a bearing the edges tell, which a smooth model leaves out
-        return model if is_exact else None, (model if aside else model.smooth(behind)) if scouts else None
+        return model if is_exact else None, model.smooth(behind) if scouts else None
 
     def _check_distances(self) -> None:
         """Check that the bank has distances at which views are rendered."""
@@ -270,7 +272,7 @@ class LikelihoodMatcher:
             backgrounds=backgrounds,
             behind=behind,
             final=self._rendered.with_background(*backgrounds),
-            scout=None if self._scout is None else self._scout.before(behind),
+            scout=self._scout.before(behind) if isinstance(self._scout, BankModel) else None,
         )
 
     def _whole_scene_before(self, backgrounds: Sequence[Background]) -> Scene:

@@ -59,6 +59,8 @@ class DescentSettings:
     longest_step : float
         No step is longer, in natural units of 1 cm and 1°. Near a solution it should be short: where an edge crosses
         a pixel's border, slopes jump, and those of one side may lead far away on the other.
+    around : ImageModel, optional
+        What shows the views around a solution, where the images of the model itself are slow.
     policy : SearchPolicy
     """
 
@@ -71,6 +73,7 @@ class DescentSettings:
     returns_behind: NDArray[np.bool_] | None = None
     unknown_around: bool = False
     longest_step: float = DEFAULT_POLICY.longest_step
+    around: ImageModel | None = None
     policy: SearchPolicy = DEFAULT_POLICY
 
 
@@ -145,8 +148,15 @@ class Problem:
 
     def some(self, which: NDArray[np.integer]) -> Problem:
         """Return the problem of some of the candidates."""
+        return self._with(self.model, which)
+
+    def around(self, which: NDArray[np.integer]) -> Problem:
+        """Return the problem of some of the candidates, on what shows the views around solutions."""
+        return self._with(self.settings.around or self.model, which)
+
+    def _with(self, model: ImageModel, which: NDArray[np.integer]) -> Problem:
         return Problem(
-            self.model,
+            model,
             self.evidence,
             self.frame[which],
             self.class_index[which],

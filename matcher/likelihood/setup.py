@@ -128,7 +128,7 @@ class Setup:
 
     @property
     def fewest_explained(self) -> int:
-        """Returns that an answer takes where unknown things stand in view."""
+        """Returns that an answer takes where unknown things stand in view, or outliers are left out."""
         return self.policy.explained_per_parameter * len(self.free)
 
 
@@ -174,5 +174,6 @@ class Scene:
             if behind is None
             else counts(behind.phasor, behind.intensity, behind.sensor).reshape(len(behind.phasor), -1),
             longest_step=setup.policy.longest_step,
+            around=self.scout if setup.bearing_is_free else None,
             policy=setup.policy,
         )

@@ -128,6 +128,7 @@ class Search:
         self._upward, self._bearing_std_rad = upward, bearing_std_rad
         self.column_rad = sensor.pixel_rad
         most = min(sensor.cols // 4, math.ceil(min(widest_rad / self.column_rad, sensor.cols)))
+        self.widest_columns = most
         self._row_rad = 2 * math.atan(sensor.tan_half_angles[1]) / sensor.rows
         widest_up = upward.widest_rad(float(cells.distance_m[0]))
         highest = min(sensor.rows // 4, math.ceil(min(widest_up / self._row_rad, sensor.rows)))

@@ -1,0 +1,360 @@
+"""Model images at any bearing, summed from images of narrow strips of columns.
+
+A camera that turns about the vertical sees the same rays in other pixels, so that the light of a pixel is that of a
+window of the image straight ahead (PHYSICS sections 1 to 3). Images of strips, each a fourth of a column wide, are
+interpolated linearly in (D, δ), and the strips in the window of each pixel are added up, those at its borders by their
+share. Strips are rendered where a search first needs them, and kept.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from phasemark.data import Bank
+from phasemark.matcher.frequencies import OneFrequencyBank
+from phasemark.matcher.likelihood.images import VIEW, ModelImages
+from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD
+from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD, closing_period
+from phasemark.render import Renderer, Sensor, Views
+
+__all__ = ["StripModel"]
+
+_STRIPS = 4, 8
+"""Strips in a column, and in a wide one. With two, one view in a hundred costs 80 more than rendered."""
+_MOST_BYTES = 4 << 30
+"""Address space that strips may take; memory is used for those alone that were rendered."""
+_ROUNDING = 1e-9
+"""Rows: what a pixel sees ends at the border of a row where the camera has its horizon."""
+_BEARING = VIEW.index("bearing_rad")
+
+
+class StripModel:
+    """Model images at any bearing of a level landmark at the bank's height, with nothing behind it.
+
+    Parameters
+    ----------
+    bank : Bank
+        Of one modulation frequency, and of a camera without distortion.
+    widest_columns : int
+        Bearings up to this many columns are asked for.
+    """
+
+    slopes_are_cheap = True
+    alone = None
+
+    def __init__(self, bank: Bank, widest_columns: int) -> None:
+        sensor = bank.sensor
+        self._strips = strips = _strip_sensor(sensor, widest_columns)
+        self._period = closing_period(bank.delta_rad)
+        self._distance, self._delta = _axis(bank.distance_m, CELL_M), _axis(bank.delta_rad, CELL_RAD, self._period)
+        meshes = [bank.mesh(name) for name in bank.classes]
+        self._renderers = [Renderer(mesh, strips, albedo=float(mesh.metadata["albedo"])) for mesh in meshes]
+        middle = strips.lower_rows[0] if bank.lower is not None else 0
+        self._upper_rows, self._lower_rows = (0, middle), (middle, strips.rows)
+        n_class, n_d, n_a = len(bank.classes), len(self._distance), len(self._delta)
+        self._has_upper = np.zeros((n_class, n_d, 1), np.bool_)
+        self._has_lower = np.zeros((n_class if bank.lower is None else 1, n_d, n_a), np.bool_)
+        # real and imaginary part, intensity and coverage of what was rendered
+        self._upper = np.zeros((*self._has_upper.shape, 4, middle * strips.cols), np.float32)
+        self._lower = np.zeros((*self._has_lower.shape, 4, (strips.rows - middle) * strips.cols), np.float32)
+        self._lit = _lit_boxes(strips, self._distance, [own.topology.vertices for own in self._renderers])
+        self._lock = threading.Lock()
+        self._borders, self._cam2level = _borders(sensor), sensor.cam2level
+        tan_h, tan_v = strips.tan_half_angles
+        self._projection = np.array([*strips.centre_px, strips.cols / (2 * tan_h), strips.rows / (2 * tan_v)])
+
+    @staticmethod
+    def suits(bank: Bank, widest_columns: int) -> bool:
+        """Return whether a bank can have strips: more than one view, no distortion, and room for them."""
+        sensor = bank.sensor
+        if isinstance(bank, OneFrequencyBank) or sensor.bends_rays or min(len(bank.distance_m), len(bank.delta_rad)) < 2:
+            return False
+        n_d = (bank.distance_m[-1] - bank.distance_m[0]) / CELL_M
+        n_a = (bank.delta_rad[-1] - bank.delta_rad[0]) / CELL_RAD
+        n_class = 1 if bank.lower is not None else len(bank.classes)
+        pixels = sensor.rows * _strips_of_column(sensor) * (sensor.cols + 2 * _margin(widest_columns))
+        return bool(16 * n_class * max(n_d, 2) * max(n_a, 2) * pixels <= _MOST_BYTES)
+
+    def of_frames(self, frame: NDArray[np.int64]) -> StripModel:
+        """Return the model itself: nothing stands behind the landmark in any frame."""
+        return self
+
+    def limits(self) -> tuple[float, float]:
+        """Return the bank's first and last distance."""
+        return float(self._distance[0]), float(self._distance[-1])
+
+    def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return that every pixel may be relied on."""
+        return np.ones((len(view), len(self._borders)), np.bool_)
+
+    def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
+        """Interpolate strips and add them up; distance, δ and bearing can be free."""
+        m, pixels = len(view), len(self._borders)
+        phasor, shade = np.empty((m, pixels), np.complex128), np.empty((m, 2, pixels))
+        slope = np.empty((m, 3 if free else 0, pixels), np.complex128)
+        step_d, step_a = _step(self._distance), _step(self._delta)
+        x = np.clip((view[:, 0] - self._distance[0]) / step_d, 0, len(self._distance) - 1)
+        y = (view[:, 1] - self._delta[0]) / step_a
+        n_a = len(self._delta)
+        y = y % n_a if self._period is not None else np.clip(y, 0, n_a - 1)
+        i = np.minimum(x.astype(np.int64), len(self._distance) - 2)
+        j = y.astype(np.int64) % n_a if self._period is not None else np.minimum(y.astype(np.int64), n_a - 2)
+        node = np.stack([class_index, i, j, (j + 1) % n_a], axis=1)
+        self._render_missing(node)
+        place, step = np.stack([x - i, y - j], axis=1), np.array([step_d, step_a])
+        _images(
+            node, place, step, view[:, _BEARING], self._upper, self._lower, self._lit, self._cam2level, self._borders,
+            self._projection, self._strips.cols, phasor, slope, shade,
+        )  # fmt: skip
+        return ModelImages(phasor, slope[:, [VIEW.index(name) for name in free]], shade[:, 0], shade[:, 1])
+
+    first_images = images
+
+    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
+        """Return images at turned views, and keep the slopes of the views before."""
+        return replace(self.images(class_index, view, ()), slope=like.slope)
+
+    def reach(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        std: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the least and greatest coverage three standard deviations away along each parameter."""
+        moves = np.zeros((len(view), len(free), len(VIEW)))
+        moves[:, np.arange(len(free)), [VIEW.index(name) for name in free]] = 3 * std
+        ends = [view + side * moves[:, k] for k in range(len(free)) for side in (-1.0, 1.0)]
+        coverage = [self.images(class_index, end, ()).coverage for end in ends]
+        return np.minimum.reduce(coverage), np.maximum.reduce(coverage)
+
+    def wide_slopes(
+        self,
+        class_index: NDArray[np.int64],
+        view: NDArray[np.float64],
+        free: Sequence[str],
+        step: NDArray[np.float64],
+    ) -> None:
+        """Return None: the model is as smooth as its strips."""
+
+    def differences(
+        self, class_index: NDArray[np.int64], view: NDArray[np.float64], moves: NDArray[np.float64]
+    ) -> NDArray[np.complex128]:
+        """Return half the differences of images at both ends."""
+        ends = [
+            [self.images(class_index, view + side * moves[:, k], ()).phasor for side in (1.0, -1.0)]
+            for k in range(moves.shape[1])
+        ]
+        return np.stack([(one - other) / 2 for one, other in ends], axis=1)
+
+    def _render_missing(self, node: NDArray[np.int64]) -> None:
+        """Render strips at nodes that no view needed before: (m, 4) class, distance, and the angles on either side."""
+        lower, upper = np.zeros_like(self._has_lower), np.zeros_like(self._has_upper)
+        c, i, *angles = node.T
+        for at in (i, i + 1):
+            upper[c, at] = self._upper_rows[1] > 0
+            for j in angles:
+                lower[c if len(lower) > 1 else 0, at, j] = True
+        if not (lower & ~self._has_lower).any() and not (upper & ~self._has_upper).any():
+            return
+        with self._lock:
+            for values, has, wanted, rows in (
+                (self._lower, self._has_lower, lower, self._lower_rows),
+                (self._upper, self._has_upper, upper, self._upper_rows),
+            ):
+                for k in np.flatnonzero((wanted & ~has).any(axis=(1, 2))):
+                    at = np.nonzero(wanted[k] & ~has[k])
+                    views = Views.broadcast(self._distance[at[0]], self._delta[at[1]])
+                    seen = self._renderers[k].render_views(views, rows=rows)
+                    planes = seen.phasor.real, seen.phasor.imag, seen.intensity, seen.coverage
+                    values[k][at] = np.stack(planes, axis=1).reshape(len(views), 4, -1)
+                    has[k][at] = True
+
+
+def _strips_of_column(sensor: Sensor) -> int:
+    return _STRIPS[1 if sensor.pixel_rad > WIDE_PIXEL_RAD else 0]
+
+
+def _margin(widest_columns: int) -> int:
+    """Return how many columns beyond the image a camera sees that turns by some: at its sides columns are narrower."""
+    return widest_columns + widest_columns // 3 + 1
+
+
+def _strip_sensor(sensor: Sensor, widest_columns: int) -> Sensor:
+    """Return the camera whose pixels are the strips of another, wider by some columns on either side."""
+    (tan_h, tan_v), (u0, v0), margin = sensor.tan_half_angles, sensor.centre_px, _margin(widest_columns)
+    wide = sensor.cols + 2 * margin
+    n = _strips_of_column(sensor)
+    return sensor.with_(
+        lens=None,
+        cols=n * wide,
+        half_angle_h_deg=math.degrees(math.atan(tan_h * wide / sensor.cols)),
+        half_angle_v_deg=math.degrees(math.atan(tan_v)),
+        principal_point_px=(n * (u0 + margin), v0),
+        fill_factor=(1.0, 1.0),
+        dead_pixels=(),
+        hot_pixels=(),
+    )
+
+
+def _axis(grid: NDArray[np.float64], step: float, period: float | None = None) -> NDArray[np.float64]:
+    """Return the nodes of an axis of strips over the range of a bank's: regular, at most a step apart."""
+    if period is not None:
+        n = max(math.ceil(period / step - 1e-6), 2)
+        return np.asarray(grid[0] + np.arange(n) * period / n)
+    n = max(math.ceil((grid[-1] - grid[0]) / step - 1e-6) + 1, 2)
+    return np.linspace(grid[0], grid[-1], n)
+
+
+def _step(axis: NDArray[np.float64]) -> float:
+    return float(axis[-1] - axis[0]) / (len(axis) - 1)
+
+
+def _lit_boxes(
+    strips: Sensor, distance_m: NDArray[np.float64], vertices: Sequence[NDArray[np.float64]]
+) -> NDArray[np.int64]:
+    """Return which strips may see landmarks straight ahead, (distances, 4): rows and columns, the last excluded.
+
+    The landmarks lie in an upright cylinder about their axis.
+    """
+    radius = max(float(np.hypot(own[:, 0], own[:, 1]).max()) for own in vertices)
+    low, high = min(float(own[:, 2].min()) for own in vertices), max(float(own[:, 2].max()) for own in vertices)
+    boxes = np.empty((len(distance_m), 4), np.int64)
+    for k, distance in enumerate(distance_m):
+        around = np.linspace(0, 2 * np.pi, 64)
+        wide = radius / math.cos(np.pi / 63)  # the polygon goes around the circle
+        x, y = distance + wide * np.cos(around), wide * np.sin(around)
+        points = np.array([(px, py, z) for px, py in zip(x, y, strict=True) for z in (low, high)]) @ strips.cam2level
+        boxes[k] = 0, strips.rows, 0, strips.cols
+        if (points[:, 0] > 0.1 * distance).all():
+            u, v = strips.image_points(points[:, 1] / points[:, 0], points[:, 2] / points[:, 0])
+            for part, values, n in ((slice(0, 2), v, strips.rows), (slice(2, 4), u, strips.cols)):
+                boxes[k, part] = np.clip((math.floor(values.min()), math.ceil(values.max())), 0, n)
+    return boxes
+
+
+def _borders(sensor: Sensor) -> NDArray[np.float64]:
+    """Return the level directions of the middles of the left, right, upper and lower border of the active areas."""
+    v, u = (grid.ravel() + 0.5 for grid in np.mgrid[: sensor.rows, : sensor.cols])
+    half_u, half_v = sensor.fill_factor[0] / 2, sensor.fill_factor[1] / 2
+    points = ((u - half_u, v), (u + half_u, v), (u, v - half_v), (u, v + half_v))
+    return np.ascontiguousarray(np.stack([sensor.ray_directions(*point) for point in points], axis=1))
+
+
+_compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"})
+
+
+@_compiled
+def _turned_camera(bearing, cam2level, out):  # type: ignore[no-untyped-def]
+    """Fill the rotation from the level frame of a camera at some bearing to the tilted camera straight ahead."""
+    cos, sin = math.cos(bearing), math.sin(bearing)
+    for a in range(3):
+        out[a, 0] = cam2level[0, a] * cos - cam2level[1, a] * sin
+        out[a, 1] = cam2level[0, a] * sin + cam2level[1, a] * cos
+        out[a, 2] = cam2level[2, a]
+
+
+@_compiled
+def _window(turn, border, projection, out):  # type: ignore[no-untyped-def]
+    """Fill first and last column and row, as image coordinates of the strips, of what a pixel sees."""
+    for k in range(4):
+        d0, d1, d2 = border[k]
+        x = turn[0, 0] * d0 + turn[0, 1] * d1 + turn[0, 2] * d2
+        if k < 2:
+            out[k] = projection[0] - (turn[1, 0] * d0 + turn[1, 1] * d1 + turn[1, 2] * d2) / x * projection[2]
+        else:
+            out[k] = projection[1] - (turn[2, 0] * d0 + turn[2, 1] * d1 + turn[2, 2] * d2) / x * projection[3]
+
+
+@_compiled
+def _mix(near0, near1, far0, far1, d, a, step, n_slopes, box, first_row, cols, out):  # type: ignore[no-untyped-def]
+    """Interpolate strips between two distances and two angles, in the rows of a group that are lit.
+
+    `out` is (8, strips): real and imaginary part, intensity, coverage, the slopes of the first two by D and by δ.
+    """
+    w00, w01 = np.float32((1 - d) * (1 - a)), np.float32((1 - d) * a)
+    w10, w11 = np.float32(d * (1 - a)), np.float32(d * a)
+    d0, d1 = np.float32((1 - a) / step[0]), np.float32(a / step[0])
+    a0, a1 = np.float32((1 - d) / step[1]), np.float32(d / step[1])
+    rows = near0.shape[1] // cols
+    for r in range(max(box[0] - first_row, 0), min(box[1] - first_row, rows)):
+        begin, end, to = r * cols + box[2], r * cols + box[3], first_row * cols
+        for part in range(4):
+            for q in range(begin, end):
+                out[part, to + q] = (
+                    w00 * near0[part, q] + w01 * near1[part, q] + w10 * far0[part, q] + w11 * far1[part, q]
+                )
+        if n_slopes:
+            for part in range(2):
+                for q in range(begin, end):
+                    x00, x01, x10, x11 = near0[part, q], near1[part, q], far0[part, q], far1[part, q]
+                    out[4 + part, to + q] = d0 * (x10 - x00) + d1 * (x11 - x01)
+                    out[6 + part, to + q] = a0 * (x01 - x00) + a1 * (x11 - x10)
+
+
+@_compiled
+def _at(strips, first, box, u):  # type: ignore[no-untyped-def]
+    """Return the light of a row of strips about a column, the mean over the width of a strip."""
+    c = math.floor(u - 0.5)
+    share = u - 0.5 - c
+    light = 0j
+    if box[2] <= c < box[3]:
+        light += (1.0 - share) * complex(strips[0, first + c], strips[1, first + c])
+    if box[2] <= c + 1 < box[3]:
+        light += share * complex(strips[0, first + c + 1], strips[1, first + c + 1])
+    return light
+
+
+@_compiled
+def _images(  # type: ignore[no-untyped-def]
+    node, place, step, bearing, upper, lower, lit, cam2level, borders, projection, cols, phasor, slope, shade
+):
+    """Fill phasor, slopes by D, δ and bearing, and intensity with coverage of m images.
+
+    The bearing moves the borders of what a pixel sees: its slope is what comes in there less what leaves.
+    """
+    m, n_slopes, pixels = slope.shape
+    middle = upper.shape[4] // cols
+    turn, window, sums = np.empty((3, 3)), np.empty(4), np.empty(8)
+    strips = np.empty((8, upper.shape[4] + lower.shape[4]), np.float32)
+    for k in range(m):
+        c, i, j0, j1 = node[k]
+        box, (d, a) = lit[i], place[k]
+        own = lower[c if len(lower) > 1 else 0]
+        _mix(own[i, j0], own[i, j1], own[i + 1, j0], own[i + 1, j1], d, a, step, n_slopes, box, middle, cols, strips)
+        if middle:
+            one, other = upper[c, i, 0], upper[c, i + 1, 0]
+            _mix(one, one, other, other, d, a, step, n_slopes, box, 0, cols, strips)
+        _turned_camera(bearing[k], cam2level, turn)
+        for p in range(pixels):
+            _window(turn, borders[p], projection, window)
+            u0, u1, v0, v1 = window
+            # columns move as (1 + tan²) per radian
+            move0 = projection[2] * (1.0 + ((projection[0] - u0) / projection[2]) ** 2)
+            move1 = projection[2] * (1.0 + ((projection[0] - u1) / projection[2]) ** 2)
+            sums[:] = 0.0
+            by_bearing = 0j
+            first, last = max(math.floor(u0), box[2]), min(math.ceil(u1), box[3])
+            for r in range(max(math.floor(v0 + _ROUNDING), box[0]), min(math.ceil(v1 - _ROUNDING), box[1])):
+                high = min(v1, r + 1.0) - max(v0, float(r))
+                for q in range(first, last):
+                    share = high * (min(u1, q + 1.0) - max(u0, float(q)))
+                    for part in range(8 if n_slopes else 4):
+                        sums[part] += share * strips[part, r * cols + q]
+                if n_slopes:
+                    by_bearing += high * (
+                        move1 * _at(strips, r * cols, box, u1) - move0 * _at(strips, r * cols, box, u0)
+                    )
+            area = (u1 - u0) * (v1 - v0)
+            light = complex(sums[0], sums[1])
+            phasor[k, p], shade[k, 0, p], shade[k, 1, p] = light / area, sums[2] / area, sums[3] / area
+            if n_slopes:
+                slope[k, 0, p], slope[k, 1, p] = complex(sums[4], sums[5]) / area, complex(sums[6], sums[7]) / area
+                slope[k, 2, p] = (by_bearing - light * (move1 - move0) / (u1 - u0)) / area
