@@ -18,7 +18,7 @@ _FOLDERS = {
     "matcher": "pixel_agreement",
     "matcher/filters": "loops",
     "matcher/histograms": "background_search expected_targets histogram_table poisson_fit table_search target_matcher",
-    "matcher/likelihood": "bank_images residuals",
+    "matcher/likelihood": "bank_images residuals strip_images",
     "matcher/nearest": "bank_minima cells search templates",
     "render": "background compile_cache kernel unwrapping",
     "render/direct": "bin_counts fit_model footprints photon_counts sample_counts scene_samples targets transients",

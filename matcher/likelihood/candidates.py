@@ -24,7 +24,7 @@ _SOFT_M = 0.01
 _SCOUT_PIXELS = 0.05
 """Standard deviation of ranges that is added for a scout at any bearing, in widths of a pixel at 1 m: its own error."""
 _APART, _APART_COLUMNS = (0.01, math.radians(2.0)), 0.25
-"""Distance and angle, and columns of bearing, within which minima of such a scout lead to one."""
+"""Distance and angle, and columns of bearing, within which minima of a scout at any bearing lead to one."""
 _BEST_BESIDE = 2
 """Views around a side minimum that are refined."""
 _Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]

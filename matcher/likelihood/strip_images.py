@@ -22,17 +22,19 @@ from phasemark.matcher.frequencies import OneFrequencyBank
 from phasemark.matcher.likelihood.images import VIEW, ModelImages
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD
 from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD, closing_period
-from phasemark.render import Renderer, Sensor, Views
+from phasemark.render import PhasorImages, Renderer, Sensor, Views
 
 __all__ = ["StripModel"]
 
 _STRIPS = 4, 8
 """Strips in a column, and in a wide one. With two, one view in a hundred costs 80 more than rendered."""
 _MOST_BYTES = 4 << 30
-"""Address space that strips may take; memory is used for those alone that were rendered."""
+"""Memory that the strips of a bank may take; it is used for those alone that were rendered."""
 _ROUNDING = 1e-9
 """Rows: what a pixel sees ends at the border of a row where the camera has its horizon."""
 _BEARING = VIEW.index("bearing_rad")
+_Kept = tuple[NDArray[np.int64], NDArray[np.float32]]
+"""Places of strips, four for each view, among those that are kept, and these."""
 
 
 class StripModel:
@@ -57,13 +59,9 @@ class StripModel:
         meshes = [bank.mesh(name) for name in bank.classes]
         self._renderers = [Renderer(mesh, strips, albedo=float(mesh.metadata["albedo"])) for mesh in meshes]
         middle = strips.lower_rows[0] if bank.lower is not None else 0
-        self._upper_rows, self._lower_rows = (0, middle), (middle, strips.rows)
         n_class, n_d, n_a = len(bank.classes), len(self._distance), len(self._delta)
-        self._has_upper = np.zeros((n_class, n_d, 1), np.bool_)
-        self._has_lower = np.zeros((n_class if bank.lower is None else 1, n_d, n_a), np.bool_)
-        # real and imaginary part, intensity and coverage of what was rendered
-        self._upper = np.zeros((*self._has_upper.shape, 4, middle * strips.cols), np.float32)
-        self._lower = np.zeros((*self._has_lower.shape, 4, (strips.rows - middle) * strips.cols), np.float32)
+        self._upper = _Rendered((n_class, n_d, 1), middle * strips.cols)
+        self._lower = _Rendered((n_class if bank.lower is None else 1, n_d, n_a), (strips.rows - middle) * strips.cols)
         self._lit = _lit_boxes(strips, self._distance, [own.topology.vertices for own in self._renderers])
         self._lock = threading.Lock()
         self._borders, self._cam2level = _borders(sensor), sensor.cam2level
@@ -74,7 +72,7 @@ class StripModel:
     def suits(bank: Bank, widest_columns: int) -> bool:
         """Return whether a bank can have strips: more than one view, no distortion, and room for them."""
         sensor = bank.sensor
-        if isinstance(bank, OneFrequencyBank) or sensor.bends_rays or min(len(bank.distance_m), len(bank.delta_rad)) < 2:
+        if isinstance(bank, OneFrequencyBank) or sensor.bends_rays or 1 in (len(bank.distance_m), len(bank.delta_rad)):
             return False
         n_d = (bank.distance_m[-1] - bank.distance_m[0]) / CELL_M
         n_a = (bank.delta_rad[-1] - bank.delta_rad[0]) / CELL_RAD
@@ -106,11 +104,11 @@ class StripModel:
         y = y % n_a if self._period is not None else np.clip(y, 0, n_a - 1)
         i = np.minimum(x.astype(np.int64), len(self._distance) - 2)
         j = y.astype(np.int64) % n_a if self._period is not None else np.minimum(y.astype(np.int64), n_a - 2)
-        node = np.stack([class_index, i, j, (j + 1) % n_a], axis=1)
-        self._render_missing(node)
+        corners = np.stack([i, j, i, (j + 1) % n_a, i + 1, j, i + 1, (j + 1) % n_a], axis=1).reshape(m, 4, 2)
+        upper, lower = self._kept(class_index, corners)
         place, step = np.stack([x - i, y - j], axis=1), np.array([step_d, step_a])
         _images(
-            node, place, step, view[:, _BEARING], self._upper, self._lower, self._lit, self._cam2level, self._borders,
+            upper, lower, place, step, view[:, _BEARING], self._lit[i], self._cam2level, self._borders,
             self._projection, self._strips.cols, phasor, slope, shade,
         )  # fmt: skip
         return ModelImages(phasor, slope[:, [VIEW.index(name) for name in free]], shade[:, 0], shade[:, 1])
@@ -154,28 +152,49 @@ class StripModel:
         ]
         return np.stack([(one - other) / 2 for one, other in ends], axis=1)
 
-    def _render_missing(self, node: NDArray[np.int64]) -> None:
-        """Render strips at nodes that no view needed before: (m, 4) class, distance, and the angles on either side."""
-        lower, upper = np.zeros_like(self._has_lower), np.zeros_like(self._has_upper)
-        c, i, *angles = node.T
-        for at in (i, i + 1):
-            upper[c, at] = self._upper_rows[1] > 0
-            for j in angles:
-                lower[c if len(lower) > 1 else 0, at, j] = True
-        if not (lower & ~self._has_lower).any() and not (upper & ~self._has_upper).any():
-            return
+    def _kept(self, class_index: NDArray[np.int64], corners: NDArray[np.int64]) -> list[_Kept]:
+        """Return where the upper and the lower strips at (m, 4, 2) nodes are kept, and render those that are missing.
+
+        The upper rows see no lower part, and a round upper part looks alike from all sides.
+        """
+        middle, rows = self._upper.pixels // self._strips.cols, self._strips.rows
+        found: list[_Kept] = []
         with self._lock:
-            for values, has, wanted, rows in (
-                (self._lower, self._has_lower, lower, self._lower_rows),
-                (self._upper, self._has_upper, upper, self._upper_rows),
-            ):
-                for k in np.flatnonzero((wanted & ~has).any(axis=(1, 2))):
-                    at = np.nonzero(wanted[k] & ~has[k])
-                    views = Views.broadcast(self._distance[at[0]], self._delta[at[1]])
-                    seen = self._renderers[k].render_views(views, rows=rows)
-                    planes = seen.phasor.real, seen.phasor.imag, seen.intensity, seen.coverage
-                    values[k][at] = np.stack(planes, axis=1).reshape(len(views), 4, -1)
-                    has[k][at] = True
+            for kept, part in ((self._upper, (0, middle)), (self._lower, (middle, rows))):
+                n_class, _, n_a = kept.slot.shape
+                c, i, j = (np.minimum(class_index, n_class - 1)[:, None], corners[..., 0], corners[..., 1] % n_a)
+                if kept.pixels:
+                    for k in np.unique(c[(kept.slot[c, i, j] < 0).any(axis=1)]):
+                        wanted = np.zeros(kept.slot.shape[1:], np.bool_)
+                        own = c[:, 0] == k
+                        wanted[i[own], j[own]] = True
+                        at_d, at_a = np.nonzero(wanted & (kept.slot[k] < 0))
+                        views = Views.broadcast(self._distance[at_d], self._delta[at_a])
+                        kept.add(k, at_d, at_a, self._renderers[k].render_views(views, rows=part))
+                found.append((kept.slot[c, i, j], kept.values))
+        return found
+
+
+class _Rendered:
+    """Real and imaginary part, intensity and coverage of strips at the nodes that were rendered, (n, 4, pixels)."""
+
+    def __init__(self, nodes: tuple[int, int, int], pixels: int) -> None:
+        self.pixels = pixels
+        self.slot = np.full(nodes, -1, np.int64)
+        self.values = np.empty((0, 4, pixels), np.float32)
+        self._used = 0
+
+    def add(self, k: int, at_d: NDArray[np.int64], at_a: NDArray[np.int64], image: PhasorImages) -> None:
+        """Keep images of a class; who reads the values of before goes on reading them."""
+        end = self._used + len(at_d)
+        if end > len(self.values):
+            grown = np.empty((max(end, len(self.values) * 3 // 2), 4, self.pixels), np.float32)
+            grown[: self._used] = self.values[: self._used]
+            self.values = grown
+        planes = image.phasor.real, image.phasor.imag, image.intensity, image.coverage
+        self.values[self._used : end] = np.stack(planes, axis=1).reshape(len(at_d), 4, -1)
+        self.slot[k, at_d, at_a] = np.arange(self._used, end)
+        self._used = end
 
 
 def _strips_of_column(sensor: Sensor) -> int:
@@ -274,11 +293,13 @@ def _window(turn, border, projection, out):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _mix(near0, near1, far0, far1, d, a, step, n_slopes, box, first_row, cols, out):  # type: ignore[no-untyped-def]
+def _mix(values, corners, d, a, step, n_slopes, box, first_row, cols, out):  # type: ignore[no-untyped-def]
     """Interpolate strips between two distances and two angles, in the rows of a group that are lit.
 
     `out` is (8, strips): real and imaginary part, intensity, coverage, the slopes of the first two by D and by δ.
     """
+    near0, near1 = values[corners[0]], values[corners[1]]
+    far0, far1 = values[corners[2]], values[corners[3]]
     w00, w01 = np.float32((1 - d) * (1 - a)), np.float32((1 - d) * a)
     w10, w11 = np.float32(d * (1 - a)), np.float32(d * a)
     d0, d1 = np.float32((1 - a) / step[0]), np.float32(a / step[0])
@@ -314,24 +335,23 @@ def _at(strips, first, box, u):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _images(  # type: ignore[no-untyped-def]
-    node, place, step, bearing, upper, lower, lit, cam2level, borders, projection, cols, phasor, slope, shade
+    upper, lower, place, step, bearing, lit, cam2level, borders, projection, cols, phasor, slope, shade
 ):
-    """Fill phasor, slopes by D, δ and bearing, and intensity with coverage of m images.
+    """Fill phasor, slopes by D, δ and bearing, and intensity with coverage of m images, each between four nodes.
 
-    The bearing moves the borders of what a pixel sees: its slope is what comes in there less what leaves.
+    The bearing moves the borders of what a pixel sees: its slope is the light that comes in there less the
+    light that leaves.
     """
     m, n_slopes, pixels = slope.shape
-    middle = upper.shape[4] // cols
+    (upper_at, above), (lower_at, below) = upper, lower
+    middle = above.shape[2] // cols
     turn, window, sums = np.empty((3, 3)), np.empty(4), np.empty(8)
-    strips = np.empty((8, upper.shape[4] + lower.shape[4]), np.float32)
+    strips = np.empty((8, above.shape[2] + below.shape[2]), np.float32)
     for k in range(m):
-        c, i, j0, j1 = node[k]
-        box, (d, a) = lit[i], place[k]
-        own = lower[c if len(lower) > 1 else 0]
-        _mix(own[i, j0], own[i, j1], own[i + 1, j0], own[i + 1, j1], d, a, step, n_slopes, box, middle, cols, strips)
+        box, (d, a) = lit[k], place[k]
+        _mix(below, lower_at[k], d, a, step, n_slopes, box, middle, cols, strips)
         if middle:
-            one, other = upper[c, i, 0], upper[c, i + 1, 0]
-            _mix(one, one, other, other, d, a, step, n_slopes, box, 0, cols, strips)
+            _mix(above, upper_at[k], d, a, step, n_slopes, box, 0, cols, strips)
         _turned_camera(bearing[k], cam2level, turn)
         for p in range(pixels):
             _window(turn, borders[p], projection, window)
