@@ -21,11 +21,8 @@ from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, 
 FIXED = ("distance_m", "delta_rad")
 WALL = Background(wall_m=4.0)
 NO_SEARCH = (
-    "min_returns",
     "frames_at_once",
     "cache_bytes",
-    "same_m",
-    "same_rad",
     "tolerated_sigma",
     "ambiguity",
 )
@@ -77,9 +74,7 @@ def policy(sensor: Sensor, seed: int) -> dict[str, Any]:
 
 
 def _changed(value: Any, factor: float) -> Any:
-    """Return a value scaled; counts stay whole and tuples are scaled element by element."""
-    if isinstance(value, tuple):
-        return tuple(factor * element for element in value)
+    """Return a value scaled; counts stay whole."""
     if isinstance(value, int):
         return max(1, round(factor * value))
     return factor * value

@@ -21,13 +21,6 @@ def test_a_probability_of_one_is_refused(field):
         replace(SearchPolicy(), **{field: 1.0})  # type: ignore[arg-type]
 
 
-def test_a_grid_takes_two_positive_steps():
-    with pytest.raises(UsageError, match="two positive numbers, metres and radians"):
-        SearchPolicy(fine_grid=(0.01, 0.0))
-    with pytest.raises(UsageError, match="two positive numbers"):
-        SearchPolicy(coarse_grid=(0.01,))  # type: ignore[arg-type]
-
-
 def test_a_policy_is_frozen():
     with pytest.raises(AttributeError):
         SearchPolicy().max_iterations = 3

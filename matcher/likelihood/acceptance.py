@@ -92,7 +92,7 @@ def _answer(
     if not len(own):
         nothing = {**dict.fromkeys(names, 0.0), "none": 1.0}
         return Match(class_name=None, accepted=False, free=setup.free, class_probability=nothing, reason="no landmark")
-    kept = distinct(fits, own, setup.shapes.symmetry, setup.policy.same_m, setup.policy.same_rad)
+    kept = distinct(fits, own, setup.shapes.symmetry)
     best = kept[0]
     # "none" weighs as a fit that just fails a χ² test with the noise as stated, or as a scene without a landmark
     cost_of_unknown = DISAGREEMENT * float(fits.unexplained[best])

@@ -16,8 +16,10 @@ from phasemark.matcher.likelihood.background_estimate import (
     without_background,
 )
 from phasemark.matcher.likelihood.candidates import fit_views
-from phasemark.matcher.likelihood.fits import BETTER_COST, Fits, best_of_frame, least_of_frame
+from phasemark.matcher.likelihood.fits import BETTER_COST, MOST_REFINED, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.kinks import CLOSE_BY_RAD
+from phasemark.matcher.likelihood.profiles import with_profiles
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence
@@ -27,6 +29,13 @@ from phasemark.render import Background
 from phasemark.render.view import delta_period_rad
 
 __all__ = ["AutoBackground"]
+
+_WALLS_BEYOND_M = 0.5, 1.0, 2.0, 4.0
+"""Distances behind the landmark at which a wall is tried where no pixel sees the background alone."""
+_BACKGROUND_ROUNDS = 4
+"""How often background and views are fitted in turn."""
+_OTHER_ANGLES = 12
+"""Angles that a frame before an estimated background is tried from where nothing else fits."""
 
 
 _TOGETHER = 8
@@ -84,7 +93,13 @@ class AutoBackground:
         # 4  try other angles of the landmark
         which = self._doubtful(backgrounds, fits)
         fits = Fits.joined([fits, self._other_angles(which, backgrounds, evidence, fits)])
-        return self._with_better_backgrounds(which, backgrounds, evidence, fits)
+        backgrounds, fits = self._with_better_backgrounds(which, backgrounds, evidence, fits)
+        # 5  look how far the answers may be off
+        parts = []
+        for which in _without_and_with(backgrounds):
+            scene = self._scene(_standing(backgrounds, which))
+            parts.append(_numbered(with_profiles(self._setup, scene, evidence[which], _of_frames(fits, which)), which))
+        return backgrounds, Fits.joined(parts)
 
     @property
     def _tilted(self) -> bool:
@@ -100,11 +115,8 @@ class AutoBackground:
         """Return what the far pixels of each frame show, and fits to its other pixels."""
         around = [self._surroundings(frames, k) for k in range(len(frames))]
         backgrounds = [own.background for own in around]
-        stands = np.array([own is not None for own in backgrounds])
         parts = []
-        for which in (np.flatnonzero(~stands), np.flatnonzero(stands)):
-            if not which.size:
-                continue
+        for which in _without_and_with(backgrounds):
             some = evidence[which]
             seen, behind = some.seen, _standing(backgrounds, which)
             if behind:
@@ -147,7 +159,7 @@ class AutoBackground:
             return fits[:0]
         own = _of_frames(fits, which)
         best = best_of_frame(own)
-        n = self._setup.policy.other_angles
+        n = _OTHER_ANGLES
         source = np.repeat(best, n - 1)
         period = np.array([delta_period_rad(self._setup.shapes.symmetry[c]) for c in own.class_index[source]])
         view = own.view[source]
@@ -168,7 +180,7 @@ class AutoBackground:
         best = best_of_frame(fits)
         nearest_m = np.zeros(len(backgrounds))
         nearest_m[fits.frame[best]] = fits.view[best, 0]
-        for beyond_m in self._setup.policy.walls_beyond_m:
+        for beyond_m in _WALLS_BEYOND_M:
             if not without.size:
                 break
             tried = list(backgrounds)
@@ -184,14 +196,14 @@ class AutoBackground:
         self, which: NDArray[np.int64], backgrounds: list[Background | None], evidence: Evidence, fits: Fits
     ) -> _Standing:
         """Fit the background of each frame behind its best view, then the views before it, while that helps."""
-        setup, policy = self._setup, self._setup.policy
+        setup = self._setup
         found: _Standing = backgrounds, fits
-        for _ in range(policy.background_rounds):
+        for _ in range(_BACKGROUND_ROUNDS):
             which, moved, starts = self._moved_backgrounds(which, *found, evidence)
             if not which.size:
                 break
             some, scene = evidence[which], self._scene(_standing(moved, which))
-            settings = replace(scene.settings(setup), look_beside_rad=policy.close_by_rad)
+            settings = replace(scene.settings(setup), look_beside_rad=CLOSE_BY_RAD)
             again = refine(scene.final, some, starts.frame, starts.class_index, starts.view, settings)
             before = least_of_frame(found[1], len(backgrounds))[which]
             now = least_of_frame(again, len(which))
@@ -221,7 +233,7 @@ class AutoBackground:
             background = backgrounds[k]
             if not own.size or background is None:
                 continue
-            best = fits[own[np.argsort(fits.cost[own], kind="stable")][: self._setup.policy.most_refined]]
+            best = fits[own[np.argsort(fits.cost[own], kind="stable")][:MOST_REFINED]]
             class_index, free = int(best.class_index[0]), self._setup.free
             found, view = fit_background(
                 self._rendered, evidence[k : k + 1], class_index, best.view[0], free, background
@@ -233,6 +245,12 @@ class AutoBackground:
             starts.append(_numbered(best, np.full(k + 1, len(kept))))
             kept.append(k)
         return np.array(kept, np.int64), moved, Fits.joined(starts) if starts else fits[:0]
+
+
+def _without_and_with(backgrounds: list[Background | None]) -> list[NDArray[np.int64]]:
+    """Return which frames have no background, and which have one; none that is empty."""
+    stands = np.array([own is not None for own in backgrounds])
+    return [which for which in (np.flatnonzero(~stands), np.flatnonzero(stands)) if which.size]
 
 
 def _standing(backgrounds: list[Background | None], which: NDArray[np.int64]) -> list[Background]:

@@ -8,23 +8,36 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.likelihood.fits import Fits, distinct, distinct_of_frames, least_of_frame
+from phasemark.matcher.likelihood.fits import (
+    MOST_REFINED,
+    SAME_M,
+    SAME_RAD,
+    Fits,
+    distinct,
+    distinct_of_frames,
+    least_of_frame,
+)
 from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.kinks import CLOSE_BY_RAD
 from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.refine import costs_at, refine
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
-from phasemark.matcher.nearest.bank_minima import Starts
-from phasemark.matcher.nearest.grid import CELL_M
+from phasemark.matcher.nearest.bank_minima import CostOf, Starts
+from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD
 
-__all__ = ["fit_neighbouring_views", "fit_starts", "fit_views"]
+__all__ = ["costs_on_scout", "fit_neighbouring_views", "fit_starts", "fit_views"]
+
+_STEP_AFTER_SCOUT = 0.1, 1.0
+"""Longest step, in natural units, of a descent before a background or on phasors that starts where a scout ended, and
+of others after a scout. Near a solution it is short: where an edge crosses a pixel's border, slopes jump."""
 
 _SOFT_M = 0.01
 """Standard deviation of ranges that is added for the first steps of a robust descent: half a cell."""
 _SCOUT_PIXELS = 0.05
-"""Standard deviation of ranges that is added for a scout at any bearing, in widths of a pixel at 1 m: its own error."""
+"""Standard deviation of ranges that is added for a scout made of strips, in widths of a pixel at 1 m: its own error."""
 _APART, _APART_COLUMNS = (0.01, math.radians(2.0)), 0.25
-"""Distance and angle, and columns of bearing, within which minima of a scout at any bearing lead to one."""
+"""Distance and angle, and columns of bearing, within which minima of that scout lead to one."""
 _BEST_BESIDE = 2
 """Views around a side minimum that are refined."""
 _Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
@@ -63,24 +76,46 @@ def fit_starts(
     explains = np.full(len(evidence.weight), np.inf)
     explains[which] = limit
     most = None if known is None else explains
-    aside = scene.scout is not None and setup.bearing_is_free
-    seen = evidence.with_further_noise(_SCOUT_PIXELS * setup.bank.sensor.pixel_rad) if aside else evidence
     start = which[starts.frame], starts.class_index, starts.view
-    if aside:
-        start = _best_of(setup, scene, seen, *start[:2], _spread(scene, start[2]), 1)
+    seen = _on_scout(setup, scene, evidence)
+    if scene.strips is not None:
+        start = _best_of(setup, scene, seen, *start[:2], _spread(setup, scene, start[2]), 1)
     fits = _descended(setup, scene, seen, start, known)
     if scene.scout is not None:
-        fits = _finished(setup, scene, evidence, fits, most)
-    stuck = _are_stuck(setup, scene, fits, explains, most)
+        fits = _finished(setup, scene, evidence, fits, explains, most)
+        if scene.strips is not None:
+            return fits
+    stuck = _are_stuck(setup, fits, explains, most)
     beside = _beside(setup, scene, evidence, fits, stuck, most, roughly=scene.scout is None)
     fits = Fits.joined([fits, beside])
-    return fits if scene.scout is not None else _finished(setup, scene, evidence, fits, most)
+    return fits if scene.scout is not None else _finished(setup, scene, evidence, fits, explains, most)
 
 
-def _spread(scene: Scene, view: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return views around some, (m, 9, 6): nearer and farther, and at other bearings of the same headings."""
-    off_m, aside = CELL_M / 2, scene.search.column_rad / 2
-    moves = [(d, b, b, 0.0, 0.0, 0.0) for d in (-off_m, 0.0, off_m) for b in (-aside, 0.0, aside)]
+def costs_on_scout(setup: Setup, scene: Scene, evidence: Evidence, which: NDArray[np.int64]) -> CostOf | None:
+    """Return what tells the costs of views of some frames on a scout made of strips; None without one."""
+    strips = scene.strips
+    if strips is None:
+        return None
+    settings, seen = scene.settings(setup), _on_scout(setup, scene, evidence)
+
+    def cost_of(f: int, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.float64]:
+        return costs_at(strips, seen, np.full(len(view), which[f]), class_index, view, settings)
+
+    return cost_of
+
+
+def _on_scout(setup: Setup, scene: Scene, evidence: Evidence) -> Evidence:
+    """Return frames with the errors of a scout made of strips, if there is one."""
+    if scene.strips is None:
+        return evidence
+    return evidence.with_further_noise(_SCOUT_PIXELS * setup.bank.sensor.pixel_rad)
+
+
+def _spread(setup: Setup, scene: Scene, view: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return views around some, (m, 9, 6): nearer and farther, and turned or at other bearings of the same headings."""
+    half = scene.search.column_rad / 2 if setup.bearing_is_free else CELL_RAD / 2
+    turns = [(side * half, side * half * setup.bearing_is_free) for side in (-1, 0, 1)]
+    moves = [(off, *turn, 0.0, 0.0, 0.0) for off in (-CELL_M / 2, 0.0, CELL_M / 2) for turn in turns]
     return np.asarray(view[:, None] + np.array(moves))
 
 
@@ -127,8 +162,8 @@ def _descended(
 
 def _apart(setup: Setup, scene: Scene) -> tuple[float, ...]:
     """Return how far apart minima are of their own: distance, angle, and bearing on a scout at any."""
-    if scene.scout is None or not setup.bearing_is_free:
-        return setup.policy.same_m, setup.policy.same_rad
+    if scene.strips is None:
+        return SAME_M, SAME_RAD
     return *_APART, _APART_COLUMNS * scene.search.column_rad
 
 
@@ -138,12 +173,11 @@ def _near(fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] |
 
 
 def _are_stuck(
-    setup: Setup, scene: Scene, fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] | None
+    setup: Setup, fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] | None
 ) -> NDArray[np.bool_]:
     """Return which fits ended not far above what explains their frame: their cells may still hold an explanation."""
     near = _near(fits, explains, most)
-    margin = setup.policy.likely_cost if setup.bearing_is_free and scene.scout is not None else setup.policy.margin_cost
-    stuck = (fits.cost > explains[fits.frame]) & (fits.cost < near[fits.frame] + margin)
+    stuck = (fits.cost > explains[fits.frame]) & (fits.cost < near[fits.frame] + setup.policy.margin_cost)
     return np.asarray(stuck & (near >= explains)[fits.frame])
 
 
@@ -162,9 +196,7 @@ def _beside(
     A descent stops at side minima, where an edge of the landmark has left a pixel.
     """
     settings = scene.settings(setup) if roughly else _close_settings(setup, scene, evidence)
-    which = distinct_of_frames(
-        fits, np.flatnonzero(stuck), setup.shapes.symmetry, setup.policy.same_m, setup.policy.same_rad
-    )
+    which = distinct_of_frames(fits, np.flatnonzero(stuck), setup.shapes.symmetry)
     if not which.size:
         return fits[:0]
     views = _around(setup, scene, fits.view[which])
@@ -199,12 +231,18 @@ def _rough(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
 
 
 def _finished(
-    setup: Setup, scene: Scene, evidence: Evidence, fits: Fits, most: NDArray[np.float64] | None = None
+    setup: Setup,
+    scene: Scene,
+    evidence: Evidence,
+    fits: Fits,
+    explains: NDArray[np.float64] | None = None,
+    most: NDArray[np.float64] | None = None,
 ) -> Fits:
     """Refine on the final images those rough fits that are likely; of fits that came to one place, the best.
 
     A fit is likely that is near the best of its frame, or near a cost `most` of each frame. The others keep their cost.
-    That of a scout is shifted by the change of the best fit of the frame.
+    That of a scout is shifted by the change of the best fit of the frame. `explains` is the cost up to which a view
+    explains each frame.
     """
     policy, n = setup.policy, len(evidence.weight)
     near = least_of_frame(fits, n) if most is None else most
@@ -213,10 +251,36 @@ def _finished(
     settings = scene.settings(setup) if scene.scout is None else _close_settings(setup, scene, evidence)
     rival = None if most is None else most[again.frame]
     final = refine(scene.final, evidence, again.frame, again.class_index, again.view, settings, rival=rival)
+    if scene.scout is not None and explains is not None:
+        final = Fits.joined([final, _recovered(setup, scene, evidence, again, final, explains, settings)])
     others = fits[np.setdiff1d(np.arange(len(fits)), likely)]
     if scene.scout is not None and most is None:
         others = _shifted(others, final, fits, n)
     return Fits.joined([final, others.with_free(len(setup.free))])
+
+
+def _recovered(
+    setup: Setup,
+    scene: Scene,
+    evidence: Evidence,
+    scouted: Fits,
+    final: Fits,
+    explains: NDArray[np.float64],
+    settings: DescentSettings,
+) -> Fits:
+    """Refine again, from around where they explain their frame on the scout, fits that do not on the final images.
+
+    A scout blurs the step in which an edge enters a pixel: at its minimum, a column of pixels may lie beyond the step.
+    """
+    limit = explains[final.frame]
+    lost = scouted[(scouted.cost <= limit + setup.policy.close_cost) & (final.cost > limit)]
+    if not len(lost):
+        return final[:0]
+    around = _surrounded(setup, lost)
+    own = around.frame, around.class_index, around.view
+    cost = costs_at(scene.final, evidence, *own, settings).reshape(-1, len(lost))
+    best = around[cost.argmin(axis=0) * len(lost) + np.arange(len(lost))]
+    return refine(scene.final, evidence, best.frame, best.class_index, best.view, settings)
 
 
 def _shifted(others: Fits, final: Fits, scouted: Fits, n: int) -> Fits:
@@ -260,7 +324,7 @@ def fit_neighbouring_views(
     cost = costs_at(scene.final, evidence, around.frame, around.class_index, around.view, close)
     order = np.lexsort((cost, around.frame))
     place = np.arange(len(order)) - np.searchsorted(around.frame[order], around.frame[order])
-    again = around[order[place < setup.policy.most_refined]]
+    again = around[order[place < MOST_REFINED]]
     rival = least_of_frame(fits, len(evidence.weight))[again.frame]
     limit = np.full(len(again), np.inf)
     return refine(scene.final, evidence, again.frame, again.class_index, again.view, close, limit, rival)
@@ -268,25 +332,21 @@ def fit_neighbouring_views(
 
 def _close_settings(setup: Setup, scene: Scene, evidence: Evidence) -> DescentSettings:
     """Return how a descent runs that starts near a minimum."""
-    policy = setup.policy
     side_peaks = evidence.on == "phasors" or scene.behind is not None
     return replace(
         scene.settings(setup),
-        longest_step=policy.step_after_scout
-        if side_peaks and not setup.bearing_has_prior
-        else policy.step_after_scout_aside,
-        look_beside_rad=policy.close_by_rad if side_peaks else (),
+        longest_step=_STEP_AFTER_SCOUT[0 if side_peaks and not setup.bearing_has_prior else 1],
+        look_beside_rad=CLOSE_BY_RAD if side_peaks else (),
     )
 
 
 def _most_likely(setup: Setup, fits: Fits, ordered: list[int]) -> NDArray[np.int64]:
     """Return the few fits of each frame that are refined again: of places of their own, best first."""
-    policy = setup.policy
     chosen: list[int] = []
     for k in ordered:
         same = [j for j in chosen if fits.frame[j] == fits.frame[k]]
-        if len(same) < policy.most_refined:
-            own = distinct(fits, np.array([*same, k]), setup.shapes.symmetry, policy.same_m, policy.same_rad)
+        if len(same) < MOST_REFINED:
+            own = distinct(fits, np.array([*same, k]), setup.shapes.symmetry)
             if len(own) > len(same):
                 chosen.append(int(k))
     return np.array(chosen, np.int64)

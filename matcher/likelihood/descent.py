@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State, picked
+from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, LONGEST_STEP, Problem, State, picked
+
+SETTLED_COST, ROUGH_COST = 1e-3, 0.1
+"""A step that promises to lower the cost by less is not taken, and one that promised less than a hundred times as much
+was the last; the second for first comparisons of minima."""
+_KEPT_SLOPES_COST = 30.0
+"""Where a step promises less than this, slopes rendered before serve again, until a step with them fails."""
+_OPTIMISM = 3.0
+"""A descent gives up where even this many times the promised decrease would not save it."""
 
 _FIRST_DAMPING = 1e-3
 _HOPELESS_DAMPING = 1e5
@@ -29,7 +37,7 @@ def descend(problem: Problem, state: State, settled: float) -> State:
         step, limited = _steps(problem, sums.information[active], sums.gradient[active], damping[active], reach[active])
         # the predicted decrease: stop where it is negligible, or where several times it stays above the limit
         promise = np.einsum("mp,mp->m", sums.gradient[active], step)
-        worth = (promise > settled) & (sums.cost[active] - problem.policy.optimism * promise < problem.limit[active])
+        worth = (promise > settled) & (sums.cost[active] - _OPTIMISM * promise < problem.limit[active])
         active, step, promise, limited = active[worth], step[worth], promise[worth], limited[worth]
         if not active.size:
             break
@@ -37,7 +45,7 @@ def descend(problem: Problem, state: State, settled: float) -> State:
         theta[:, problem.columns] += step
         theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN], active)
         theta[:, ALBEDO_COLUMN] = np.maximum(theta[:, ALBEDO_COLUMN], 1e-3)
-        promises_little = promise < problem.policy.kept_slopes_cost
+        promises_little = promise < _KEPT_SLOPES_COST
         goes_on = np.ones(len(active), np.bool_)
         for which, with_slopes in ((np.flatnonzero(~promises_little), True), (np.flatnonzero(promises_little), False)):
             if not which.size:
@@ -49,7 +57,7 @@ def descend(problem: Problem, state: State, settled: float) -> State:
             goes_on[which] = (promise[which] > _LAST_PROMISE * settled) | ~better
             damping[tried] = np.where(better, np.maximum(damping[tried] * 0.1, 1e-9), damping[tried] * 8)
             # who still has far to go after a step that was cut short may step further, until one fails
-            farther = np.minimum(2 * reach[tried], problem.policy.longest_step)
+            farther = np.minimum(2 * reach[tried], LONGEST_STEP)
             reach[tried] = np.where(better & limited[which], np.maximum(farther, reach[tried]), reach[tried])
             reach[tried[~better]] = problem.settings.longest_step
             failed_on_old = tried[~better & slopes_are_old[tried]]

@@ -13,6 +13,11 @@ from numpy.typing import NDArray
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render.view import delta_period_rad
 
+SAME_M, SAME_RAD = 2e-3, math.radians(0.2)
+"""Fits of one class nearer to each other than this are one."""
+MOST_REFINED = 12
+"""Explanations of a frame that are looked around where none fits, and that move with an estimated background."""
+
 BETTER_COST = 1.0
 """By how much the cost of a look-alike must be lower: below that both views remain, and the answer is ambiguous."""
 
@@ -127,8 +132,8 @@ def distinct(
     fits: Fits,
     own: NDArray[np.int64],
     symmetry: Sequence[int],
-    same_m: float,
-    same_rad: float,
+    same_m: float = SAME_M,
+    same_rad: float = SAME_RAD,
     same_bearing_rad: float = math.inf,
 ) -> list[int]:
     """Return some fits of one frame, best first, without those that came to the same place.
@@ -169,8 +174,8 @@ def distinct_of_frames(
     fits: Fits,
     which: NDArray[np.int64],
     symmetry: Sequence[int],
-    same_m: float,
-    same_rad: float,
+    same_m: float = SAME_M,
+    same_rad: float = SAME_RAD,
     same_bearing_rad: float = math.inf,
 ) -> NDArray[np.int64]:
     """Return those of some fits that came to places of their own, the best at each; see :func:`distinct`."""

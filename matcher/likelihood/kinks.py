@@ -5,17 +5,30 @@ Where an edge of the landmark crosses a pixel's border, slopes jump, and whether
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import whole_cost
-from phasemark.matcher.likelihood.descent import descend
+from phasemark.matcher.likelihood.descent import SETTLED_COST, descend
 from phasemark.matcher.likelihood.fits import BETTER_COST
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Sums
 from phasemark.matcher.likelihood.uncertainty import view_covariance
+
+CLOSE_BY_RAD = tuple(math.radians(angle) for angle in (-0.7, -0.28, -0.12, 0.12, 0.28, 0.7))
+"""Offsets of δ at which a solution before a background or on phasors is compared with a parabola."""
+_PARABOLA_SHARE = 0.5
+"""A cost there below this share of the parabola's shows another minimum."""
+_PROMISING_COST = 20.0
+"""What a view beside a solution may cost more and still lead to a better one."""
+_SETTLING_ROUNDS = 3
+"""How often a view that contradicts some pixels is left for a better one nearby."""
+_SETTLING_SIGMA = -5.0, -2.5, -1.5, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 1.5, 2.5, 5.0
+"""Where those are looked for, in standard deviations along the axes of the covariance."""
 
 
 def look_beside(problem: Problem, state: State) -> State:
@@ -42,9 +55,9 @@ def look_beside(problem: Problem, state: State) -> State:
     rise -= state.sums.cost[near, None]
     # expected rise beside a single minimum: offset² / var(δ); a rise far below that shows another minimum
     expected_rise = sides**2 / np.einsum("mpp->mp", view_covariance(problem, state.sums))[near, d][:, None]
-    best = np.argmin(rise - problem.policy.parabola_share * expected_rise, axis=1)
+    best = np.argmin(rise - _PARABOLA_SHARE * expected_rise, axis=1)
     parabola = np.take_along_axis(expected_rise, best[:, None], axis=1)[:, 0]
-    most = np.minimum(problem.policy.promising_cost, problem.policy.parabola_share * parabola)
+    most = np.minimum(_PROMISING_COST, _PARABOLA_SHARE * parabola)
     chosen = np.flatnonzero(np.take_along_axis(rise, best[:, None], axis=1)[:, 0] < most)
     if not chosen.size:
         return state
@@ -53,7 +66,7 @@ def look_beside(problem: Problem, state: State) -> State:
     theta[:, problem.columns[others]] += step[at] * unit
     theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN], which)
     some = problem.some(which)
-    found = descend(some, some.state(theta, state.use[which]), problem.policy.settled_cost)
+    found = descend(some, some.state(theta, state.use[which]), SETTLED_COST)
     better = np.flatnonzero(found.sums.cost < state.sums.cost[which])
     state.update(which[better], picked(found, better))
     return state
@@ -67,7 +80,7 @@ def settle(problem: Problem, state: State) -> State:
     """
     cost, contradicted = whole_cost(problem, state)
     near = problem.near_best(state, problem.policy.close_cost)
-    for _ in range(problem.policy.settling_rounds):
+    for _ in range(_SETTLING_ROUNDS):
         near = near[np.flatnonzero(contradicted[near] | (cost[near] > problem.rival[near]))]
         if not near.size:
             break
@@ -88,7 +101,7 @@ def settle(problem: Problem, state: State) -> State:
         at = chosen * moves.shape[1] + best[chosen]
         near = near[chosen]
         there = problem.some(near)
-        found = descend(there, there.at(theta[at], with_slopes=True), problem.policy.settled_cost)
+        found = descend(there, there.at(theta[at], with_slopes=True), SETTLED_COST)
         news, still = whole_cost(there, found)
         wins = np.flatnonzero(news < cost[near])
         state.update(near[wins], picked(found, wins))
@@ -104,7 +117,7 @@ def _moves(problem: Problem, sums: Sums, which: NDArray[np.integer]) -> NDArray[
     known = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
     values, vectors = np.linalg.eigh(np.where(known[:, None, None], matrix, np.eye(p)))
     axes = vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), 1.0)[:, None, :]
-    sizes = np.array(problem.policy.settling_sigma)
+    sizes = np.array(_SETTLING_SIGMA)
     moves = np.einsum("kpa,s->kasp", axes, sizes).reshape(len(which), -1, p)
     longest = np.abs(moves).max(axis=2, keepdims=True)
     return np.asarray(moves * np.minimum(1.0, 2.0 / np.maximum(longest, 1e-30)) * problem.scale)

@@ -23,6 +23,7 @@ from phasemark.matcher.likelihood.auto_background import AutoBackground
 from phasemark.matcher.likelihood.background_estimate import NEAREST_WALL_M
 from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.profiles import with_profiles
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.likelihood.search import search_views
@@ -37,7 +38,7 @@ from phasemark.matcher.nearest.bank_minima import Search, SearchOfFrames, Upward
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD, CellBounds, Turned
 from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD, first_step
 from phasemark.matcher.nearest.templates import Observation
-from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS, counts
 from phasemark.render import Background, PhasorImages, Views
 from phasemark.render.phasor_images import wrap_difference_m
 
@@ -50,6 +51,9 @@ BEARING_STD_RAD, TILT_STD_RAD = math.radians(1.5), math.radians(3.0)
 """Standard deviations of the bearing, and of pitch and roll, before a frame is seen, unless the matcher is told."""
 
 
+_FINE_GRID, _COARSE_GRID = (0.011, math.radians(1.1)), (0.022, math.radians(2.2))
+"""Widest steps of a bank, metres and radians, on which interpolated images are at the bound, and on which they lead to
+the solution."""
 _SHARES_OF_COLUMN = -0.5, -0.25, 0.25, 0.5
 _PIXELS_AT_ONCE = 1 << 20
 """Of all frames that are matched together. Each takes up to a kilobyte, for every candidate has an image of it."""
@@ -139,6 +143,7 @@ class LikelihoodMatcher:
         fits = search_views(self._setup, self._scene, evidence, evidence.seen, bare)
         if self._setup.unknown:
             fits = fit_without_borders(self._setup, self._scene, evidence, fits)
+        fits = with_profiles(self._setup, self._scene, evidence, fits)
         answers = rank(self._setup, frames, fits, bare, [self._stated] * len(frames))
         answers = self._with_mirror(evidence, answers)
         return self._with_shared_errors(frames, evidence, answers)
@@ -204,14 +209,14 @@ class LikelihoodMatcher:
 
     def _bank_models(self, behind: PhasorImages | None) -> tuple[BankModel | None, BankModel | StripModel | None]:
         """Return the interpolated images that the answer is taken from, and those of a scout; None where unfit."""
-        setup, policy = self._setup, self._setup.policy
+        setup = self._setup
         fixed = setup.free == VIEW[:2]
-        is_exact = fixed and setup.on == "ranges" and self._stated is None
-        is_exact = is_exact and BankModel.grid_is_fine_enough(self._bank, *policy.fine_grid)
-        aside = setup.free == VIEW[:3] and setup.on == "ranges" and self._stated is None and not self._auto
-        if aside and StripModel.suits(self._bank, self._search.widest_columns):
+        alone = setup.on == "ranges" and self._stated is None
+        is_exact = fixed and alone and BankModel.grid_is_fine_enough(self._bank, *_FINE_GRID)
+        has_strips = alone and not is_exact and not self._auto and setup.free in (VIEW[:2], VIEW[:3])
+        if has_strips and StripModel.suits(self._bank, self._search.widest_columns):
             return None, StripModel(self._bank, self._search.widest_columns)
-        scouts = fixed and BankModel.grid_is_fine_enough(self._bank, *policy.coarse_grid)
+        scouts = fixed and BankModel.grid_is_fine_enough(self._bank, *_COARSE_GRID)
         if not (is_exact or scouts):
             return None, None
         model = BankModel(self._bank)
@@ -219,7 +224,7 @@ class LikelihoodMatcher:
 
     def _check_distances(self) -> None:
         """Check that the bank has distances at which views are rendered."""
-        nearest, (step_m, step_rad) = self._rendered.limits()[0], self._setup.policy.fine_grid
+        nearest, (step_m, step_rad) = self._rendered.limits()[0], _FINE_GRID
         if self._bank.distance_m[-1] < nearest:
             raise UsageError(
                 f"the bank ends at {self._bank.distance_m[-1]:g} m, and views nearer than {nearest:.3g} m, half the"
@@ -284,7 +289,7 @@ class LikelihoodMatcher:
         """Return how badly a wall at its best distance explains all of each frame, (n,)."""
         seen, cost = evidence.seen, np.full(len(evidence.weight), np.inf)
         weight = np.where(seen.returned, seen.weight, 0.0)
-        enough = (seen.returned.sum(axis=1) >= self._setup.policy.min_returns) & (weight.sum(axis=1) > 0)
+        enough = (seen.returned.sum(axis=1) >= MIN_RETURNS) & (weight.sum(axis=1) > 0)
         which = np.flatnonzero(enough)
         forward = self._bank.sensor.axis_cosine().ravel() * seen.range_m[which]
         wall_m = np.average(np.where(seen.returned[which], forward, 0.0), axis=1, weights=weight[which])

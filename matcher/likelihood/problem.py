@@ -19,6 +19,9 @@ from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MUST_RETURN_COVERAGE, counts
 
+LONGEST_STEP = 3.0
+"""Longest step of a descent, in natural units of 1 cm and 1°."""
+
 ALBEDO = "albedo"
 """Name of the factor on the landmark's brightness, profiled out on phasors."""
 ALBEDO_COLUMN = len(VIEW)
@@ -72,7 +75,7 @@ class DescentSettings:
     prior_std: tuple[float, ...] = ()
     returns_behind: NDArray[np.bool_] | None = None
     unknown_around: bool = False
-    longest_step: float = DEFAULT_POLICY.longest_step
+    longest_step: float = LONGEST_STEP
     around: ImageModel | None = None
     policy: SearchPolicy = DEFAULT_POLICY
 

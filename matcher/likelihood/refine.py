@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.chi_squared import p_values_of, worse_of_two
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels, whole_cost
-from phasemark.matcher.likelihood.descent import descend
+from phasemark.matcher.likelihood.descent import ROUGH_COST, SETTLED_COST, descend
 from phasemark.matcher.likelihood.fits import Fits
 from phasemark.matcher.likelihood.images import ImageModel
 from phasemark.matcher.likelihood.kinks import look_beside, settle
@@ -31,6 +31,12 @@ from phasemark.matcher.likelihood.uncertainty import (
     view_covariance,
 )
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, FILLED_COVERAGE
+
+_AXIS_ROUNDS = 3
+"""How often slopes are differenced along the axes of the covariance, which they make in turn, where height, pitch or
+roll is free."""
+_RECOUNT_COST = 25.0
+"""Cost by which a view may grow, contradicted pixels included, after deciding again which pixels count."""
 
 _VIEWS_AT_ONCE = 512
 """Views whose costs are told together: their images stay in the processor's cache."""
@@ -77,7 +83,7 @@ def refine(
     state = problem.start(view)
     if roughly:
         start = picked(state, np.arange(len(frame)))
-        state = descend(problem, state, settings.policy.rough_cost)
+        state = descend(problem, state, ROUGH_COST)
         # pixels that did not count at the start may be contradicted at the end
         worse = np.flatnonzero(whole_cost(problem, state)[0] > whole_cost(problem, start)[0])
         state.update(worse, picked(start, worse))
@@ -124,11 +130,11 @@ def _descend_near(problem: Problem, state: State) -> State:
     """Descend to the minimum; roughly only where another explanation is better by far."""
     policy = problem.policy
     if not np.isfinite(problem.rival).any():
-        return descend(problem, state, policy.settled_cost)
-    state = descend(problem, state, policy.rough_cost)
+        return descend(problem, state, SETTLED_COST)
+    state = descend(problem, state, ROUGH_COST)
     near = np.flatnonzero(state.sums.cost <= problem.rival + policy.close_cost)
     if near.size:
-        state.update(near, descend(problem.some(near), picked(state, near), policy.settled_cost))
+        state.update(near, descend(problem.some(near), picked(state, near), SETTLED_COST))
     return state
 
 
@@ -140,9 +146,9 @@ def _recounted(problem: Problem, state: State) -> State:
     if changed.size:
         again = problem.some(changed)
         before = whole_cost(again, picked(state, changed))[0]
-        moved = descend(again, again.state(state.theta[changed], use[changed]), policy.settled_cost)
+        moved = descend(again, again.state(state.theta[changed], use[changed]), SETTLED_COST)
         # pixels that no longer count may hold a view no longer: it would slide to where they are contradicted
-        better = np.flatnonzero(whole_cost(again, moved)[0] <= before + policy.recount_cost)
+        better = np.flatnonzero(whole_cost(again, moved)[0] <= before + _RECOUNT_COST)
         state.update(changed[better], picked(moved, better))
     return state
 
@@ -217,7 +223,7 @@ def _uncertainty(
     without_one = np.full((len(state.theta), len(problem.settings.free)), np.inf)
     if near.size:
         there = problem.some(near)
-        for _ in range(problem.policy.axis_rounds if problem.height_or_tilt_is_free else 1):
+        for _ in range(_AXIS_ROUNDS if problem.height_or_tilt_is_free else 1):
             if problem.height_or_tilt_is_free:
                 wide: NDArray[np.complex128] | None = slopes_along_axes(there, state, near, covariance[near])
             else:

@@ -25,6 +25,9 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT, one_frame_limit_m
 from phasemark.render import Sensor
 from phasemark.render.sensor.range_noise import phase_image_variance
 
+STRANGE_SIGMA = 5.0
+"""Among unknown things, a return farther from the model than this sees something else."""
+
 ResidualKind = Literal["ranges", "phasors"]
 
 

@@ -10,14 +10,18 @@ from scipy import special
 
 from phasemark.matcher.chi_squared import largest_costs
 from phasemark.matcher.likelihood.acceptance import is_acceptable
-from phasemark.matcher.likelihood.candidates import fit_neighbouring_views, fit_starts
+from phasemark.matcher.likelihood.candidates import costs_on_scout, fit_neighbouring_views, fit_starts
 from phasemark.matcher.likelihood.fits import BETTER_COST, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.nearest.bank_minima import Starts
 from phasemark.matcher.nearest.templates import Observation
+from phasemark.matcher.pixel_agreement import MIN_RETURNS
 
 __all__ = ["are_doubtful", "search_views"]
+
+_REFUSED_P = 0.01
+"""p-value at which views around the best fits are tried too."""
 
 
 _STARTS_AT_ONCE = 4096
@@ -41,11 +45,12 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     """
     which, nu = _worth_a_search(setup, evidence, bare), evidence.scatter_freedom
     # 1, 2  bound the cost in every cell of the bank, and start in those that may hold an explanation
-    starts = scene.search.of_frames(which).starts(seen[which], _limit(setup, seen[which], nu[which]))
+    cost_of = costs_on_scout(setup, scene, evidence, which)
+    starts = scene.search.of_frames(which).starts(seen[which], _limit(setup, seen[which], nu[which]), cost_of)
     # 3, 4  descend from there, and refine on final images
     fits = fit_starts(setup, scene, evidence, which, starts, _most(setup, evidence[which]))
     # 5  where nothing fits, look around the best fits
-    poor = np.flatnonzero(are_doubtful(setup, fits, len(evidence.weight), setup.policy.refused_p))
+    poor = np.flatnonzero(are_doubtful(setup, fits, len(evidence.weight), _REFUSED_P))
     if poor.size:
         fits = Fits.joined([fits, fit_neighbouring_views(setup, scene, evidence, poor, fits)])
     # 6  where the best fit would be accepted, look for rivals in all cells that are left
@@ -74,7 +79,9 @@ def _with_rivals(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
         near = fits.cost <= least_of_frame(fits, len(evidence.weight))[fits.frame] + setup.rival_cost
         known = fits[near & np.isin(fits.frame, which)]
         places = [(known.class_index[own], known.view[own]) for own in (known.frame == k for k in which)]
-        starts = scene.search.of_frames(which).uncovered(seen[which], limit, places)
+        starts = scene.search.of_frames(which).uncovered(
+            seen[which], limit, places, costs_on_scout(setup, scene, evidence, which)
+        )
         parts = [fits]
         for some in _in_parts(starts, len(which)):
             own = known[np.isin(known.frame, which[some])]
@@ -114,6 +121,6 @@ def are_doubtful(setup: Setup, fits: Fits, n: int, p: float | None = None) -> ND
 def _worth_a_search(setup: Setup, evidence: Evidence, bare: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return which frames have enough returns to place a landmark, and are not explained without one."""
     returned = evidence.seen.returned
-    enough = (returned & setup.used).sum(axis=1) >= setup.policy.min_returns
+    enough = (returned & setup.used).sum(axis=1) >= MIN_RETURNS
     explained = bare <= special.chdtri(np.maximum(returned.sum(axis=1), 1), setup.false_alarm)
     return np.flatnonzero(enough & ~explained)

@@ -15,6 +15,7 @@ from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import SearchPolicy
+from phasemark.matcher.likelihood.strip_images import StripModel
 from phasemark.matcher.nearest.bank_minima import Search, SearchOfFrames
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
 from phasemark.render import Background, PhasorImages
@@ -160,6 +161,11 @@ class Scene:
         """Return the scene with images alone that the answer is taken from."""
         return replace(self, scout=None)
 
+    @property
+    def strips(self) -> StripModel | None:
+        """The scout, if it is made of strips."""
+        return self.scout if isinstance(self.scout, StripModel) else None
+
     def settings(self, setup: Setup) -> DescentSettings:
         """Return how a descent runs before these backgrounds."""
         behind = self.behind
@@ -173,7 +179,6 @@ class Scene:
             returns_behind=None
             if behind is None
             else counts(behind.phasor, behind.intensity, behind.sensor).reshape(len(behind.phasor), -1),
-            longest_step=setup.policy.longest_step,
-            around=self.scout if setup.bearing_is_free else None,
+            around=self.strips,
             policy=setup.policy,
         )

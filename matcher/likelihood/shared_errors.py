@@ -14,7 +14,7 @@ from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.acceptance import is_determined
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
-from phasemark.matcher.likelihood.residuals import Evidence, range_residuals
+from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals
 from phasemark.matcher.likelihood.setup import Setup
 from phasemark.matcher.likelihood.systematic import (
     Systematic,
@@ -137,7 +137,7 @@ def _carried(
     phasor = image.phasor.reshape(len(which), -1)
     if setup.unknown:
         residual = range_residuals(phasor, evidence, which)
-        weight = np.where(weight * residual**2 > setup.policy.strange_sigma**2, 0.0, weight)
+        weight = np.where(weight * residual**2 > STRANGE_SIGMA**2, 0.0, weight)
 
     def whitened(slopes: NDArray[np.complex128]) -> NDArray[np.float64]:
         flat, root = slopes.reshape(*slopes.shape[:2], -1), np.sqrt(weight)[:, None]

@@ -10,6 +10,10 @@ from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
 from phasemark.matcher.likelihood.residuals import Sums, range_residuals, robust_weight
 
+_SLOPE_WIDTH = 0.05
+"""Least half width, in natural units, over which final slopes are differenced, so that a kink narrower than this does
+not make the covariance."""
+
 
 def view_covariance(problem: Problem, sums: Sums) -> NDArray[np.float64]:
     """Return the covariance of the view, (m, p, p): inverse information, or the sandwich."""
@@ -36,7 +40,7 @@ def slopes_around(
     None where the model is smooth.
     """
     view = np.ascontiguousarray(state.theta[which, :ALBEDO_COLUMN])
-    step = np.maximum(0.5 * std, problem.policy.slope_width * problem.scale[: std.shape[1]])
+    step = np.maximum(0.5 * std, _SLOPE_WIDTH * problem.scale[: std.shape[1]])
     if not problem.with_albedo:
         slope = problem.model.wide_slopes(problem.class_index, view, problem.settings.free, step)
         if slope is None:
@@ -64,7 +68,7 @@ def slopes_along_axes(
     scaled = covariance / np.outer(scale, scale)
     known = np.asarray(np.isfinite(scaled).all(axis=(1, 2)))
     values, vectors = np.linalg.eigh(np.where(known[:, None, None], scaled, np.eye(p)))
-    length = np.clip(0.5 * np.sqrt(np.maximum(values, 0.0)), problem.policy.slope_width, 1.0)
+    length = np.clip(0.5 * np.sqrt(np.maximum(values, 0.0)), _SLOPE_WIDTH, 1.0)
     moves = np.zeros((len(which), p, len(VIEW)))
     moves[:, :, problem.columns[:p]] = (vectors * length[:, None]).transpose(0, 2, 1) * scale
     view = np.ascontiguousarray(state.theta[which, :ALBEDO_COLUMN])

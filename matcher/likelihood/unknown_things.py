@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.likelihood.fits import Fits, distinct_of_frames, least_of_frame
 from phasemark.matcher.likelihood.images import ImageModel
 from phasemark.matcher.likelihood.refine import refine
-from phasemark.matcher.likelihood.residuals import Evidence, range_residuals
+from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals
 from phasemark.matcher.likelihood.setup import Scene, Setup
 
 __all__ = ["fit_without_borders"]
@@ -27,7 +27,7 @@ def fit_without_borders(setup: Setup, scene: Scene, evidence: Evidence, fits: Fi
     least = least_of_frame(fits, len(evidence.weight))
     close = np.isfinite(fits.cost) & (fits.cost < least[fits.frame] + policy.margin_cost)
     close &= fits.explained >= setup.fewest_explained
-    modes = distinct_of_frames(fits, np.flatnonzero(close), setup.shapes.symmetry, policy.same_m, policy.same_rad)
+    modes = distinct_of_frames(fits, np.flatnonzero(close), setup.shapes.symmetry)
     some = fits[modes]
     kept = np.ones_like(evidence.seen.returned)
     np.logical_and.at(kept, some.frame, _inside(setup, model, evidence, some))
@@ -49,7 +49,7 @@ def _inside(setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits) -> 
     phasor = model.of_frames(frame).images(fits.class_index, np.ascontiguousarray(fits.view), ()).phasor
     size = np.sqrt(evidence.weight[frame]) * np.abs(range_residuals(phasor, evidence, frame))
     returned = evidence.seen.returned[frame]
-    other = returned & ((phasor == 0) | (size > setup.policy.strange_sigma))
+    other = returned & ((phasor == 0) | (size > STRANGE_SIGMA))
     shape = (-1, evidence.sensor.rows, evidence.sensor.cols)
     kept = np.ones(other.shape, np.bool_)
     for strange in (other, other | ~returned):  # beside pixels without a return too, where enough are left
@@ -77,7 +77,7 @@ def _scatter_of_columns(setup: Setup, model: ImageModel, evidence: Evidence, fit
     """
     rows, cols = evidence.sensor.rows, evidence.sensor.cols
     m, p = len(fits), len(setup.free)
-    strange2 = setup.policy.strange_sigma**2
+    strange2 = STRANGE_SIGMA**2
     model = model.of_frames(fits.frame)
     image = model.images(fits.class_index, np.ascontiguousarray(fits.view), setup.free)
     turn = np.divide(1.0, image.phasor, out=np.zeros_like(image.phasor), where=image.phasor != 0)

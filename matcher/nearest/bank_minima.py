@@ -8,7 +8,7 @@ shifted in is missing. A return that is shifted out costs 1, the mean of a compa
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
@@ -26,6 +26,8 @@ from phasemark.render.view import VIEW_FIELDS
 _T = TypeVar("_T", bound=np.generic)
 Known = tuple[NDArray[np.int64], NDArray[np.float64]]
 """Classes and views that explain a frame."""
+CostOf = Callable[[int, NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]
+"""Returns the costs of a frame, which is counted from 0, at classes and views."""
 
 _MOST_UP = 4
 """Number of shifts upwards, and downwards, that are compared."""
@@ -144,7 +146,7 @@ class Search:
         """Return the search for some frames: it is the same for all."""
         return self
 
-    def starts(self, seen: Observation, limit: NDArray[np.float64]) -> Starts:
+    def starts(self, seen: Observation, limit: NDArray[np.float64], cost_of: CostOf | None = None) -> Starts:
         """Return the local minima among the cells of every frame that may hold an explanation, of each class its own.
 
         Parameters
@@ -153,16 +155,25 @@ class Search:
             Whole frames.
         limit : (n,) float64
             Cost up to which a view explains a frame. Where no cell is below, the limit of the frame is raised.
+        cost_of : callable, optional
+            Returns the costs of views of some classes of a frame, more exactly than the cells tell them.
         """
         frames, found = _Moved(self, seen), []
         for f in range(len(limit)):
             own = limit[f]
             while not np.isfinite(cost := frames.costs(f, own)).any():
                 own *= _RAISED
+            self._tell(cost, f, cost_of)
             found.append(self._views(cost, [modes(cost, c, _N_MODES, *self._neighbours) for c in self._classes]))
         return _joined(found)
 
-    def uncovered(self, seen: Observation, limit: NDArray[np.float64], known: Sequence[Known]) -> Starts:
+    def uncovered(
+        self,
+        seen: Observation,
+        limit: NDArray[np.float64],
+        known: Sequence[Known],
+        cost_of: CostOf | None = None,
+    ) -> Starts:
         """Return views in all cells of every frame that may hold an explanation but are not close to a known one.
 
         Parameters
@@ -171,12 +182,15 @@ class Search:
         limit : (n,) float64
         known : sequence of (classes, views)
             What explains each frame, (k,) int64 and (k, 6) float64.
+        cost_of : callable, optional
+            As for :meth:`starts`.
         """
         frames, found = _Moved(self, seen), []
         for f in range(len(limit)):
             cost = frames.costs(f, limit[f])
             for c, view in zip(*known[f], strict=True):
                 cost[self._close_to(int(c), view)] = np.inf
+            self._tell(cost, f, cost_of)
             places = [cover(cost, c, *self._neighbours, *_CLOSE) for c in self._classes]
             found.append(self._views(cost, places))
         return _joined(found)
@@ -186,21 +200,28 @@ class Search:
         frames = _Moved(self, seen)
         return np.array([frames.has_cell(f, own) for f, own in enumerate(limit)], np.bool_)
 
+    def _tell(self, cost: NDArray[np.float32], f: int, cost_of: CostOf | None) -> None:
+        """Replace the costs of cells that may explain a frame by those of their middles, if these can be told."""
+        if cost_of is not None:
+            at = b, c, i, j = np.nonzero(np.isfinite(cost))
+            cost[at] = cost_of(f, c, self._middles(b, i, j))
+
+    def _middles(self, b: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the views in the middles of cells, (k, 6)."""
+        view = np.zeros((len(b), len(VIEW_FIELDS)))
+        view[:, 0], view[:, 1], view[:, 2] = self.cells.distance_m[i], self.cells.delta_rad[j], self._bearing_rad[b]
+        for k, shift in enumerate(b):
+            view[k, 3:5] = self._upward.split(self._elevation(shift), view[k, 0])
+        return view
+
     def _views(self, cost: NDArray[np.float32], places: Sequence[NDArray[np.int64]]) -> Starts:
         """Return the views in some cells of one frame, (k, 3) of each class; best first."""
-        class_index, views, costs = [], [], []
-        for c, own in enumerate(places):
-            for b, i, j in own[own[:, 0] >= 0]:
-                distance = float(self.cells.distance_m[i])
-                height, pitch = self._upward.split(self._elevation(b), distance)
-                class_index.append(c)
-                views.append((distance, self.cells.delta_rad[j], self._bearing_rad[b], height, pitch, 0.0))
-                costs.append(float(cost[b, c, i, j]))
+        places = [own[own[:, 0] >= 0] for own in places]
+        c = np.repeat(np.arange(len(places)), [len(own) for own in places])
+        b, i, j = np.concatenate(places).T
+        costs = cost[b, c, i, j].astype(np.float64)
         order = np.argsort(costs, kind="stable")
-        return Starts(
-            np.zeros(len(order), np.int64), np.array(class_index, np.int64)[order],
-            np.array(views, np.float64).reshape(-1, len(VIEW_FIELDS))[order], np.array(costs)[order],
-        )  # fmt: skip
+        return Starts(np.zeros(len(order), np.int64), c[order], self._middles(b, i, j)[order], costs[order])
 
     def _close_to(self, c: int, view: NDArray[np.float64]) -> tuple[Any, ...]:
         """Return which cells of a class are close to a view, as an index of costs; whatever the elevation."""
@@ -290,15 +311,31 @@ class SearchOfFrames:
         """Return the search for some of the frames."""
         return SearchOfFrames([self._searches[k] for k in frame], self.column_rad)
 
-    def starts(self, seen: Observation, limit: NDArray[np.float64]) -> Starts:
+    def starts(self, seen: Observation, limit: NDArray[np.float64], cost_of: CostOf | None = None) -> Starts:
         """Return the best modes of every frame; see :meth:`Search.starts`."""
-        return _joined([own.starts(seen[k : k + 1], limit[k : k + 1]) for k, own in enumerate(self._searches)])
+        alone = [(seen[k : k + 1], limit[k : k + 1], _of_one(cost_of, k)) for k in range(len(self._searches))]
+        return _joined([own.starts(*frame) for own, frame in zip(self._searches, alone, strict=True)])
 
-    def uncovered(self, seen: Observation, limit: NDArray[np.float64], known: Sequence[Known]) -> Starts:
+    def uncovered(
+        self,
+        seen: Observation,
+        limit: NDArray[np.float64],
+        known: Sequence[Known],
+        cost_of: CostOf | None = None,
+    ) -> Starts:
         """Return views in the cells that are left; see :meth:`Search.uncovered`."""
+        alone = [(slice(k, k + 1), _of_one(cost_of, k)) for k in range(len(self._searches))]
         return _joined(
-            [own.uncovered(seen[k : k + 1], limit[k : k + 1], known[k : k + 1]) for k, own in enumerate(self._searches)]
+            [
+                own.uncovered(seen[k], limit[k], known[k], cost)
+                for own, (k, cost) in zip(self._searches, alone, strict=True)
+            ]
         )
+
+
+def _of_one(cost_of: CostOf | None, k: int) -> CostOf | None:
+    """Return the costs of frame `k` as those of the first."""
+    return None if cost_of is None else lambda f, class_index, view: cost_of(f + k, class_index, view)
 
 
 def _joined(parts: Sequence[Starts]) -> Starts:
