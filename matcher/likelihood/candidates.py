@@ -17,14 +17,15 @@ from phasemark.matcher.likelihood.fits import (
     distinct_of_frames,
     least_of_frame,
 )
-from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.kinks import CLOSE_BY_RAD
 from phasemark.matcher.likelihood.problem import DescentSettings
-from phasemark.matcher.likelihood.refine import costs_at, refine
+from phasemark.matcher.likelihood.refine import costs_at, refine, slid
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.nearest.bank_minima import CostOf, Starts
 from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD
+from phasemark.matcher.pixel_agreement import DISAGREEMENT
 
 __all__ = ["costs_on_scout", "fit_neighbouring_views", "fit_starts", "fit_views"]
 
@@ -42,8 +43,10 @@ _BEST_BESIDE = 2
 """Views around a side minimum that are refined."""
 _Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
 """Frame, class and view of each."""
-_ASIDE_RAD = tuple(math.radians(angle) for angle in (0.12, 0.3, 0.7, 1.5, 3.0))
-"""How far to either side of a side minimum in δ views are tried."""
+_ASIDE_RAD = tuple(math.radians(angle) for angle in (0.12, 0.3, 0.6, 1.0, 1.4, 1.8, 2.2, 2.6, 3.0))
+"""How far to either side of a side minimum in δ views are tried: the valley of a part on its edge is half a degree."""
+_ASIDE_COLUMNS = 0.25, 0.5, 1.0, 1.5, 2.0
+"""The same in bearing, in columns: the step of an edge by a column leads from one side minimum to the next."""
 
 
 def fit_starts(
@@ -81,14 +84,18 @@ def fit_starts(
     if scene.strips is not None:
         start = _best_of(setup, scene, seen, *start[:2], _spread(setup, scene, start[2]), 1)
     fits = _descended(setup, scene, seen, start, known)
+    if scene.strips is not None:
+        scouted = replace(scene, final=scene.strips)
+        stuck = _are_stuck(setup, fits, explains, most)
+        fits = Fits.joined([fits, _beside(setup, scouted, seen, fits, stuck, None)])
     if scene.scout is not None:
-        fits = _finished(setup, scene, evidence, fits, explains, most)
+        fits = _finished(setup, scene, evidence, fits, most, start, explains)
         if scene.strips is not None:
             return fits
     stuck = _are_stuck(setup, fits, explains, most)
     beside = _beside(setup, scene, evidence, fits, stuck, most, roughly=scene.scout is None)
     fits = Fits.joined([fits, beside])
-    return fits if scene.scout is not None else _finished(setup, scene, evidence, fits, explains, most)
+    return fits if scene.scout is not None else _finished(setup, scene, evidence, fits, most)
 
 
 def costs_on_scout(setup: Setup, scene: Scene, evidence: Evidence, which: NDArray[np.int64]) -> CostOf | None:
@@ -99,7 +106,7 @@ def costs_on_scout(setup: Setup, scene: Scene, evidence: Evidence, which: NDArra
     settings, seen = scene.settings(setup), _on_scout(setup, scene, evidence)
 
     def cost_of(f: int, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.float64]:
-        return costs_at(strips, seen, np.full(len(view), which[f]), class_index, view, settings)
+        return slid(strips, seen, np.full(len(view), which[f]), class_index, view, settings, CELL_M)[0]
 
     return cost_of
 
@@ -112,11 +119,17 @@ def _on_scout(setup: Setup, scene: Scene, evidence: Evidence) -> Evidence:
 
 
 def _spread(setup: Setup, scene: Scene, view: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return views around some, (m, 9, 6): nearer and farther, and turned or at other bearings of the same headings."""
-    half = scene.search.column_rad / 2 if setup.bearing_is_free else CELL_RAD / 2
-    turns = [(side * half, side * half * setup.bearing_is_free) for side in (-1, 0, 1)]
-    moves = [(off, *turn, 0.0, 0.0, 0.0) for off in (-CELL_M / 2, 0.0, CELL_M / 2) for turn in turns]
-    return np.asarray(view[:, None] + np.array(moves))
+    """Return views around some, (m, 9, 6): turned, and nearer and farther, or at other bearings."""
+    steps = np.zeros((9, len(VIEW)))
+    shares = np.linspace(-1.0, 1.0, 3)
+    if setup.bearing_is_free:  # of the same heading and of others
+        aside = np.repeat(shares, 3) * scene.search.column_rad / 2
+        steps[:, 1], steps[:, 2] = aside + np.tile(shares, 3) * CELL_RAD / 2, aside
+    elif scene.strips is not None:
+        steps[:, 1] = np.linspace(-CELL_RAD, CELL_RAD, 9)
+    else:
+        steps[:, 0], steps[:, 1] = np.repeat(shares, 3) * CELL_M / 2, np.tile(shares, 3) * CELL_RAD / 2
+    return np.asarray(view[:, None] + steps)
 
 
 def _best_of(
@@ -127,14 +140,18 @@ def _best_of(
     class_index: NDArray[np.int64],
     views: NDArray[np.float64],
     n: int,
+    model: ImageModel | None = None,
 ) -> _Starts:
-    """Return the best n of k views each, (m, k, 6), on the scout at any bearing if there is one."""
+    """Return the best n of k views each, (m, k, 6), on some model; unless it is stated on strips if there are any."""
     m, k = views.shape[:2]
     of_each, settings = np.repeat(np.arange(m), k), scene.settings(setup)
     views = views.reshape(-1, len(VIEW))
-    model = settings.around or scene.final
-    cost = costs_at(model, evidence, frame[of_each], class_index[of_each], views, settings).reshape(m, k)
-    best = (np.argsort(cost, axis=1)[:, :n] + k * np.arange(m)[:, None]).ravel()
+    arguments = evidence, frame[of_each], class_index[of_each], views, settings
+    if model is None and scene.strips is not None:
+        cost, views = slid(scene.strips, *arguments, CELL_M)
+    else:
+        cost = costs_at(model or scene.final, *arguments)
+    best = (np.argsort(cost.reshape(m, k), axis=1)[:, :n] + k * np.arange(m)[:, None]).ravel()
     return frame[of_each[best]], class_index[of_each[best]], views[best]
 
 
@@ -235,14 +252,15 @@ def _finished(
     scene: Scene,
     evidence: Evidence,
     fits: Fits,
-    explains: NDArray[np.float64] | None = None,
     most: NDArray[np.float64] | None = None,
+    start: _Starts | None = None,
+    explains: NDArray[np.float64] | None = None,
 ) -> Fits:
     """Refine on the final images those rough fits that are likely; of fits that came to one place, the best.
 
     A fit is likely that is near the best of its frame, or near a cost `most` of each frame. The others keep their cost.
-    That of a scout is shifted by the change of the best fit of the frame. `explains` is the cost up to which a view
-    explains each frame.
+    That of a scout is shifted by the change of the best fit of the frame. Where `start` tells where a scout began, fits
+    that it explains and the final images do not, by the cost `explains` of each frame, are looked for again.
     """
     policy, n = setup.policy, len(evidence.weight)
     near = least_of_frame(fits, n) if most is None else most
@@ -251,36 +269,32 @@ def _finished(
     settings = scene.settings(setup) if scene.scout is None else _close_settings(setup, scene, evidence)
     rival = None if most is None else most[again.frame]
     final = refine(scene.final, evidence, again.frame, again.class_index, again.view, settings, rival=rival)
-    if scene.scout is not None and explains is not None:
-        final = Fits.joined([final, _recovered(setup, scene, evidence, again, final, explains, settings)])
+    if start is not None and explains is not None and scene.scout is not None:
+        promised = np.minimum(again.cost + DISAGREEMENT, explains[again.frame])
+        lost = (again.cost <= explains[again.frame] + policy.close_cost) & (final.cost > promised)
+        if lost.any():
+            final = Fits.joined([final, _recovered(setup, scene, evidence, start, again[lost])])
     others = fits[np.setdiff1d(np.arange(len(fits)), likely)]
     if scene.scout is not None and most is None:
         others = _shifted(others, final, fits, n)
     return Fits.joined([final, others.with_free(len(setup.free))])
 
 
-def _recovered(
-    setup: Setup,
-    scene: Scene,
-    evidence: Evidence,
-    scouted: Fits,
-    final: Fits,
-    explains: NDArray[np.float64],
-    settings: DescentSettings,
-) -> Fits:
-    """Refine again, from around where they explain their frame on the scout, fits that do not on the final images.
+def _recovered(setup: Setup, scene: Scene, evidence: Evidence, start: _Starts, lost: Fits) -> Fits:
+    """Refine on final images from elsewhere: from around lost fits of a scout, or from where it began.
 
-    A scout blurs the step in which an edge enters a pixel: at its minimum, a column of pixels may lie beyond the step.
+    Strips blur the step in which an edge enters a pixel: beyond it, at their minimum, may lie a column of pixels. A
+    scout without the pixels that have a kink may have its minimum degrees away.
     """
-    limit = explains[final.frame]
-    lost = scouted[(scouted.cost <= limit + setup.policy.close_cost) & (final.cost > limit)]
-    if not len(lost):
-        return final[:0]
-    around = _surrounded(setup, lost)
-    own = around.frame, around.class_index, around.view
-    cost = costs_at(scene.final, evidence, *own, settings).reshape(-1, len(lost))
-    best = around[cost.argmin(axis=0) * len(lost) + np.arange(len(lost))]
-    return refine(scene.final, evidence, best.frame, best.class_index, best.view, settings)
+    if scene.strips is not None:
+        own, class_index = lost.frame, lost.class_index
+        views = _surrounded(setup, lost).view.reshape(-1, len(lost), len(VIEW)).transpose(1, 0, 2)
+    else:
+        n = len(setup.shapes.names)
+        also = np.isin(start[0] * n + start[1], lost.frame * n + lost.class_index)
+        own, class_index, views = start[0][also], start[1][also], _spread(setup, scene, start[2][also])
+    best = _best_of(setup, scene, evidence, own, class_index, views, _BEST_BESIDE, model=scene.final)
+    return refine(scene.final, evidence, *best, _close_settings(setup, scene, evidence))
 
 
 def _shifted(others: Fits, final: Fits, scouted: Fits, n: int) -> Fits:
@@ -291,12 +305,11 @@ def _shifted(others: Fits, final: Fits, scouted: Fits, n: int) -> Fits:
 
 def _around(setup: Setup, scene: Scene, view: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return views around some, (m, k, 6): turned, and at other bearings, with and without the heading kept."""
-    turns = (*(-angle for angle in _ASIDE_RAD), *_ASIDE_RAD)
-    moves = [(turn, 0.0) for turn in turns]
+    moves = [(side * angle, 0.0) for angle in _ASIDE_RAD for side in (-1.0, 1.0)]
     if setup.bearing_is_free:
-        half = scene.search.column_rad / 2
-        bearings = (-half, -half / 2, half / 2, half)
-        moves += [(turn, b) for b in bearings for turn in (0.0, *(b + off for off in (0.0, *turns[1::2])))]
+        turns = [side * angle for angle in _ASIDE_RAD[1::3] for side in (-1.0, 1.0)]
+        bearings = [side * share * scene.search.column_rad for share in _ASIDE_COLUMNS for side in (-1.0, 1.0)]
+        moves += [(turn, b) for b in bearings for turn in (0.0, *(b + off for off in (0.0, *turns)))]
     steps = np.zeros((len(moves), len(VIEW)))
     steps[:, 1:3] = moves
     return np.asarray(view[:, None] + steps)

@@ -64,5 +64,5 @@ def _rise(
     )
     grid, own = (setup.bank.distance_m, setup.bank.delta_rad), VIEW.index(setup.free[column])
     periods = [delta_period_rad(setup.shapes.symmetry[c]) for c in fits.class_index]
-    inside = [is_in_range(*grid, one, period) for one, period in zip(view, periods, strict=True)]
+    inside = np.array([is_in_range(*grid, one, period) for one, period in zip(view, periods, strict=True)], np.bool_)
     return np.where(inside & (held.view[:, own] == view[:, own]), held.cost - fits.cost, np.inf)

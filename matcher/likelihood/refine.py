@@ -18,7 +18,7 @@ from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels, whole_cost
 from phasemark.matcher.likelihood.descent import ROUGH_COST, SETTLED_COST, descend
 from phasemark.matcher.likelihood.fits import Fits
-from phasemark.matcher.likelihood.images import ImageModel
+from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.kinks import look_beside, settle
 from phasemark.matcher.likelihood.outline import stands_out
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, DescentSettings, Problem, State, picked
@@ -124,6 +124,37 @@ def _costs_of_part(
         return whole_cost(problem, problem.start(view))[0]
     theta = np.column_stack([problem.clipped(view.copy(), np.arange(len(view))), np.ones(len(view))])
     return whole_cost(problem, problem.at(theta))[0]
+
+
+def slid(
+    model: ImageModel,
+    evidence: Evidence,
+    frame: NDArray[np.int64],
+    class_index: NDArray[np.int64],
+    view: NDArray[np.float64],
+    settings: DescentSettings,
+    farthest_m: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what m candidates cost at the best distance nearby, and the views there; arguments as for :func:`refine`.
+
+    The ranges of all pixels grow as the distance does, and nothing else changes: good to `farthest_m`.
+    """
+    costs, views = [np.empty(0)], [np.empty((0, len(VIEW)))]
+    settings = replace(settings, free=VIEW[:1], prior_std=())
+    for first in range(0, len(frame), _VIEWS_AT_ONCE):
+        own = slice(first, first + _VIEWS_AT_ONCE)
+        problem = Problem(model, evidence, frame[own], class_index[own], settings, np.full(len(frame[own]), np.inf))
+        there = view[own].copy()
+        theta = np.column_stack([problem.clipped(there, np.arange(len(there))), np.ones(len(there))])
+        images = model.images(class_index[own], np.ascontiguousarray(there), ())
+        slope = images.phasor * (1j / evidence.sensor.metres_per_radian)
+        state = problem.summed(theta, problem.pixels_at(images, theta), replace(images, slope=slope[:, None]))
+        gradient, information = state.sums.gradient[:, 0], state.sums.information[:, 0, 0]
+        step = np.clip(gradient / np.maximum(information, 1e-30), -farthest_m, farthest_m)
+        there[:, 0] += step
+        costs.append(whole_cost(problem, state)[0] - (2 * gradient - information * step) * step)
+        views.append(problem.clipped(there, np.arange(len(there))))
+    return np.concatenate(costs), np.concatenate(views)
 
 
 def _descend_near(problem: Problem, state: State) -> State:
