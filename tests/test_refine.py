@@ -301,7 +301,7 @@ def test_each_candidate_has_the_wall_the_limits_and_the_search_of_its_frame(bank
         def __init__(self, k):
             self.k = k
 
-        def starts(self, seen, limit):
+        def starts(self, seen, limit, cost_of):
             return Starts(np.zeros(1, np.int64), np.full(1, self.k), np.zeros((1, 6)), np.zeros(1))
 
     searches: Any = [Only(0), Only(1)]

@@ -1,4 +1,4 @@
-"""How far an answer may be off where its covariance does not tell: the likelihood at the tolerance.
+"""The likelihood at the tolerance, which tells how far an answer may be off where its covariance does not.
 
 Beside a kink one side of a valley is steep and the other flat, and no parabola about its lowest point describes both.
 So distance or angle is held at its tolerance, the other parameters follow, and the cost there tells how wide the valley

@@ -21,13 +21,15 @@ from phasemark.data import Bank
 from phasemark.matcher.frequencies import OneFrequencyBank
 from phasemark.matcher.likelihood.images import VIEW, ModelImages
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD
-from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD, closing_period
+from phasemark.matcher.nearest.grid import closing_period
 from phasemark.render import PhasorImages, Renderer, Sensor, Views
 
 __all__ = ["StripModel"]
 
 _STRIPS = 4, 8
 """Strips in a column, and in a wide one. With two, one view in a hundred costs 80 more than rendered."""
+_STEP_M, _STEP_RAD = 0.02, math.radians(1.0)
+"""Widest steps between nodes. With 2° some views at 0.7 m cost 200 more than rendered: edges move by half a pixel."""
 _MOST_BYTES = 4 << 30
 """Memory that the strips of a bank may take; it is used for those alone that were rendered."""
 _ROUNDING = 1e-9
@@ -55,7 +57,7 @@ class StripModel:
         sensor = bank.sensor
         self._strips = strips = _strip_sensor(sensor, widest_columns)
         self._period = closing_period(bank.delta_rad)
-        self._distance, self._delta = _axis(bank.distance_m, CELL_M), _axis(bank.delta_rad, CELL_RAD, self._period)
+        self._distance, self._delta = _axis(bank.distance_m, _STEP_M), _axis(bank.delta_rad, _STEP_RAD, self._period)
         meshes = [bank.mesh(name) for name in bank.classes]
         self._renderers = [Renderer(mesh, strips, albedo=float(mesh.metadata["albedo"])) for mesh in meshes]
         middle = strips.lower_rows[0] if bank.lower is not None else 0
@@ -74,8 +76,8 @@ class StripModel:
         sensor = bank.sensor
         if isinstance(bank, OneFrequencyBank) or sensor.bends_rays or 1 in (len(bank.distance_m), len(bank.delta_rad)):
             return False
-        n_d = (bank.distance_m[-1] - bank.distance_m[0]) / CELL_M
-        n_a = (bank.delta_rad[-1] - bank.delta_rad[0]) / CELL_RAD
+        n_d = (bank.distance_m[-1] - bank.distance_m[0]) / _STEP_M
+        n_a = (bank.delta_rad[-1] - bank.delta_rad[0]) / _STEP_RAD
         n_class = 1 if bank.lower is not None else len(bank.classes)
         pixels = sensor.rows * _strips_of_column(sensor) * (sensor.cols + 2 * _margin(widest_columns))
         return bool(16 * n_class * max(n_d, 2) * max(n_a, 2) * pixels <= _MOST_BYTES)
@@ -217,6 +219,7 @@ def _strip_sensor(sensor: Sensor, widest_columns: int) -> Sensor:
         half_angle_h_deg=math.degrees(math.atan(tan_h * wide / sensor.cols)),
         half_angle_v_deg=math.degrees(math.atan(tan_v)),
         principal_point_px=(n * (u0 + margin), v0),
+        whole_image_px=None,
         fill_factor=(1.0, 1.0),
         dead_pixels=(),
         hot_pixels=(),
