@@ -1,6 +1,7 @@
 """Views whose likelihood has side minima all around: the search finds them, or something as likely."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.render import Background, Renderer, Views, capture
 
 FIXED, BEARING = ("distance_m", "delta_rad"), ("distance_m", "delta_rad", "bearing_rad")
-VIEWS = {
+VIEWS: dict[str, tuple[tuple[int, int], int, str, int, tuple[float, float, float], dict[str, Any]]] = {
     # an arch on its edge: without the pixels that have a kink its images are alike over ten degrees
     "edge": ((212, 4), 0, "0.64:0.76:0.02", 4, (0.6857, 116.96, 0.0), {"free": FIXED}),
     "edge before a wall": (
@@ -35,6 +36,10 @@ def part_of(seed, number):
     return part
 
 
+def likelihood_of(matcher):
+    return matcher._method
+
+
 @pytest.mark.parametrize("name", VIEWS)
 def test_nothing_is_likelier_than_the_answer(name, tmp_path):
     seed, number, distance_m, exposures, (distance, delta_deg, bearing_deg), options = VIEWS[name]
@@ -48,7 +53,7 @@ def test_nothing_is_likelier_than_the_answer(name, tmp_path):
         image = renderer.render_views(Views(*truth.T.copy()), background=options.get("background"))
         frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(5), n_frames=exposures))
         matcher = Matcher(bank, "refine", **options)
-        method, evidence = matcher._method, Evidence.from_frames(frames.with_pooled_noise(), "ranges")
+        method, evidence = likelihood_of(matcher), Evidence.from_frames(frames.with_pooled_noise(), "ranges")
         scene, each = method._scene, np.arange(N)
         true = refine(scene.final, evidence, each, np.zeros(N, np.int64), truth, scene.settings(method._setup))
         for k, match in enumerate(matcher.match(frames)):
