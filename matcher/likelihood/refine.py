@@ -80,15 +80,14 @@ def refine(
     """
     limit = np.full(len(frame), np.inf) if give_up_above is None else give_up_above
     problem = Problem(model, evidence, frame, class_index, settings, limit, rival)
-    state = problem.start(view)
+    start = problem.start(view)
+    state = picked(start, np.arange(len(frame)))
+    state = descend(problem, state, ROUGH_COST) if roughly else _descend_near(problem, state)
+    # pixels that did not count at the start may be contradicted at the end
+    worse = np.flatnonzero(whole_cost(problem, state)[0] > whole_cost(problem, start)[0])
+    state.update(worse, picked(start, worse))
     if roughly:
-        start = picked(state, np.arange(len(frame)))
-        state = descend(problem, state, ROUGH_COST)
-        # pixels that did not count at the start may be contradicted at the end
-        worse = np.flatnonzero(whole_cost(problem, state)[0] > whole_cost(problem, start)[0])
-        state.update(worse, picked(start, worse))
         return conclude(problem, state, look_around=False)
-    state = _descend_near(problem, state)
     if settings.look_beside_rad:
         state = look_beside(problem, state)
     state = _recounted(problem, state)
