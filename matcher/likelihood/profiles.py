@@ -24,12 +24,16 @@ from phasemark.render.view import delta_period_rad
 
 __all__ = ["with_profiles"]
 
+_RISE = 16.0
+"""By how much the cost must rise at the tolerance. With nine, three standard deviations, one true view in four hundred
+lies beyond it where an answer is only just determined; along a flat valley many answers are."""
+
 
 def with_profiles(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     """Return fits with deviations of distance and angle as wide as the likelihood at their tolerances has them.
 
-    Only the best fit of each frame is looked at, if it would be accepted. A cost that rises by r at the tolerance t
-    stands for a standard deviation of t / √r.
+    Only the best fit of each frame is looked at, if it would be accepted. Where its cost rises by r < 16 at the
+    tolerance t, its deviation is that with which it is refused, or t / √r if that is larger.
     """
     best = best_of_frame(fits)
     best = best[[is_acceptable(setup, fits, int(k)) for k in best]]
@@ -40,7 +44,9 @@ def with_profiles(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) ->
         which = best if name == "distance_m" else best[math.pi > tolerance * symmetry]
         for side in (-tolerance, tolerance):
             rise = np.maximum(_rise(setup, scene, evidence, fits[which], column, side), 1e-12)
-            std[which, column] = np.maximum(std[which, column], tolerance / np.sqrt(rise))
+            refused = 1.001 * tolerance / setup.policy.tolerated_sigma
+            wide = np.where(rise < _RISE, np.maximum(refused, tolerance / np.sqrt(rise)), 0.0)
+            std[which, column] = np.maximum(std[which, column], wide)
     return replace(fits, std_without_one=std)
 
 
@@ -58,7 +64,7 @@ def _rise(
     moves = offset * fits.covariance[:, column] / fits.covariance[:, column, column, None]
     view = fits.view.copy()
     view[:, [VIEW.index(name) for name in setup.free]] += moves
-    enough = fits.cost + setup.policy.tolerated_sigma**2
+    enough = fits.cost + _RISE
     held = refine(
         scene.final, evidence, fits.frame, fits.class_index, view, settings, give_up_above=enough, roughly=True
     )
