@@ -78,7 +78,7 @@ def test_a_symmetry_that_was_not_stated_makes_every_view_ambiguous(tmp_path, fre
         (BOX, {"distance_m": "1.0"}, 2 * math.pi, 0),
         (BOX, {"distance_m": "0.6:4.6:2"}, 2 * math.pi, 9),
         (BOX, {"delta_deg": "0:360:20"}, 2 * math.pi, 9),
-        (TRIANGLE, {"distance_m": "0.6:1.6:0.2", "delta_deg": "0:360:20"}, 2 * math.pi, 8),
+        (TRIANGLE, {"distance_m": "0.6:1.6:0.2", "delta_deg": "0:360:20"}, 2 * math.pi, 9),
         (TRIANGLE, {"delta_deg": "0:180:2"}, math.pi, 9),
     ],
     ids=["one view", "one distance", "steps of 2 m", "steps of 20°", "steps of 20 cm and 20°", "half a circle"],

@@ -52,14 +52,14 @@ def rise_at(matcher, frames, k, match, offset_rad):
     return costs_at(method._scene.final, evidence, frame, class_index, view, settings).min() - match.chi2
 
 
-def test_accepted_answers_rise_by_sixteen_at_the_tolerance_whatever_their_covariance(bank):
+def test_accepted_answers_rise_by_three_and_a_half_sigma_at_the_tolerance_whatever_their_covariance(bank):
     frames, matcher = frames_of(bank, 1, 40), Matcher(bank, "refine", free=("distance_m", "delta_rad"))
     narrow = 0
     for k, match in enumerate(matcher.match(frames)):
         rise = min(rise_at(matcher, frames, k, match, side * TOLERANCE_RAD) for side in (-1, 1))
         if match.accepted:
-            assert rise > 16.0 - 0.5  # the grid of distances is not the minimum
-        elif match.covariance is not None and 3 * math.sqrt(match.covariance[1, 1]) < TOLERANCE_RAD and rise < 16.0:
+            assert rise > 3.5**2 - 0.5  # the grid of distances is not the minimum
+        elif match.covariance is not None and 3 * math.sqrt(match.covariance[1, 1]) < TOLERANCE_RAD and rise < 3.5**2:
             assert match.reason in ("undetermined", "poor fit")
             narrow += 1
     assert narrow > 2  # parabolas alone would have passed these

@@ -24,7 +24,7 @@ from phasemark.render.view import delta_period_rad
 
 __all__ = ["with_profiles"]
 
-_RISE = 16.0
+_RISE = 3.5**2
 """By how much the cost must rise at the tolerance. With nine, three standard deviations, one true view in four hundred
 lies beyond it where an answer is only just determined; along a flat valley many answers are."""
 
@@ -32,7 +32,7 @@ lies beyond it where an answer is only just determined; along a flat valley many
 def with_profiles(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     """Return fits with deviations of distance and angle as wide as the likelihood at their tolerances has them.
 
-    Only the best fit of each frame is looked at, if it would be accepted. Where its cost rises by r < 16 at the
+    Only the best fit of each frame is looked at, if it would be accepted. Where its cost rises by r < 12.25 at the
     tolerance t, its deviation is that with which it is refused, or t / √r if that is larger.
     """
     best = best_of_frame(fits)

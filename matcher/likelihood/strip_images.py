@@ -28,8 +28,9 @@ __all__ = ["StripModel"]
 
 _STRIPS = 4, 8
 """Strips in a column, and in a wide one. With two, one view in a hundred costs 80 more than rendered."""
-_STEP_M, _STEP_RAD = 0.02, math.radians(1.0)
-"""Widest steps between nodes. With 2° some views at 0.7 m cost 200 more than rendered: edges move by half a pixel."""
+_STEP_M, _STEPS_RAD = 0.02, (math.radians(1.0), math.radians(2.0))
+"""Widest steps between nodes, the second angle for wide pixels. At 2° edges of a part at 0.7 m move by half a pixel of
+2°, and some views cost 200 more than rendered."""
 _MOST_BYTES = 4 << 30
 """Memory that the strips of a bank may take; it is used for those alone that were rendered."""
 _ROUNDING = 1e-9
@@ -57,7 +58,10 @@ class StripModel:
         sensor = bank.sensor
         self._strips = strips = _strip_sensor(sensor, widest_columns)
         self._period = closing_period(bank.delta_rad)
-        self._distance, self._delta = _axis(bank.distance_m, _STEP_M), _axis(bank.delta_rad, _STEP_RAD, self._period)
+        self._distance, self._delta = (
+            _axis(bank.distance_m, _STEP_M),
+            _axis(bank.delta_rad, _STEPS_RAD[_is_wide(sensor)], self._period),
+        )
         meshes = [bank.mesh(name) for name in bank.classes]
         self._renderers = [Renderer(mesh, strips, albedo=float(mesh.metadata["albedo"])) for mesh in meshes]
         middle = strips.lower_rows[0] if bank.lower is not None else 0
@@ -77,7 +81,7 @@ class StripModel:
         if isinstance(bank, OneFrequencyBank) or sensor.bends_rays or 1 in (len(bank.distance_m), len(bank.delta_rad)):
             return False
         n_d = (bank.distance_m[-1] - bank.distance_m[0]) / _STEP_M
-        n_a = (bank.delta_rad[-1] - bank.delta_rad[0]) / _STEP_RAD
+        n_a = (bank.delta_rad[-1] - bank.delta_rad[0]) / _STEPS_RAD[_is_wide(sensor)]
         n_class = 1 if bank.lower is not None else len(bank.classes)
         pixels = sensor.rows * _strips_of_column(sensor) * (sensor.cols + 2 * _margin(widest_columns))
         return bool(16 * n_class * max(n_d, 2) * max(n_a, 2) * pixels <= _MOST_BYTES)
@@ -199,8 +203,12 @@ class _Rendered:
         self._used = end
 
 
+def _is_wide(sensor: Sensor) -> bool:
+    return sensor.pixel_rad > WIDE_PIXEL_RAD
+
+
 def _strips_of_column(sensor: Sensor) -> int:
-    return _STRIPS[1 if sensor.pixel_rad > WIDE_PIXEL_RAD else 0]
+    return _STRIPS[_is_wide(sensor)]
 
 
 def _margin(widest_columns: int) -> int:
