@@ -22,6 +22,9 @@ from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad, w
 
 __all__ = ["is_acceptable", "is_determined", "rank"]
 
+_SAME_SIGMA = 3.0
+"""Fits of one class nearer to each other than this many standard deviations are of one posterior."""
+
 
 def rank(
     setup: Setup,
@@ -96,11 +99,14 @@ def _answer(
     best = kept[0]
     # "none" weighs as a fit that just fails a χ² test with the noise as stated, or as a scene without a landmark
     cost_of_unknown = DISAGREEMENT * float(fits.unexplained[best])
-    weight = _weights(np.append(fits.cost[kept], min(bare, float(chi2_at_edge[best]) + cost_of_unknown)))
-    reason = _reason(setup, fits, kept, weight[:-1], bare)
+    costs = np.append(fits.cost[kept], min(bare, float(chi2_at_edge[best]) + cost_of_unknown))
+    log_share = _log_shares(setup, fits, kept)
+    weight = _weights(costs - 2 * np.append(log_share, log_share[0]))
+    reason = _reason(setup, fits, kept, (weight[:-1], _weights(costs[:-1])), bare)
     candidates = _candidates(setup, fits, kept, weight)
-    condition, weak = weak_direction(setup.free, information=fits.information[best])
     covariance = fits.covariance[best]
+    observed = np.where(np.isfinite(covariance), fits.information[best], np.nan)
+    condition, weak = weak_direction(setup.free, information=observed)
     is_landmark = reason != "no landmark"
     return Match(
         class_name=candidates[0].class_name if is_landmark else None,
@@ -127,9 +133,34 @@ def _answer(
 
 
 def _weights(costs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the probabilities of explanations, by exp(−cost / 2)."""
+    """Return the shares of explanations, by exp(−cost / 2)."""
     weight = np.exp(-0.5 * np.minimum(costs - costs.min(), 1400.0))
     return np.asarray(weight / weight.sum())
+
+
+def _log_shares(setup: Setup, fits: Fits, kept: list[int]) -> NDArray[np.float64]:
+    """Return the logarithms of the shares of all views that the posterior around some fits of one frame fills, (k,).
+
+    By Laplace's approximation it is (2π)^(p/2) / √det(2π + R I R), with the information I and the ranges R that the
+    parameters have before a frame is seen: the bank's distances, the class's period of δ, one metre, one radian. A fit
+    within three standard deviations of a better one of its class is part of that: its share is 0.
+    """
+    shapes, classes, turn = setup.shapes, fits.class_index[kept], setup.free.index("delta_rad")
+    periods = np.array([delta_period_rad(shapes.symmetry[c]) for c in classes])
+    ranges = np.ones((len(kept), len(setup.free)))
+    ranges[:, setup.free.index("distance_m")] = np.ptp(setup.bank.distance_m) or 1.0
+    ranges[:, turn] = periods
+    information = np.nan_to_num(fits.information[kept])
+    in_ranges = information * ranges[:, :, None] * ranges[:, None] / (2 * np.pi)
+    shares = -0.5 * np.linalg.slogdet(np.eye(len(setup.free)) + in_ranges)[1]
+    views = fits.view[kept][:, [VIEW.index(name) for name in setup.free]]
+    for k in range(1, len(kept)):
+        better = np.flatnonzero((classes[:k] == classes[k]) & np.isfinite(shares[:k]))
+        off = views[k] - views[better]
+        off[:, turn] = wrap_delta_difference_rad(off[:, turn], periods[k])
+        if (np.einsum("jp,jpq,jq->j", off, information[better], off) < _SAME_SIGMA**2).any():
+            shares[k] = -np.inf
+    return np.asarray(shares)
 
 
 def _candidates(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float64]) -> tuple[Candidate, ...]:
@@ -152,7 +183,9 @@ def _class_probability(names: Sequence[str], candidates: Sequence[Candidate], no
     return {**dict.fromkeys(names, 0.0), **of_class, "none": none}
 
 
-def _reason(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float64], bare: float) -> Reason:
+def _reason(
+    setup: Setup, fits: Fits, kept: list[int], weights: Sequence[NDArray[np.float64]], bare: float
+) -> Reason:
     """Return why the best fit of a frame is refused; empty where it is accepted."""
     best = kept[0]
     if not fits.capped[best] < bare:
@@ -166,14 +199,18 @@ def _reason(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float6
         return "undetermined"
     if not _is_in_bank(setup, fits, best):
         return "outside the bank"
-    return "ambiguous" if _is_ambiguous(setup, fits, kept, weight) else ""
+    return "ambiguous" if _is_ambiguous(setup, fits, kept, weights) else ""
 
 
-def _is_ambiguous(setup: Setup, fits: Fits, kept: list[int], weight: NDArray[np.float64]) -> bool:
-    """Return whether other classes, or views beyond the tolerance, are too probable; `kept` is best first."""
+def _is_ambiguous(setup: Setup, fits: Fits, kept: list[int], weights: Sequence[NDArray[np.float64]]) -> bool:
+    """Return whether other classes, or views beyond the tolerance, are too probable; `kept` is best first.
+
+    Classes are weighed with the share of all views that look so, and without it: who looks at one view alone, and at
+    no others, sees its rivals more often than one in a thousand.
+    """
     policy, best = setup.policy, kept[0]
     other = fits.class_index[kept] != fits.class_index[best]
-    if weight[other].sum() > policy.ambiguity * weight.sum():
+    if any(weight[other].sum() > policy.ambiguity * weight.sum() for weight in weights):
         return True
     # where a landmark looks alike from two sides, a single pixel at an edge must not decide between them
     alike = np.flatnonzero(~other & (fits.cost[kept] < fits.cost[best] + setup.rival_cost))

@@ -81,12 +81,15 @@ def _steps(
     damping: NDArray[np.float64],
     reach: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return damped steps, (m, p), none longer than its reach in any parameter, and which were cut short."""
+    """Return damped steps, (m, p), none longer than its reach along any axis of the information, and which were cut.
+
+    A direction that a frame hardly tells, as the angle of a body that is nearly round, does not hold up the others.
+    """
     scaled = information * np.outer(problem.scale, problem.scale)
     diagonal = np.einsum("mpp->mp", scaled)
     floor = 1e-12 * diagonal.max(axis=1, initial=0.0) + 1e-300
     held = scaled + np.einsum("mp,pq->mpq", damping[:, None] * diagonal + floor[:, None], np.eye(len(problem.scale)))
-    step = np.linalg.solve(held, (gradient * problem.scale)[:, :, None])[:, :, 0]
-    longest = np.abs(step).max(axis=1)
-    share = np.minimum(1.0, reach / np.maximum(longest, 1e-30))
-    return np.asarray(step * share[:, None] * problem.scale), share < 1.0
+    values, axes = np.linalg.eigh(held)
+    wanted = np.einsum("mpa,mp->ma", axes, gradient * problem.scale) / np.maximum(values, floor[:, None])
+    step = np.clip(wanted, -reach[:, None], reach[:, None])
+    return np.einsum("mpa,ma->mp", axes, step) * problem.scale, (step != wanted).any(axis=1)

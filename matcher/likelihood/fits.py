@@ -55,7 +55,7 @@ class Fits:
     covariance : (m, p, p) float64
         Of the free parameters of the view, nuisances taken into account; NaN where some direction is not observed.
     information : (m, p, p) float64
-        Its inverse.
+        Its inverse, and where some direction is not observed, what the descent's own slopes tell.
     std_without_one : (m, p) float64
         Largest standard deviations after any one pixel is left out. One pixel at an edge may claim more than it knows,
         so an answer is judged by these. Infinite where they were not computed.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.chi_squared import p_values_of, worse_of_two
-from phasemark.matcher.information import covariance_of
+from phasemark.matcher.information import covariance_of, eliminated
 from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels, whole_cost
 from phasemark.matcher.likelihood.descent import ROUGH_COST, SETTLED_COST, descend
 from phasemark.matcher.likelihood.fits import Fits
@@ -195,11 +195,13 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     """
     settings = problem.settings
     # 1  count contradicted pixels within three standard deviations, by the covariance of the descent's own slopes
-    near = _near_solutions(problem, state) if look_around else np.empty(0, np.intp)
+    nowhere = np.empty(0, np.intp)
+    near = _near_solutions(problem, state) if look_around or problem.model.slopes_are_cheap else nowhere
     sums, covariance = _sums_of_all_pixels(problem, state), view_covariance(problem, state.sums)
     pixels = _judged_pixels(problem, state, near, covariance)
     # 2  take the covariance of solutions that may still win from wide differences
     competitive = near[(sums.cost + _further_cost(pixels))[near] <= problem.rival[near] + DISAGREEMENT]
+    competitive = competitive if look_around else nowhere
     covariance, without_one = _uncertainty(problem, state, competitive)
     # 3  count contradicted pixels again, by that covariance: it may excuse more of them, or fewer
     if competitive.size:
@@ -209,7 +211,9 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     cost, prior = sums.cost + further, problem.prior_cost(state.theta)
     unexplained = pixels.unexplained.sum(axis=1)
     tested = cost - prior - DISAGREEMENT * unexplained
-    scale = problem.scale[: len(settings.free)]
+    p = len(settings.free)
+    unit = np.outer(problem.scale, problem.scale)[:p, :p]
+    information = covariance_of(covariance / unit) / unit  # the inverse of a covariance is information
     return Fits(
         frame=problem.frame,
         class_index=problem.class_index,
@@ -224,8 +228,7 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
         stands_out=pixels.stands_out,
         prior=prior,
         covariance=covariance,
-        # the inverse of a covariance is information
-        information=covariance_of(covariance / np.outer(scale, scale)) * np.outer(1 / scale, 1 / scale),
+        information=np.where(np.isfinite(information), information, eliminated(state.sums.information, p)),
         std_without_one=without_one,
     )
 
