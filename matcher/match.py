@@ -33,7 +33,8 @@ class Candidate:
     cost : float
         Whitened squared distance of the frame from the candidate's image.
     weight : float
-        Its share of the likelihood, among all explanations with the match itself and "none".
+        Its probability, among all explanations with the match itself and "none"; 0 within three standard deviations of
+        a better one of its class, which counts it in.
     bearing_rad, height_m, pitch_rad, roll_rad : float
         Other parameters of the view, metres and radians.
     """
@@ -73,7 +74,7 @@ class Match:
     p_value : float
         Probability of a larger χ² if the model is right.
     class_probability : mapping of str to float
-        Of each class and of "none".
+        Of each class, over all of its views, and of "none".
     alternatives : tuple of Candidate
         The best of each other class, and further modes of the likelihood, best first.
     symmetry : int
