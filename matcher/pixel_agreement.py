@@ -8,7 +8,8 @@
 
 Nothing that a frame shows is free: a return is either compared with the range of light that the model has there, or it
 costs what a residual of five standard deviations does. The only exception are pixels that an edge enters or leaves
-within the uncertainty of the view; a return there costs 1, the average cost of a compared pixel.
+within the uncertainty of the view, all of them at one view nearby; a return there costs 1, the average cost of a
+compared pixel.
 """
 
 from __future__ import annotations

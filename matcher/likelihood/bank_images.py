@@ -118,19 +118,6 @@ class BankModel:
         """Interpolate; nothing is kept."""
         return self.images(class_index, view, free)
 
-    def reach(
-        self,
-        class_index: NDArray[np.int64],
-        view: NDArray[np.float64],
-        free: Sequence[str],
-        std: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the least and greatest coverage among the 16 neighbours on the grid."""
-        m, pixels = len(view), self._sensor.rows * self._sensor.cols
-        low, high = np.empty((m, pixels)), np.empty((m, pixels))
-        _extremes(class_index, view, *self._grid(), self._upper, self._lower, low, high)
-        return low, high
-
     def wide_slopes(
         self,
         class_index: NDArray[np.int64],
@@ -158,8 +145,8 @@ class BankModel:
         """Return which pixels are smooth enough."""
         if not self._smooth_only:
             return np.ones((len(view), self._sensor.rows * self._sensor.cols), np.bool_)
-        low, high = self.reach(class_index, view, (), np.empty((len(view), 0)))
-        bend = np.empty(low.shape)
+        low, high, bend = np.empty((3, len(view), self._sensor.rows * self._sensor.cols))
+        _extremes(class_index, view, *self._grid(), self._upper, self._lower, low, high)
         _bends(class_index, view, *self._grid(), self._upper, self._lower, bend)
         inside = (high < _FAINT) | (low > 1 - _FAINT) | ((low > _FAINT) & (high < 1 - _FAINT))
         return inside & (bend < _STRAIGHT)

@@ -92,18 +92,6 @@ class ImageModel(Protocol):
     def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
         """Return images of views that differ from those of `like` in δ alone, with the slopes of `like`."""
 
-    def reach(
-        self,
-        class_index: NDArray[np.int64],
-        view: NDArray[np.float64],
-        free: Sequence[str],
-        std: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the least and the greatest coverage nearby, (m, pixels) each.
-
-        Nearby is within three `std` (m, p), or among the neighbours on a grid.
-        """
-
     def wide_slopes(
         self,
         class_index: NDArray[np.int64],

@@ -224,27 +224,6 @@ class RenderedModel:
         """Return that every pixel may be relied on."""
         return np.ones((len(view), self.sensor.rows * self.sensor.cols), np.bool_)
 
-    def reach(
-        self,
-        class_index: NDArray[np.int64],
-        view: NDArray[np.float64],
-        free: Sequence[str],
-        std: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the least and greatest coverage three standard deviations away along each parameter."""
-        low = np.full((len(view), self.sensor.rows * self.sensor.cols), np.inf)
-        high = np.zeros(low.shape)
-        for k, name in enumerate(free):
-            for side in (-3.0, 3.0):
-                moved = view.copy()
-                moved[:, VIEW.index(name)] += side * std[:, k]
-                self._clip(moved, np.arange(len(moved)))
-                for c in np.unique(class_index):
-                    of = np.flatnonzero(class_index == c)
-                    coverage = self._render(c, moved[of], of).coverage.reshape(len(of), -1)
-                    low[of], high[of] = np.minimum(low[of], coverage), np.maximum(high[of], coverage)
-        return low, high
-
     def _clip(self, view: NDArray[np.float64], which: NDArray[np.integer]) -> None:
         """Move views, in place, to distances at which a landmark may be; `which` of all they are."""
         nearest, farthest = self.limits()

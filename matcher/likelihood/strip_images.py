@@ -125,20 +125,6 @@ class StripModel:
         """Return images at turned views, and keep the slopes of the views before."""
         return replace(self.images(class_index, view, ()), slope=like.slope)
 
-    def reach(
-        self,
-        class_index: NDArray[np.int64],
-        view: NDArray[np.float64],
-        free: Sequence[str],
-        std: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the least and greatest coverage three standard deviations away along each parameter."""
-        moves = np.zeros((len(view), len(free), len(VIEW)))
-        moves[:, np.arange(len(free)), [VIEW.index(name) for name in free]] = 3 * std
-        ends = [view + side * moves[:, k] for k in range(len(free)) for side in (-1.0, 1.0)]
-        coverage = [self.images(class_index, end, ()).coverage for end in ends]
-        return np.minimum.reduce(coverage), np.maximum.reduce(coverage)
-
     def wide_slopes(
         self,
         class_index: NDArray[np.int64],

@@ -32,6 +32,19 @@ def capped_std(problem: Problem, covariance: NDArray[np.float64]) -> NDArray[np.
     return np.asarray(np.minimum(std, problem.scale[:p]))
 
 
+def capped_axes(problem: Problem, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the axes of covariances as columns, (m, p, p), one standard deviation long.
+
+    None is longer than a natural unit; where a covariance is unknown, they are the units themselves.
+    """
+    p = covariance.shape[1]
+    scaled = covariance / np.outer(problem.scale, problem.scale)[:p, :p]
+    known = np.asarray(np.isfinite(scaled).all(axis=(1, 2)))
+    values, vectors = np.linalg.eigh(np.where(known[:, None, None], scaled, np.eye(p)))
+    length = np.minimum(np.sqrt(np.maximum(values, 0.0)), 1.0)
+    return np.asarray(vectors * length[:, None, :] * problem.scale[:p, None])
+
+
 def slopes_around(
     problem: Problem, state: State, which: NDArray[np.integer], std: NDArray[np.float64]
 ) -> NDArray[np.complex128] | None:
