@@ -150,9 +150,9 @@ def _log_shares(setup: Setup, fits: Fits, kept: list[int]) -> NDArray[np.float64
     ranges = np.ones((len(kept), len(setup.free)))
     ranges[:, setup.free.index("distance_m")] = np.ptp(setup.bank.distance_m) or 1.0
     ranges[:, turn] = periods
-    information = np.nan_to_num(fits.information[kept])
+    information = np.nan_to_num(fits.information[kept], posinf=0.0, neginf=0.0)
     in_ranges = information * ranges[:, :, None] * ranges[:, None] / (2 * np.pi)
-    shares = -0.5 * np.linalg.slogdet(np.eye(len(setup.free)) + in_ranges)[1]
+    shares = -0.5 * np.log1p(np.maximum(np.linalg.eigvalsh(in_ranges), 0.0)).sum(axis=1)
     views = fits.view[kept][:, [VIEW.index(name) for name in setup.free]]
     for k in range(1, len(kept)):
         better = np.flatnonzero((classes[:k] == classes[k]) & np.isfinite(shares[:k]))
@@ -183,9 +183,7 @@ def _class_probability(names: Sequence[str], candidates: Sequence[Candidate], no
     return {**dict.fromkeys(names, 0.0), **of_class, "none": none}
 
 
-def _reason(
-    setup: Setup, fits: Fits, kept: list[int], weights: Sequence[NDArray[np.float64]], bare: float
-) -> Reason:
+def _reason(setup: Setup, fits: Fits, kept: list[int], weights: Sequence[NDArray[np.float64]], bare: float) -> Reason:
     """Return why the best fit of a frame is refused; empty where it is accepted."""
     best = kept[0]
     if not fits.capped[best] < bare:

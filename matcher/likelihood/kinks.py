@@ -17,7 +17,7 @@ from phasemark.matcher.likelihood.fits import BETTER_COST
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Sums
-from phasemark.matcher.likelihood.uncertainty import view_covariance
+from phasemark.matcher.likelihood.uncertainty import capped_axes, view_covariance
 
 CLOSE_BY_RAD = tuple(math.radians(angle) for angle in (-0.7, -0.28, -0.12, 0.12, 0.28, 0.7))
 """Offsets of δ at which a solution before a background or on phasors is compared with a parabola."""
@@ -112,12 +112,7 @@ def settle(problem: Problem, state: State) -> State:
 
 def _moves(problem: Problem, sums: Sums, which: NDArray[np.integer]) -> NDArray[np.float64]:
     """Return steps along the axes of the covariance, (k, moves, p); where there is none, natural units."""
-    p = len(problem.columns)
-    matrix = covariance_of(sums.information[which] * np.outer(problem.scale, problem.scale))
-    known = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
-    values, vectors = np.linalg.eigh(np.where(known[:, None, None], matrix, np.eye(p)))
-    axes = vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), 1.0)[:, None, :]
-    sizes = np.array(_SETTLING_SIGMA)
-    moves = np.einsum("kpa,s->kasp", axes, sizes).reshape(len(which), -1, p)
-    longest = np.abs(moves).max(axis=2, keepdims=True)
-    return np.asarray(moves * np.minimum(1.0, 2.0 / np.maximum(longest, 1e-30)) * problem.scale)
+    axes = capped_axes(problem, covariance_of(sums.information[which], problem.scale))
+    moves = np.einsum("kpa,s->kasp", axes, np.array(_SETTLING_SIGMA)).reshape(len(which), -1, len(problem.columns))
+    longest = np.abs(moves / problem.scale).max(axis=2, keepdims=True)
+    return np.asarray(moves * np.minimum(1.0, 2.0 / np.maximum(longest, 1e-30)))
