@@ -113,9 +113,13 @@ class StripModel:
         corners = np.stack([i, j, i, (j + 1) % n_a, i + 1, j, i + 1, (j + 1) % n_a], axis=1).reshape(m, 4, 2)
         upper, lower = self._kept(class_index, corners)
         place, step = np.stack([x - i, y - j], axis=1), np.array([step_d, step_a])
+        bearings, which = np.unique(view[:, _BEARING], return_inverse=True)
+        order = np.lexsort((view[:, 1], view[:, 0], class_index))  # of one heading and distance one after the other
+        windows = np.empty((len(bearings), pixels, 4))
+        _windows(bearings, self._cam2level, self._borders, self._projection, windows)
         _images(
-            upper, lower, place, step, view[:, _BEARING], self._lit[i], self._cam2level, self._borders,
-            self._projection, self._strips.cols, phasor, slope, shade,
+            upper, lower, order, place, step, windows, which, self._lit[i], self._projection, self._strips.cols,
+            phasor, slope, shade,
         )  # fmt: skip
         return ModelImages(phasor, slope[:, [VIEW.index(name) for name in free]], shade[:, 0], shade[:, 1])
 
@@ -168,23 +172,23 @@ class StripModel:
 
 
 class _Rendered:
-    """Real and imaginary part, intensity and coverage of strips at the nodes that were rendered, (n, 4, pixels)."""
+    """Real and imaginary part, intensity and coverage of strips at the nodes that were rendered, (n, pixels, 4)."""
 
     def __init__(self, nodes: tuple[int, int, int], pixels: int) -> None:
         self.pixels = pixels
         self.slot = np.full(nodes, -1, np.int64)
-        self.values = np.empty((0, 4, pixels), np.float32)
+        self.values = np.empty((0, pixels, 4), np.float32)
         self._used = 0
 
     def add(self, k: int, at_d: NDArray[np.int64], at_a: NDArray[np.int64], image: PhasorImages) -> None:
         """Keep images of a class; who reads the values of before goes on reading them."""
         end = self._used + len(at_d)
         if end > len(self.values):
-            grown = np.empty((max(end, len(self.values) * 3 // 2), 4, self.pixels), np.float32)
+            grown = np.empty((max(end, len(self.values) * 3 // 2), self.pixels, 4), np.float32)
             grown[: self._used] = self.values[: self._used]
             self.values = grown
         planes = image.phasor.real, image.phasor.imag, image.intensity, image.coverage
-        self.values[self._used : end] = np.stack(planes, axis=1).reshape(len(at_d), 4, -1)
+        self.values[self._used : end] = np.stack(planes, axis=-1).reshape(len(at_d), -1, 4)
         self.slot[k, at_d, at_a] = np.arange(self._used, end)
         self._used = end
 
@@ -278,43 +282,69 @@ def _turned_camera(bearing, cam2level, out):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _window(turn, border, projection, out):  # type: ignore[no-untyped-def]
-    """Fill first and last column and row, as image coordinates of the strips, of what a pixel sees."""
-    for k in range(4):
-        d0, d1, d2 = border[k]
-        x = turn[0, 0] * d0 + turn[0, 1] * d1 + turn[0, 2] * d2
-        if k < 2:
-            out[k] = projection[0] - (turn[1, 0] * d0 + turn[1, 1] * d1 + turn[1, 2] * d2) / x * projection[2]
-        else:
-            out[k] = projection[1] - (turn[2, 0] * d0 + turn[2, 1] * d1 + turn[2, 2] * d2) / x * projection[3]
+def _windows(bearings, cam2level, borders, projection, out):  # type: ignore[no-untyped-def]
+    """Fill first and last column and row, as image coordinates of the strips, of what pixels see at some bearings."""
+    turn = np.empty((3, 3))
+    for b in range(len(bearings)):
+        _turned_camera(bearings[b], cam2level, turn)
+        for p in range(len(borders)):
+            for k in range(4):
+                d0, d1, d2 = borders[p, k, 0], borders[p, k, 1], borders[p, k, 2]
+                x = turn[0, 0] * d0 + turn[0, 1] * d1 + turn[0, 2] * d2
+                i = 1 if k < 2 else 2
+                aside = (turn[i, 0] * d0 + turn[i, 1] * d1 + turn[i, 2] * d2) / x
+                out[b, p, k] = projection[i - 1] - aside * projection[i + 1]
 
 
 @_compiled
-def _mix(values, corners, d, a, step, n_slopes, box, first_row, cols, out):  # type: ignore[no-untyped-def]
-    """Interpolate strips between two distances and two angles, in the rows of a group that are lit.
-
-    `out` is (8, strips): real and imaginary part, intensity, coverage, the slopes of the first two by D and by δ.
-    """
+def _mix(values, corners, d, a, box, first_row, cols, out):  # type: ignore[no-untyped-def]
+    """Interpolate strips between two distances and two angles, in the lit rows of a group, into (strips, 4)."""
     near0, near1 = values[corners[0]], values[corners[1]]
     far0, far1 = values[corners[2]], values[corners[3]]
     w00, w01 = np.float32((1 - d) * (1 - a)), np.float32((1 - d) * a)
     w10, w11 = np.float32(d * (1 - a)), np.float32(d * a)
+    for r in range(max(box[0] - first_row, 0), min(box[1] - first_row, len(near0) // cols)):
+        to = (first_row + r) * cols
+        for q in range(box[2], box[3]):
+            at = r * cols + q
+            for part in range(4):
+                out[to + q, part] = (
+                    w00 * near0[at, part] + w01 * near1[at, part] + w10 * far0[at, part] + w11 * far1[at, part]
+                )
+
+
+@_compiled
+def _mix_slopes(values, corners, d, a, step, box, first_row, cols, out):  # type: ignore[no-untyped-def]
+    """Fill the slopes of both parts of the phasor by D and by δ in the same way, into (strips, 4)."""
+    near0, near1 = values[corners[0]], values[corners[1]]
+    far0, far1 = values[corners[2]], values[corners[3]]
     d0, d1 = np.float32((1 - a) / step[0]), np.float32(a / step[0])
     a0, a1 = np.float32((1 - d) / step[1]), np.float32(d / step[1])
-    rows = near0.shape[1] // cols
-    for r in range(max(box[0] - first_row, 0), min(box[1] - first_row, rows)):
-        begin, end, to = r * cols + box[2], r * cols + box[3], first_row * cols
-        for part in range(4):
-            for q in range(begin, end):
-                out[part, to + q] = (
-                    w00 * near0[part, q] + w01 * near1[part, q] + w10 * far0[part, q] + w11 * far1[part, q]
-                )
-        if n_slopes:
+    for r in range(max(box[0] - first_row, 0), min(box[1] - first_row, len(near0) // cols)):
+        to = (first_row + r) * cols
+        for q in range(box[2], box[3]):
+            at = r * cols + q
             for part in range(2):
-                for q in range(begin, end):
-                    x00, x01, x10, x11 = near0[part, q], near1[part, q], far0[part, q], far1[part, q]
-                    out[4 + part, to + q] = d0 * (x10 - x00) + d1 * (x11 - x01)
-                    out[6 + part, to + q] = a0 * (x01 - x00) + a1 * (x11 - x10)
+                x00, x01, x10, x11 = near0[at, part], near1[at, part], far0[at, part], far1[at, part]
+                out[to + q, part] = d0 * (x10 - x00) + d1 * (x11 - x01)
+                out[to + q, 2 + part] = a0 * (x01 - x00) + a1 * (x11 - x10)
+
+
+@_compiled
+def _summed(strips, window, box, cols, out):  # type: ignore[no-untyped-def]
+    """Fill the sums over what a pixel sees of the four numbers of strips."""
+    u0, u1, v0, v1 = window[0], window[1], window[2], window[3]
+    sum0, sum1, sum2, sum3 = 0.0, 0.0, 0.0, 0.0
+    first, last = max(math.floor(u0), box[2]), min(math.ceil(u1), box[3])
+    for r in range(max(math.floor(v0 + _ROUNDING), box[0]), min(math.ceil(v1 - _ROUNDING), box[1])):
+        high = min(v1, r + 1.0) - max(v0, float(r))
+        for q in range(first, last):
+            share, at = high * (min(u1, q + 1.0) - max(u0, float(q))), r * cols + q
+            sum0 += share * strips[at, 0]
+            sum1 += share * strips[at, 1]
+            sum2 += share * strips[at, 2]
+            sum3 += share * strips[at, 3]
+    out[0], out[1], out[2], out[3] = sum0, sum1, sum2, sum3
 
 
 @_compiled
@@ -324,54 +354,61 @@ def _at(strips, first, box, u):  # type: ignore[no-untyped-def]
     share = u - 0.5 - c
     light = 0j
     if box[2] <= c < box[3]:
-        light += (1.0 - share) * complex(strips[0, first + c], strips[1, first + c])
+        light += (1.0 - share) * complex(strips[first + c, 0], strips[first + c, 1])
     if box[2] <= c + 1 < box[3]:
-        light += share * complex(strips[0, first + c + 1], strips[1, first + c + 1])
+        light += share * complex(strips[first + c + 1, 0], strips[first + c + 1, 1])
     return light
 
 
 @_compiled
 def _images(  # type: ignore[no-untyped-def]
-    upper, lower, place, step, bearing, lit, cam2level, borders, projection, cols, phasor, slope, shade
+    upper, lower, order, place, step, windows, which, lit, projection, cols, phasor, slope, shade
 ):
     """Fill phasor, slopes by D, δ and bearing, and intensity with coverage of m images, each between four nodes.
 
     The bearing moves the borders of what a pixel sees: its slope is the light that comes in there less the
     light that leaves.
     """
-    m, n_slopes, pixels = slope.shape
+    n_slopes, pixels = slope.shape[1:]
     (upper_at, above), (lower_at, below) = upper, lower
-    middle = above.shape[2] // cols
-    turn, window, sums = np.empty((3, 3)), np.empty(4), np.empty(8)
-    strips = np.empty((8, above.shape[2] + below.shape[2]), np.float32)
-    for k in range(m):
-        box, (d, a) = lit[k], place[k]
-        _mix(below, lower_at[k], d, a, step, n_slopes, box, middle, cols, strips)
-        if middle:
-            _mix(above, upper_at[k], d, a, step, n_slopes, box, 0, cols, strips)
-        _turned_camera(bearing[k], cam2level, turn)
-        for p in range(pixels):
-            _window(turn, borders[p], projection, window)
-            u0, u1, v0, v1 = window
-            # columns move as (1 + tan²) per radian
-            move0 = projection[2] * (1.0 + ((projection[0] - u0) / projection[2]) ** 2)
-            move1 = projection[2] * (1.0 + ((projection[0] - u1) / projection[2]) ** 2)
-            sums[:] = 0.0
-            by_bearing = 0j
-            first, last = max(math.floor(u0), box[2]), min(math.ceil(u1), box[3])
-            for r in range(max(math.floor(v0 + _ROUNDING), box[0]), min(math.ceil(v1 - _ROUNDING), box[1])):
-                high = min(v1, r + 1.0) - max(v0, float(r))
-                for q in range(first, last):
-                    share = high * (min(u1, q + 1.0) - max(u0, float(q)))
-                    for part in range(8 if n_slopes else 4):
-                        sums[part] += share * strips[part, r * cols + q]
-                if n_slopes:
-                    by_bearing += high * (
-                        move1 * _at(strips, r * cols, box, u1) - move0 * _at(strips, r * cols, box, u0)
-                    )
-            area = (u1 - u0) * (v1 - v0)
-            light = complex(sums[0], sums[1])
-            phasor[k, p], shade[k, 0, p], shade[k, 1, p] = light / area, sums[2] / area, sums[3] / area
+    middle = above.shape[1] // cols
+    sums, slopes = np.empty(4), np.empty(4)
+    strips = np.empty((above.shape[1] + below.shape[1], 4), np.float32)
+    steep = np.empty((len(strips) if n_slopes else 0, 4), np.float32)
+    last = -1
+    for k in order:
+        box, d, a = lit[k], place[k, 0], place[k, 1]
+        same = last >= 0 and place[last, 0] == d and place[last, 1] == a
+        for i in range(4):
+            same = same and lower_at[last, i] == lower_at[k, i] and upper_at[last, i] == upper_at[k, i]
+        if not same:
+            _mix(below, lower_at[k], d, a, box, middle, cols, strips)
+            if middle:
+                _mix(above, upper_at[k], d, a, box, 0, cols, strips)
             if n_slopes:
-                slope[k, 0, p], slope[k, 1, p] = complex(sums[4], sums[5]) / area, complex(sums[6], sums[7]) / area
-                slope[k, 2, p] = (by_bearing - light * (move1 - move0) / (u1 - u0)) / area
+                _mix_slopes(below, lower_at[k], d, a, step, box, middle, cols, steep)
+                if middle:
+                    _mix_slopes(above, upper_at[k], d, a, step, box, 0, cols, steep)
+        last = k
+        for p in range(pixels):
+            window = windows[which[k], p]
+            u0, u1, v0, v1 = window[0], window[1], window[2], window[3]
+            _summed(strips, window, box, cols, sums)
+            area = 1.0 / ((u1 - u0) * (v1 - v0))
+            light = complex(sums[0], sums[1])
+            phasor[k, p], shade[k, 0, p], shade[k, 1, p] = light * area, sums[2] * area, sums[3] * area
+            if n_slopes:
+                _summed(steep, window, box, cols, slopes)
+                # columns move as (1 + tan²) per radian
+                move0 = projection[2] * (1.0 + ((projection[0] - u0) / projection[2]) ** 2)
+                move1 = projection[2] * (1.0 + ((projection[0] - u1) / projection[2]) ** 2)
+                by_bearing = 0j
+                for r in range(max(math.floor(v0 + _ROUNDING), box[0]), min(math.ceil(v1 - _ROUNDING), box[1])):
+                    high = min(v1, r + 1.0) - max(v0, float(r))
+                    come, leave = _at(strips, r * cols, box, u1), _at(strips, r * cols, box, u0)
+                    by_bearing += high * (move1 * come - move0 * leave)
+                slope[k, 0, p], slope[k, 1, p] = (
+                    complex(slopes[0], slopes[1]) * area,
+                    complex(slopes[2], slopes[3]) * area,
+                )
+                slope[k, 2, p] = (by_bearing - light * (move1 - move0) / (u1 - u0)) * area
