@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import kernel
 from phasemark.render.view import FARTHEST_M, Views
 
 
@@ -165,7 +165,7 @@ def _extremes(
     return farthest, -vertices[:, 2].min() - views.height_m
 
 
-@inlined
+@kernel
 def background_hit(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the multiple of a ray at which it meets the nearer plane, its albedo, and cos θ times the ray's length.
 
@@ -183,7 +183,7 @@ def background_hit(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-unt
     return t, albedo, facing
 
 
-@inlined
+@kernel
 def background_line(parameters, cos_b, sin_b, level):  # type: ignore[no-untyped-def]
     """Return the line where wall and floor meet, or the floor's horizon, as (tx, ty, tz): tx + ty · y + tz · z = 0.
 
@@ -200,7 +200,7 @@ def background_line(parameters, cos_b, sin_b, level):  # type: ignore[no-untyped
     return tx, ty, tz
 
 
-@inlined
+@kernel
 def nearer_plane(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return which plane a ray meets first: 1 the wall, 2 the floor, 0 neither; see :func:`background_hit`."""
     forward, plane, t = dx * cos_b + dy * sin_b, 0, 0.0
@@ -211,7 +211,7 @@ def nearer_plane(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyp
     return plane
 
 
-@inlined
+@kernel
 def hit_of_plane(parameters, plane, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the result of :func:`background_hit` for one plane, whether it is the nearer one or not."""
     forward = dx * cos_b + dy * sin_b

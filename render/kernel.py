@@ -4,6 +4,9 @@ A kernel borrows the arrays it is given and allocates none. numba is told so (`_
 every array at every call and every use of a field of a tuple: atomic operations that took two fifths of the time, and
 more where threads share a mesh. A function that makes an array must not be a kernel: numba refuses to compile it.
 The option is not documented by numba; a version without it compiles the same functions, slower.
+
+To numba a literal has a type of its own. What it is passed to is compiled for it, and again for other numbers, so a
+counter that is passed on starts from ``np.int64(0)``.
 """
 
 from __future__ import annotations
@@ -21,4 +24,4 @@ kernel = njit(**_BORROWING)
 """Compile a function that allocates nothing; floats divide as numpy's do."""
 
 inlined = njit(**_BORROWING, inline="always")
-"""Compile a small function that is copied into its callers."""
+"""Compile a function as a part of its one caller: numba optimises what is called again in every caller."""

@@ -130,6 +130,8 @@ def _room_for_borders(n: int, p: int) -> Borders:
         weights=np.empty(n),
         regions=np.empty((n, 2), np.int32),
         segment=np.empty(n, np.int32),
+        ends=np.empty((n, 2), np.int32),
+        along=np.empty((n, 2)),
         side=np.empty(n),
         along_v=np.empty(n, np.int8),
         pixel=np.empty(n, np.int64),
@@ -579,9 +581,9 @@ class Renderer:
         for task in tasks:
             poses, own = _poses(views[task], background[task], camera), _of_views(sums, task)
             behind = background[task, :2].any()
-            motion = _motion(views[task], poses, camera, parameters)
             slopes = None
             if slope is not None:
+                motion = _motion(views[task], poses, camera, parameters)
                 columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
                 columns = np.array([columns_hz.index(hz) for hz in self.sensor.frequencies_hz])
                 slopes = SlopeSums(slope[:, _pixels_of(task, sums)], columns, motion, own, turns)
@@ -589,7 +591,7 @@ class Renderer:
             while view < len(poses.lens):
                 reached, n = plan_rays(
                     view, mesh, poses, camera, self.splits, light.fastest, buffers.edges,
-                    buffers.scratch, buffers.samples, own.state, motion, buffers.borders,
+                    buffers.scratch, buffers.samples, own.state, buffers.borders,
                 )  # fmt: skip
                 if reached <= view:
                     buffers.make_room(reached)
@@ -750,8 +752,6 @@ def _poses(views: Views, background: NDArray[np.float64], camera: Camera) -> Pos
 def _motion(views: Views, poses: Poses, camera: Camera, parameters: Sequence[str]) -> Motion:
     """Return the poses of views, and of each with one parameter after the other moved."""
     p = len(parameters)
-    if not p:
-        return Motion(poses, np.empty(0), np.empty((1, 4)))
     many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_FIELDS))
     for k, name in enumerate(parameters):
         getattr(many, name)[k + 1 :: 1 + p] += STEP

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark.render.background import Background, background_hit, nearer_plane, parameters_of_views
-from phasemark.render.integral.arguments import Camera, Motion, Poses, towards_level
+from phasemark.render.integral.arguments import Camera, Poses, towards_level
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.light import landmark_hit
@@ -166,13 +166,12 @@ class SceneMesh:
         rows, cols = grid.stop_row - grid.first_row, grid.cols
         state = np.zeros((1, rows, cols), np.uint8)
         buffers = self._buffers(rows, cols)
-        still = Motion(pose, np.empty(0), np.empty((1, 4)))  # no slopes are asked for
         behind = bool(background[:2].any())
         fastest = _RADIANS_PER_SCALE / scale[0] if behind else 0.0
         while True:
             reached, n = plan_rays(
                 0, mesh, pose, grid, 1, fastest, buffers.edges, buffers.scratch, buffers.samples, state,
-                still, buffers.borders,
+                buffers.borders,
             )  # fmt: skip
             if reached == 1:
                 break

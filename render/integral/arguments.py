@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.render.kernel import inlined
+from phasemark.render.kernel import kernel
 
 
 class Distortion(NamedTuple):
@@ -188,7 +188,11 @@ class Borders(NamedTuple):
     regions : (m, 2) int32
         Numbers of the intervals on both sides, towards smaller and larger x; see :class:`Samples`.
     segment : (m,) int32
-        The edge.
+        The edge, while its view is planned.
+    ends : (m, 2) int32
+        Its vertices; the first is −1 for that of the background.
+    along : (m, 2) float64
+        u and v from its begin to its end.
     side : (m,) float64
         +1 for a limb with its surface towards larger x, −1 towards smaller x, 0 for a crease.
     along_v : (m,) int8
@@ -206,6 +210,8 @@ class Borders(NamedTuple):
     weights: NDArray[np.float64]
     regions: NDArray[np.int32]
     segment: NDArray[np.int32]
+    ends: NDArray[np.int32]
+    along: NDArray[np.float64]
     side: NDArray[np.float64]
     along_v: NDArray[np.int8]
     pixel: NDArray[np.int64]
@@ -308,7 +314,7 @@ class Sums(NamedTuple):
     state: NDArray[np.uint8]
 
 
-@inlined
+@kernel
 def towards_landmark(matrix, y, z):  # type: ignore[no-untyped-def]
     """Return the ray (1, y, z) in the landmark frame; `matrix` as in :class:`Poses`, of one view."""
     return (
@@ -318,7 +324,7 @@ def towards_landmark(matrix, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@inlined
+@kernel
 def towards_level(level, y, z):  # type: ignore[no-untyped-def]
     """Return the ray (1, y, z) in the level camera frame; `level` as in :class:`Poses`, of one view."""
     return (

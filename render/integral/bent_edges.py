@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from phasemark.render.integral.edges_in_pixels import clip
 from phasemark.render.integral.image_rays import image_of
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import kernel
 
 FULL = -1
 """Number of segments that says that there is no room for more."""
@@ -120,7 +120,7 @@ def add_bent_edge(ya, za, yb, zb, start, end, limb, camera, edges, n):  # type: 
     return n + links
 
 
-@inlined
+@kernel
 def _clip_to_lens(ya, za, yb, zb, lens):  # type: ignore[no-untyped-def]
     """Return the shares of a line, in tangents, between which it lies where the lens matters and does not fold."""
     low, high = clip(ya, za, yb, zb, lens.low_y, lens.low_z, lens.high_y, lens.high_z)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from phasemark.render.integral.edges_in_pixels import edge_at
 from phasemark.render.integral.quadrature_rules import G2W, G2X, G3W, G3X
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import kernel
 
 _THIN = 1e-4
 """An edge that crosses a strip thinner than this (pixels) runs nearly along x: :func:`_place_level` handles it."""
@@ -53,7 +53,7 @@ def place_borders(strip, box, scratch, borders):  # type: ignore[no-untyped-def]
     scratch.last_strip[0], scratch.last_strip[1] = k, slabs[last, 1]
 
 
-@inlined
+@kernel
 def _node(nodes, g):  # type: ignore[no-untyped-def]
     """Return place and weight of a Gauss point on [0, 1]."""
     if nodes == 1:
@@ -63,7 +63,7 @@ def _node(nodes, g):  # type: ignore[no-untyped-def]
     return G3X[g], G3W[g]
 
 
-@inlined
+@kernel
 def _append(x, s, weight, left, right, link, sweep_v, scale, scratch, borders):  # type: ignore[no-untyped-def]
     """Append one point; `sweep_v` says that s is v, the coordinate along which the weight is a length."""
     n = borders.placed[0]

@@ -13,40 +13,34 @@ from phasemark.render.background import background_edge, background_line
 from phasemark.render.integral.bent_edges import TANGENTS
 from phasemark.render.integral.edge_projection import project
 from phasemark.render.integral.image_rays import rates_of, ray_of
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import kernel
 
 
 @kernel
-def follow_borders(view, first, mesh, motion, background, camera, edges, borders):  # type: ignore[no-untyped-def]
-    """Fill depth and rates of the borders of one view, from `first` on.
+def follow_borders(mesh, motion, poses, camera, borders):  # type: ignore[no-untyped-def]
+    """Fill depth and rates of borders; behind a lens with distortion do it with :func:`follow_bent_borders`.
 
     Parameters
     ----------
-    view, first : int
     mesh : MeshTopology
     motion : Motion
-    background : (4,) float64
+    poses : Poses
+        Those that the borders' pixels count.
     camera : Camera
-    edges : Edges
     borders : Borders
     """
-    if camera.distortion.model != 0:
-        _follow_bent_borders(view, first, mesh, motion, background, camera, edges, borders)
-        return
     moved, step, shifted = motion.poses, motion.step, motion.segments
-    p = len(step)
-    depth_a, depth_b, last = 0.0, 0.0, -1
-    for b in range(first, min(borders.placed[0], len(borders.weights))):
-        e = borders.segment[b]
-        start, end = edges.ends[e, 0], edges.ends[e, 1]
-        if e != last:
-            last = e
+    p, pixels = len(step), (camera.stop_row - camera.first_row) * camera.cols
+    depth_a, depth_b, last_view, last_start, last_end = 0.0, 0.0, -1, -2, -2
+    for b in range(min(borders.placed[0], len(borders.weights))):
+        view, start, end = borders.pixel[b] // pixels, borders.ends[b, 0], borders.ends[b, 1]
+        if view != last_view or start != last_start or end != last_end:
+            last_view, last_start, last_end = view, start, end
             for k in range(p + 1):
                 pose = view * (p + 1) + k
                 if start < 0:
-                    bearing = moved.bearing[pose]
-                    cos_b, sin_b = math.cos(bearing), math.sin(bearing)
-                    background_edge(background, cos_b, sin_b, moved.level[pose], camera, shifted[k])
+                    bearing, behind = moved.bearing[pose], poses.background[view]
+                    background_edge(behind, math.cos(bearing), math.sin(bearing), moved.level[pose], camera, shifted[k])
                 else:
                     project(mesh.vertices, start, end, moved.matrix[pose], moved.offset[pose], camera, shifted[k])
             if start >= 0:
@@ -58,32 +52,28 @@ def follow_borders(view, first, mesh, motion, background, camera, edges, borders
             borders.rates[b, k] = (_crossing(shifted[k + 1], s, along_v) - here) / step[k]
         borders.depth[b] = 0.0
         if start >= 0 and depth_a > 0.0 and depth_b > 0.0:
-            own = shifted[0]
-            du, dv = own[2] - own[0], own[3] - own[1]
-            share = ((borders.points[b, 0] - own[0]) * du + (borders.points[b, 1] - own[1]) * dv) / (du * du + dv * dv)
-            share = min(max(share, 0.0), 1.0)
-            borders.depth[b] = 1.0 / ((1.0 - share) / depth_a + share / depth_b)
+            borders.depth[b] = _depth_on(shifted[0], borders.points[b, 0], borders.points[b, 1], depth_a, depth_b)
 
 
 @kernel
-def _follow_bent_borders(view, first, mesh, motion, background, camera, edges, borders):  # type: ignore[no-untyped-def]
-    """Follow the borders of edges behind a lens with distortion.
+def follow_bent_borders(mesh, motion, poses, camera, borders):  # type: ignore[no-untyped-def]
+    """Do the same behind a lens with distortion.
 
     With φ the distance of a fixed ray from the edge, in tangents, the edge is where φ = 0. Along the normal m of a link
     it moves by −φ̇ / (∇φ · m), and the link along x by that over m_x: weights are lengths along the link, not the curve.
     """
     moved, step, shifted = motion.poses, motion.step, motion.segments
-    p = len(step)
-    depth_a, depth_b, start, end = 0.0, 0.0, -2, -2
-    for b in range(first, min(borders.placed[0], len(borders.weights))):
-        e = borders.segment[b]
-        if edges.ends[e, 0] != start or edges.ends[e, 1] != end:
-            start, end = edges.ends[e, 0], edges.ends[e, 1]
+    p, pixels = len(step), (camera.stop_row - camera.first_row) * camera.cols
+    depth_a, depth_b, last_view, last_start, last_end = 0.0, 0.0, -1, -2, -2
+    for b in range(min(borders.placed[0], len(borders.weights))):
+        view, start, end = borders.pixel[b] // pixels, borders.ends[b, 0], borders.ends[b, 1]
+        if view != last_view or start != last_start or end != last_end:
+            last_view, last_start, last_end = view, start, end
             for k in range(p + 1):
                 pose = view * (p + 1) + k
                 if start < 0:
-                    bearing = moved.bearing[pose]
-                    tx, ty, tz = background_line(background, math.cos(bearing), math.sin(bearing), moved.level[pose])
+                    bearing, behind = moved.bearing[pose], poses.background[view]
+                    tx, ty, tz = background_line(behind, math.cos(bearing), math.sin(bearing), moved.level[pose])
                     size = math.sqrt(ty * ty + tz * tz)
                     shifted[k, 0], shifted[k, 1], shifted[k, 2] = tx / size, ty / size, tz / size
                 else:
@@ -94,8 +84,7 @@ def _follow_bent_borders(view, first, mesh, motion, background, camera, edges, b
         y_u, z_u, y_v, z_v = rates_of(camera, y, z)
         here, along_u = _distance(shifted[0], start < 0, y, z, y_u, z_u)
         _, along_v = _distance(shifted[0], start < 0, y, z, y_v, z_v)
-        link = edges.segments[e]
-        du, dv = link[2] - link[0], link[3] - link[1]
+        du, dv = borders.along[b, 0], borders.along[b, 1]
         across = dv if borders.along_v[b] == 1 else -du
         along_x = (along_u * dv - along_v * du) * across / (du * du + dv * dv)
         for k in range(p):
@@ -103,14 +92,19 @@ def _follow_bent_borders(view, first, mesh, motion, background, camera, edges, b
             borders.rates[b, k] = (here - away) / (step[k] * along_x) if along_x != 0.0 else 0.0
         borders.depth[b] = 0.0
         if start >= 0 and depth_a > 0.0 and depth_b > 0.0:
-            own = shifted[0]
-            dy, dz = own[2] - own[0], own[3] - own[1]
-            share = ((y - own[0]) * dy + (z - own[1]) * dz) / (dy * dy + dz * dz)
-            share = min(max(share, 0.0), 1.0)
-            borders.depth[b] = 1.0 / ((1.0 - share) / depth_a + share / depth_b)
+            borders.depth[b] = _depth_on(shifted[0], y, z, depth_a, depth_b)
 
 
-@inlined
+@kernel
+def _depth_on(line, x, y, depth_a, depth_b):  # type: ignore[no-untyped-def]
+    """Return the depth of an edge beside a point, from the depths of its ends."""
+    dx, dy = line[2] - line[0], line[3] - line[1]
+    share = ((x - line[0]) * dx + (y - line[1]) * dy) / (dx * dx + dy * dy)
+    share = min(max(share, 0.0), 1.0)
+    return 1.0 / ((1.0 - share) / depth_a + share / depth_b)
+
+
+@kernel
 def _distance(line, by_normal, y, z, y_s, z_s):  # type: ignore[no-untyped-def]
     """Return how far a ray lies from a line, in tangents, and how fast that changes along a way through the image.
 
@@ -126,14 +120,14 @@ def _distance(line, by_normal, y, z, y_s, z_s):  # type: ignore[no-untyped-def]
     return away, along
 
 
-@inlined
+@kernel
 def _depth(mesh, poses, pose, vertex):  # type: ignore[no-untyped-def]
     """Return how far a vertex lies along the camera's axis."""
     matrix, corner = poses.matrix[pose], mesh.vertices[vertex]
     return matrix[0, 0] * corner[0] + matrix[0, 1] * corner[1] + matrix[0, 2] * corner[2] + poses.offset[pose, 0]
 
 
-@inlined
+@kernel
 def _crossing(segment, s, along_v):  # type: ignore[no-untyped-def]
     """Return where the line of a segment meets the line at s across the sweep."""
     i = 1 if along_v else 0

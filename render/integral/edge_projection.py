@@ -13,9 +13,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from phasemark.render.integral.bent_edges import FULL, TANGENTS, add_bent_edge, start_extents
 from phasemark.render.integral.mesh_topology import CLUSTER
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import kernel
 
 _NEAR_M = 1e-6
 
@@ -46,7 +48,7 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
     vertices, planes, creases, concave, folds = mesh.vertices, mesh.planes, mesh.creases, mesh.concave, mesh.folds
     smooth_planes, clusters = mesh.smooth_planes, mesh.clusters
     lens, matrix, offset = poses.lens[view], poses.matrix[view], poses.offset[view]
-    n = 0
+    n, crease, limb = np.int64(0), np.int64(0), np.int64(1)
     start_extents(edges)
     for e in range(len(creases)):
         start, end, face, other = creases[e, 0], creases[e, 1], creases[e, 2], creases[e, 3]
@@ -55,7 +57,7 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
             before, before_other = _height(planes, face, lens) > 0.0, _height(planes, other, lens) > 0.0
             if not (before or before_other) or (concave[e] and not (before and before_other)):
                 continue
-        n = _add_edge(vertices, start, end, 0, matrix, offset, camera, edges, n)
+        n = _add_edge(vertices, start, end, crease, matrix, offset, camera, edges, n)
         if n < 0:
             return FULL
     heights = edges.heights
@@ -77,7 +79,7 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
                 if before == (_smooth_height(smooth_planes, folds[e, 2], lens) > 0.0):
                     continue
                 a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
-                n = _add_edge(vertices, a, b, 1, matrix, offset, camera, edges, n)
+                n = _add_edge(vertices, a, b, limb, matrix, offset, camera, edges, n)
                 if n < 0:
                     return FULL
     return n
@@ -97,19 +99,19 @@ def _add_edge(vertices, a, b, limb, matrix, offset, camera, edges, n):  # type: 
     return n
 
 
-@inlined
+@kernel
 def _height(planes, f, lens):  # type: ignore[no-untyped-def]
     """Return how far before the front of a face the lens is."""
     return planes[f, 0] * lens[0] + planes[f, 1] * lens[1] + planes[f, 2] * lens[2] - planes[f, 3]
 
 
-@inlined
+@kernel
 def _smooth_height(planes, i, lens):  # type: ignore[no-untyped-def]
     """Return the same for a smooth face; `planes` has a row for each number, not for each face."""
     return planes[0, i] * lens[0] + planes[1, i] * lens[1] + planes[2, i] * lens[2] - planes[3, i]
 
 
-@inlined
+@kernel
 def project(vertices, a, b, matrix, offset, camera, segment):  # type: ignore[no-untyped-def]
     """Project the edge between two vertices into `segment` (4,); return whether any of it lies before the camera.
 

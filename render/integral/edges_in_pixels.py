@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import kernel
 
 MAX_SEGMENTS = 128
 """Edges in a box above which it is quartered rather than swept: crossings are searched pair by pair."""
@@ -60,7 +60,7 @@ def bin_segments(n_segments, camera, edges):  # type: ignore[no-untyped-def]
     return n
 
 
-@inlined
+@kernel
 def clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
     """Return the shares (lo, hi) of a segment between which it lies in a box; lo ≥ hi where it does not."""
     du, dv = ub - ua, vb - va
@@ -122,7 +122,7 @@ def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore
     return m
 
 
-@inlined
+@kernel
 def edge_at(edges, i, s):  # type: ignore[no-untyped-def]
     """Return where an edge meets the line at `s`."""
     return edges[i, 1] + (s - edges[i, 0]) * edges[i, 5]

@@ -10,7 +10,7 @@ import math
 from phasemark.render.background import background_hit
 from phasemark.render.integral.arguments import towards_level
 from phasemark.render.integral.image_rays import ray_of
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import kernel
 
 _PER_PART_RAD = 1.0
 """Turn of the phase that two Gauss points a side integrate."""
@@ -48,7 +48,7 @@ def parts_of_pixel(r, c, background, fastest, cos_b, sin_b, level, camera):  # t
     return _parts(fastest * along_u), _parts(fastest * along_v)
 
 
-@inlined
+@kernel
 def _corner(u, v, background, cos_b, sin_b, level, camera):  # type: ignore[no-untyped-def]
     """Return how far the background behind an image point is, inf where there is none, and its amplitude."""
     y, z = ray_of(camera, u, v)
@@ -61,7 +61,7 @@ def _corner(u, v, background, cos_b, sin_b, level, camera):  # type: ignore[no-u
     return distance, albedo * facing / (length * distance * distance)
 
 
-@inlined
+@kernel
 def _recedes(one, other):  # type: ignore[no-untyped-def]
     """Return how much the range changes between two points, as far as the light is worth it.
 
@@ -71,7 +71,7 @@ def _recedes(one, other):  # type: ignore[no-untyped-def]
     return min(abs(other - one), near) if near < math.inf else 0.0
 
 
-@inlined
+@kernel
 def _parts(turn):  # type: ignore[no-untyped-def]
     """Return how many parts a turn of the phase takes."""
     return int(max(math.ceil(min(turn / _PER_PART_RAD, _MOST_PARTS)), 1))

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import kernel
 
 _LEAF = 4
 _DEEPEST = 128  # nodes that wait to be looked at
@@ -198,7 +198,7 @@ def _enters(bounds, node, origin, inverse, nearest):  # type: ignore[no-untyped-
     return lo if lo <= hi * (1 + 1e-12) else np.inf
 
 
-@inlined
+@kernel
 def _edge_side(vertices, i, j, origin, d):  # type: ignore[no-untyped-def]
     """Return on which side of the edge i → j a ray passes; exactly opposite for j → i."""
     a, b, sign = (i, j, 1.0) if i < j else (j, i, -1.0)

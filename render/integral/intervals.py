@@ -15,7 +15,7 @@ from phasemark.render.integral.borders import place_borders
 from phasemark.render.integral.edges_in_pixels import edge_at
 from phasemark.render.integral.limbs import nearest_limb
 from phasemark.render.integral.quadrature_rules import FELT, place_points
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import kernel
 
 EMPTY = 1e-10
 """Pieces narrower than this (pixels) are not sampled."""
@@ -79,7 +79,7 @@ def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ign
         a, b, left, right = _interval(0.5 * (start + stop), i, strip, box, scratch, box.curved, box.curved)
         near_left, near_right = a - left < FELT, right - b < FELT
         limb, width = near_left or near_right, b - a
-        a_low, b_low = _bounds(start, 0, i, strip, box, scratch)
+        a_low, b_low = _bounds(start, np.int64(0), i, strip, box, scratch)
         a_high, b_high = _bounds(stop, strip.n_slabs - 1, i, strip, box, scratch)
         extent = max(stop - start, abs(a_high - a_low), abs(b_high - b_low))
         steep = False
@@ -118,7 +118,7 @@ def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ign
     return n, region
 
 
-@inlined
+@kernel
 def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
     """Return where, from 0 to 1, a strip of some widths at its ends and in its middle is cut, t of the pieces on.
 
@@ -134,7 +134,7 @@ def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
     return t
 
 
-@inlined
+@kernel
 def _gauss_rule(lo, hi, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     """Return the Gauss rule for the width of an interval from `lo` to `hi` as weight.
 
@@ -185,7 +185,7 @@ def _gauss_rule(lo, hi, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     return 2, m0, max(s_a, lo), min(s_b, hi), above / root
 
 
-@inlined
+@kernel
 def _bounds(s, slab, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     """Return the ends of interval i on the line at s, which lies in a slab."""
     row, edges, links = slab * strip.k, scratch.edges, scratch.links
@@ -194,7 +194,7 @@ def _bounds(s, slab, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     return a, b
 
 
-@inlined
+@kernel
 def _interval(  # type: ignore[no-untyped-def]
     s, i, strip, box, scratch, seek_left, seek_right
 ):

@@ -45,7 +45,7 @@ def sum_samples(n, samples, mesh, poses, camera, light, sums):  # type: ignore[n
             _add_order(j, start, stop, samples, light, sums)
 
 
-@kernel
+@inlined
 def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # type: ignore[no-untyped-def]
     """Write the returns of some samples, and add them to intensity and coverage."""
     rays, weights, returns = samples.rays, samples.weights, samples.returns
@@ -96,14 +96,14 @@ def _add_order(j, start, stop, samples, light, sums):  # type: ignore[no-untyped
     sums.phasor[index, j] = total
 
 
-@inlined
+@kernel
 def _amplitude(distance, reflected, length, vignetting):  # type: ignore[no-untyped-def]
     """Return the amplitude of a hit; `length` is that of the ray (1, y, z), `reflected` ρ cos θ times that length."""
     a = reflected / (length * distance * distance)
     return a / (length * length * length * length) if vignetting else a
 
 
-@inlined
+@kernel
 def _add_phasor(index, distance, reflected, length, weight, light, sums):  # type: ignore[no-untyped-def]
     """Add the light of one hit to a pixel; see :func:`_amplitude`."""
     a = weight * _amplitude(distance, reflected, length, light.vignetting)
@@ -113,7 +113,7 @@ def _add_phasor(index, distance, reflected, length, weight, light, sums):  # typ
         sums.phasor[index, j] += complex(a * math.cos(phase), a * math.sin(phase))
 
 
-@inlined
+@kernel
 def phasor_of(distance, reflected, length, light):  # type: ignore[no-untyped-def]
     """Return the light of one hit at the modulation frequency; see :func:`_amplitude`."""
     a = _amplitude(distance, reflected, length, light.vignetting)
@@ -121,7 +121,7 @@ def phasor_of(distance, reflected, length, light):  # type: ignore[no-untyped-de
     return complex(a * math.cos(phase), a * math.sin(phase))
 
 
-@inlined
+@kernel
 def landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def]
     """Return the multiple of the ray (1, y, z) at its hit, and |cos θ| there times the ray's length."""
     dx, dy, dz = towards_landmark(matrix, y, z)
@@ -136,7 +136,7 @@ def landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def
     return _curved_hit(mesh, face, ox, oy, oz, dx, dy, dz)
 
 
-@inlined
+@kernel
 def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the multiple of the ray at its hit, and |cos θ| of the shading normal times the ray's length.
 

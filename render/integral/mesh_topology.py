@@ -366,14 +366,14 @@ def _average_corners(vertices, faces, normals, patch, corner_of, start, cos_limi
             weight[f, k] = math.sqrt(cx * cx + cy * cy + cz * cz) / squares
     out = np.zeros((n_faces, 3, 3))
     for f in range(n_faces):
-        nx, ny, nz = normals[f]
+        nx, ny, nz = normals[f, 0], normals[f, 1], normals[f, 2]
         for k in range(3):
             vertex = faces[f, k]
             tx, ty, tz = 0.0, 0.0, 0.0
             apex = False
             for j in range(start[vertex], start[vertex + 1]):
                 g, corner = corner_of[j] // 3, corner_of[j] % 3
-                gx, gy, gz = normals[g]
+                gx, gy, gz = normals[g, 0], normals[g, 1], normals[g, 2]
                 if nx * gx + ny * gy + nz * gz >= cos_limit:
                     share = weight[g, corner]
                     tx, ty, tz = tx + share * gx, ty + share * gy, tz + share * gz
@@ -382,6 +382,10 @@ def _average_corners(vertices, faces, normals, patch, corner_of, start, cos_limi
             if not apex:
                 length = math.sqrt(tx * tx + ty * ty + tz * tz)
                 out[f, k, 0], out[f, k, 1], out[f, k, 2] = tx / length, ty / length, tz / length
-        if not out[f].any():
-            out[f] = normals[f]
+        smooth = False
+        for k in range(3):
+            smooth = smooth or out[f, k, 0] != 0.0 or out[f, k, 1] != 0.0 or out[f, k, 2] != 0.0
+        if not smooth:
+            for k in range(3):
+                out[f, k, 0], out[f, k, 1], out[f, k, 2] = nx, ny, nz
     return out

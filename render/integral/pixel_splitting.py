@@ -21,7 +21,7 @@ from phasemark.render.integral.intervals import Box
 from phasemark.render.integral.limbs import MAX_LIMBS, collect_limbs, lists_limb
 from phasemark.render.integral.quadrature_rules import G2X, G3W, G3X
 from phasemark.render.integral.strips import MAX_EVENTS, MAX_LINKS, MAX_SLABS, find_events, sweep_box
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inlined, kernel
 
 _MAX_DEPTH = 5
 
@@ -99,7 +99,7 @@ class Scratch(NamedTuple):
         )
 
 
-@kernel
+@inlined
 def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples, borders, n, region):  # type: ignore[no-untyped-def]
     """Place the samples of one pixel.
 
@@ -212,7 +212,7 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
             depth += 4
             continue
         if n_events < 0:
-            m, trusted = 0, False
+            m, trusted = np.int64(0), False
             n_events = find_events(box, m, scratch)
         n, region = sweep_box(box, n_events, m, scratch, samples, borders, n, region)
         if n < 0:

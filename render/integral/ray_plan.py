@@ -8,7 +8,6 @@ import numpy as np
 
 from phasemark.render.background import background_edge, background_line
 from phasemark.render.integral.bent_edges import add_bent_edge
-from phasemark.render.integral.edge_motion import follow_borders
 from phasemark.render.integral.edge_projection import project_edges
 from phasemark.render.integral.edges_in_pixels import bin_segments
 from phasemark.render.integral.floor_phase import parts_of_pixel
@@ -36,7 +35,7 @@ SHORT_SEGMENTS = -2
 
 @kernel
 def plan_rays(  # type: ignore[no-untyped-def]
-    first, mesh, poses, camera, splits, fastest, edges, scratch, samples, state, motion, borders
+    first, mesh, poses, camera, splits, fastest, edges, scratch, samples, state, borders
 ):
     """Place the samples of as many views as fit into the buffers, from view `first` on.
 
@@ -56,9 +55,8 @@ def plan_rays(  # type: ignore[no-untyped-def]
         ``points``, ``rays``, ``weights``, ``regions`` and ``pixel`` are overwritten.
     state : (n, rows, cols) uint8, overwritten
         Per pixel :data:`SKIPPED`, :data:`SPLIT` or :data:`UNTRUSTED`.
-    motion : Motion
     borders : Borders
-        Overwritten; without room for any, nothing is asked of the edges' motion.
+        Overwritten but for ``depth`` and ``rates``; without room for any, nothing is asked of the edges' motion.
 
     Returns
     -------
@@ -68,7 +66,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
     """
     head, reach, bent_lens = edges.head, camera.distortion.reach, camera.distortion.model != 0
     rows, cols = camera.stop_row - camera.first_row, camera.cols
-    n, region, n_borders, room = 0, 0, 0, len(borders.weights)
+    n, region, n_borders, room = np.int64(0), np.int64(0), np.int64(0), len(borders.weights)
     borders.placed[0] = 0
     for view in range(first, len(poses.lens)):
         n_edges = project_edges(mesh, poses, view, camera, edges)
@@ -129,9 +127,11 @@ def plan_rays(  # type: ignore[no-untyped-def]
                 trace(before, n, samples, camera)
                 for b in range(n_borders, borders.placed[0]):
                     borders.pixel[b] = index
+                    e = borders.segment[b]
+                    borders.ends[b, 0], borders.ends[b, 1] = edges.ends[e, 0], edges.ends[e, 1]
+                    borders.along[b, 0] = edges.segments[e, 2] - edges.segments[e, 0]
+                    borders.along[b, 1] = edges.segments[e, 3] - edges.segments[e, 1]
                 n_borders = borders.placed[0]
-        if room > 0:
-            follow_borders(view, first_border, mesh, motion, background, camera, edges, borders)
     return len(poses.lens), n
 
 
@@ -155,7 +155,8 @@ def _add_background(background, cos_b, sin_b, level, camera, edges, n):  # type:
         ya, yb = -(tx + tz * za) / ty, -(tx + tz * zb) / ty
     else:
         return n
-    return add_bent_edge(ya, za, yb, zb, -1, -1, 0, camera, edges, n)
+    nowhere = np.int32(-1)
+    return add_bent_edge(ya, za, yb, zb, nowhere, nowhere, np.int64(0), camera, edges, n)
 
 
 @kernel

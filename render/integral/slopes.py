@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.render.integral.arguments import Borders, Camera, Light, Motion, Poses, Samples, Sums
+from phasemark.render.integral.edge_motion import follow_bent_borders, follow_borders
 from phasemark.render.integral.light import add_background, sum_samples
 from phasemark.render.integral.mesh_topology import MeshTopology
 from phasemark.render.integral.ray_plan import SKIPPED, UNTRUSTED
@@ -44,7 +45,7 @@ class SlopeSums:
         own: Sums,
         turns: NDArray[np.bool_],
     ) -> None:
-        self._slope, self._columns, self._own, self._turns = slope, columns, own, turns
+        self._slope, self._columns, self._motion, self._own, self._turns = slope, columns, motion, own, turns
         p = len(motion.step)
         self._poses = [
             Poses(*(np.ascontiguousarray(part[k :: 1 + p]) for part in motion.poses)) for k in range(1, 1 + p)
@@ -71,6 +72,8 @@ class SlopeSums:
         light: Light,
     ) -> None:
         """Add n samples and the points on edges of some of the views, (first, one past the last)."""
+        follow = follow_bent_borders if camera.distortion.model else follow_borders
+        follow(mesh, self._motion, poses, camera, borders)
         frequencies = light._replace(orders=light.orders[self._columns])
         per_view = self._own.state[0].size
         pixels = slice(views[0] * per_view, views[1] * per_view)

@@ -6,6 +6,8 @@ line across it meets them in the same order.
 
 from __future__ import annotations
 
+import numpy as np
+
 from phasemark.render.integral.edges_in_pixels import MAX_SEGMENTS, edge_at
 from phasemark.render.integral.intervals import EMPTY, Strip, sample_strip
 from phasemark.render.kernel import inlined, kernel
@@ -64,7 +66,7 @@ def find_events(box, m, scratch):  # type: ignore[no-untyped-def]
     return n
 
 
-@inlined
+@kernel
 def _activate(lo, hi, m, started, n_active, scratch):  # type: ignore[no-untyped-def]
     """Update the list of edges that span the slab [lo, hi], ordered along its middle line.
 
@@ -94,7 +96,7 @@ def _activate(lo, hi, m, started, n_active, scratch):  # type: ignore[no-untyped
     return started, n_active
 
 
-@inlined
+@kernel
 def _continues(m, last, n, stop, lo, scratch):  # type: ignore[no-untyped-def]
     """Return True if the edges of two neighbouring slabs are the same, or links of the same smooth curves.
 
@@ -130,7 +132,7 @@ def _continues(m, last, n, stop, lo, scratch):  # type: ignore[no-untyped-def]
     return True
 
 
-@kernel
+@inlined
 def sweep_box(box, n_events, m, scratch, samples, borders, n, region):  # type: ignore[no-untyped-def]
     """Sample a box strip by strip.
 
@@ -138,7 +140,7 @@ def sweep_box(box, n_events, m, scratch, samples, borders, n, region):  # type: 
     which the same chains run side by side make one strip, in which the chains are smooth curves.
     """
     events, active, slabs, links = scratch.events, scratch.active, scratch.slabs, scratch.links
-    started, n_active, n_slabs, k = 0, 0, 0, 0
+    started, n_active, n_slabs, k = np.int64(0), np.int64(0), 0, np.int64(0)
     scratch.n_edges[0], scratch.last_strip[0] = m, -1.0
     for e in range(n_events - 1):
         lo, hi = max(events[e], box.s0), min(events[e + 1], box.s1)
@@ -150,7 +152,7 @@ def sweep_box(box, n_events, m, scratch, samples, borders, n, region):  # type: 
             full = n_slabs == len(slabs) or (n_slabs + 1) * k > len(links)
             joined = not full and n_active == k and lo - stop <= EMPTY
             if not (joined and _continues(m, (n_slabs - 1) * k, k, stop, lo, scratch)):
-                n, region = sample_strip(Strip(n_slabs, k), box, scratch, samples, borders, n, region)
+                n, region = sample_strip(Strip(n_slabs, int(k)), box, scratch, samples, borders, n, region)
                 if n < 0:
                     return -1, region
                 n_slabs = 0
@@ -160,5 +162,5 @@ def sweep_box(box, n_events, m, scratch, samples, borders, n, region):  # type: 
             links[n_slabs * k + i] = active[i]
         n_slabs += 1
     if n_slabs > 0:
-        n, region = sample_strip(Strip(n_slabs, k), box, scratch, samples, borders, n, region)
+        n, region = sample_strip(Strip(n_slabs, int(k)), box, scratch, samples, borders, n, region)
     return n, region

@@ -9,7 +9,7 @@ from phasemark.render.integral.arguments import towards_landmark, towards_level
 from phasemark.render.integral.face_search import find_face
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.light import landmark_hit, phasor_of
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import kernel
 
 _SAME_DEPTH = 1e-4
 """Relative difference of two depths up to which they are one."""
@@ -59,7 +59,7 @@ def sum_borders(n, samples, first_of, mesh, poses, camera, light, borders, slope
             slope[index, k] += borders.weights[b] * borders.rates[b, k] * jump
 
 
-@inlined
+@kernel
 def _light_beside(b, which, y, z, view, samples, first_of, mesh, poses, camera, light, borders):  # type: ignore[no-untyped-def]
     """Return depth and light of what is seen on one side of an edge; depth is infinite where there is nothing."""
     points, region = samples.points, borders.regions[b, which]

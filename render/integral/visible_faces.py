@@ -7,6 +7,8 @@ has an apex, the face is looked for; elsewhere, and where it is not found, the r
 
 from __future__ import annotations
 
+import numpy as np
+
 from phasemark.render.integral.arguments import towards_landmark
 from phasemark.render.integral.face_search import find_face, look_about, plane_hit, turns_smoothly
 from phasemark.render.integral.ray_plan import SPLIT
@@ -32,7 +34,7 @@ def pick_scouts(n, samples):  # type: ignore[no-untyped-def]
     return count
 
 
-@inlined
+@kernel
 def _scout(start, stop, weights):  # type: ignore[no-untyped-def]
     """Return the sample with the largest weight, the middle one if it is among those.
 
@@ -57,7 +59,7 @@ def share_faces(n, mesh, share, scout_face, samples, poses, camera, state):  # t
     Returns how many indices were written to ``samples.chosen``.
     """
     regions, pixel, face, chosen = samples.regions, samples.pixel, samples.face, samples.chosen
-    count, start, region = 0, 0, 0
+    count, start, region = np.int64(0), 0, 0
     states = state.reshape(-1)
     for k in range(1, n + 1):
         if k < n and regions[k] == regions[start]:
@@ -69,7 +71,7 @@ def share_faces(n, mesh, share, scout_face, samples, poses, camera, state):  # t
             for i in range(start, k):
                 face[i] = found
         elif known and mesh.searched[found]:
-            count = _search(start, k, scout, count, mesh, samples, poses, camera)
+            count = _search(np.int64(start), k, scout, count, mesh, samples, poses, camera)
         else:
             for i in range(start, k):
                 if i != scout:
@@ -80,7 +82,7 @@ def share_faces(n, mesh, share, scout_face, samples, poses, camera, state):  # t
     return count
 
 
-@kernel
+@inlined
 def _search(start, stop, scout, count, mesh, samples, poses, camera):  # type: ignore[no-untyped-def]
     """Find the faces of the samples of a curved patch, beginning with the scout's; list what is not found.
 
