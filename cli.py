@@ -32,6 +32,7 @@ from phasemark.matcher.commands import (
     strangers,
     sweep,
     verify,
+    warm,
 )
 
 if TYPE_CHECKING:
@@ -121,6 +122,7 @@ _add(
         "accuracy": accuracy.accuracy_line,
         "demo": demo.demo_report,
         "drive": drive.drive_robot,
+        "warm": warm.warm_kernels,
     },
 )
 _add_group(

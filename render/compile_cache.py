@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from phasemark import UsageError
+from phasemark.render.compile_notes import announce_compilation
 from phasemark.render.compiled_sources import COMPILED_SOURCES, ROOT, compiled_sources_hash
 
 _THREADS = "NUMBA_NUM_THREADS"
@@ -128,3 +129,4 @@ def _make_private(folder: Path) -> bool:
 
 prepare_compile_cache()
 stamp_with_all_sources()
+announce_compilation()

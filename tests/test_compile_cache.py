@@ -6,7 +6,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
+import pytest
+
+from phasemark import UsageError
+from phasemark.cli import main
+from phasemark.matcher.warm import warm
+from phasemark.render import compile_notes
 from phasemark.render.compiled_sources import COMPILED_SOURCES, ROOT, compiled_sources_hash
 
 _COMPILERS = ("njit", "kernel", "inlined", "_compiled", "_vectorised")
@@ -113,3 +120,41 @@ def test_a_changed_function_of_another_module_is_compiled_again(tmp_path):
 def test_sources_that_cannot_be_read_count_as_empty(tmp_path):
     (tmp_path / "one.py").write_text("")
     assert compiled_sources_hash(tmp_path, ("one.py",)) == compiled_sources_hash(tmp_path / "none", ("one.py",))
+
+
+def compiling(module):
+    """Return what numba tells when it begins to compile, or ends."""
+    dispatcher = SimpleNamespace(py_func=SimpleNamespace(__module__=module))
+    return SimpleNamespace(data={"dispatcher": dispatcher})
+
+
+def test_a_second_of_compiling_is_told_once_for_rendering_and_once_for_matching(monkeypatch, capsys):
+    monkeypatch.setattr(compile_notes, "_AFTER_S", 0.2)
+    listener = compile_notes._Listener()
+
+    def compile_for(module, seconds):
+        listener.on_start(compiling(module))
+        listener.on_start(compiling(module))  # a function that the first calls
+        listener.on_end(compiling(module))
+        time.sleep(seconds)
+        listener.on_end(compiling(module))
+        return capsys.readouterr().err
+
+    assert compile_for("phasemark.render.renderer", 0.02) == ""
+    assert compile_for("a_users.own_module", 0.3) == ""
+    assert compile_for("phasemark.render.renderer", 0.3) == "compiling for rendering, once, about 25 s\n"
+    assert compile_for("phasemark.render.direct.targets", 0.3) == ""
+    # short pieces add up
+    assert "".join(compile_for("phasemark.matcher.nearest.cells", 0.06) for _ in range(6)).startswith(
+        "compiling for matching, once"
+    )
+
+
+def test_warm_prepares_what_is_asked_for_and_refuses_other_work(capsys):
+    assert main(["warm", "--for", "match", "--for", "histograms"]) == 0
+    rows = capsys.readouterr().out.splitlines()
+    assert [row.split()[0] for row in rows[1:]] == ["match", "histograms"]
+    assert main(["warm", "--for", "flying"]) == 2
+    assert "'flying' is not one of 'render', 'match', 'histograms'" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="render, match, histograms"):
+        warm("flying")

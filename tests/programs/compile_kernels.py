@@ -9,9 +9,9 @@ import numpy as np
 from builders import pure_image
 from oracles.exact_pixels import exact_pixels
 
-from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Matcher, kalman_filter, phasor_mean
+from phasemark.matcher import kalman_filter, phasor_mean
+from phasemark.matcher.warm import warm
 from phasemark.render import Background, Renderer, Sensor, Views, capture, preset
 
 PMD = preset("pmd-16x16")
@@ -37,16 +37,6 @@ def the_rest() -> None:
     exact_pixels("cylinder", PMD, Views.broadcast(1.0, 0.3), np.array([[8, 8]]), background=BEHIND)
 
 
-def matching() -> None:
-    """Matching of ranges and phasors, with and without a background."""
-    bank = build_bank(BankPlan(classes=("cylinder", "cone"), distance_m="0.9:1.1:0.02", delta_deg="0:180:4"))
-    for behind in (None, BEHIND):
-        image = Renderer(MESH, PMD).render(1.0, 0.3, background=behind)
-        filtered = kalman_filter(capture(image, PMD, rng=np.random.default_rng(0), n_frames=50))
-        for on in ("ranges", "phasors"):
-            Matcher(bank, method="refine", on=on, background=behind).match(filtered)
-
-
 if __name__ == "__main__":
     for part in sys.argv[1:]:
-        {"rendering": rendering, "matching": matching, "rest": the_rest}[part]()
+        {"rendering": rendering, "matching": lambda: warm("match"), "rest": the_rest}[part]()

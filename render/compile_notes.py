@@ -1,0 +1,60 @@
+"""Word on standard error that numba compiles, which the first use of the program waits for.
+
+What is compiled is kept (:mod:`~phasemark.render.compile_cache`), so that this happens once.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+
+from numba.core import event
+
+_AFTER_S = 1.0
+_ABOUT_S = {"rendering": 25, "matching": 20}
+"""Processor time that compiling takes altogether, on two cores of a server of 2020."""
+_OTHER = "the work of others"
+
+
+class _Listener(event.Listener):
+    """Tells once for each part of the program that it is compiled, after a second of that."""
+
+    def __init__(self) -> None:
+        self._spent_s = dict.fromkeys((*_ABOUT_S, _OTHER), 0.0)
+        self._depth, self._begun, self._part = 0, 0.0, ""
+        self._timer: threading.Timer | None = None
+
+    def on_start(self, event: event.Event) -> None:
+        """Count the time of a function that others do not wait for."""
+        self._depth += 1
+        if self._depth > 1:
+            return
+        package, _, place = event.data["dispatcher"].py_func.__module__.partition(".")
+        self._part, self._begun = "matching" if place.startswith("matcher.") else "rendering", time.monotonic()
+        if package != "phasemark":
+            self._part = _OTHER
+        elif (rest := _AFTER_S - self._spent_s[self._part]) > 0.0:
+            self._timer = threading.Timer(rest, _tell, (self._part,))
+            self._timer.daemon = True
+            self._timer.start()
+
+    def on_end(self, event: event.Event) -> None:
+        """Stop counting."""
+        self._depth -= 1
+        if self._depth == 0:
+            self._spent_s[self._part] += time.monotonic() - self._begun
+            if self._timer is not None:
+                self._timer.cancel()
+                self._timer = None
+
+
+def _tell(part: str) -> None:
+    if sys.stderr is not None:
+        sys.stderr.write(f"compiling for {part}, once, about {_ABOUT_S[part]} s\n")
+        sys.stderr.flush()
+
+
+def announce_compilation() -> None:
+    """Write a line on standard error when a second has been spent on compiling."""
+    event.register("numba:compile", _Listener())  # type: ignore[no-untyped-call]
