@@ -44,6 +44,8 @@ def model_image(
             match.delta_rad,
             match.bearing_rad,
             match.height_m,
+            match.pitch_rad,
+            match.roll_rad,
             background=match.background or background,
         )
         counted = counts(rendered.phasor[0], rendered.intensity[0], bank.sensor)

@@ -244,6 +244,18 @@ def test_the_model_beside_a_match_is_the_bank_image_composed_with_the_background
     assert len(match_figure(noise_free(images, 50), match, bank, WALL, k).axes) == 6  # three panels, three colour bars
 
 
+def test_the_model_beside_a_match_of_a_tilted_camera_is_tilted(bank):
+    free = ("distance_m", "delta_rad", "pitch_rad", "roll_rad")
+    image = Renderer(bank.mesh("cone"), bank.sensor, albedo=bank.mesh("cone").metadata["albedo"]).render(
+        1.0, 0.7, 0.0, 0.0, math.radians(3), math.radians(-2)
+    )
+    frames = noise_free(image, 50)
+    (match,) = Matcher(bank, "refine", free=free).match(frames)
+    residual = (frames.range_m[0] - model_range_m(bank, match, None)) / frames.std_m[0]
+    assert np.nanmax(np.abs(residual)) < 1  # 5 and more without pitch and roll
+    assert np.isfinite(residual).sum() > 60
+
+
 def test_the_model_beside_a_match_is_found_in_a_bank_of_more_than_one_period(tmp_path):
     plan = BankPlan(classes=("cone",), distance_m="0.9:1.1:0.1", delta_deg="0:360:30")  # repeats after 180°
     with build_bank(plan, tmp_path / "bank.h5") as opened:
