@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.figure import Figure
 from PIL import Image
 from PIL.PngImagePlugin import PngImageFile
 
@@ -323,6 +324,16 @@ def test_an_existing_folder_needs_force_and_is_replaced_whole(frames, tmp_path):
 def test_an_unknown_format_is_named(frames, tmp_path):
     with pytest.raises(UsageError, match="to=… must be one of npz, csv, jsonl, png16, ply, bop, rosbag, got 'gif'"):
         exported(frames, tmp_path, "gif")
+
+
+def test_the_figure_of_a_frame_of_a_set_names_its_class_and_view(frames, tmp_path, monkeypatch):
+    titles = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *where, **how: titles.append(figure.get_suptitle()))
+    for index in (0, 5):
+        main(["frames", "show", str(frames.path), "--index", str(index), "-o", str(tmp_path / f"{index}.png")])
+        sample = frames[index]
+        assert titles[-1].startswith(f"frame {index}: {sample['class_name']}, D = {sample['distance_m']:.3f} m, δ = ")
+    assert titles[0] != titles[1].replace("frame 5", "frame 0")
 
 
 def test_the_commands_export_import_and_show(frames, tmp_path, capsys):

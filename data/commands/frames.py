@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -282,6 +283,7 @@ def frames_show(
                 figure = opened.histograms([index]).plot()
             else:
                 figure = opened.frames([index]).plot(coverage=opened[index]["coverage"])
+            figure.suptitle(_title(index, opened[index]))
     elif is_histogram_log(frames):
         log = read_histograms(frames, sensor=read_sensor(sensor)).frames
         _refuse_index(index, len(log))
@@ -293,6 +295,16 @@ def frames_show(
     buffer = bytes_io.BytesIO()
     figure.savefig(buffer, format="png", dpi=120)
     typer.echo(write_atomically(out, buffer.getvalue(), force=force))
+
+
+def _title(index: int, sample: Mapping[str, Any]) -> str:
+    """Return what a frame of a set shows: its class and its view."""
+    from phasemark.render import Views
+    from phasemark.render.figures import view_in_words
+    from phasemark.render.view import VIEW_FIELDS
+
+    views = Views.broadcast(*(sample[name] for name in VIEW_FIELDS))
+    return f"frame {index}: {sample['class_name']}, {view_in_words(views, 0)}"
 
 
 def _refuse_index(index: int, n: int) -> None:
