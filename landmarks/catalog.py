@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from phasemark import UsageError
 from phasemark.landmarks.spec import Box, Cone, Cylinder, LandmarkSpec, Sphere
 
 _BOX = Box(length_m=0.24, width_m=0.16, height_m=0.15)
 _HEIGHT_M = 0.15
+
+
+class _Catalog(dict[str, LandmarkSpec]):
+    """Landmarks by name; what asks for another is told which there are."""
+
+    def __missing__(self, name: object) -> LandmarkSpec:
+        raise UsageError(f"no landmark '{name}': {', '.join(self)}")
 
 
 def catalog() -> dict[str, LandmarkSpec]:
@@ -15,6 +23,11 @@ def catalog() -> dict[str, LandmarkSpec]:
     -------
     dict of str to LandmarkSpec
         A new dictionary, in the order above.
+
+    Raises
+    ------
+    UsageError
+        The dictionary is asked for a name that it does not have.
 
     Examples
     --------
@@ -27,4 +40,4 @@ def catalog() -> dict[str, LandmarkSpec]:
         "sphere": Sphere(radius_m=_HEIGHT_M / 2),
         "post": Cylinder(radius_m=0.035, height_m=_HEIGHT_M),
     }
-    return {name: LandmarkSpec(name=name, box=_BOX, upper=upper) for name, upper in uppers.items()}
+    return _Catalog({name: LandmarkSpec(name=name, box=_BOX, upper=upper) for name, upper in uppers.items()})

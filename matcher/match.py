@@ -126,6 +126,23 @@ class Match:
     pitch_rad: float = 0.0
     roll_rad: float = 0.0
 
+    def __repr__(self) -> str:
+        """Describe in one line what was found, with one standard deviation of what was free."""
+        verdict = "accepted" if self.accepted else f"refused: {self.reason}"
+        if self.class_name is None:
+            return f"Match({verdict})"
+        std = dict.fromkeys(self.free, math.nan)
+        if self.covariance is not None:
+            std = dict(zip(self.free, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+        words = []
+        for name in self.free or ("distance_m", "delta_rad"):
+            value, own = getattr(self, name), std.get(name, math.nan)
+            label, unit = name.rsplit("_", 1)
+            if unit == "rad":
+                value, own, unit = math.degrees(value), math.degrees(own), "°"
+            words.append(f"{label} {value:.5g}{'' if math.isnan(own) else f' ± {own:.2g}'} {unit}".replace(" °", "°"))
+        return f"Match({self.class_name}, {verdict}: {', '.join(words)}, p = {self.p_value:.2g})"
+
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers and text, angles in degrees too; NaN as None, so that it is valid JSON."""
 
@@ -238,6 +255,10 @@ class Matches(Sequence[Match]):
         if isinstance(index, slice):
             return Matches(self._matches[index])
         return self._matches[index]
+
+    def __repr__(self) -> str:
+        """Describe in one line how many answers there are, and how many were accepted."""
+        return f"Matches({len(self)} answers, {int(self.accepted.sum())} accepted)"
 
     def __len__(self) -> int:
         return len(self._matches)

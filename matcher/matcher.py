@@ -36,7 +36,7 @@ from phasemark.matcher.likelihood.systematic import SYSTEMATICS, check_systemati
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.matcher.one_frequency import OneFrequency
-from phasemark.render import Background
+from phasemark.render import Background, Frames
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
 
@@ -179,6 +179,11 @@ class Matcher:
         for name, value in stated.items():
             if not value > 0:
                 raise UsageError(f"'{name}' must be positive, got {value!r}")
+            widest = math.pi if name == "tolerance_rad" else math.pi / 4
+            if name.endswith("_rad") and widest < value < math.inf:
+                raise UsageError(
+                    f"'{name}' is an angle in radians, at most {widest:.3g}, got {value!r}: use math.radians of degrees"
+                )
         if not 0 < false_alarm < 1:
             raise UsageError(f"'false_alarm' must be in (0, 1), got {false_alarm!r}")
         self.bank = bank
@@ -276,6 +281,8 @@ class Matcher:
         on = self.options["on"]
         if self._direct is not None:
             return Matches(self._direct.match(direct_frames(self.bank, on, frames)))
+        if isinstance(frames, Frames):
+            raise UsageError("frames must be filtered first: kalman_filter(frames)")
         if not isinstance(frames, FilteredFrames):
             raise UsageError(
                 f'on="{on}" takes filtered frames: match histograms on="histograms", or their targets on="targets"'

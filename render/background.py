@@ -117,10 +117,14 @@ def parameters_of_views(background: Backgrounds, n: int) -> NDArray[np.float64]:
     Raises
     ------
     UsageError
-        There are more or fewer backgrounds than views.
+        There are more or fewer backgrounds than views, or one is something else.
     """
     if background is None or isinstance(background, Background):
         return np.tile((background or Background()).parameters(), (n, 1))
+    if not isinstance(background, Sequence) or any(not isinstance(own, Background | None) for own in background):
+        raise UsageError(
+            f"'background' must be a Background, as Background(wall_m=4.0), or one for each view, got {background!r}"
+        )
     if len(background) != n:
         raise UsageError(f"'background' must be one for all {n} views or one for each, got {len(background)}")
     return np.array([(own or Background()).parameters() for own in background]).reshape(n, 4)

@@ -78,6 +78,10 @@ class Frames:
     figure: ClassVar[Callable[..., Figure]]
     """Function that draws it; the package sets it, because drawing imports matplotlib, which takes half a second."""
 
+    def __repr__(self) -> str:
+        """Describe in one line how many frames there are, and the camera."""
+        return f"Frames({len(self)} positions × {self.n_frames} frames, {self.sensor!r})"
+
     def __init__(
         self,
         range_m: ArrayLike,

@@ -130,6 +130,10 @@ class PhasorImages:
     harmonics: Mapping[int, NDArray[np.complex128]] = field(default_factory=dict)
     by_hz: Mapping[float, NDArray[np.complex128]] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Describe in one line how many images there are, and the camera."""
+        return f"PhasorImages({len(self)} views, {self.sensor!r})"
+
     def __len__(self) -> int:
         return len(self.phasor)
 

@@ -193,6 +193,10 @@ class Renderer:
         intersector: str = "auto",
         splits: int = 1,
     ) -> None:
+        if not (mesh is None or hasattr(mesh, "vertices")):
+            raise UsageError(
+                f"'mesh' must be a mesh, got {type(mesh).__name__}: build_mesh makes one of a LandmarkSpec"
+            )
         if not 0 < albedo <= 1:
             raise UsageError(f"'albedo' must be in (0, 1], got {albedo!r}")
         if splits != int(splits) or not 1 <= splits <= _MAX_SPLITS:

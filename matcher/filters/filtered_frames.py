@@ -101,6 +101,10 @@ class FilteredFrames:
             if array is not None and array.shape != shape:
                 raise UsageError(f"'{name}' must have shape (n, rows, cols) = {shape}, got {array.shape}")
 
+    def __repr__(self) -> str:
+        """Describe in one line how many frames there are, and the camera."""
+        return f"FilteredFrames({len(self)} positions, {self.sensor!r})"
+
     def __len__(self) -> int:
         return len(self.range_m)
 

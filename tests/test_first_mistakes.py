@@ -1,0 +1,83 @@
+"""What a first script gets wrong is answered in words, and what it prints is one line."""
+
+import math
+
+import numpy as np
+import pytest
+
+from phasemark import UsageError
+from phasemark.data import BankPlan, build_bank
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.matcher import Matcher, kalman_filter
+from phasemark.render import Renderer, capture, preset
+
+SENSOR = preset("pmd-16x16")
+
+
+@pytest.fixture(scope="module")
+def bank(tmp_path_factory):
+    plan = BankPlan(classes=("cone",), distance_m="0.9:1.1:0.02", delta_deg="0:180:2")
+    with build_bank(plan, tmp_path_factory.mktemp("bank") / "bank.h5") as built:
+        yield built
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return Renderer(build_mesh(catalog()["cone"]), SENSOR)
+
+
+@pytest.fixture(scope="module")
+def frames(renderer):
+    return capture(renderer.render(1.0, 0.5), SENSOR, rng=np.random.default_rng(0), n_frames=50)
+
+
+def test_a_landmark_that_is_not_in_the_catalogue_is_answered_with_those_that_are():
+    with pytest.raises(UsageError, match="no landmark 'cyl': cylinder, cone, sphere, post"):
+        catalog()["cyl"]
+    assert catalog().get("cyl") is None and "cyl" not in catalog()
+
+
+def test_a_specification_is_no_mesh():
+    with pytest.raises(UsageError, match="'mesh' must be a mesh, got LandmarkSpec: build_mesh makes one"):
+        Renderer(catalog()["cone"], SENSOR)
+
+
+@pytest.mark.parametrize("background", [4.0, [4.0], {"wall_m": 4.0}])
+def test_a_background_is_a_background(renderer, background):
+    with pytest.raises(UsageError, match=r"'background' must be a Background, as Background\(wall_m=4.0\)"):
+        renderer.render(1.0, background=background)
+
+
+def test_frames_are_filtered_before_they_are_matched(bank, frames):
+    with pytest.raises(UsageError, match=r"kalman_filter\(frames\)"):
+        Matcher(bank, "refine").match(frames)
+
+
+@pytest.mark.parametrize(
+    "options", [{"bearing_std_rad": 1.5}, {"pitch_std_rad": 3.0}, {"roll_std_rad": 3}, {"tolerance_rad": 6}]
+)
+def test_degrees_where_radians_are_meant_are_refused(bank, options):
+    (name,) = options
+    with pytest.raises(UsageError, match=rf"'{name}' is an angle in radians, .* use math.radians of degrees"):
+        Matcher(bank, "refine", **options)
+    Matcher(bank, "refine", **{name: math.radians(options[name])})
+
+
+def test_what_is_printed_is_one_line_of_what_it_is(bank, renderer, frames):
+    filtered = kalman_filter(frames)
+    matches = Matcher(bank, "refine").match(filtered)
+    assert repr(frames) == f"Frames(1 positions × 50 frames, {SENSOR!r})"
+    assert repr(filtered) == f"FilteredFrames(1 positions, {SENSOR!r})"
+    assert repr(renderer.render([1.0, 1.1])) == f"PhasorImages(2 views, {SENSOR!r})"
+    assert repr(matches) == "Matches(1 answers, 1 accepted)"
+    match = matches[0]
+    std = np.sqrt(np.diag(match.covariance))
+    assert repr(match) == (
+        f"Match(cone, accepted: distance {match.distance_m:.5g} ± {std[0]:.2g} m,"
+        f" delta {math.degrees(match.delta_rad):.5g} ± {math.degrees(std[1]):.2g}°,"
+        f" bearing {math.degrees(match.bearing_rad):.5g} ± {math.degrees(std[2]):.2g}°, p = {match.p_value:.2g})"
+    )
+    empty = Matcher(bank, "refine").match(
+        kalman_filter(capture(Renderer(None, SENSOR).render(1.0), SENSOR, rng=np.random.default_rng(1)))
+    )
+    assert repr(empty[0]) == "Match(refused: no landmark)"
