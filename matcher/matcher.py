@@ -30,7 +30,6 @@ from phasemark.matcher.likelihood.likelihood_matcher import (
     LikelihoodMatcher,
     Pixels,
 )
-from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.likelihood.systematic import SYSTEMATICS, check_systematic
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches
@@ -192,6 +191,11 @@ class Matcher:
         self.options: Mapping[str, Any] = MappingProxyType(
             {"free": free, "background": background, "on": on, "pixels": pixels, "robust": robust}
         )
+        arguments = {
+            **self.options, **stated, "false_alarm": false_alarm, "systematic": systematic, "workers": workers,
+            "policy": policy,
+        }  # fmt: skip
+        self._made_from = bank, method, arguments
         self._one: OneFrequency | None = None
         self._systematic = check_systematic(systematic)
         self._direct: DirectMethod | None = None
@@ -221,24 +225,7 @@ class Matcher:
             self._one = bank.one
         self._method: MatchMethod
         if method == "refine":
-            self._method = LikelihoodMatcher(
-                bank,
-                free=free,
-                background=background,
-                false_alarm=false_alarm,
-                on=cast(ResidualKind, on),
-                pixels=pixels,
-                robust=robust,
-                bearing_std_rad=bearing_std_rad,
-                height_std_m=height_std_m,
-                pitch_std_rad=pitch_std_rad,
-                roll_std_rad=roll_std_rad,
-                systematic=self._systematic,
-                tolerance_m=tolerance_m,
-                tolerance_rad=tolerance_rad,
-                workers=workers,
-                policy=policy,
-            )
+            self._method = LikelihoodMatcher(bank, **{**arguments, "systematic": self._systematic})
             return
         fixed = free is None or tuple(free) == VIEW[:2]
         if not fixed or on != "ranges" or pixels != "all" or robust or isinstance(background, str):
@@ -252,6 +239,10 @@ class Matcher:
             tolerance_m=tolerance_m,
             tolerance_rad=tolerance_rad,
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle a matcher as what it was made from."""
+        return _matcher, self._made_from
 
     @property
     def table_bytes(self) -> int:
@@ -369,3 +360,7 @@ def _check_word(name: str, value: object, words: tuple[str, ...], before: str = 
     if not isinstance(value, str) or value not in words:
         shown = repr(value) if isinstance(value, str) else type(value).__name__
         raise UsageError(f"'{name}' must be {before}{' or '.join(map(repr, words))}, got {shown}")
+
+
+def _matcher(bank: Bank, method: str, arguments: dict[str, Any]) -> Matcher:
+    return Matcher(bank, method, **arguments)

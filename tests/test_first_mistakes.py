@@ -1,6 +1,8 @@
 """What a first script gets wrong is answered in words, and what it prints is one line."""
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -82,3 +84,16 @@ def test_what_is_printed_is_one_line_of_what_it_is(bank, renderer, frames):
         kalman_filter(capture(Renderer(None, SENSOR).render(1.0), SENSOR, rng=np.random.default_rng(1)))
     )
     assert repr(empty[0]) == "Match(refused: no landmark)"
+
+
+@pytest.mark.parametrize("again", [lambda one: pickle.loads(pickle.dumps(one)), copy.deepcopy])
+def test_renderers_banks_and_matchers_are_copied_and_pickled(bank, renderer, frames, again):
+    np.testing.assert_array_equal(again(renderer).render(1.0, 0.5).phasor, renderer.render(1.0, 0.5).phasor)
+    with again(bank) as opened:
+        np.testing.assert_array_equal(opened.image("cone", 3, 7).phasor, bank.image("cone", 3, 7).phasor)
+    matcher, filtered = (
+        Matcher(bank, "refine", free=("distance_m", "delta_rad"), tolerance_m=0.02),
+        kalman_filter(frames),
+    )
+    assert again(matcher).options == matcher.options
+    assert again(matcher).match(filtered)[0].as_dict() == matcher.match(filtered)[0].as_dict()

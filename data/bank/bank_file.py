@@ -290,6 +290,10 @@ class Bank:
     ) -> None:
         self.close()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle a bank as the file that it is: it is opened again."""
+        return open_bank, (self.path.absolute(),)
+
     def close(self) -> None:
         """Close the file; arrays read before stay usable."""
         self._file.close()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import weakref
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numba import njit
@@ -49,6 +49,7 @@ class EmbreeIntersector:
                 " intersector='float64'"
             )
         self._open.add(self)
+        self._mesh = vertices, faces
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
@@ -60,6 +61,10 @@ class EmbreeIntersector:
         )
         # the first query builds the hierarchy, which is not safe from several threads at once
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle a scene as its mesh."""
+        return EmbreeIntersector, self._mesh
 
     def first_face(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
         """Return the index of the first face met by each ray, −1 where none is."""
