@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from phasemark import UsageError
-from phasemark.render.compile_notes import announce_compilation
 from phasemark.render.compiled_sources import COMPILED_SOURCES, ROOT, compiled_sources_hash
 
 _THREADS = "NUMBA_NUM_THREADS"
@@ -127,6 +126,13 @@ def _make_private(folder: Path) -> bool:
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077
 
 
+def _announce_compilation() -> None:
+    """Import numba after :func:`prepare_compile_cache`, which checks what it would stop at."""
+    from phasemark.render.compile_notes import announce_compilation
+
+    announce_compilation()
+
+
 prepare_compile_cache()
 stamp_with_all_sources()
-announce_compilation()
+_announce_compilation()

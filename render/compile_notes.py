@@ -5,6 +5,7 @@ What is compiled is kept (:mod:`~phasemark.render.compile_cache`), so that this 
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -14,6 +15,8 @@ from numba.core import event
 _AFTER_S = 1.0
 _ABOUT_S = {"rendering": 25, "matching": 20}
 """Processor time that compiling takes altogether, on two cores of a server of 2020."""
+_SWITCH = "PHASEMARK_COMPILE_NOTES"
+"""Environment variable that is 0 where no line is wanted."""
 _OTHER = "the work of others"
 
 
@@ -56,5 +59,7 @@ def _tell(part: str) -> None:
 
 
 def announce_compilation() -> None:
-    """Write a line on standard error when a second has been spent on compiling."""
+    """Write a line on standard error when a second has been spent on compiling, unless the environment forbids it."""
+    if os.environ.get(_SWITCH) == "0":
+        return
     event.register("numba:compile", _Listener())  # type: ignore[no-untyped-call]

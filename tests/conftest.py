@@ -14,6 +14,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 os.environ.setdefault("MPLBACKEND", "agg")
 
+# Where code is compiled again, tests that compare all of standard error must not find a line about that.
+os.environ["PHASEMARK_COMPILE_NOTES"] = "0"
+
 # A shell starts background jobs with SIGINT ignored, and programs inherit that: interrupted ones would not notice.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

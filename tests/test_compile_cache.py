@@ -150,6 +150,17 @@ def test_a_second_of_compiling_is_told_once_for_rendering_and_once_for_matching(
     )
 
 
+@pytest.mark.parametrize("switch", ["0", "1", None])
+def test_the_line_about_compiling_can_be_switched_off(monkeypatch, switch):
+    registered = []
+    monkeypatch.setattr(compile_notes.event, "register", lambda kind, listener: registered.append(kind))
+    monkeypatch.delenv("PHASEMARK_COMPILE_NOTES")
+    if switch is not None:
+        monkeypatch.setenv("PHASEMARK_COMPILE_NOTES", switch)
+    compile_notes.announce_compilation()
+    assert registered == ([] if switch == "0" else ["numba:compile"])
+
+
 def test_warm_prepares_what_is_asked_for_and_refuses_other_work(capsys):
     assert main(["warm", "--for", "match", "--for", "histograms"]) == 0
     rows = capsys.readouterr().out.splitlines()

@@ -298,7 +298,7 @@ def frames_show(
 
 
 def _title(index: int, sample: Mapping[str, Any]) -> str:
-    """Return what a frame of a set shows: its class and its view."""
+    """Return class and view of a frame of a set."""
     from phasemark.render import Views
     from phasemark.render.figures import view_in_words
     from phasemark.render.view import VIEW_FIELDS

@@ -14,7 +14,7 @@ from phasemark.data.commands.console import LongWork, duration, echo_table
 
 
 class Work(StrEnum):
-    """What is compiled for."""
+    """Work to compile for."""
 
     render = "render"
     match = "match"
