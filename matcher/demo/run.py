@@ -29,7 +29,7 @@ from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.position.robot_pose import robot_poses
 from phasemark.matcher.statistics import view_errors
 from phasemark.render import Background, PhasorImages, Renderer, Views, capture
-from phasemark.render.view import delta_period_rad
+from phasemark.render.view import VIEW_FIELDS, delta_period_rad
 
 SENSOR = "pmd-16x16"
 WALL_M = 3.0
@@ -139,9 +139,10 @@ def run_demo(
     """Run the paper's experiment on simulated frames.
 
     Each landmark is put before a wall at 3 m, at each distance and angle and again 0.37 of a bank step further in
-    both; `repetitions` times `n_frames` noisy frames are captured, filtered and matched, and the robot is placed. The
-    nearest image matches all of them, maximum likelihood those between grid points. Every cell has its own random
-    stream, so the result does not depend on the number of workers.
+    both; the camera faces it, as the paper's did. `repetitions` times `n_frames` noisy frames are captured, filtered
+    and matched, and the robot is placed. The nearest image matches all of them, maximum likelihood those between grid
+    points, with D and δ free. Every cell has its own random stream, so the result does not depend on the number of
+    workers.
 
     Parameters
     ----------
@@ -186,7 +187,7 @@ def run_demo(
     bank = build_bank(plan, bank_path, force=force, workers=workers)
     background = Background(wall_m=WALL_M)
     nearest = Matcher(bank, background=background)
-    likelihood = Matcher(bank, "refine", background=background, workers=1)
+    likelihood = Matcher(bank, "refine", free=VIEW_FIELDS[:2], background=background, workers=1)
     seconds = {"bank": time.perf_counter() - started, "render": 0.0, "capture": 0.0, "filter": 0.0, "match": 0.0}
     specs = catalog()
     renderers = {
@@ -258,7 +259,7 @@ def _repeated(image: PhasorImages, n: int) -> PhasorImages:
         np.repeat(image.intensity, n, axis=0),
         np.repeat(image.coverage, n, axis=0),
         image.sensor,
-        Views(*(np.repeat(a, n) for a in (view.distance_m, view.delta_rad, view.bearing_rad, view.height_m))),
+        Views(*(np.repeat(getattr(view, name), n) for name in VIEW_FIELDS)),
     )
 
 
