@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -153,7 +154,7 @@ def test_a_second_of_compiling_is_told_once_for_rendering_and_once_for_matching(
 @pytest.mark.parametrize("switch", ["0", "1", None])
 def test_the_line_about_compiling_can_be_switched_off(monkeypatch, switch):
     registered = []
-    monkeypatch.setattr(compile_notes.event, "register", lambda kind, listener: registered.append(kind))
+    monkeypatch.setattr("numba.core.event.register", lambda kind, listener: registered.append(kind))
     monkeypatch.delenv("PHASEMARK_COMPILE_NOTES")
     if switch is not None:
         monkeypatch.setenv("PHASEMARK_COMPILE_NOTES", switch)
@@ -167,5 +168,6 @@ def test_warm_prepares_what_is_asked_for_and_refuses_other_work(capsys):
     assert [row.split()[0] for row in rows[1:]] == ["match", "histograms"]
     assert main(["warm", "--for", "flying"]) == 2
     assert "'flying' is not one of 'render', 'match', 'histograms'" in capsys.readouterr().err
+    flying: Any = "flying"
     with pytest.raises(UsageError, match="render, match, histograms"):
-        warm("flying")
+        warm(flying)

@@ -1,6 +1,7 @@
 """Pixels that a solution contradicts are excused by one view nearby, not each by another."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,8 +47,9 @@ def test_fits_cost_what_one_view_nearby_contradicts(bank):
     frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(3), n_frames=50))
     matcher = Matcher(bank, "refine")
     evidence = Evidence.from_frames(matcher.read_out(frames).without_offset().with_pooled_noise(), "ranges")
-    scene, each = matcher._method._scene, np.arange(N)
-    settings = scene.settings(matcher._method._setup)
+    likelihood: Any = matcher._method
+    scene, each = likelihood._scene, np.arange(N)
+    settings = scene.settings(likelihood._setup)
 
     wedge = np.tile([*WEDGE, 0.0, 0.0, 0.0], (N, 1))
     true = refine(scene.final, evidence, each, np.ones(N, np.int64), wedge, settings)

@@ -3,6 +3,7 @@
 import copy
 import math
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,8 +42,9 @@ def test_a_landmark_that_is_not_in_the_catalogue_is_answered_with_those_that_are
 
 
 def test_a_specification_is_no_mesh():
+    cone: Any = catalog()["cone"]
     with pytest.raises(UsageError, match="'mesh' must be a mesh, got LandmarkSpec: build_mesh makes one"):
-        Renderer(catalog()["cone"], SENSOR)
+        Renderer(cone, SENSOR)
 
 
 @pytest.mark.parametrize("background", [4.0, [4.0], {"wall_m": 4.0}])
@@ -63,7 +65,8 @@ def test_degrees_where_radians_are_meant_are_refused(bank, options):
     (name,) = options
     with pytest.raises(UsageError, match=rf"'{name}' is an angle in radians, .* use math.radians of degrees"):
         Matcher(bank, "refine", **options)
-    Matcher(bank, "refine", **{name: math.radians(options[name])})
+    in_radians: dict[str, Any] = {name: math.radians(options[name])}
+    Matcher(bank, "refine", **in_radians)
 
 
 def test_what_is_printed_is_one_line_of_what_it_is(bank, renderer, frames):
