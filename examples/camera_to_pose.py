@@ -27,16 +27,15 @@ from scipy import stats
 from phasemark import InputFileError, PhasemarkError
 from phasemark.data.files import write_atomically
 
-DEGREE = math.pi / 180
 SHOWN = {
-    "distance_m": ("distance_m", "D", "mm", 1e-3),
-    "delta_rad": ("delta_deg", "δ", "°", DEGREE),
-    "bearing_rad": ("bearing_deg", "bearing", "°", DEGREE),
-    "height_m": ("height_m", "height", "mm", 1e-3),
-    "pitch_rad": ("pitch_deg", "pitch", "°", DEGREE),
-    "roll_rad": ("roll_deg", "roll", "°", DEGREE),
+    "distance_m": ("D", "mm", 1e-3),
+    "delta_deg": ("δ", "°", 1.0),
+    "bearing_deg": ("bearing", "°", 1.0),
+    "height_m": ("height", "mm", 1e-3),
+    "pitch_deg": ("pitch", "°", 1.0),
+    "roll_deg": ("roll", "°", 1.0),
 }
-"""Of each free number: its key in the answer, its name, and the unit and its size in which it is drawn."""
+"""Of each free number: its name, and the unit in which it is drawn with its size in the unit of the answer."""
 ONE_SIGMA, WIDE = 1.0, math.sqrt(stats.chi2.ppf(0.95, 2))
 """Radii of the ellipses, in standard deviations."""
 
@@ -63,7 +62,7 @@ def ellipse(covariance: NDArray[np.float64], radius: float) -> NDArray[np.float6
 def figure_of(match: dict[str, Any]) -> Figure:
     """Draw densities on the diagonal and ellipses of all pairs below it; the correlation stands above."""
     free = match["free"]
-    size = np.array([SHOWN[name][3] for name in free])
+    size = np.array([SHOWN[name][2] for name in free])
     covariance = np.array(match["covariance"]) / np.outer(size, size)
     std = np.sqrt(np.diag(covariance))
     n = len(free)
@@ -72,7 +71,7 @@ def figure_of(match: dict[str, Any]) -> Figure:
     for i in range(n):
         for j in range(n):
             axes = panels[i, j]
-            across, unit = SHOWN[free[j]][1], SHOWN[free[j]][2]
+            across, unit, _ = SHOWN[free[j]]
             if j > i:
                 axes.axis("off")
                 correlation = covariance[i, j] / (std[i] * std[j])
@@ -95,7 +94,7 @@ def figure_of(match: dict[str, Any]) -> Figure:
             if i == n - 1:
                 axes.set_xlabel(f"{across} ({unit})", fontsize=9)
             if j == 0 and i > 0:
-                axes.set_ylabel(f"{SHOWN[free[i]][1]} ({SHOWN[free[i]][2]})", fontsize=9)
+                axes.set_ylabel(f"{SHOWN[free[i]][0]} ({SHOWN[free[i]][1]})", fontsize=9)
     figure.suptitle("Errors of the pose: ellipses that hold two numbers with 39 % and 95 %; correlations above")
     return figure
 
@@ -112,9 +111,8 @@ def main() -> int:
             raise InputFileError(f"{arguments.match}: the match has no covariance: give --method refine")
         std = np.sqrt(np.diag(match["covariance"]))
         for name, error in zip(match["free"], std.tolist(), strict=True):
-            key, title, unit, size = SHOWN[name]
-            value = match[key] / (size if unit == "mm" else 1.0)
-            print(f"{title:8s} {value:10.3f} ± {error / size:.2g} {unit}")
+            title, unit, size = SHOWN[name]
+            print(f"{title:8s} {match[name] / size:10.3f} ± {error / size:.2g} {unit}")
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
         buffer = io.BytesIO()
         figure_of(match).savefig(buffer, format="png", dpi=110)

@@ -59,7 +59,8 @@ class Match:
     class_name : str or None
         The landmark's class; None: no landmark.
     accepted : bool
-        Whether the answer is right to within the matcher's tolerances; if not, `reason` says why.
+        Whether the answer passed all tests, and so is right to within the matcher's tolerances but for the exceptions
+        that docs/limits.md counts; if not, `reason` says why.
     distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad : float
         The view, PHYSICS sections 1 and 9. Without any fit, as where too few pixels returned, D and δ are NaN and the
         others 0.
@@ -144,11 +145,13 @@ class Match:
         return f"Match({self.class_name}, {verdict}: {', '.join(words)}, p = {self.p_value:.2g})"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain numbers and text, angles in degrees too; NaN as None, so that it is valid JSON."""
+        """Return plain numbers and text, valid JSON: all angles in degrees, covariances too; NaN as None."""
 
         def plain(value: float) -> float | None:
             return float(value) if math.isfinite(value) else None
 
+        shown = np.array([scale_of_degrees(name) for name in self.free])
+        unit = np.outer(shown, shown)
         return {
             "class": self.class_name,
             "accepted": self.accepted,
@@ -158,13 +161,13 @@ class Match:
             "bearing_deg": plain(math.degrees(self.bearing_rad)),
             "height_m": plain(self.height_m),
             **{
-                name.replace("_rad", "_deg"): plain(math.degrees(getattr(self, name)))
+                named_in_degrees(name): plain(math.degrees(getattr(self, name)))
                 for name in ("pitch_rad", "roll_rad")
                 if name in self.free or getattr(self, name)
             },
-            "free": list(self.free),
-            "covariance": None if self.covariance is None else self.covariance.tolist(),
-            "systematic": {name: part.tolist() for name, part in self.systematic.items()},
+            "free": [named_in_degrees(name) for name in self.free],
+            "covariance": None if self.covariance is None else (unit * self.covariance).tolist(),
+            "systematic": {name: (unit * part).tolist() for name, part in self.systematic.items()},
             "chi2": plain(self.chi2),
             "dof": self.dof,
             "p_value": plain(self.p_value),
@@ -180,14 +183,27 @@ class Match:
                 for other in self.alternatives
             ],
             "condition_number": plain(self.condition_number),
-            "weak_direction": dict(self.weak_direction),
+            "weak_direction": {
+                named_in_degrees(name): plain(scale_of_degrees(name) * std) for name, std in self.weak_direction.items()
+            },
             "may_be_mirrored": self.may_be_mirrored,
             "wall_m": None if self.background is None else self.background.wall_m,
+            "floor_m": None if self.background is None else self.background.floor_m,
         }
 
     def _repr_html_(self) -> str:
         """Show the match in a notebook."""
         return table_html(_COLUMNS, [_cells(self)])
+
+
+def named_in_degrees(name: str) -> str:
+    """Return the name of a parameter in degrees, where it is an angle: ``delta_deg`` for ``delta_rad``."""
+    return name.removesuffix("_rad") + "_deg" if name.endswith("_rad") else name
+
+
+def scale_of_degrees(name: str) -> float:
+    """Return by what a parameter is multiplied to get the unit of :func:`named_in_degrees`."""
+    return math.degrees(1.0) if name.endswith("_rad") else 1.0
 
 
 _MOST_SHOWN = 100

@@ -5,15 +5,17 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 import trimesh
 
 import phasemark
 from phasemark.cli import main
 from phasemark.landmarks import check_mesh
+from phasemark.matcher import Match
 from phasemark.matcher.position.robot_pose import RobotPose
 from phasemark.matcher.sweep.compare import Difference
 from phasemark.matcher.sweep.plan import Condition
-from phasemark.render import preset
+from phasemark.render import Background, preset
 
 ROOT = Path(phasemark.__file__).parent
 
@@ -28,6 +30,25 @@ def test_a_robot_pose_is_plain_numbers_in_degrees():
     found = json.loads(json.dumps(known.as_dict(), allow_nan=False))
     np.testing.assert_allclose(list(found["std"].values()), [2, 3, 3])
     assert found["mahalanobis"] == 1.5
+
+
+def test_all_angles_of_a_match_and_a_robot_pose_are_degrees():
+    std = np.array([0.001, np.radians(2.0), np.radians(3.0)])
+    match = Match(
+        "cone", True, 1.0, np.radians(30.0), np.radians(-4.0), free=("distance_m", "delta_rad", "bearing_rad"),
+        covariance=np.diag(std**2), systematic={"declared": np.diag(std**2)},
+        weak_direction={"distance_m": 0.001, "delta_rad": np.radians(2.0)}, background=Background(floor_m=0.4),
+    )  # fmt: skip
+    found = json.loads(json.dumps(match.as_dict(), allow_nan=False))
+    assert found["free"] == ["distance_m", "delta_deg", "bearing_deg"]
+    assert [found[name] for name in found["free"]] == pytest.approx([1.0, 30.0, -4.0])
+    for matrix in (found["covariance"], found["systematic"]["declared"]):
+        np.testing.assert_allclose(np.sqrt(np.diag(matrix)), [0.001, 2.0, 3.0])
+    assert found["weak_direction"] == pytest.approx({"distance_m": 0.001, "delta_deg": 2.0})
+    assert (found["wall_m"], found["floor_m"]) == (None, 0.4)
+    assert not [key for key in found if key.endswith("_rad")]
+    pose = RobotPose(1.0, 2.0, 0.0, (0.0, 0.0), 0.0, 0.0, 0.0, np.diag([4.0, 9.0, np.radians(3) ** 2])).as_dict()
+    np.testing.assert_allclose(np.sqrt(np.diag(pose["covariance"])), list(pose["std"].values()))
 
 
 def test_a_difference_of_two_sweeps_has_no_nan():

@@ -423,7 +423,7 @@ def matched(folder, capsys, sensor, albedo, truth):
     assert main(match) == 0
     answers = json.loads(capsys.readouterr().out)["matches"]
     distance_m, delta_rad, heading_rad = truth
-    std = np.sqrt([np.diag(answer["covariance"])[:2] for answer in answers])
+    std = np.sqrt([np.diag(answer["covariance"])[:2] for answer in answers]) * [1.0, math.radians(1)]
     heading_std = np.radians([answer["poses"][0]["std"]["heading_deg"] for answer in answers])
     return np.stack(
         [

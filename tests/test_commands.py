@@ -238,7 +238,7 @@ def test_refinement_tells_standard_deviations_and_fixes_or_frees_the_bearing(run
     for bearing in ([], ["--free", "bearing"]):
         code, out, _ = run(*refine, *bearing)
         (match,) = json.loads(out)["matches"]
-        assert match["free"] == ["distance_m", "delta_rad", "bearing_rad"]
+        assert match["free"] == ["distance_m", "delta_deg", "bearing_deg"]
         assert np.array(match["covariance"]).shape == (3, 3)
         assert match["bearing_deg"] == pytest.approx(0.0, abs=0.3)
     auto = ["--unit", "m", "--quantity", "range", "--auto-background", "--method", "refine"]

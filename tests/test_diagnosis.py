@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from builders import strangers
 
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank
+from phasemark.data.plans import MeshPlan
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, diagnose, kalman_filter
 from phasemark.matcher.diagnosis.search import _Seen
@@ -182,3 +184,22 @@ def test_the_command_names_the_option_that_makes_a_refused_frame_fit(banks, tmp_
     done = capsys.readouterr()
     assert done.err == ""
     assert "diagnosis" not in json.loads(done.out)["matches"][0]
+
+
+def test_a_diagnosis_that_fails_loses_no_answer(tmp_path, capsys):
+    """Maximum likelihood, which a diagnosis tries, refuses what the nearest image takes: a panel as wide as this."""
+    trimesh.creation.box((0.01, 4.0, 4.0)).export(tmp_path / "panel.stl")
+    panel = MeshPlan(name="panel", path=str(tmp_path / "panel.stl"), unit="m")
+    grid = {"distance_m": "0.4:1.0:0.2", "delta_deg": "-60:60:20", "layout": "full"}
+    build_bank(BankPlan(sensor="vl53l5cx-8x8", meshes=(panel,), **grid), tmp_path / "bank.h5").close()
+    ranges = np.random.default_rng(1).uniform(0.2, 2.0, (8, 8))
+    np.savez(tmp_path / "frames.npz", range=ranges, unit="m", quantity="range")
+    estimates = tmp_path / "estimates.csv"
+    arguments = ["match", str(tmp_path / "bank.h5"), str(tmp_path / "frames.npz"), "--wall", "1.2"]
+    assert main([*arguments, "--json", "--estimates", str(estimates)]) == 0
+    done = capsys.readouterr()
+    (answer,) = json.loads(done.out)["matches"]
+    assert not answer["accepted"]
+    assert len(estimates.read_text().splitlines()) == 2
+    *_, note = done.err.splitlines()
+    assert note.startswith("note: frame 0 is refused, and its diagnosis failed (UsageError: the bank ends at 1 m")

@@ -259,9 +259,9 @@ def test_every_example_explains_itself(path, tmp_path):
 
 def written_match(path, **changes):
     """Write what `phasemark match --json` prints of a pose of three numbers, heights and pitches trading."""
-    covariance = [[1e-6, 0, 0], [0, 4e-6, -3e-6], [0, -3e-6, 4e-6]]
+    covariance = [[1e-6, 0, 0], [0, 4e-6, -1.7e-4], [0, -1.7e-4, 0.0121]]
     match = {
-        "accepted": True, "free": ["distance_m", "height_m", "pitch_rad"], "covariance": covariance,
+        "accepted": True, "free": ["distance_m", "height_m", "pitch_deg"], "covariance": covariance,
         "distance_m": 1.02, "height_m": 0.01, "pitch_deg": 2.0, **changes,
     }  # fmt: skip
     path.write_text(json.dumps({"matches": [match]}))
@@ -273,7 +273,7 @@ def test_a_pose_is_printed_with_its_standard_deviations_and_drawn(tmp_path):
     assert done.returncode == 0, done.stderr
     lines = [line.split() for line in done.stdout.splitlines()]
     assert lines[:2] == [["D", "1020.000", "±", "1", "mm"], ["height", "10.000", "±", "2", "mm"]]
-    assert lines[2] == ["pitch", "2.000", "±", "0.11", "°"]  # 2 mrad
+    assert lines[2] == ["pitch", "2.000", "±", "0.11", "°"]
     assert (tmp_path / "out" / "pose.png").read_bytes().startswith(b"\x89PNG")
 
 

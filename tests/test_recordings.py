@@ -14,8 +14,10 @@ from phasemark.cli import main
 from phasemark.data import open_bank, read_frames
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
+from phasemark.matcher.commands.match_table import bank_ends, summary
 from phasemark.matcher.recordings.estimates_table import match_in_batches
 from phasemark.render import Background, Renderer, preset
+from phasemark.render.sensor.sensor_file import sensor_toml
 
 ZONES = preset("vl53l5cx-8x8")
 WALL = ["--wall", 1.5]
@@ -75,8 +77,9 @@ def test_every_frame_of_a_moving_camera_is_a_match_with_its_time(run, folder):
     match.append("--auto-background")  # the wall comes nearer with the landmark
     code, out, err = run(*match, "--json")
     assert code == 0
-    assert len(err.splitlines()) == 1
-    assert "may be those of images mirrored left to right" in err
+    counted, mirrored = err.splitlines()
+    assert counted == f"note: {N} of {N} frames accepted"
+    assert "may be those of images mirrored left to right" in mirrored
     matches = json.loads(out)["matches"]
     # 15 frames a second, in whole milliseconds
     assert [one["time_s"] for one in matches] == [round(k / 15, 3) for k in range(N)]
@@ -85,14 +88,17 @@ def test_every_frame_of_a_moving_camera_is_a_match_with_its_time(run, folder):
     np.testing.assert_allclose([one["distance_m"] for one in matches], truth, atol=0.002)
     code, out, _ = run(*match)
     header, *rows = out.splitlines()
-    assert header.split()[:3] == ["frame", "time", "(s)"]
+    titles = ["frame", "time (s)", "class", "D (m)", "δ (°)", "bearing (°)", "background", "accepted", "p"]
+    assert [title.strip() for title in header.split("  ") if title] == titles
+    assert all(row.count(" ± ") == 3 and " wall 1." in row for row in rows)
     assert [row.split()[:3] for row in rows] == [[str(k), f"{k / 15:.3f}", "cylinder"] for k in range(N)]
 
 
 def test_without_moving_one_note_says_that_something_moved(run, folder):
     code, out, err = run("match", folder / "bank.h5", folder / "flight.csv", *READ, "--no-diagnosis")
     assert code == 0
-    assert [line.split()[0] for line in out.splitlines()] == ["position", "0"]
+    header, _ = out.splitlines()  # one position needs no number
+    assert header.split() == ["class", "D", "(m)", "δ", "(°)", "accepted", "p"]
     assert len(err.splitlines()) == 1
     assert err.startswith(f"note: {folder / 'flight.csv'}: the camera or the scene moved during the file")
     assert "--moving matches every frame by itself" in err
@@ -179,9 +185,9 @@ def test_estimates_are_a_table_of_what_was_free(run, folder, tmp_path):
     assert out.splitlines()[-1] == str(file)
     rows = rows_of(file)
     assert list(rows[0]) == [
-        "index", "time_s", "class", "accepted", "distance_m", "distance_std_m", "delta_deg", "delta_std_deg",
-        "bearing_deg", "bearing_std_deg", "corr_distance_delta", "corr_distance_bearing", "corr_delta_bearing", "chi2",
-        "dof", "p_value", "reason",
+        "index", "time_s", "pose_time_s", "class", "accepted", "distance_m", "distance_std_m", "delta_deg",
+        "delta_std_deg", "bearing_deg", "bearing_std_deg", "corr_distance_delta", "corr_distance_bearing",
+        "corr_delta_bearing", "chi2", "dof", "p_value", "reason",
     ]  # fmt: skip
     _, out, _ = run(*match, "--free", "bearing", "--json")
     for k, (row, answer) in enumerate(zip(rows, json.loads(out)["matches"], strict=True)):
@@ -190,12 +196,13 @@ def test_estimates_are_a_table_of_what_was_free(run, folder, tmp_path):
         expected = {
             "index": k,
             "time_s": answer["time_s"],
+            "pose_time_s": answer["pose_time_s"],
             "distance_m": answer["distance_m"],
             "distance_std_m": std[0],
             "delta_deg": answer["delta_deg"],
-            "delta_std_deg": math.degrees(std[1]),
+            "delta_std_deg": std[1],
             "bearing_deg": answer["bearing_deg"],
-            "bearing_std_deg": math.degrees(std[2]),
+            "bearing_std_deg": std[2],
             "corr_distance_bearing": covariance[0, 2] / (std[0] * std[2]),
             "corr_delta_bearing": covariance[1, 2] / (std[1] * std[2]),
             "chi2": answer["chi2"],
@@ -345,3 +352,54 @@ def test_a_recording_that_cannot_be_simulated_is_one_line(run, tmp_path, monkeyp
     assert len(err.splitlines()) == 1
     assert contains in err
     assert [path.name for path in tmp_path.iterdir()] == ["taken.csv"]
+
+
+def test_the_time_of_a_pose_has_the_delay_of_the_sensor_and_moves_repeated_stamps(run, folder, tmp_path):
+    ranges = np.full((4, 8, 8), 0.7)
+    stamps_ms = np.array([0.0, 100.0, 300.0, 300.0])  # the third was taken at 200 ms, and stamped with the fourth
+    np.savez(tmp_path / "late.npz", range=ranges, unit="m", quantity="range", t_ms=stamps_ms)
+    text = sensor_toml(ZONES.with_(delay_s=-0.05), {}, header=[], otherwise="assumed")
+    (tmp_path / "late.toml").write_text(text, encoding="utf-8")
+    grid = ["--distance", "0.6:0.8:0.1", "--delta", "0:180:30"]
+    bank = tmp_path / "late.h5"
+    assert run("bank", "build", "--class", "cylinder", "--sensor", tmp_path / "late.toml", *grid, "-o", bank)[0] == 0
+    match = ["match", bank, tmp_path / "late.npz", "--no-diagnosis"]
+    assert run(*match, "--moving", "--estimates", tmp_path / "moving.csv")[0] == 0
+    moving = rows_of(tmp_path / "moving.csv")
+    assert [float(row["time_s"]) for row in moving] == [0.0, 0.1, 0.3, 0.3]
+    np.testing.assert_allclose([float(row["pose_time_s"]) for row in moving], [-0.05, 0.05, 0.15, 0.25], atol=1e-9)
+    assert run(*match, "--estimates", tmp_path / "still.csv")[0] == 0
+    (still,) = rows_of(tmp_path / "still.csv")
+    assert float(still["time_s"]) == pytest.approx(0.175)
+    assert float(still["pose_time_s"]) == pytest.approx(0.1)  # the mean of 0, 0.1, 0.2 and 0.3, less 0.05
+
+
+def test_the_summary_counts_reasons_and_names_the_end_of_the_bank(run, folder, tmp_path):
+    assert run("frames", "simulate", *SCENE, "--moving", "--frames", 12, "--to-distance", 1.0, "--to-delta", 30,
+               "-o", tmp_path / "away.csv")[0] == 0  # fmt: skip
+    match = ["match", folder / "bank.h5", tmp_path / "away.csv", *READ, *WALL, "--moving", "--no-diagnosis"]
+    code, out, err = run(*match)
+    assert code == 0
+    counted, end = err.splitlines()
+    rows = out.splitlines()[1:]
+    accepted = sum(" yes " in row for row in rows)
+    assert counted.startswith(f"note: {accepted} of 12 frames accepted; refused: ")
+    assert sum(int(part.split()[0]) for part in counted.split("refused: ")[1].split(", ")) == 12 - accepted
+    # 0.75 to 1 m in 12 steps: 8 of 12 are beyond 0.82 m
+    assert end.startswith("note: the bank ends at 0.82 m, where ")
+    assert " of 12 frames have their best fit" in end
+    assert "--distance" in end
+
+
+def test_answers_inside_a_bank_and_at_the_ends_of_a_coarse_one_are_no_pile():
+    grid = [0.8, 1.0, 1.2]
+    assert bank_ends([0.8, 1.0, 1.2] * 9, grid, "frame") == []
+    fine = [0.5 + 0.01 * k for k in range(50)]
+    assert bank_ends([0.7, 0.8, math.nan, fine[-1]] * 3, fine[:31], "frame") == [
+        "the bank ends at 0.8 m, where 6 of 9 frames have their best fit: if the landmark may be farther, build it with"
+        " a wider --distance"
+    ]
+    assert bank_ends([math.nan], fine, "position") == []
+    assert summary(["", "poor fit", "", "ambiguous", "poor fit"], "frame") == (
+        "2 of 5 frames accepted; refused: 2 poor fit, 1 ambiguous"
+    )

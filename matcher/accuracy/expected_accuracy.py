@@ -16,6 +16,7 @@ from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_
 from phasemark.matcher.accuracy.look_alikes import class_distances_squared
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.match import named_in_degrees
 from phasemark.render import Background, Renderer, Views, predicted_range_std
 
 EDGES, FACES = "noise of edge pixels", "noise of face pixels"
@@ -137,7 +138,7 @@ class AccuracyCard:
                 "views": len(self.views),
                 "views_observed": int(observed.sum()),
                 "n_frames": self.n_frames,
-                "free": list(self.free),
+                "free": [named_in_degrees(name) for name in self.free],
                 **std,
                 "position_std_m": _median(self.position_std_m),
                 "worst_position_std_m": float(self.position_std_m[observed].max()) if observed.any() else math.nan,

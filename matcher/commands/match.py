@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from phasemark import UsageError
-from phasemark.data.commands.console import LongWork, Table, echo_json, tell
+from phasemark.data.commands.console import LongWork, Table, echo_json, one_line, tell
 from phasemark.data.commands.inputs import note_too_far, open_any_bank
 from phasemark.data.commands.options import (
     FrameReading,
@@ -23,7 +23,7 @@ from phasemark.data.commands.options import (
 from phasemark.data.commands.outputs import refuse_unwritable_files
 from phasemark.matcher.commands.diagnosis_flags import Given, diagnosis_text
 from phasemark.matcher.commands.match_options import Place, Results, Search
-from phasemark.matcher.commands.match_table import match_rows
+from phasemark.matcher.commands.match_table import Columns, bank_ends, match_rows, summary
 
 if TYPE_CHECKING:
     from phasemark.data import Bank
@@ -78,12 +78,12 @@ def match_frames(
             _note_motion(measured, frames)
         printed = _Answers(search, place, results, landmarks, plots, moving)
         printed.match_all(matcher, positions)
-        printed.note_what_is_open()
+        printed.note_what_is_open(matcher)
+        if results.estimates is not None:
+            write_atomically(results.estimates, printed.estimated.to_csv().encode(), force=results.force)
         printed.diagnose(matcher, reading)
         if results.as_json:
             echo_json({"bank": str(bank), "frames": str(frames), "matches": printed.answers})
-        if results.estimates is not None:
-            write_atomically(results.estimates, printed.estimated.to_csv().encode(), force=results.force)
         for k, path in plots.items():
             _save_match_figure(path, *printed.drawn[k], opened, search.background, results.force)
     if not (results.as_json or results.as_jsonl):
@@ -117,6 +117,7 @@ def _match_directly(
         tell(f"note: histograms are rendered first, a table of {format_size(matcher.table_bytes)}")
         printed = _Answers(search, place, results, landmarks, {}, moving)
         printed.match_all(matcher, positions)
+        printed.note_what_is_open(matcher)
         if results.as_json:
             echo_json({"bank": str(bank), "frames": str(frames), "matches": printed.answers})
         if results.estimates is not None:
@@ -141,6 +142,9 @@ def _refuse_turned(reading: FrameReading) -> None:
             )
 
 
+_OUTSIDE = "outside the bank"
+
+
 class _Answers:
     """Matches that are printed batch by batch, and what of them is needed at the end."""
 
@@ -153,23 +157,35 @@ class _Answers:
         plots: Mapping[int, Path],
         moving: bool,
     ) -> None:
-        from phasemark.matcher.recordings.estimates_table import EstimateTable
-
         self._search, self._place, self._results, self._landmarks = search, place, results, landmarks
-        self._plots, self._moving = plots, moving
+        self._plots, self._moving, self._counted = plots, moving, "frame" if moving else "position"
         self._table: Table | None = None  # its columns are those of the first match
-        self.estimated = EstimateTable(search.parameters)
         self.answers: list[dict[str, Any]] = []  # all of them only for --json, whose answers are one list
         self.drawn: dict[int, tuple[FilteredFrames, Match]] = {}
         self._refused: tuple[int, FilteredFrames] | None = None
-        self._n_accepted = self._n_mirrored = self._n_outside = 0
+        self._pose_time_s: Sequence[float] | None = None
+        self._reasons: list[str] = []
+        self._distances_m: list[float] = []
+        self._n_mirrored = 0
 
     def match_all(self, matcher: Matcher, positions: Frames | DirectPositions) -> None:
         """Match all positions, and print each batch as soon as it is known."""
+        from phasemark.matcher.filters.stamps import pose_times_s
         from phasemark.matcher.recordings.direct_positions import DirectPositions, match_directly
-        from phasemark.matcher.recordings.estimates_table import match_in_batches
+        from phasemark.matcher.recordings.estimates_table import EstimateTable, match_in_batches
 
         n, averaged = len(positions), self._search.filter()
+        self._columns = Columns(
+            self._counted if self._moving or n > 1 else None,
+            self._search.parameters,
+            matcher.options["background"],
+            self._landmarks is not None,
+        )
+        frames = positions.frames if isinstance(positions, DirectPositions) else positions
+        stamps_s = getattr(frames, "time_s", None)
+        if stamps_s is not None:
+            self._pose_time_s = pose_times_s(stamps_s, matcher.bank.sensor.delay_s).tolist()
+        self.estimated = EstimateTable(self._search.parameters, self._pose_time_s)
         at_once = NEAREST_AT_ONCE if self._search.method == "nearest" else REFINED_AT_ONCE
         with LongWork("matching") if n > at_once else nullcontext() as progress:
             if isinstance(positions, DirectPositions):
@@ -192,11 +208,13 @@ class _Answers:
         answer = match.as_dict()
         if batch.filtered.time_s is not None:
             answer["time_s"] = float(batch.filtered.time_s[k])
+        if self._pose_time_s is not None:
+            answer["pose_time_s"] = self._pose_time_s[index]
         if self._landmarks is not None:
             answer["poses"] = self._place.poses(match, self._landmarks)
-        self._n_accepted += match.accepted
+        self._reasons.append("" if match.accepted else match.reason or "no landmark")
+        self._distances_m.append(match.distance_m)
         self._n_mirrored += bool(match.may_be_mirrored)
-        self._n_outside += match.reason == "outside the bank"
         if isinstance(batch, DirectBatch):
             return answer
         if index in self._plots:
@@ -212,22 +230,31 @@ class _Answers:
             for k, answer in enumerate(answers, start):
                 typer.echo(json.dumps({"index": k, **answer}, ensure_ascii=False, allow_nan=False))
         else:
-            rows = match_rows(answers, start, self._moving)
+            rows = match_rows(answers, start, self._columns)
             self._table = self._table or Table(list(rows[0]))
             self._table.echo([list(row.values()) for row in rows])
 
-    def note_what_is_open(self) -> None:
-        """Say where the bank ends too early, and where nothing shows whether images are mirrored."""
-        if self._n_outside:
+    def note_what_is_open(self, matcher: Matcher) -> None:
+        """Count what was accepted; say where the bank ends too early, and where images may be mirrored."""
+        if len(self._reasons) > 1:
+            tell(f"note: {summary(self._reasons, self._counted)}")
+        if n_outside := self._reasons.count(_OUTSIDE):
             tell(
-                f"note: {self._n_outside} frames show views outside the bank, where no other explanation was"
+                f"note: {n_outside} {self._counted}s show views outside the bank, where no other explanation was"
                 " looked for: build it over a wider range (bank info shows the range)"
             )
+        inside = [d for d, reason in zip(self._distances_m, self._reasons, strict=True) if reason != _OUTSIDE]
+        for note in bank_ends(inside, matcher.bank.distance_m.tolist(), self._counted):
+            tell(f"note: {note}")
         if self._n_mirrored:
             tell(
                 f"note: {self._n_mirrored} of {self._n_accepted} accepted answers may be those of images mirrored left"
                 " to right, which their landmarks do not show: check it once with something held to one side (--flip-h)"
             )
+
+    @property
+    def _n_accepted(self) -> int:
+        return self._reasons.count("")
 
     def diagnose(self, matcher: Matcher, reading: FrameReading) -> None:
         """Name the setting that would make the first refused position fit."""
@@ -239,7 +266,12 @@ class _Answers:
         if self._refused is None or self._results.no_diagnosis or search.unknown_background or some_right:
             return
         index, filtered = self._refused
-        diagnosis = replace(diagnose(matcher, filtered, 0, background=search.background), index=index)
+        try:
+            diagnosis = replace(diagnose(matcher, filtered, 0, background=search.background), index=index)
+        except Exception as error:  # it only comments on answers, which must not be lost
+            what = f"{type(error).__name__}: {one_line(str(error))}"
+            tell(f"note: frame {index} is refused, and its diagnosis failed ({what}); --no-diagnosis leaves it out")
+            return
         message = diagnosis_text(diagnosis, Given(reading, search.method == "nearest", search.fix == "bearing"))
         tell(f"note: {message}")
         if self._results.as_json:

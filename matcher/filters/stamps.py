@@ -56,3 +56,22 @@ def spread_stamps(stamps_s: NDArray[np.float64]) -> NDArray[np.float64]:
         elif abs(after - k * period) < _SAME_GAP * period:
             out[start:end] = stamps_s[start] + after / k * np.arange(k)
     return out
+
+
+def pose_times_s(stamps_s: NDArray[np.float64], delay_s: float) -> NDArray[np.float64]:
+    """Return the time that the pose of each position belongs to: repeated stamps moved, averaged, the delay added.
+
+    Parameters
+    ----------
+    stamps_s : (n, frames) float64
+        Of n positions, or with one frame each of a camera that moves; in the order of the frames, seconds.
+    delay_s : float
+        Of the sensor, added to a stamp.
+
+    Returns
+    -------
+    (n,) float64
+    """
+    moving = stamps_s.shape[1] == 1
+    spread = spread_stamps(stamps_s[:, 0])[:, None] if moving else np.stack([spread_stamps(own) for own in stamps_s])
+    return np.asarray(spread.mean(axis=1) + delay_s)

@@ -99,15 +99,16 @@ class RobotPose:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return position and heading as plain numbers, in degrees, for JSON; the covariance is in radians."""
+        """Return position and heading as plain numbers, for JSON: metres and degrees, in the covariance too."""
         covariance = self.covariance
+        unit = np.array([1.0, 1.0, math.degrees(1.0)])
         std = None if covariance is None else [math.sqrt(max(float(covariance[k, k]), 0.0)) for k in range(3)]
         return {
             "x_m": self.x_m,
             "y_m": self.y_m,
             "heading_deg": math.degrees(self.heading_rad),
             "std": None if std is None else {"x_m": std[0], "y_m": std[1], "heading_deg": math.degrees(std[2])},
-            "covariance": None if covariance is None else covariance.tolist(),
+            "covariance": None if covariance is None else (covariance * np.outer(unit, unit)).tolist(),
             "mahalanobis": self.mahalanobis if math.isfinite(self.mahalanobis) else None,
         }
 

@@ -81,21 +81,25 @@ def match_in_batches(
 class EstimateTable:
     """Estimates of the positions of a recording as comma-separated values.
 
-    Columns: index, time_s, class, accepted; each parameter of the view that was estimated (`distance_m`, `delta_deg`,
-    `bearing_deg`, `height_m`) with its standard deviation (`distance_std_m`, `delta_std_deg`, …); the correlation of
-    each pair (`corr_distance_delta`, …); chi2, dof, p_value, reason. A cell is empty where there is nothing to say.
+    Columns: index, time_s (the stamp as it was read), pose_time_s (the time that the pose belongs to,
+    :func:`~phasemark.matcher.filters.stamps.pose_times_s`), class, accepted; each parameter of the view that was
+    estimated (`distance_m`, `delta_deg`, `bearing_deg`, `height_m`) with its standard deviation (`distance_std_m`,
+    `delta_std_deg`, …); the correlation of each pair (`corr_distance_delta`, …); chi2, dof, p_value, reason. A cell is
+    empty where there is nothing to say.
 
     Parameters
     ----------
     free : sequence of str
         The parameters that were estimated, in the order of the covariance.
+    pose_time_s : sequence of float, optional
+        Of each position.
     """
 
-    def __init__(self, free: Sequence[str]) -> None:
-        self._free = tuple(free)
+    def __init__(self, free: Sequence[str], pose_time_s: Sequence[float] | None = None) -> None:
+        self._free, self._pose_time_s = tuple(free), pose_time_s
         self._text = io.StringIO()
         self._writer = csv.writer(self._text, lineterminator="\n")
-        header = ["index", "time_s", "class", "accepted"]
+        header = ["index", "time_s", "pose_time_s", "class", "accepted"]
         for name, unit, _ in (_COLUMNS[parameter] for parameter in self._free):
             header += [f"{name}{unit}", f"{name}_std{unit}"]
         header += [f"corr_{_COLUMNS[a][0]}_{_COLUMNS[b][0]}" for a, b in combinations(self._free, 2)]
@@ -110,8 +114,12 @@ class EstimateTable:
         """
         times = batch.filtered.time_s
         for k, match in enumerate(batch.matches):
-            time_s = math.nan if times is None else float(times[k])
-            self._writer.writerow([batch.start + k, _cell(time_s), *self._cells(match)])
+            index = batch.start + k
+            stamps = [
+                math.nan if times is None else float(times[k]),
+                math.nan if self._pose_time_s is None else self._pose_time_s[index],
+            ]
+            self._writer.writerow([index, *map(_cell, stamps), *self._cells(match)])
 
     def to_csv(self) -> str:
         """Return the table with its header."""
