@@ -118,6 +118,8 @@ sensor = "vl53l5cx-8x8"
 variants = ["mixed"]
 wall_m = { normal = [3.8, 0.1], within = [3.0, 4.1] }
 """
+RANGES_ALONE = FAR_FRAMES + "histograms = false\n"
+FAR_HISTOGRAMS = FAR_FRAMES.replace("4.1", "4.9")
 FAR_SWEEP = """
 name = "far"
 bank_distance_m = [15.0, 17.0]
@@ -141,9 +143,16 @@ axes = { distance_m = [16.0], wall_m = [0.0, 18.0] }
             [f"'distance_m' at 20 m {WRAPS} 5.01 m"],
         ),
         (
-            FAR_FRAMES,
+            RANGES_ALONE,
             ["frames", "build", "plan.toml", "--dry-run", "-o", "f.h5"],
-            ["'wall_m' at 4.1 m is beyond the sensor's 'max_range_m' = 4 m: the sensor reports nothing from there"],
+            ["'wall_m' at 4.1 m is beyond the sensor's 'max_range_m' = 4 m: the sensor reports no range from there"],
+        ),
+        # targets of histograms are found as far as their bins reach, 128 of 3.75 cm
+        (FAR_FRAMES, ["frames", "build", "plan.toml", "--dry-run", "-o", "f.h5"], []),
+        (
+            FAR_HISTOGRAMS,
+            ["plan", "check", "plan.toml"],
+            ["'wall_m' at 4.9 m is beyond the histograms, which end at 4.8 m"],
         ),
         (FAR_SWEEP, ["plan", "check", "plan.toml"], ["axes.distance_m", "axes.wall_m", "bank_distance_m"]),
     ],

@@ -130,8 +130,8 @@ def background_of(wall: float | None, floor: float | None) -> Background | None:
     return None if wall is None and floor is None else Background(wall_m=wall, floor_m=floor)
 
 
-def note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None]) -> None:
-    """Write a note for each distance that the sensor shows wrapped, or not at all.
+def note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None], *, in_histograms: bool = False) -> None:
+    """Write a note for each distance that the sensor shows wrapped, or not at all, in its ranges or histograms.
 
     Raises
     ------
@@ -141,7 +141,9 @@ def note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None]) -> Non
     from phasemark.render.sensor.sensor_quantities import SPEED_OF_LIGHT_M_S
 
     for name, distance_m in distances_m.items():
-        described = None if distance_m is None else sensor.describe_beyond_range(name, distance_m)
+        described = (
+            None if distance_m is None else sensor.describe_beyond_range(name, distance_m, in_histograms=in_histograms)
+        )
         if described is not None and distance_m is not None and len(sensor.frequencies_hz) > 1:
             divisor_hz = SPEED_OF_LIGHT_M_S / (2 * distance_m)
             raise UsageError(
@@ -154,8 +156,11 @@ def note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None]) -> Non
 
 def note_plan_too_far(plan: PlanWithDistances) -> None:
     """Write a note for each key of a plan with distances that the sensor shows wrapped, or not at all."""
+    from phasemark.data.plans.frame_plan import FramePlan
+
     distances_m = {f"'{name}'": distance_m for name, distance_m in plan.greatest_distances_m().items()}
-    note_too_far(plan.build_sensor(), distances_m)
+    in_histograms = isinstance(plan, FramePlan) and plan.has_histograms
+    note_too_far(plan.build_sensor(), distances_m, in_histograms=in_histograms)
 
 
 class PlanWithDistances(Protocol):

@@ -296,7 +296,6 @@ class FramePlan(ScenePlan):
             raise UsageError("'keep_taps' and the variant 'shot' must be left out: a direct sensor has neither")
         if self.histograms and sensor.histogram is None:
             raise UsageError("'histograms' must be left out: the sensor has no [histogram] table")
-        has_table = sensor.histogram is not None
         order: tuple[Variant, ...] = ("hard", "mixed", "shot")
         return self.model_copy(
             update={
@@ -305,9 +304,14 @@ class FramePlan(ScenePlan):
                 "meshes": tuple(find_symmetries(meshes)),
                 "sensor_overrides": sensor.model_dump(mode="json"),
                 "variants": tuple(name for name in order if name in self.variants),
-                "histograms": has_table if self.histograms is None and has_table else self.histograms,
+                "histograms": True if self.has_histograms else self.histograms,
             }
         )
+
+    @property
+    def has_histograms(self) -> bool:
+        """Whether histograms of a direct sensor are made, and not ranges alone."""
+        return self.build_sensor().histogram is not None if self.histograms is None else self.histograms
 
     def greatest_distances_m(self) -> dict[str, float]:
         """Return the far end of the landmarks' and walls' distances, metres."""

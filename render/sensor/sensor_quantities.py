@@ -146,7 +146,7 @@ class SensorQuantities(SensorFields):
         """Range at which all phases repeat: c / 2f, of several frequencies c / (2 · gcd) (PHYSICS section 10)."""
         return SPEED_OF_LIGHT_M_S / (2 * common_divisor_hz(self.frequencies_hz))
 
-    def describe_beyond_range(self, name: str, distance_m: float) -> str | None:
+    def describe_beyond_range(self, name: str, distance_m: float, *, in_histograms: bool = False) -> str | None:
         """Return a sentence on what the sensor shows of something too far away, or None if it is near enough.
 
         Parameters
@@ -154,11 +154,14 @@ class SensorQuantities(SensorFields):
         name : str
             What has this distance, for the sentence.
         distance_m : float
+        in_histograms : bool
+            Whether a direct sensor's histograms are kept, and the targets in them.
 
         Returns
         -------
         str or None
-            Ranges wrap at c / 2f; a direct sensor reports nothing from beyond `max_range_m`.
+            Ranges wrap at c / 2f; a direct sensor reports no range beyond `max_range_m`, and counts nothing beyond the
+            last bin of its histograms.
 
         Examples
         --------
@@ -168,11 +171,16 @@ class SensorQuantities(SensorFields):
         """
         if not math.isfinite(distance_m):
             return None
+        if in_histograms and self.histogram is not None:
+            end_m = self.histogram.start_m + self.histogram.bins * self.histogram.bin_width_m
+            if distance_m <= end_m:
+                return None
+            return f"{name} at {distance_m:g} m is beyond the histograms, which end at {end_m:.4g} m"
         if self.kind == "direct" and self.max_range_m is not None:
             if distance_m <= self.max_range_m:
                 return None
             limit = f"the sensor's 'max_range_m' = {self.max_range_m:.4g} m"
-            return f"{name} at {distance_m:g} m is beyond {limit}: the sensor reports nothing from there"
+            return f"{name} at {distance_m:g} m is beyond {limit}: the sensor reports no range from there"
         period_m = self.unambiguous_range_m
         if distance_m < period_m:
             return None
