@@ -12,11 +12,16 @@ from typing import Any
 from pydantic import BaseModel
 
 from phasemark import InputFileError, UsageError
-from phasemark.data.plans.bank_plan import BankPlan, ScenePlan, read_plan
+from phasemark.data.bank.build_bank import BankJob
+from phasemark.data.frames.build_frames import FrameJob
+from phasemark.data.plans.bank_plan import BankPlan, factored_refusal, read_plan
 from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.inputs.toml_file import read_toml
 from phasemark.matcher.design import DesignPlan, example_design, read_design_plan
+from phasemark.matcher.design.search import Search
 from phasemark.matcher.drive import DrivePlan, example_drive, read_drive_plan
+from phasemark.matcher.drive.simulate import specs_of
+from phasemark.matcher.sweep.job import Round, SweepJob
 from phasemark.matcher.sweep.plan import SweepPlan, read_sweep_plan
 
 
@@ -33,25 +38,61 @@ def _shipped(package: str, name: str) -> Callable[[], str]:
     return partial(resources.files(package).joinpath(name).read_text, encoding="utf-8")
 
 
-def _read_scene(model: type[ScenePlan], path: str | os.PathLike[str]) -> BaseModel:
-    plan = read_plan(path, model)
-    try:
-        return plan.resolve()
-    except UsageError as error:
-        raise UsageError(f"{path}: {error}") from None
+_CHECKED_VIEWS = 1 << 20
+"""Most views of a frame set that are drawn and checked; it takes seconds."""
+
+
+def _read_bank(path: str | os.PathLike[str]) -> BankPlan:
+    """Read the plan of a bank, and refuse what its build would refuse; nearer views than the first are not built."""
+    plan = read_plan(path, BankPlan)
+    resolved = plan.resolve()
+    changes: dict[str, Any] = {"distance_m": resolved.distance_m[:1]}
+    if "layout" not in plan.model_fields_set and factored_refusal(resolved) is not None:
+        changes["layout"] = "full"  # as the command builds it
+    BankJob(resolved.model_copy(update=changes)).check_views()
+    return resolved
+
+
+def _read_frames(path: str | os.PathLike[str]) -> FramePlan:
+    """Read the plan of a frame set, and refuse what its build would refuse."""
+    plan = read_plan(path, FramePlan).resolve()
+    FrameJob(plan.model_copy(update={"views": min(plan.views, _CHECKED_VIEWS)})).check_views()
+    return plan
+
+
+def _read_sweep(path: str | os.PathLike[str]) -> SweepPlan:
+    """Read the plan of a sweep, and refuse what its banks, cameras and views would be refused for."""
+    plan = read_sweep_plan(path).resolve()
+    conditions = range(len(plan.conditions()))
+    SweepJob(plan, Round(0, tuple(conditions), 0, plan.trials)).check_views()
+    for method in plan.methods:
+        bank = plan.bank_plan(method)
+        BankJob(bank.model_copy(update={"distance_m": bank.distance_m[:1]})).check_views()
+    return plan
+
+
+def _read_drive(path: str | os.PathLike[str]) -> DrivePlan:
+    """Read the plan of a drive, and refuse a camera or landmarks that are not shipped."""
+    plan = read_drive_plan(path)
+    plan.build_sensor()
+    specs_of(plan)
+    return plan
+
+
+def _read_design(path: str | os.PathLike[str]) -> DesignPlan:
+    """Read the plan of a design, and refuse a camera or a range that no landmark can serve."""
+    plan = read_design_plan(path)
+    Search(plan)
+    return plan
 
 
 _KINDS = {
     # first, for what might be any of them
-    "bank": _Kind(BankPlan, _shipped("phasemark.data.plans", "examples/bank.toml"), partial(_read_scene, BankPlan)),
-    "frames": _Kind(
-        FramePlan, _shipped("phasemark.data.plans", "examples/frames.toml"), partial(_read_scene, FramePlan)
-    ),
-    "sweep": _Kind(
-        SweepPlan, _shipped("phasemark.matcher.sweep", "plans/paper.toml"), lambda path: read_sweep_plan(path).resolve()
-    ),
-    "drive": _Kind(DrivePlan, example_drive, read_drive_plan),
-    "design": _Kind(DesignPlan, example_design, read_design_plan),
+    "bank": _Kind(BankPlan, _shipped("phasemark.data.plans", "examples/bank.toml"), _read_bank),
+    "frames": _Kind(FramePlan, _shipped("phasemark.data.plans", "examples/frames.toml"), _read_frames),
+    "sweep": _Kind(SweepPlan, _shipped("phasemark.matcher.sweep", "plans/paper.toml"), _read_sweep),
+    "drive": _Kind(DrivePlan, example_drive, _read_drive),
+    "design": _Kind(DesignPlan, example_design, _read_design),
 }
 KINDS = tuple(_KINDS)
 """Names of all kinds."""
@@ -97,7 +138,9 @@ def plan_schema(kind: str) -> dict[str, Any]:
 
 
 def check_plan(path: str | os.PathLike[str], kind: str | None = None) -> tuple[str, BaseModel]:
-    """Read a plan, resolve it, and return its kind and the resolved plan.
+    """Read a plan, resolve it, and return its kind and the resolved plan; what a run refuses at once is refused.
+
+    Files that the plan names are read and views are checked; nothing is rendered, and no program of a method is run.
 
     Parameters
     ----------
@@ -122,7 +165,12 @@ def check_plan(path: str | os.PathLike[str], kind: str | None = None) -> tuple[s
         except InputFileError:
             keys = set()  # reading it below says what is wrong
         kind = max(KINDS, key=lambda name: len(keys & set(_KINDS[name].model.model_fields)))
-    return kind, _kind(kind).load(path)
+    load = _kind(kind).load
+    try:
+        return kind, load(path)
+    except UsageError as error:
+        where = os.fspath(path)
+        raise error if str(error).startswith(f"{where}: ") else UsageError(f"{where}: {error}") from None
 
 
 def _kind(name: str) -> _Kind:

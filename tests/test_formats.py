@@ -11,6 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import trimesh
 from programs.regenerate_golden import BANK, BANK_PLAN, FRAMES, FRAMES_PLAN
 
 from phasemark import InputFileError, UsageError
@@ -132,6 +133,62 @@ def test_plan_commands_print_and_check(tmp_path, capsys):
     assert "'tour' is not one of 'bank', 'frames', 'sweep', 'drive'" in capsys.readouterr().err
     with pytest.raises(UsageError, match="unknown kind of plan 'tour'"):
         plan_schema("tour")
+
+
+CONE = 'classes = ["cone"]\n'
+MESH = '[[meshes]]\nname = "part"\npath = "{}"\n'
+SWEEP = 'name = "x"\nbank_distance_m = [0.9, 1.1]\nmethods = [{{ name = "n", method = "nearest"{} }}]\n'
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "code", "part"),
+    [
+        ("bank", CONE + 'distance_m = "0.05:0.5:0.05"', 2, "the lens is inside the landmark's bounding box"),
+        ("bank", MESH.format("missing.stl") + 'unit = "m"', 3, "missing.stl: cannot be read"),
+        ("bank", MESH.format("cube.stl"), 2, "cube.stl: say in which unit it is"),
+        ("bank", 'model = "planar"\n' + MESH.format("cube.stl") + 'unit = "m"', 2, "'model' must be 'ray' or 'hard'"),
+        ("bank", 'layout = "factored"\n' + MESH.format("cube.stl") + 'unit = "m"', 2, "no factored bank"),
+        ("frames", CONE + "views = 9\ndistance_m = { uniform = [0.05, 0.3] }", 2, "the lens is inside"),
+        ("frames", CONE + "views = 9\nwall_m = 0.6", 2, "the wall at 0.6 m is before"),
+        ("frames", CONE + "views = 9\nfloor_m = 0.05", 2, "the floor 0.05 m below the lens is above"),
+        ("frames", CONE + "views = 9\npitch_deg = 89", 2, "turn the landmark out of the image"),
+        ("frames", "views = 9\n" + MESH.format("missing.stl") + 'unit = "m"', 3, "missing.stl: cannot be read"),
+        ("sweep", CONE + SWEEP.format("") + "axes = { wall_m = [0.8] }", 2, "condition 0: the wall at 0.8 m is before"),
+        (
+            "sweep", CONE + SWEEP.format("").replace("0.9", "0.05") + "axes = { distance_m = [0.1] }", 2,
+            "condition 0: in view 0 the lens is inside",
+        ),
+        (
+            "sweep", 'sensor = "vl53l5cx-8x8"\n' + SWEEP.format("") + "axes = { noise_factor = [1, 2] }", 2,
+            "condition 1: 'signal_e' must be left out",
+        ),
+        (
+            "sweep", 'sensor = "vl53l5cx-8x8"\n' + SWEEP.format(', on = "phasors"').replace("nearest", "refine"), 2,
+            "method 'n': on=\"phasors\" needs amplitudes",
+        ),
+        ("sweep", SWEEP.format("") + MESH.format("missing.stl") + 'unit = "m"', 3, "missing.stl: cannot be read"),
+        (
+            "sweep", SWEEP.format(', bank_model = "planar"') + MESH.format("cube.stl") + 'unit = "m"', 2,
+            "'model' must be 'ray' or 'hard'",
+        ),
+        ("drive", "another class", 2, "'map.landmark.class' must be one of cylinder, cone, sphere, post, got 'nosuch'"),
+        ("design", 'sensor = "nosuch"', 2, "unknown sensor 'nosuch'"),
+    ],
+)  # fmt: skip
+def test_a_plan_that_a_build_would_refuse_is_refused_by_its_check(
+    tmp_path, monkeypatch, capsys, kind, text, code, part
+):
+    monkeypatch.chdir(tmp_path)
+    trimesh.creation.box((0.2, 0.1, 0.3)).export("cube.stl")
+    if kind == "drive":
+        text = re.sub('class = "[^"]*"', 'class = "nosuch"', plan_example("drive"), count=1)
+    Path("plan.toml").write_text(text, encoding="utf-8")
+    assert main(["plan", "check", "--kind", kind, "plan.toml"]) == code
+    done = capsys.readouterr()
+    assert done.out == ""
+    *_, line = done.err.splitlines()
+    assert line.startswith("error: ")
+    assert part in line
 
 
 @pytest.mark.parametrize("golden", [BANK, FRAMES], ids=["bank", "frames"])

@@ -196,6 +196,7 @@ class _Slab:
     first: int
     views: Views
     images_of: ImagesOf
+    renderer: Renderer | None
 
 
 class BankJob:
@@ -232,7 +233,19 @@ class BankJob:
     def whole_images(self) -> list[ImagesOf]:
         """Return a renderer of whole images for each class, whatever parts the bank holds."""
         rows = (0, self.sensor.rows)
-        return [_images_of(self.plan, self.sensor, landmark, "both", rows) for landmark in self.landmarks]
+        return [_images_of(self.plan, self.sensor, landmark, "both", rows)[0] for landmark in self.landmarks]
+
+    def check_views(self) -> None:
+        """Refuse a plan with views that cannot be rendered, before any is.
+
+        Raises
+        ------
+        UsageError
+            Naming the view.
+        """
+        for slab in self._slabs:
+            if slab.renderer is not None:
+                slab.renderer.check_can_be_seen(slab.views.in_camera(self.sensor), None)
 
     def identity(self) -> dict[str, Any]:
         """Return all that the bank's bytes depend on."""
@@ -300,8 +313,8 @@ def _slabs(plan: BankPlan, sensor: Sensor, landmarks: list[Landmark]) -> Iterato
     for group, part, views, shown in jobs:
         if group in LAYOUT_GROUPS[plan.layout]:
             for k, landmark in enumerate(shown):
-                images_of = _images_of(plan, sensor, landmark, part, group_rows(group, sensor))
-                yield _Slab(group, k * len(views), views, images_of)
+                images_of, renderer = _images_of(plan, sensor, landmark, part, group_rows(group, sensor))
+                yield _Slab(group, k * len(views), views, images_of, renderer)
 
 
 def _refuse_impossible(plan: BankPlan) -> None:
@@ -371,18 +384,21 @@ def _images_of(
     landmark: Landmark,
     part: Literal["both", "lower", "upper"],
     rows: tuple[int, int],
-) -> ImagesOf:
-    """Return the function that makes the model images of a landmark, or of one of its parts, on some rows."""
+) -> tuple[ImagesOf, Renderer | None]:
+    """Return the function that makes the model images of a landmark or one of its parts on some rows, and its renderer.
+
+    The planar model has none.
+    """
     if plan.model == "planar":
         assert landmark.spec is not None  # _refuse_impossible has seen to it
         outline = _top_view(landmark.spec)
         return lambda views: planar_images(
             outline, sensor, views, albedo=landmark.albedo, harmonics=plan.harmonics, rows=rows
-        )
+        ), None
     mesh = landmark.mesh if landmark.spec is None else build_mesh(landmark.spec, part=part)
     renderer = Renderer(mesh, sensor, albedo=landmark.albedo, harmonics=plan.harmonics)
     variant: Variant = "hard" if plan.model == "hard" else "exact"
-    return lambda views: renderer.render_views(views, rows=rows, variant=variant)
+    return lambda views: renderer.render_views(views, rows=rows, variant=variant), renderer
 
 
 def _top_view(spec: LandmarkSpec) -> PlanarLandmark:

@@ -201,16 +201,28 @@ class RobotEquipment:
             The catalogue has no such class, or no such camera is shipped.
         """
         sensor = plan.build_sensor()
-        specs = catalog()
-        names = list(dict.fromkeys(landmark.class_name for landmark in plan.map.landmark))
-        for name in names:
-            if name not in specs:
-                raise UsageError(f"'map.landmark.class' must be one of {', '.join(specs)}, got {name!r}")
-        bank = _bank(plan, names, workers)
+        specs = specs_of(plan)
+        bank = _bank(plan, list(specs), workers)
         tilts = plan.camera.tilt_std_rad
         known: dict[str, Any] = {f"{name.removesuffix('_rad')}_std_rad": std for name, std in tilts.items()}
         matcher = Matcher(bank, "refine", free=(*FREE, *tilts), background="auto", workers=workers, **known)
-        return cls(sensor, matcher, {name: _renderer(specs[name], sensor) for name in names})
+        return cls(sensor, matcher, {name: _renderer(spec, sensor) for name, spec in specs.items()})
+
+
+def specs_of(plan: DrivePlan) -> dict[str, LandmarkSpec]:
+    """Return the landmarks on the map of a plan, by class.
+
+    Raises
+    ------
+    UsageError
+        The catalogue has no such class.
+    """
+    known = catalog()
+    names = list(dict.fromkeys(landmark.class_name for landmark in plan.map.landmark))
+    for name in names:
+        if name not in known:
+            raise UsageError(f"'map.landmark.class' must be one of {', '.join(known)}, got {name!r}")
+    return {name: known[name] for name in names}
 
 
 def _renderer(spec: LandmarkSpec, sensor: Sensor) -> Renderer:

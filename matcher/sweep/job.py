@@ -182,6 +182,25 @@ class SweepJob:
             for before in np.cumsum([0, *self.items[:-1]])
         ]
 
+    def check_views(self) -> None:
+        """Refuse conditions whose camera is impossible or whose views cannot be rendered, before any is.
+
+        Raises
+        ------
+        UsageError
+            Naming the condition or the method.
+        """
+        for method in self.plan.methods:
+            if method.on == "phasors" and self.sensor.kind == "direct":
+                raise UsageError(f"method '{method.name}': on=\"phasors\" needs amplitudes, and the sensor is direct")
+        for number, n in zip(self.of.conditions, self.items, strict=True):
+            try:
+                sensor = self.true_sensor(number)
+                views = self.views(number, self.of.first, self.of.first + n).in_camera(sensor)
+                self.renderer(number, sensor).check_can_be_seen(views, self.background(number))
+            except UsageError as error:
+                raise UsageError(f"condition {number}: {error}") from None
+
     def make(self, slab: int, start: int, stop: int) -> list[NDArray[Any]]:
         """Make some trials of a condition."""
         number = self.of.conditions[slab]
