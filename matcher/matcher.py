@@ -63,6 +63,10 @@ class DirectMethod(Protocol):
 class Matcher:
     """Matches filtered frames against a bank.
 
+    ``Matcher(bank, "refine", background="auto").match(kalman_filter(frames))`` is the usual call. State what is known:
+    `background`, what stands behind the landmark, and `free`, what of the view is estimated. Few need to change the
+    other parameters.
+
     Parameters
     ----------
     bank : Bank
@@ -106,14 +110,13 @@ class Matcher:
         of the frames' sensor leaves, what the sensor declares of a pose, and what the jitter of its stamps makes of
         the camera's motion. All unless stated.
     tolerance_m, tolerance_rad : float
-        How far off an accepted answer may be. An answer of "refine" is refused as "undetermined" where three standard
-        deviations of a free length or angle exceed this. An answer is refused as "ambiguous" where other classes keep
-        a probability of more than 0.001 ("refine"), or where a view farther away than this costs less than one
-        contradicted pixel more, or would be accepted itself ("nearest").
+        How far off an accepted answer may be. An answer is refused as "undetermined" where the frame leaves a free
+        length or angle open by more than this, and as "ambiguous" where another class, or a view farther away than
+        this, explains the frame too.
     workers : int, optional
         Threads that render (None: one for each processor), where "refine" renders; the answer does not depend on it.
     policy : SearchPolicy
-        Tuning numbers of "refine": how wide and how long it searches.
+        How wide and how long "refine" searches: see :class:`~phasemark.matcher.SearchPolicy`.
 
     Attributes
     ----------

@@ -3,6 +3,8 @@
 import copy
 import math
 import pickle
+import pydoc
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Matcher, kalman_filter
+from phasemark.matcher import Matcher, SearchPolicy, kalman_filter
 from phasemark.render import Renderer, capture, preset
 
 SENSOR = preset("pmd-16x16")
@@ -100,3 +102,12 @@ def test_renderers_banks_and_matchers_are_copied_and_pickled(bank, renderer, fra
     )
     assert again(matcher).options == matcher.options
     assert again(matcher).match(filtered)[0].as_dict() == matcher.match(filtered)[0].as_dict()
+
+
+def test_help_on_the_matcher_begins_with_its_use_and_names_no_tuning_number():
+    text = pydoc.plain(pydoc.render_doc(Matcher))
+    use = 'Matcher(bank, "refine", background="auto").match(kalman_filter(frames))'
+    assert text.index(use) < text.index("Parameters")
+    assert "SearchPolicy()" in text
+    assert [one.name for one in fields(SearchPolicy) if one.name in text] == []
+    assert repr(SearchPolicy(max_iterations=40)) == "SearchPolicy(max_iterations=40)"

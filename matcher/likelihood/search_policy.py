@@ -73,6 +73,11 @@ class SearchPolicy:
     tolerated_sigma: float = 3.0
     ambiguity: float = 1e-3
 
+    def __repr__(self) -> str:
+        """Name the fields that differ from their defaults."""
+        own = [f"{one.name}={value!r}" for one in fields(self) if (value := getattr(self, one.name)) != one.default]
+        return f"SearchPolicy({', '.join(own)})"
+
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
