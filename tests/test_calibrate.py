@@ -140,6 +140,9 @@ def test_a_dark_landmark_is_calibrated_on_the_little_that_it_returns():
     found = calibrate(MESH, frames, poses, on="ranges", free=free, albedo=0.05)
     assert np.median(found.range_std_m[found.range_std_m > 0]) * math.sqrt(50) > 0.05 * PMD.metres_per_radian
     assert (found.pose_residuals > 10).all()
+    assert repr(found).startswith("Calibration(8 poses: pitch ")
+    assert repr(found).count(" ± ") == 3
+    assert "\n" not in repr(found)
     assert nees(found, truth) < stats.chi2.ppf(0.999, 3)
 
 

@@ -33,6 +33,11 @@ def bad_day():
     return characterise(preset("pmd-16x16-wiggle"), rng=np.random.default_rng(12), n_frames=N)
 
 
+def test_a_data_sheet_is_described_in_one_line(good_day):
+    n, off = len(good_day.comparisons), len(good_day.disagreements)
+    assert repr(good_day) == f"Characterisation({good_day.sensor!r}: {n - off} of {n} series as predicted)"
+
+
 # The prediction, by other arithmetic than the chain's
 
 

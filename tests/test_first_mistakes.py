@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_sweep_tables import linear_sweep
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Matcher, SearchPolicy, kalman_filter
-from phasemark.render import Renderer, capture, preset
+from phasemark.matcher import Matcher, SearchPolicy, cramer_rao, kalman_filter
+from phasemark.matcher.diagnosis.diagnose import Diagnosis
+from phasemark.render import Renderer, Views, capture, preset
 
 SENSOR = preset("pmd-16x16")
 
@@ -89,6 +91,14 @@ def test_what_is_printed_is_one_line_of_what_it_is(bank, renderer, frames):
         kalman_filter(capture(Renderer(None, SENSOR).render(1.0), SENSOR, rng=np.random.default_rng(1)))
     )
     assert repr(empty[0]) == "Match(refused: no landmark)"
+    views = Views.broadcast([1.0, 1.0, 1.0], 0.5)
+    bound = cramer_rao(renderer, views)
+    std_m, std_deg = bound.std("distance_m")[0], math.degrees(bound.std("delta_rad")[0])
+    assert repr(bound) == f"Bound(3 views: standard deviation of distance {std_m:.2g} m, delta {std_deg:.2g}°)"
+    diagnosis = Diagnosis(4, empty[0], n_returned=2)
+    assert repr(diagnosis) == f"Diagnosis({diagnosis})"
+    trials = linear_sweep(10, np.random.default_rng(1))
+    assert repr(trials) == "SweepTrials(10 trials of 1 conditions, least squares)"
 
 
 @pytest.mark.parametrize("again", [lambda one: pickle.loads(pickle.dumps(one)), copy.deepcopy])

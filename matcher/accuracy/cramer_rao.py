@@ -6,6 +6,7 @@ number which pixels count, whether ranges or phasors are measured, what is free,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -59,6 +60,15 @@ class Bound:
     information: NDArray[np.float64]
     pixels: NDArray[np.bool_]
     systematic: NDArray[np.float64] | None = None
+
+    def __repr__(self) -> str:
+        """Describe in one line the median standard deviation of each parameter."""
+        words = []
+        for name in self.free:
+            label, unit = name.rsplit("_", 1)
+            std = float(np.median(self.std(name)))
+            words.append(f"{label} {math.degrees(std):.2g}°" if unit == "rad" else f"{label} {std:.2g} {unit}")
+        return f"Bound({len(self.information)} views: standard deviation of {', '.join(words)})"
 
     @property
     def covariance(self) -> NDArray[np.float64]:

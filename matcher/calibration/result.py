@@ -13,7 +13,7 @@ from phasemark.matcher.calibration.known_poses import POSE_UNITS, KnownPoses
 from phasemark.matcher.calibration.mounting_model import HALF_ANGLES, MOUNTING_NAMES, NAMES, PARAMETERS, Mounting
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.render import Sensor
-from phasemark.render.integral.rounding import error_text, value_and_error
+from phasemark.render.integral.rounding import error_text, value_and_error, with_error
 from phasemark.render.sensor.lens_fields import TERMS
 from phasemark.render.sensor.sensor_file import sensor_toml
 
@@ -120,6 +120,15 @@ class Calibration:
             return 0.0
         k = self.free.index(name)
         return math.sqrt(float(self.covariance[k, k]))
+
+    def __repr__(self) -> str:
+        """Describe in one line what was free with its standard deviation, and the test of the fit."""
+        words = []
+        for name in self.free:
+            one = PARAMETERS[name]
+            number = with_error(one.shown * self.value(name), one.shown * self.std(name))
+            words.append(f"{name} {number} {one.unit}".strip())
+        return f"Calibration({len(self.poses)} poses: {', '.join(words)}; p = {self.p_value:.2g})"
 
     @property
     def correlation(self) -> NDArray[np.float64]:

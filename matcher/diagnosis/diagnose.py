@@ -152,6 +152,10 @@ class Diagnosis:
             text += f"; it fits as well with {other.words}: {told(other)}"
         return text
 
+    def __repr__(self) -> str:
+        """Return the message in one line, as the text of a diagnosis."""
+        return f"Diagnosis({self.message()})"
+
     def __str__(self) -> str:
         """Return the message with the library's names."""
         return self.message()

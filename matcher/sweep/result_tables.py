@@ -103,6 +103,10 @@ class SweepTrials:
     def __len__(self) -> int:
         return len(self.truth)
 
+    def __repr__(self) -> str:
+        """Describe in one line how many trials there are, and of which methods."""
+        return f"SweepTrials({len(self)} trials of {len(self.conditions)} conditions, {', '.join(self.methods)})"
+
     @property
     def numbers(self) -> tuple[str, ...]:
         """What views are made of: four names, six where the plan has a tilt."""

@@ -188,6 +188,11 @@ class Characterisation:
     defects: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        """Describe in one line how many series agree with what the sensor's numbers predict."""
+        n = len(self.comparisons)
+        return f"Characterisation({self.sensor!r}: {n - len(self.disagreements)} of {n} series as predicted)"
+
     def of_figure(self, figure: str) -> tuple[Comparison, ...]:
         """Return the series of a figure; none if the sensor does not have it."""
         return tuple(one for one in self.comparisons if one.figure == figure)
