@@ -7,6 +7,7 @@ import io
 import json
 import math
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,11 +25,12 @@ from phasemark.matcher.filters.filtered_frames import kalman_filter
 from phasemark.matcher.sweep.answer import answer, answer_cells
 from phasemark.matcher.sweep.compare import compare_cells
 from phasemark.matcher.sweep.examples import sweep_frames
-from phasemark.matcher.sweep.figures.errors import maps
+from phasemark.matcher.sweep.figures.errors import against_axis, maps
 from phasemark.matcher.sweep.figures.trust import confusion
 from phasemark.matcher.sweep.job import Round, SweepJob
-from phasemark.matcher.sweep.plan import Method, SweepPlan
+from phasemark.matcher.sweep.plan import Condition, Method, SweepPlan
 from phasemark.matcher.sweep.report import summary, write_report
+from phasemark.matcher.sweep.result_tables import SweepTrials
 from phasemark.matcher.sweep.run import read_sweep, run_sweep
 from phasemark.render import Renderer, preset
 
@@ -346,3 +348,46 @@ def test_bank_models_without_mixed_pixels_go_with_the_nearest_image_only(kind):
         return
     with pytest.raises(UsageError, match="'a' refines, which needs 'bank_model' ray, got hard"):
         Method(name="a", method=kind, bank_model="hard")
+
+
+def always_the_same(n: int = 60) -> SweepTrials:
+    """Two sides of a box, 28° and 70°; one method errs by twice the bound, the other always answers 1 m and 28.6°."""
+    rng = np.random.default_rng(3)
+    trials = linear_sweep(n, rng)
+    truth = trials.truth.copy()
+    condition = np.arange(n) // (n // 2)  # trials of a condition follow one another
+    truth[:, 1] = np.radians(np.where(condition == 0, 28.0, 70.0) + rng.uniform(-1, 1, n))
+    honest = truth[:, None].copy()
+    honest[:, 0, :2] += 2 * (trials.estimate - trials.truth[:, None])[:, 0, :2]
+    same = truth[:, None].copy()
+    same[:, 0, :2] = truth[:, :1].mean(), np.radians(28.6)
+    names = "bound", "covariance", "chi2", "p_value", "p_none", "seconds", "dof", "found", "modes", "accepted"
+    both: dict[str, Any] = {name: np.concatenate([getattr(trials, name)] * 2, axis=1) for name in names}
+    return dataclasses.replace(
+        trials, conditions=(Condition("box", delta_deg=28.0), Condition("box", delta_deg=70.0)),
+        methods=("same", "honest"), free=trials.free * 2, outlier=(0.2, 5.0), condition=condition, truth=truth,
+        estimate=np.concatenate([same, honest], axis=1), **both,
+    )  # fmt: skip
+
+
+def test_a_method_that_always_says_the_same_ranks_behind_one_with_larger_errors_and_no_outliers():
+    trials = always_the_same()
+    cells = trials.cells()
+    same = [cell for cell in cells if cell.method == "same"]
+    assert [cell.outliers.value for cell in same] == [0.0, 1.0]
+    assert math.isfinite(same[0].rmse["delta_rad"].value)
+    assert not math.isfinite(same[1].rmse["delta_rad"].value)
+    assert answer_cells(cells)[0].method == "honest"
+    first, second, _ = summary(trials, cells)
+    assert "bound: honest no outliers, " in first  # the best method first
+    assert "; same 50 % outliers, " in first
+    assert "for same, 100 % outliers at δ = 70°" in second
+    (alone,) = {cell.method for cell in answer_cells(same)}
+    assert alone == "same"
+    assert "(1 σ), 50 % outliers left out, with same; class right" in answer(same)
+    legend = against_axis(cells, "delta_deg", ["delta_deg"]).legends[0]
+    written = [text.get_text() for text in legend.get_texts()]
+    assert "same, 50 % outliers" in written
+    assert "same, with outliers" in written
+    panel = maps(same, "rmse").axes[0]
+    assert [text.get_text() for text in panel.texts][1] == "100 % out"

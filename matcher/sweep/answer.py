@@ -11,7 +11,7 @@ import numpy as np
 from phasemark.landmarks import mesh_symmetry
 from phasemark.matcher.accuracy.expected_accuracy import AccuracyCard, accuracy_card, sides_of
 from phasemark.matcher.sweep.job import SweepJob
-from phasemark.matcher.sweep.result_tables import Cell, condition_axes
+from phasemark.matcher.sweep.result_tables import Cell, condition_axes, outlier_share, outliers_in_words
 from phasemark.render import Renderer
 from phasemark.render.view import delta_period_rad
 
@@ -29,8 +29,8 @@ def answer_cells(cells: Sequence[Cell]) -> list[Cell]:
     """Return the cells that a page answers with: one method's, of all classes and angles, at one distance.
 
     The distance is the middle one of the design, the other axes are at their first values, and the method is the one
-    whose errors are nearest to the bound there. The error itself would favour a method that answers with grid points,
-    which may be nearer to the truth than what the frames tell.
+    with the fewest outliers there, and of several the one whose other errors are nearest to the bound. The error itself
+    would favour a method that answers with grid points, which may be nearer to the truth than what the frames tell.
 
     Parameters
     ----------
@@ -51,9 +51,10 @@ def answer_cells(cells: Sequence[Cell]) -> list[Cell]:
     middle = distances[len(distances) // 2]
     by_method: dict[str, list[Cell]] = {}
     for one in plain:
-        if one.condition.distance_m == middle and _found(one):
+        if one.condition.distance_m == middle:
             by_method.setdefault(one.method, []).append(one)
-    return min(by_method.values(), key=_badness, default=[])
+    found = [own for own in by_method.values() if any(map(_found, own))]
+    return min(found, key=lambda own: (outlier_share(own), _badness(own)), default=[])
 
 
 def answer(cells: Sequence[Cell]) -> str:
@@ -72,12 +73,12 @@ def answer(cells: Sequence[Cell]) -> str:
     where = ", ".join(SAID[name].format(getattr(condition, name)) for name in axes)
     trials = sum(one.n for one in own)
     right = sum(round(one.class_right.value * one.n) for one in own)
-    lost = sum(round(one.outliers.value * one.answered.value * one.n) for one in own if one.answered.value)
+    left_out = f", {outliers_in_words(own)} left out," if outlier_share(own) else ""
+    rms = {name: _rms([one.rmse[name].value for one in own if _found(one)]) for name in ("distance_m", "delta_rad")}
     return (
-        f"At {condition.distance_m:g} m{f' ({where})' if where else ''} you get"
-        f" {1e3 * _rms([one.rmse['distance_m'].value for one in own]):.2g} mm and"
-        f" {math.degrees(_rms([one.rmse['delta_rad'].value for one in own])):.2g}° (1 σ) with {own[0].method}; class"
-        f" right {100 * right / trials:.4g} % of {trials} trials{f', {lost} outliers left out' if lost else ''}."
+        f"At {condition.distance_m:g} m{f' ({where})' if where else ''} you get {1e3 * rms['distance_m']:.2g} mm and"
+        f" {math.degrees(rms['delta_rad']):.2g}° (1 σ){left_out} with {own[0].method}; class"
+        f" right {100 * right / trials:.4g} % of {trials} trials."
     )
 
 
@@ -118,7 +119,7 @@ def _found(cell: Cell) -> bool:
 
 def _badness(cells: Sequence[Cell]) -> float:
     """Return the larger of the ratios of distance and angle to the bound, pooled; infinite where there is no bound."""
-    ratios = [_rms([one.ratio[name].value for one in cells]) for name in ("distance_m", "delta_rad")]
+    ratios = [_rms([one.ratio[name].value for one in cells if _found(one)]) for name in ("distance_m", "delta_rad")]
     return max(ratios) if all(map(math.isfinite, ratios)) else math.inf
 
 

@@ -24,7 +24,13 @@ from phasemark.matcher.sweep.examples import job_of_plan, worst_examples
 from phasemark.matcher.sweep.figures.sheet import sweep_figures
 from phasemark.matcher.sweep.figures.style import COLUMN_NAME
 from phasemark.matcher.sweep.plan import SweepPlan
-from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, condition_axes
+from phasemark.matcher.sweep.result_tables import (
+    Cell,
+    SweepTrials,
+    condition_axes,
+    outlier_share,
+    outliers_in_words,
+)
 from phasemark.matcher.sweep.run import read_plan_of, read_sweep, sweep_folder, write_cells
 from phasemark.render.integral.rounding import with_interval
 
@@ -103,8 +109,8 @@ def _write_report(ours: OwnedFiles) -> Path:
         figures=shown,
         examples=examples,
         header=(
-            *(COLUMN_NAME[name] for name in axes), "method", "trials", "RMSE of D (mm)", "bound on D (mm)",
-            "RMSE / bound, D", "RMSE of δ (°)", "bound on δ (°)", "RMSE / bound, δ", "share of outliers",
+            *(COLUMN_NAME[name] for name in axes), "method", "trials", "share of outliers", "RMSE of D (mm)",
+            "bound on D (mm)", "RMSE / bound, D", "RMSE of δ (°)", "bound on δ (°)", "RMSE / bound, δ",
             "share of classes right", "NEES per parameter", "coverage of the 95 % ellipsoid",
         ),
         rows=[_row(cell, axes) for cell in _worst_first(landmarks)[:_MOST_ROWS]],
@@ -118,22 +124,25 @@ def _write_report(ours: OwnedFiles) -> Path:
 def summary(trials: SweepTrials, cells: Sequence[Cell]) -> list[str]:
     """Summarise a sweep in three sentences: accuracy of each method, where it fails, and the classes it finds."""
     landmarks = [cell for cell in cells if not cell.stranger]
-    methods = trials.methods
-    accurate = "; ".join(f"{method} {_accuracy([c for c in landmarks if c.method == method])}" for method in methods)
-    sentences = [f"Root mean square errors in the median cell, and their ratios to the Cramér–Rao bound: {accurate}."]
+    of_method = {name: [cell for cell in landmarks if cell.method == name] for name in trials.methods}
+    # those with the fewest outliers first
+    methods = sorted(trials.methods, key=lambda name: (outlier_share(of_method[name]), _typical_ratio(of_method[name])))
+    accurate = "; ".join(f"{method} {_accuracy(of_method[method])}" for method in methods)
+    sentences = [
+        "Outliers, and without them root mean square errors in the median cell and their ratios to the Cramér–Rao"
+        f" bound: {accurate}."
+    ]
     worst = []
     for method in methods:
-        mine = [cell for cell in landmarks if cell.method == method and _badness(cell) > -math.inf]
-        outliers = sum(round(c.outliers.value * c.answered.value * c.n) for c in mine if c.answered.value)
+        mine = [cell for cell in of_method[method] if _rank(cell) > (0.0, -math.inf)]
         if mine:
-            cell = max(mine, key=_badness)
-            worst.append(
-                f"for {method}, {_badness(cell):.3g} times the bound at {_where(cell, landmarks)}"
-                + (f" ({outliers} outlier{'s' * (outliers > 1)} in all)" if outliers else "")
-            )
+            cell = max(mine, key=_rank)
+            what = [outliers_in_words([cell])] if outlier_share([cell]) else []
+            what += [f"{_badness(cell):.3g} times the bound"] if math.isfinite(_badness(cell)) else []
+            worst.append(f"for {method}, {' and '.join(what)} at {_where(cell, landmarks)}")
     if worst:
         sentences.append(f"The worst cells are, {'; '.join(worst)}.")
-    classes = "; ".join(_classes(trials, m) for m in range(len(methods)))
+    classes = "; ".join(_classes(trials, m) for m in range(len(trials.methods)))
     return [*sentences, f"{classes[:1].upper()}{classes[1:]}."]
 
 
@@ -144,7 +153,14 @@ def _accuracy(cells: Sequence[Cell]) -> str:
         ratio = [cell.ratio[name].value for cell in cells if math.isfinite(cell.ratio[name].value)]
         if rmse and ratio:
             parts.append(f"{np.median(rmse):.2g}{unit} in {label} ({np.median(ratio):.3g} times)")
-    return " and ".join(parts) or "no answer"
+    if not parts and not outlier_share(cells):
+        return "no answer"
+    return ", ".join([outliers_in_words(cells), *([" and ".join(parts)] if parts else [])])
+
+
+def _typical_ratio(cells: Sequence[Cell]) -> float:
+    ratios = [_badness(cell) for cell in cells if math.isfinite(_badness(cell))]
+    return float(np.median(ratios)) if ratios else math.inf
 
 
 def _classes(trials: SweepTrials, m: int) -> str:
@@ -176,8 +192,13 @@ def _badness(cell: Cell) -> float:
     return max((ratio.value for ratio in cell.ratio.values() if math.isfinite(ratio.value)), default=-math.inf)
 
 
+def _rank(cell: Cell) -> tuple[float, float]:
+    """Return how bad a cell is: by its share of outliers, then by its errors over their bound."""
+    return outlier_share([cell]), _badness(cell)
+
+
 def _worst_first(cells: Sequence[Cell]) -> list[Cell]:
-    return sorted(cells, key=lambda cell: -_badness(cell))
+    return sorted(cells, key=_rank, reverse=True)
 
 
 def _with_interval(value: Interval, scale: float = 1.0) -> str:
@@ -189,11 +210,11 @@ def _with_interval(value: Interval, scale: float = 1.0) -> str:
 def _row(cell: Cell, axes: Sequence[str]) -> list[str]:
     values = [getattr(cell.condition, name) for name in axes]
     out = [f"{value:g}" if isinstance(value, int | float) else str(value) for value in values]
-    out += [cell.method, str(cell.n)]
+    out += [cell.method, str(cell.n), _with_interval(cell.outliers)]
     for name, _, _, scale in _PARAMETERS:
         out += [_with_interval(cell.rmse[name], scale), f"{cell.bound[name] * scale:.3g}"]
         out.append(_with_interval(cell.ratio[name]))
-    out += [_with_interval(one) for one in (cell.outliers, cell.class_right, cell.nees, cell.coverage[0.95])]
+    out += [_with_interval(one) for one in (cell.class_right, cell.nees, cell.coverage[0.95])]
     return out
 
 

@@ -345,6 +345,19 @@ class Cell:
         return finite_or_none(self.row())
 
 
+def outlier_share(cells: Sequence[Cell]) -> float:
+    """Return the share of outliers among the answers of some cells; 0 where nothing was answered."""
+    answered = [cell.answered.value * cell.n if cell.answered.value > 0 else 0.0 for cell in cells]
+    lost = sum(cell.outliers.value * n for cell, n in zip(cells, answered, strict=True) if n)
+    return lost / sum(answered) if any(answered) else 0.0
+
+
+def outliers_in_words(cells: Sequence[Cell]) -> str:
+    """Return the share of outliers among the answers of some cells as text, such as "4.2 % outliers"."""
+    share = 100 * outlier_share(cells)
+    return f"{share:.0f} % outliers" if share >= 99.5 else f"{share:.2g} % outliers" if share else "no outliers"
+
+
 _UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
 

@@ -27,7 +27,7 @@ from phasemark.matcher.sweep.figures.style import (
     value_ticks,
 )
 from phasemark.matcher.sweep.plan import Method
-from phasemark.matcher.sweep.result_tables import Cell, SweepTrials
+from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, outlier_share, outliers_in_words
 
 RATIO_SPAN = (0.25, 4.0)
 """Ends of the colours of a map of ratios, about 1 in the middle; what lies beyond has the colour of the end."""
@@ -56,8 +56,13 @@ def against_axis(cells: Sequence[Cell], axis: str, axes: Sequence[str]) -> Figur
             ]
             bias = [_mean([cell.bias[parameter] for cell in along[value]], scale) for value in values]
             look = {"color": colour, "marker": mark, "linestyle": stroke, "markersize": 4, "capsize": 2, "linewidth": 1}
-            _with_bars(rows[0][column], x, rmse, {**look, "label": as_written(method)})
-            if any(value > 1.02 * one.value for value, one in zip(whole, rmse, strict=True)):
+            drawn_cells = [cell for value in values for cell in along[value]]
+            lost = f", {outliers_in_words(drawn_cells)}" if outlier_share(drawn_cells) else ""
+            _with_bars(rows[0][column], x, rmse, {**look, "label": as_written(method) + lost})
+            # where all answers are outliers there is no error without them
+            if any(
+                math.isfinite(value) and not value <= 1.02 * one.value for value, one in zip(whole, rmse, strict=True)
+            ):
                 rows[0][column].plot(
                     x, whole, color=colour, linewidth=0.7, alpha=0.6, marker="_" if axis in NOMINAL else None,
                     linestyle=stroke if axis in NOMINAL else "-", label=f"{as_written(method)}, with outliers",
@@ -108,13 +113,18 @@ def maps(cells: Sequence[Cell], quantity: str) -> Figure:
                 shown = panel.imshow(table, aspect="auto", origin="lower", cmap="cividis")
             middle = np.nanmean([np.nanmin(table), np.nanmax(table)]) if np.isfinite(table).any() else 0.0
             for i, j in np.ndindex(table.shape):
-                if math.isfinite(table[i, j]):
+                own = groups[method, y[i], x[j]]
+                lost = outliers_in_words(own).removesuffix("liers") if outlier_share(own) else ""
+                if not math.isfinite(table[i, j]):
+                    panel.text(j, i, lost, ha="center", va="center", color="black", fontsize=7)
+                else:
                     if quantity == "ratio":
                         ratio = max(float(table[i, j]), 1e-9)
                         colour = "white" if max(ratio, 1 / ratio) > RATIO_DARK else "black"
                     else:
                         colour = "white" if table[i, j] < middle else "black"
-                    panel.text(j, i, f"{table[i, j]:.3g}", ha="center", va="center", color=colour, fontsize=7)
+                    text = f"{table[i, j]:.3g}" + (f"\n{lost}" if lost else "")
+                    panel.text(j, i, text, ha="center", va="center", color=colour, fontsize=7)
             panel.set_xticks(range(len(x)), [f"{a:g}" for a in x])
             panel.set_yticks(range(len(y)), [f"{d:g}" for d in y])
             panel.set_xlabel(AXIS_LABEL["delta_deg"])

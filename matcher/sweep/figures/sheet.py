@@ -51,7 +51,11 @@ def _error_figures(plan: SweepPlan, trials: SweepTrials, cells: Sequence[Cell]) 
                 "1 is the best an unbiased method can do. The colours are the same in every report, from a quarter to "
                 "four times.",
             ),
-            ("rmse", "Error by distance and angle", "Root mean square error without outliers."),
+            (
+                "rmse",
+                "Error by distance and angle",
+                "Root mean square error without outliers; below it, their share, where there are any.",
+            ),
         ):
             yield SweepFigure(
                 f"map-{quantity}",
