@@ -2,12 +2,51 @@
 
 The work is done in four rooms: :mod:`phasemark.landmarks` (what stands in the world), :mod:`phasemark.render`
 (how the camera sees it), :mod:`phasemark.data` (what is kept) and :mod:`phasemark.matcher` (what the robot
-concludes). This module holds the version and the error taxonomy, one class per exit code of the command line.
+concludes). This module holds the version and the error taxonomy, one class per exit code of the command line. It
+imports the names that a first script needs from the rooms when they are used.
 """
 
 __version__ = "0.1.0"
 
-__all__ = ["InputFileError", "OutputExistsError", "PhasemarkError", "StorageError", "UsageError", "__version__"]
+TYPE_CHECKING = False  # type checkers take it for true; importing it from typing would cost more than all below
+if TYPE_CHECKING:
+    from phasemark.data import build_bank, read_frames
+    from phasemark.landmarks import read_mesh
+    from phasemark.landmarks.catalog import catalog
+    from phasemark.matcher import Matcher, kalman_filter, robot_poses
+    from phasemark.render import Renderer, capture, preset
+else:
+
+    def __getattr__(name):
+        return _on_use()[0](name)
+
+    def __dir__():
+        return _on_use()[1]()
+
+    def _on_use():
+        from phasemark.inputs.on_use import imported_on_use  # not before: it takes longer than this module
+
+        return imported_on_use(__name__)
+
+
+__all__ = [
+    "InputFileError",
+    "Matcher",
+    "OutputExistsError",
+    "PhasemarkError",
+    "Renderer",
+    "StorageError",
+    "UsageError",
+    "__version__",
+    "build_bank",
+    "capture",
+    "catalog",
+    "kalman_filter",
+    "preset",
+    "read_frames",
+    "read_mesh",
+    "robot_poses",
+]
 
 
 _TYPES = {

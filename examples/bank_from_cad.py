@@ -14,13 +14,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from phasemark import PhasemarkError, UsageError
-from phasemark.data import BankPlan, build_bank
+import phasemark as pm
 from phasemark.data.files import write_atomically
-from phasemark.data.plans import MeshPlan, parse_grid
-from phasemark.landmarks import check_mesh, export_mesh, mesh_figure, read_mesh
-from phasemark.matcher import Matcher, kalman_filter
-from phasemark.render import Renderer, capture, preset
+from phasemark.data.plans import parse_grid
+from phasemark.landmarks import check_mesh, export_mesh, mesh_figure
 
 
 def write_part(path: Path) -> None:
@@ -50,28 +47,27 @@ def main() -> int:
             path, unit = out / "bracket.stl", "mm"
             write_part(path)
         # the middle of its bounding box becomes the origin, from which D counts
-        mesh = read_mesh(path, unit=unit, origin="center")
+        mesh = pm.read_mesh(path, unit=unit, origin="center")
         report = check_mesh(mesh)
         print(f"{path}: {' × '.join(f'{100 * side:.1f}' for side in mesh.extents)} cm, {report.faces} faces")
         write_atomically(out / "part.png", mesh_figure(mesh), force=True)
 
-        plan = BankPlan(
-            classes=(),
-            meshes=(MeshPlan(name="part", path=str(path), unit=unit, origin="center"),),
-            distance_m=arguments.distance,
-            delta_deg=arguments.delta,
-            layout="full",
-        )
-        sensor = preset("pmd-16x16")
+        plan = {
+            "meshes": [{"name": "part", "path": str(path), "unit": unit, "origin": "center"}],
+            "distance_m": arguments.distance,
+            "delta_deg": arguments.delta,
+            "layout": "full",
+        }
+        sensor = pm.preset("pmd-16x16")
         middle_m = float(np.median(parse_grid(arguments.distance, "distance")))
-        with build_bank(plan, out / "bank.h5", force=True) as bank:
+        with pm.build_bank(plan, out / "bank.h5", force=True) as bank:
             view = (middle_m + 0.013, np.radians(33.0))  # between the bank's images
-            image = Renderer(bank.mesh("part"), sensor, albedo=0.8).render(*view)
-            frames = capture(image, sensor, rng=np.random.default_rng(7), n_frames=50)
-            match = Matcher(bank, method="refine").match(kalman_filter(frames))[0]
-    except (PhasemarkError, OSError) as error:
+            image = pm.Renderer(bank.mesh("part"), sensor, albedo=0.8).render(*view)
+            frames = pm.capture(image, sensor, rng=np.random.default_rng(7), n_frames=50)
+            match = pm.Matcher(bank, method="refine").match(pm.kalman_filter(frames))[0]
+    except (pm.PhasemarkError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return error.exit_code if isinstance(error, PhasemarkError) else UsageError.exit_code
+        return error.exit_code if isinstance(error, pm.PhasemarkError) else pm.UsageError.exit_code
     print(f"true view: D = {view[0]:.4f} m, δ = {np.degrees(view[1]):.2f}°")
     print(
         f"matched:   D = {match.distance_m:.4f} m, δ = {np.degrees(match.delta_rad):.2f}°, accepted: {match.accepted}"

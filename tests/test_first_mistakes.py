@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from test_sweep_tables import linear_sweep
 
+import phasemark
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
@@ -49,6 +50,17 @@ def test_a_specification_is_no_mesh():
     cone: Any = catalog()["cone"]
     with pytest.raises(UsageError, match="'mesh' must be a mesh, got LandmarkSpec: build_mesh makes one"):
         Renderer(cone, SENSOR)
+
+
+def test_a_bank_is_built_from_the_fields_of_its_plan_by_name(bank):
+    plan = {"classes": ["cone"], "distance_m": "0.9:1.1:0.02", "delta_deg": "0:180:2"}
+    with phasemark.build_bank(plan) as built:
+        assert built.identity() == bank.identity()
+    with pytest.raises(UsageError, match="unknown key 'distance'"):
+        build_bank({"distance": 1.0})
+    path: Any = "bank.h5"
+    with pytest.raises(UsageError, match=r"'plan' must be a BankPlan or its fields by name, got 'bank.h5'"):
+        build_bank(path)
 
 
 @pytest.mark.parametrize("background", [4.0, [4.0], {"wall_m": 4.0}])

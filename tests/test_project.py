@@ -79,8 +79,28 @@ for module in list(sys.modules.values()):
 
 
 def test_the_root_module_imports_nothing() -> None:
-    tree = ast.parse((ROOT / "__init__.py").read_text(encoding="utf-8"))
-    assert not [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    program = "import sys; before = set(sys.modules); import phasemark; print(*sorted(set(sys.modules) - before))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.split() == ["phasemark"], done.stderr
+
+
+FIRST_SCRIPT = {
+    "data": ["build_bank", "read_frames"],
+    "landmarks": ["catalog", "read_mesh"],
+    "matcher": ["Matcher", "kalman_filter", "robot_poses"],
+    "render": ["Renderer", "capture", "preset"],
+}
+
+
+def test_the_root_module_gives_a_first_script_the_names_of_the_rooms() -> None:
+    names = {name: room for room, own in FIRST_SCRIPT.items() for name in own}
+    for name, room in names.items():
+        assert getattr(phasemark, name) is getattr(importlib.import_module(f"phasemark.{room}"), name)
+    errors = {name for name, thing in vars(phasemark).items() if isinstance(thing, type) and name not in names}
+    assert set(phasemark.__all__) == {*names, *errors, "__version__"}
+    assert set(phasemark.__all__) <= set(dir(phasemark))
+    with pytest.raises(AttributeError, match="module 'phasemark' has no attribute 'presets'"):
+        phasemark.presets  # type: ignore[attr-defined]  # noqa: B018
 
 
 def test_imports_point_one_way() -> None:

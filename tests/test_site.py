@@ -93,6 +93,13 @@ def test_every_public_name_gets_a_page():
         assert [name for name in described if f"\n::: {name}\n" not in page] == []
 
 
+def test_a_name_of_a_room_that_the_root_module_gives_too_is_listed_once():
+    names = module("public_names").public_names()
+    assert all(issubclass(getattr(phasemark, name), phasemark.PhasemarkError) for name in names["phasemark"])
+    assert "preset" in names["phasemark.render"]
+    assert "`pm.preset`" in module("generated_pages").reference_page(linked=False)
+
+
 def test_a_function_beside_a_module_of_its_name_is_described_itself():
     found = module("public_names").described_at
     assert found("phasemark.landmarks", "catalog") == "phasemark.landmarks.catalog.catalog"

@@ -6,7 +6,7 @@ import itertools
 import json
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -62,7 +62,7 @@ class Landmark:
 
 
 def build_bank(
-    plan: BankPlan,
+    plan: BankPlan | Mapping[str, Any],
     path: str | os.PathLike[str] | None = None,
     *,
     force: bool = False,
@@ -80,8 +80,8 @@ def build_bank(
 
     Parameters
     ----------
-    plan : BankPlan
-        Plan of the bank.
+    plan : BankPlan or mapping
+        Plan of the bank, or its fields by name.
     path : path-like, optional
         The file to write; ``FILE.sha256`` goes beside it. None: a temporary file, gone once the bank is closed.
     force : bool
@@ -115,6 +115,10 @@ def build_bank(
     """
     if workers is not None and workers < 1:
         raise UsageError(f"'workers' must be at least 1, got {workers}")
+    if isinstance(plan, Mapping):
+        plan = BankPlan(**plan)
+    if not isinstance(plan, BankPlan):
+        raise UsageError(f"'plan' must be a BankPlan or its fields by name, got {plan!r}")
     if path is None:
         with TemporaryDirectory(prefix="phasemark-") as folder:
             # The open file outlives its name.

@@ -17,6 +17,7 @@ from typing import Any
 from markdown_dialect import without_roles
 from public_names import described_at, public_names
 
+import phasemark
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data.plans.frame_plan import SPREAD_SCHEMA, Distribution
 from phasemark.matcher.plan_kinds import KINDS, plan_example, plan_schema
@@ -30,6 +31,12 @@ RAISED = (UsageError, InputFileError, OutputExistsError, StorageError)
 def reference_path(module: str) -> str:
     """Return the page of a module's public names."""
     return f"reference/{module}.md"
+
+
+def first_script_names() -> str:
+    """Return the names that the root module takes from the rooms, as the code that uses them."""
+    own = public_names()["phasemark"]
+    return ", ".join(f"`pm.{name}`" for name in phasemark.__all__ if name not in (*own, "__version__"))
 
 
 def first_line(thing: object) -> str:
@@ -54,6 +61,7 @@ def reference_page(*, linked: bool) -> str:
         "# Public names",
         "",
         "Generated from the package by `make pages`; do not edit. What may be imported from where. "
+        f"`import phasemark as pm` also gives {first_script_names()}. "
         "Anything else is internal and may change. The site has a page for each of these modules, with parameters, "
         "results and errors of every name.",
         "",

@@ -16,6 +16,7 @@ def public_names() -> dict[str, list[str]]:
     """Return the public names of each module that has some.
 
     A name is public where a package lists it in ``__all__``, or where a name that once stood in a room is now found.
+    What the root module takes from a room is listed under the room alone.
 
     Returns
     -------
@@ -28,6 +29,8 @@ def public_names() -> dict[str, list[str]]:
     for places in MOVED.values():
         for place, names in places.items():
             found[place] = sorted({*found.get(place, []), *names})
+    rooms = {name for room in ROOMS[1:] for name in found[room]}
+    found["phasemark"] = [name for name in found["phasemark"] if name not in rooms]
     order = sorted(name for name in found if found[name] and name not in ROOMS)
     return {name: [each for each in found[name] if each != "__version__"] for name in (*ROOMS, *order)}
 
