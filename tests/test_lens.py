@@ -18,7 +18,7 @@ from phasemark.render import Background, Renderer, Sensor, Views, preset
 from phasemark.render.derivative import VIEW_PARAMETERS
 from phasemark.render.planar import PlanarLandmark, planar_images
 from phasemark.render.sensor import Lens
-from phasemark.render.sensor.sensor_file import sensor_toml
+from phasemark.render.sensor.sensor_file import read_sources, sensor_toml
 
 with np.load(Path(__file__).parent / "golden" / "lenses.npz") as _file:
     LENSES = json.loads(str(_file["lenses"]))
@@ -388,6 +388,25 @@ def test_an_imported_sensor_says_of_every_field_where_it_is_from(tmp_path, capsy
     shown = capsys.readouterr().out.partition("\n")[2]
     (tmp_path / "again.toml").write_text(shown, encoding="utf-8")
     assert Sensor.from_toml(tmp_path / "again.toml") == sensor
+
+
+def test_numbers_of_a_camera_that_nobody_named_are_assumed_of_an_imported_one(tmp_path, capsys):
+    (tmp_path / "info.yaml").write_text(calibrated())
+    out = tmp_path / "own.toml"
+    command = ["sensor", "import", str(tmp_path / "info.yaml"), "-o", str(out), "--force"]
+    assert main(command) == 0
+    sources = read_sources(out)
+    assumed = [name for name, text in sources.items() if text == "assumed (from pmd-16x16)"]
+    assert {"modulation_hz", "frame_rate_hz", "contrast", "signal_e"} <= set(assumed)
+    measured = [name for name, text in sources.items() if text == "measured: info.yaml"]
+    assert {*assumed, *measured} == set(sources)
+    note = capsys.readouterr().err
+    assert note.startswith("note: info.yaml states the lens alone; assumed from pmd-16x16: ")
+    assert set(note.split(": ")[2].partition(";")[0].split(", ")) == set(assumed)
+    assert note.endswith("; --like NAME|FILE takes them from another camera\n")
+    assert main([*command, "--like", "pmd-16x16"]) == 0
+    assert read_sources(out)["frame_rate_hz"] == "published (pmd-16x16)"
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize(

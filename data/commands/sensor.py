@@ -8,13 +8,13 @@ import json
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from phasemark import UsageError
 from phasemark.data.commands.command import Without
-from phasemark.data.commands.console import echo_json, echo_table, readable
+from phasemark.data.commands.console import echo_json, echo_table, readable, tell
 from phasemark.data.commands.inputs import note_too_far, read_sensor, read_sensor_sources
 from phasemark.data.commands.options import (
     Force,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from phasemark.render import Sensor
     from phasemark.render.bench.fit.fitted_sensor import FittedField
+    from phasemark.render.sensor.camera_info import CameraInfo
 
 
 def sensor_list(as_json: Json = False) -> None:
@@ -181,14 +182,14 @@ def sensor_import(
     camera_info: Annotated[Path, typer.Argument(metavar="CAMERA_INFO", help="A camera_info of ROS 1 or ROS 2, .yaml.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
     like: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--like",
             metavar="NAME|FILE",
-            help="The preset or sensor file that all other fields are taken from.",
+            help="The preset or sensor file of all other fields; without it those of pmd-16x16 are assumed.",
             autocompletion=a_preset,
         ),
-    ] = "pmd-16x16",
+    ] = None,
     modulation: Annotated[
         float | None,
         typer.Option("--modulation", metavar="HZ", help="Modulation frequency; by default that of --like."),
@@ -199,28 +200,30 @@ def sensor_import(
     """Make a sensor file from the intrinsics that ROS or OpenCV calibrated."""
     from phasemark.data.files.atomic_write import write_atomically
     from phasemark.render.sensor.camera_info import read_camera_info
-    from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD
-    from phasemark.render.sensor.sensor_fields import TABLES
+    from phasemark.render.sensor.lens_fields import DERIVED
     from phasemark.render.sensor.sensor_file import sensor_toml
 
     if out.suffix != ".toml":
         raise UsageError(f"--out must end in .toml, got '{out}'")
     refuse_existing([out], force)
     found = read_camera_info(camera_info)
-    base = read_sensor(like)
-    per_pixel = [name for name in ("dead_pixels", "hot_pixels", "zone_offset_m") if getattr(base, name)]
-    changes: dict[str, Any] = dict.fromkeys(per_pixel, ())
-    if modulation is not None:
-        changes["modulation_hz"] = modulation
-    fields = {name: value for name, value in base.model_dump().items() if name not in (*DERIVED, *TABLES)}
+    chosen = like or "pmd-16x16"
+    base, origin = read_sensor(chosen), readable(chosen)
     if base.histogram is not None:
-        raise UsageError(f"--like must be a camera without [histogram], got '{like}': zones have no lens of this kind")
-    fields |= base.calibration_without(lambda name: name.startswith(LENS_FIELD) or name in DERIVED)
-    sensor = type(base)(**{**fields, **changes, "rows": found.rows, "cols": found.cols, "lens": found.lens})
-    origin = readable(str(like))
-    stated = {k: f"{v} ({origin})" for k, v in read_sensor_sources(like).items() if k in type(base).model_fields}
-    measured = f"measured: {camera_info.name}"
-    comments = {name: text for name, text in stated.items() if name not in (*DERIVED, *TABLES, *per_pixel)}
+        raise UsageError(
+            f"--like must be a camera without [histogram], got '{chosen}': zones have no lens of this kind"
+        )
+    sensor = _with_lens_of(found, base, modulation)
+    measured, assumed = f"measured: {camera_info.name}", f"assumed (from {origin})"
+    own = {"rows", "cols", *DERIVED, *(name for name, value in sensor if value != getattr(base, name))}
+    # a number that is published of a camera which nobody named is no more than assumed of this one
+    stated = {k: f"{v} ({origin})" if like else assumed for k, v in read_sensor_sources(chosen).items()}
+    comments = {k: v for k, v in stated.items() if k in type(base).model_fields and k not in own}
+    if like is None:
+        tell(
+            f"note: {camera_info.name} states the lens alone; assumed from {origin}: {', '.join(comments)}; "
+            "--like NAME|FILE takes them from another camera"
+        )
     comments |= {"rows": measured, "cols": measured}
     comments |= {f"lens.{name}": measured for name in type(found.lens).model_fields}
     if modulation is not None:
@@ -229,12 +232,20 @@ def sensor_import(
         f"Made by phasemark from {camera_info.name} ({found.distortion_model}); all else is as in {origin}.",
         "Half angles and principal point follow from [lens]. OpenCV counts pixels from the centre of the first one.",
     ]
-    text = sensor_toml(sensor, comments, header=header, otherwise=f"assumed: as in {origin}")
-    write_atomically(out, text.encode(), force=force)
-    if as_json:
-        echo_json({"file": str(out), **sensor.as_dict()})
-        return
-    typer.echo(out)
+    write_atomically(out, sensor_toml(sensor, comments, header=header, otherwise=assumed).encode(), force=force)
+    echo_json({"file": str(out), **sensor.as_dict()}) if as_json else typer.echo(out)
+
+
+def _with_lens_of(found: CameraInfo, base: Sensor, modulation_hz: float | None) -> Sensor:
+    """Return a camera with another lens and number of pixels, without what belongs to the pixels or the old lens."""
+    from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD
+    from phasemark.render.sensor.sensor_fields import TABLES
+
+    fields = {name: value for name, value in base.model_dump().items() if name not in (*DERIVED, *TABLES)}
+    fields |= base.calibration_without(lambda name: name.startswith(LENS_FIELD) or name in DERIVED)
+    fields |= {name: () for name in ("dead_pixels", "hot_pixels", "zone_offset_m") if fields[name]}
+    fields |= {} if modulation_hz is None else {"modulation_hz": modulation_hz}
+    return type(base)(**{**fields, "rows": found.rows, "cols": found.cols, "lens": found.lens})
 
 
 def sensor_fit(
