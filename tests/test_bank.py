@@ -195,6 +195,16 @@ def test_the_file_says_where_it_comes_from(bank_file):
         json.dumps(info)
 
 
+def test_a_bank_of_a_direct_sensor_tells_bins_and_limits_and_no_modulation():
+    plan = {"classes": ["cone"], "sensor": "vl53l5cx-4x4", "distance_m": 0.8, "delta_deg": 0}
+    with build_bank(plan) as bank:
+        info = bank.info()
+    assert {"modulation_hz", "harmonics"}.isdisjoint(info)
+    assert (info["kind"], info["quantity"], info["max_range_m"]) == ("direct", "z", 4.0)
+    assert (info["bins"], info["bin_width_m"]) == (128, 0.0375)
+    assert (info["max_targets"], info["min_separation_m"]) == (4, 0.6)
+
+
 def test_a_mesh_hash_is_that_of_its_vertices_and_faces():
     mesh = trimesh.creation.box()
     content = mesh.vertices.astype("<f8").tobytes() + mesh.faces.astype("<i8").tobytes()

@@ -66,6 +66,13 @@ def test_a_shown_sensor_is_a_sensor_file_again(run: Callable[..., Outcome], name
     assert run("sensor", "show", str(path)).out == run("sensor", "show", name).out
 
 
+def test_a_direct_sensor_is_shown_without_a_modulation_of_its_own(run: Callable[..., Outcome]) -> None:
+    shown = run("sensor", "show", "vl53l5cx-8x8")
+    assert "no modulation" in shown.out.splitlines()[0]
+    assert shown.out.splitlines()[1].startswith("# modulation_hz: of the model alone")
+    assert json.loads(run("sensor", "show", "vl53l5cx-8x8", "--json").out)["unambiguous_range_m"] is None
+
+
 def test_a_sensor_as_json_has_every_field(run: Callable[..., Outcome]) -> None:
     shown = json.loads(run("sensor", "show", "pmd-16x16", "--json").out)
     assert set(Sensor.model_fields) - {"histogram", "lens"} < set(shown)  # tables that some sensors have

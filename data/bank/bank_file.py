@@ -397,14 +397,29 @@ class Bank:
             "delta_deg": format_grid(self.plan.delta_deg or ()),
             "n_delta": len(self.delta_rad),
             "images": views,
-            "harmonics": [k for k in groups[0].order.tolist() if k],
             "sensor": self.plan.sensor,
             "rows": self.sensor.rows,
             "cols": self.sensor.cols,
             **self._region_info(),
-            "modulation_hz": self.sensor.modulation_hz,
+            **self._kind_info(groups[0]),
             "mesh_sha256": hashes,
             "versions": self.versions,
+        }
+
+    def _kind_info(self, group: BankGroup) -> dict[str, Any]:
+        """Return how the camera measures; a direct one has no modulation, and the one in its file is the model's."""
+        if self.sensor.kind == "phase":
+            return {
+                "harmonics": [k for k in group.order.tolist() if k],
+                "modulation_hz": self.sensor.modulation_hz,
+            }
+        histogram = self.sensor.histogram
+        names = ("bins", "bin_width_m", "max_targets", "min_separation_m") if histogram is not None else ()
+        return {
+            "kind": self.sensor.kind,
+            "quantity": self.sensor.quantity,
+            "max_range_m": self.sensor.max_range_m,
+            **{name: getattr(histogram, name) for name in names},
         }
 
     def _region_info(self) -> dict[str, Any]:

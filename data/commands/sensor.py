@@ -105,7 +105,8 @@ def sensor_show(
         return
     if sensor.kind == "direct":
         axis = "z, along the optical axis" if sensor.quantity == "z" else "the range along the ray"
-        typer.echo(f"# direct time of flight: no taps, no phasors; its own quantity is {axis}")
+        typer.echo(f"# direct time of flight: no taps, no modulation; its own quantity is {axis}")
+        typer.echo("# modulation_hz: of the model alone, so slow that ranges in a zone are averaged by their light")
     else:
         scales = ", ".join(f"{camera.metres_per_radian:.6f}" for camera in sensor.by_frequency)
         typer.echo(f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {scales} m per radian")

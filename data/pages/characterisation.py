@@ -198,6 +198,7 @@ def _report(found: Characterisation, name: str, seed: int, pictures: dict[str, b
             (field, value)
             for field, value in sensor.model_dump(mode="json").items()
             if value != type(sensor).model_fields[field].default
+            and not (field == "modulation_hz" and sensor.kind == "direct")
         ],
         command=f"phasemark sensor characterise {name} --seed {seed} --frames {found.n_frames} -o DIR",
     )

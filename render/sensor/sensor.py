@@ -295,8 +295,9 @@ class Sensor(SensorQuantities):
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return every field, and the unambiguous range, as plain numbers and text, for JSON."""
-        return {**self.model_dump(mode="json"), "unambiguous_range_m": self.unambiguous_range_m}
+        """Return every field, and the unambiguous range (a direct sensor has none), as plain numbers, for JSON."""
+        own = self.unambiguous_range_m if self.kind == "phase" else None
+        return {**self.model_dump(mode="json"), "unambiguous_range_m": own}
 
     @classmethod
     def from_intrinsics(
