@@ -50,7 +50,7 @@ def main() -> int:
         mesh = pm.read_mesh(path, unit=unit, origin="center")
         report = check_mesh(mesh)
         print(f"{path}: {' × '.join(f'{100 * side:.1f}' for side in mesh.extents)} cm, {report.faces} faces")
-        write_atomically(out / "part.png", mesh_figure(mesh), force=True)
+        write_atomically(out / "part.png", mesh_figure(mesh, directions=True), force=True)
 
         plan = {
             "meshes": [{"name": "part", "path": str(path), "unit": unit, "origin": "center"}],

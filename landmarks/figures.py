@@ -11,6 +11,8 @@ from importlib import resources
 
 import numpy as np
 import trimesh
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
@@ -18,9 +20,13 @@ from numpy.typing import NDArray
 
 _CREASE_RAD = np.radians(30)
 _COLOUR = np.array([0.47, 0.65, 0.85])
+_SIDE_IN = 5.2
+_FIRST_COLOUR = "#b3261e"  # of the line of sight at δ = 0
 
 
-def mesh_figure(mesh: trimesh.Trimesh, *, azimuth_deg: float = -50.0, elevation_deg: float = 22.0) -> bytes:
+def mesh_figure(
+    mesh: trimesh.Trimesh, *, azimuth_deg: float = -50.0, elevation_deg: float = 22.0, directions: bool = False
+) -> bytes:
     """Draw a mesh, shaded, its edges marked.
 
     Parameters
@@ -29,15 +35,29 @@ def mesh_figure(mesh: trimesh.Trimesh, *, azimuth_deg: float = -50.0, elevation_
         Metres, landmark frame.
     azimuth_deg, elevation_deg : float
         Where it is seen from.
+    directions : bool
+        Whether to draw beside it, seen from above, the axis and the viewing directions δ (PHYSICS section 1).
 
     Returns
     -------
     bytes
         A PNG.
     """
-    figure = Figure(figsize=(5.2, 5.2))
-    axes = Axes3D(figure, (0.0, 0.03, 0.92, 0.94), computed_zorder=False)
+    figure = Figure(figsize=(_SIDE_IN * (1 + directions), _SIDE_IN))
+    share = 1 / (1 + directions)
+    axes = Axes3D(figure, (0.0, 0.03, 0.92 * share, 0.94), computed_zorder=False)
     figure.add_axes(axes)
+    if directions:
+        _draw_axis(axes, mesh)
+        _draw_directions(figure.add_axes((0.585, 0.12, 0.395, 0.79)), mesh)
+    _draw_solid(axes, mesh, azimuth_deg, elevation_deg)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=130)
+    return buffer.getvalue()
+
+
+def _draw_solid(axes: Axes3D, mesh: trimesh.Trimesh, azimuth_deg: float, elevation_deg: float) -> None:
+    """Draw a mesh in three dimensions."""
     axes.view_init(elev=elevation_deg, azim=azimuth_deg)
     towards = _direction(azimuth_deg, elevation_deg)
     light = _direction(azimuth_deg - 35, elevation_deg + 25)
@@ -60,9 +80,46 @@ def mesh_figure(mesh: trimesh.Trimesh, *, azimuth_deg: float = -50.0, elevation_
     axes.set_xlabel("x' (cm)")
     axes.set_ylabel("y' (cm)")
     axes.set_zlabel("z' (cm)")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130)
-    return buffer.getvalue()
+
+
+def _draw_axis(axes: Axes3D, mesh: trimesh.Trimesh) -> None:
+    """Draw the axis z' through a mesh, and an arrow along the line of sight at δ = 0."""
+    low, high = np.asarray(mesh.bounds)[:, 2] * 100
+    beyond = 0.12 * 100 * float(mesh.extents.max())
+    axes.plot([0, 0], [0, 0], [low - beyond, high + beyond], "-.", color="#1d2733", lw=1.0, zorder=3)
+    reach = 100 * _reach_m(mesh)
+    axes.quiver(-1.6 * reach, 0, (low + high) / 2, 0.5 * reach, 0, 0, color=_FIRST_COLOUR, lw=2.2, zorder=0)
+
+
+def _draw_directions(axes: Axes, mesh: trimesh.Trimesh) -> None:
+    """Draw a mesh from above, with the axis, and an arrow from the camera towards it for some δ."""
+    from_above, closed = np.array([0.0, 0.0, 1.0]), bool(mesh.is_watertight and mesh.volume > 0)
+    faces = np.asarray(mesh.triangles)[:, :, :2] * 100
+    edges = _visible_edges(mesh, from_above, closed)[:, :, :2] * 100
+    axes.add_collection(PolyCollection(list(faces), facecolors="0.85", edgecolors="none"))
+    axes.add_collection(LineCollection(list(edges), colors="#1d2733", linewidths=0.7))
+    reach = 100 * _reach_m(mesh)
+    for delta_deg in range(0, 360, 45):
+        colour, width, label = (_FIRST_COLOUR, 2.2, "δ = 0") if delta_deg == 0 else ("0.4", 1.0, f"{delta_deg}°")
+        x, y, _ = -reach * _direction(delta_deg, 0.0)  # the lens is at -D (cos δ, sin δ)
+        arrow = {"arrowstyle": "-|>", "color": colour, "lw": width, "mutation_scale": 16}
+        axes.annotate("", (1.08 * x, 1.08 * y), (1.5 * x, 1.5 * y), arrowprops=arrow)
+        axes.text(1.72 * x, 1.72 * y, label, color=colour, ha="center", va="center")
+    axes.plot(0, 0, "o", ms=8, mfc="white", mec="#1d2733")
+    axes.plot(0, 0, ".", ms=3, color="#1d2733")
+    paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
+    axes.annotate("axis z'", (0, 0), (7, 7), textcoords="offset points", fontsize=9, bbox=paper)
+    axes.set_xlim(-2 * reach, 2 * reach)
+    axes.set_ylim(-2 * reach, 2 * reach)
+    axes.set_aspect("equal")
+    axes.set_title("from above: δ is the direction in which the camera looks", fontsize=10)
+    axes.set_xlabel("x' (cm)")
+    axes.set_ylabel("y' (cm)", labelpad=0)
+
+
+def _reach_m(mesh: trimesh.Trimesh) -> float:
+    """Return how far a mesh reaches from the axis z', metres."""
+    return float(np.hypot(*np.asarray(mesh.vertices)[:, :2].T).max())
 
 
 def mesh_html(mesh: trimesh.Trimesh, title: str) -> str:

@@ -12,9 +12,11 @@ import matplotlib.image
 import numpy as np
 import pytest
 import trimesh
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 
 from phasemark.landmarks import build_mesh, catalog, mesh_figure
-from phasemark.landmarks.figures import mesh_html
+from phasemark.landmarks.figures import _draw_directions, mesh_html
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 BOX = trimesh.creation.box((0.2, 0.1, 0.3))
@@ -92,6 +94,22 @@ def test_the_picture_shows_the_mesh_from_where_it_is_asked():
         rows, cols = np.nonzero(blue(mesh_figure(BOX, azimuth_deg=azimuth_deg, elevation_deg=0.0)))
         # perspective enlarges the near face in both directions alike; the ink of the outline costs a pixel or two
         assert np.ptp(rows) / np.ptp(cols) == pytest.approx(ratio, rel=0.05)
+
+
+def test_directions_are_drawn_from_where_the_camera_looks(mesh):
+    axes = Figure().add_subplot()
+    _draw_directions(axes, mesh)
+    arrows = [one for one in axes.texts if isinstance(one, Annotation) and one.arrow_patch is not None]
+    labels = [one for one in axes.texts if not isinstance(one, Annotation)]
+    assert [one.get_text() for one in labels] == ["δ = 0", *(f"{delta_deg}°" for delta_deg in range(45, 360, 45))]
+    reach_cm = 100 * np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max()
+    for k, (arrow, label) in enumerate(zip(arrows, labels, strict=True)):
+        looks = np.array([np.cos(k * np.pi / 4), np.sin(k * np.pi / 4)])
+        tail, head, beside = (np.array(place) @ looks for place in (arrow.xyann, arrow.xy, label.get_position()))
+        assert beside < tail < head < -reach_cm  # the lens is at −D (cos δ, sin δ), and looks at the axis (section 1)
+        np.testing.assert_allclose(label.get_position(), beside * looks, atol=1e-9)
+    drawn = matplotlib.image.imread(io.BytesIO(mesh_figure(mesh, directions=True)))
+    assert drawn.shape[1] == 2 * matplotlib.image.imread(io.BytesIO(mesh_figure(mesh))).shape[1]
 
 
 def test_an_open_mesh_shows_its_inside():

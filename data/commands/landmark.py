@@ -61,7 +61,7 @@ def landmark_show(
     figure, page = folder / f"{name}.png", folder / f"{name}.html"
     refuse_existing([figure, page], force)
     make_folder(folder)
-    write_atomically(figure, mesh_figure(mesh), force=force)
+    write_atomically(figure, mesh_figure(mesh, directions=True), force=force)
     write_atomically(page, mesh_html(mesh, readable(name)).encode(), force=force)
     typer.echo(figure)
     typer.echo(page)
