@@ -2,12 +2,43 @@
 
 from __future__ import annotations
 
+import csv
 import math
 
 from phasemark import InputFileError
 
 _SHOWN = 40
 """Characters of a cell that a message shows."""
+
+
+def cells_of(line: str, where: str, separator: str = ",") -> list[str]:
+    """Return the cells of one line of a table; a quotation mark that is not closed does not reach the next line.
+
+    Parameters
+    ----------
+    line : str
+    where : str
+        File and line, for the message.
+    separator : str
+
+    Returns
+    -------
+    list of str
+
+    Raises
+    ------
+    InputFileError
+        A quotation mark is not closed, or a cell is longer than any number.
+
+    Examples
+    --------
+    >>> cells_of('1.5,"2"', "poses.csv, line 2")
+    ['1.5', '2']
+    """
+    try:
+        return next(csv.reader([line], delimiter=separator, strict=True))
+    except csv.Error as error:
+        raise InputFileError(f"{where}: is no line of CSV ({error}); a quotation mark must be closed") from None
 
 
 def finite_number(cell: str, where: str, column: str, *, empty_is_nan: bool = False) -> float:

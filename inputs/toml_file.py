@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,11 @@ import tomlkit
 
 from phasemark import InputFileError
 from phasemark.inputs.reading import MOST_TOML_BYTES, read_text
+
+_MOST_KEYS = 32
+"""Tables within each other that a key may name: reading takes the square of that."""
+_KEY = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+_DEEP_KEY = re.compile(rf"(?<![\w-])(?:{_KEY}[ \t]*+\.[ \t]*+){{{_MOST_KEYS}}}")
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -27,10 +33,15 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     Raises
     ------
     InputFileError
-        The file cannot be read, is too large, is not what its checksum says, or is not TOML.
+        The file cannot be read, is too large, is not what its checksum says, or is not TOML, or a key has too many
+        dots.
     """
     path = Path(path)
     text = read_text(path, most_bytes=MOST_TOML_BYTES)
+    deep = _DEEP_KEY.search(text)
+    if deep is not None:
+        line = text.count("\n", 0, deep.start()) + 1
+        raise InputFileError(f"{path}: line {line}: a key has {_MOST_KEYS} dots or more, and no plan or sensor has any")
     try:
         return tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:  # the last: nested without end

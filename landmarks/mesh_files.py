@@ -26,6 +26,9 @@ logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 _MOST_BYTES = 1 << 27
 """What MAX_FACES take in binary, with a margin; in text it is half as many faces, which no landmark needs either."""
+_MOST_AT_VERTEX = 4096
+"""Faces that may meet at one vertex: where polygons of more corners are cut into triangles, all of them lie in the way
+of each other, and finding what is near a point takes the square of their number."""
 FORMATS = ("stl", "ply", "obj", "off")
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 ORIGINS = ("file", "base", "center")
@@ -124,7 +127,7 @@ def read_mesh(
     ------
     InputFileError
         The file cannot be read, or has no faces, vertices that are not finite, indices out of range, no extent, over
-        two million faces, or an unknown format.
+        two million faces, over 4096 at one vertex, or an unknown format.
     UsageError
         An option is wrong or the unit is missing; then the message gives the extents in each unit.
 
@@ -280,6 +283,12 @@ def _parse(content: bytes, kind: str, name: str) -> tuple[NDArray[np.float64], N
     faces = faces[area > 1e-14 * float(np.ptp(vertices, axis=0).max()) ** 2]
     if not len(faces):
         raise InputFileError(f"{name}: has no extent: no face has an area")
+    meeting = int(np.bincount(faces.ravel()).max())
+    if meeting > _MOST_AT_VERTEX:
+        raise InputFileError(
+            f"{name}: {meeting} faces meet at one vertex, at most {_MOST_AT_VERTEX} can be used: give a polygon fewer"
+            " corners"
+        )
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used], faces.reshape(-1, 3)
 

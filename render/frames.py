@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
+from phasemark.inputs.numbers import real_array
 from phasemark.render.png import figure_png
 from phasemark.render.sensor.sensor import Sensor
 
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _TAPS_PER_PHASE_IMAGE = 2
-
-_Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 class Flag(IntFlag):
@@ -40,6 +39,10 @@ class Flag(IntFlag):
     """The modulation frequencies agree on no range: a mixed pixel, or one that returns at some alone; also MISSING."""
 
 
+_MOST_FLAGS = int(sum(Flag))
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+
 class Frames:
     """Frames of a camera at rest: n positions, several frames each.
 
@@ -51,7 +54,7 @@ class Frames:
         Measured amplitude and intensity, electrons per phase image, in the shape of `range_m`; of several frequencies
         those at the first.
     valid : array_like of bool, optional
-        False where the range must not be used; what is NaN is invalid in any case.
+        False where the range must not be used; what is NaN, negative or masked (`numpy.ma`) is invalid in any case.
     flags : array_like of int, optional
         :class:`Flag` of every pixel. Without it an invalid pixel gets the flag that `invalid_means` names.
     sensor : Sensor
@@ -71,8 +74,8 @@ class Frames:
     Raises
     ------
     UsageError
-        The shapes do not agree with each other or with the sensor, a valid pixel's amplitude or intensity cannot be, or
-        a time stamp is not finite.
+        The shapes do not agree with each other or with the sensor, numbers are complex, a valid pixel's amplitude or
+        intensity cannot be, a flag is no :class:`Flag`, or a time stamp is not finite.
     """
 
     figure: ClassVar[Callable[..., Figure]]
@@ -96,7 +99,7 @@ class Frames:
         time_s: ArrayLike | None = None,
         by_frequency: Sequence[Frames] = (),
     ) -> None:
-        given = ranges = np.array(range_m, dtype=np.float64)
+        given = ranges = real_array("range_m", np.ma.getdata(range_m))
         if ranges.ndim not in (2, 3, 4):
             raise UsageError(f"'range_m' must have shape (n, frames, rows, cols), got {ranges.shape}")
         shape = (1,) * (4 - ranges.ndim) + ranges.shape
@@ -105,22 +108,26 @@ class Frames:
                 f"the frames have {shape[2]} × {shape[3]} pixels, but the sensor has {sensor.rows} × {sensor.cols}"
             )
 
-        def like_range(name: str, value: ArrayLike, dtype: type[_Scalar]) -> NDArray[_Scalar]:
-            array: NDArray[_Scalar] = np.array(value, dtype=dtype)
+        def like_range(name: str, array: NDArray[_Scalar]) -> NDArray[_Scalar]:
             if array.shape != ranges.shape:
                 raise UsageError(f"'{name}' has shape {array.shape}, but 'range_m' has {ranges.shape}")
             return array.reshape(shape)
 
-        amplitude = None if amplitude_e is None else like_range("amplitude_e", amplitude_e, np.float64)
-        intensity = None if intensity_e is None else like_range("intensity_e", intensity_e, np.float64)
-        usable = np.isfinite(ranges).reshape(shape)
+        amplitude, intensity = (
+            None if value is None else like_range(name, real_array(name, np.ma.getdata(value)))
+            for name, value in (("amplitude_e", amplitude_e), ("intensity_e", intensity_e))
+        )
+        usable = (np.isfinite(ranges) & (ranges >= 0)).reshape(shape)
         if valid is not None:
-            usable &= like_range("valid", valid, np.bool_)
+            usable &= like_range("valid", np.array(np.ma.getdata(valid), dtype=np.bool_))
+        for masked in (range_m, amplitude_e, intensity_e, valid):
+            if np.ma.is_masked(masked):
+                usable &= ~np.ma.getmaskarray(np.ma.asarray(masked)).reshape(shape)
         if flags is None:
             kind = Flag.NO_RETURN if invalid_means == "no-return" else Flag.MISSING
             codes = np.where(usable, 0, int(kind)).astype(np.uint8)
         else:
-            codes = like_range("flags", flags, np.uint8)
+            codes = like_range("flags", _checked_flags(flags))
             codes[~usable & (codes == 0)] |= int(Flag.MISSING)
             usable &= codes == 0
         for name, measured, least in (("amplitude_e", amplitude, 0.0), ("intensity_e", intensity, -np.inf)):
@@ -144,7 +151,7 @@ class Frames:
         self.flags: NDArray[np.uint8] = codes
         self.taps_e: NDArray[np.float64] | None = None
         if taps_e is not None:
-            taps: NDArray[np.float64] = np.array(taps_e, dtype=np.float64)
+            taps = real_array("taps_e", taps_e)
             of_pixel = (sensor.n_phase_images, _TAPS_PER_PHASE_IMAGE)
             expected = (*given.shape[:-2], *of_pixel, *given.shape[-2:])
             if taps.shape != expected:
@@ -153,7 +160,7 @@ class Frames:
         self.time_s: NDArray[np.float64] | None = None
         """Time stamps, (n, frames) seconds, or None."""
         if time_s is not None:
-            times = np.array(time_s, dtype=np.float64)
+            times = real_array("time_s", time_s)
             if times.shape != given.shape[:-2]:
                 raise UsageError(f"'time_s' has shape {times.shape}, but must have {given.shape[:-2]}")
             if not np.isfinite(times).all():
@@ -298,6 +305,16 @@ class Frames:
     def _repr_png_(self) -> bytes | None:
         """Show the first frame in a notebook; nothing where there is none."""
         return figure_png(self.plot()) if self.range_m.size else None
+
+
+def _checked_flags(flags: ArrayLike) -> NDArray[np.uint8]:
+    """Return flags as an array of their own; refuse what no sum of :class:`Flag` is."""
+    given = np.asarray(flags)
+    codes = given.astype(np.uint8)
+    wrong = given[(codes != given) | (codes > _MOST_FLAGS)]
+    if wrong.size:
+        raise UsageError(f"'flags' must be sums of Flag, whole numbers from 0 to {_MOST_FLAGS}, got {wrong.flat[0]}")
+    return codes
 
 
 def _checked_parts(parts: Sequence[Frames], shape: tuple[int, ...], sensor: Sensor) -> tuple[Frames, ...]:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from threading import Lock
 from typing import Any, Literal
 
 import numpy as np
@@ -538,7 +539,9 @@ class Renderer:
             with ThreadPoolExecutor(workers) as pool:
                 lanes = [tasks[i::workers] for i in range(workers)]
                 list(pool.map(lambda lane: run(lane, ordered, behind, camera, light, sums), lanes))
-        self.untrusted_pixels += int((sums.state == UNTRUSTED).sum())
+        untrusted = int((sums.state == UNTRUSTED).sum())
+        with _COUNTING:
+            self.untrusted_pixels += untrusted
         phasor, intensity, coverage, upper = (
             _restored(values.reshape(*shape, *values.shape[1:]), order)
             for values in (sums.phasor, sums.intensity, sums.coverage, sums.upper)
@@ -694,6 +697,8 @@ def background_image(background: Background, sensor: Sensor) -> PhasorImages:
     return Renderer(None, sensor).render(distance_m=1.0, background=background)
 
 
+_COUNTING = Lock()
+"""Threads may share a renderer, and its count; the lock is no part of it, so that it can be copied and pickled."""
 _TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
 _MOST_TOPOLOGIES = 16
 
@@ -709,6 +714,10 @@ def _topology(mesh: SurfaceMesh) -> MeshTopology:
     key = digest.digest()
     found = _TOPOLOGIES.get(key)
     if found is None:
+        faces, n = np.asarray(mesh.faces), len(mesh.vertices)
+        wrong = faces[(faces < 0) | (faces >= n)]
+        if wrong.size:
+            raise UsageError(f"a face of the mesh names vertex {wrong[0]}, but there are {n}, counted from 0")
         found = MeshTopology.from_mesh(unite_shells(mesh))
         _TOPOLOGIES[key] = found
         if len(_TOPOLOGIES) > _MOST_TOPOLOGIES:

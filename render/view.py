@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
+from phasemark.inputs.numbers import real_array
 from phasemark.render.rigid import product, rigid_transforms, tilt2level
 
 if TYPE_CHECKING:
@@ -145,7 +146,9 @@ class Views:
         values = []
         for name, given in zip(names, (distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad), strict=True):
             try:
-                values.append(np.asarray(given, dtype=float))
+                values.append(real_array(name, given))
+            except UsageError:
+                raise
             except (TypeError, ValueError, OverflowError):
                 raise UsageError(f"'{name}' must be numbers, got {given!r}") from None
         for name, value in zip(names, values, strict=True):

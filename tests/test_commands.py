@@ -410,7 +410,7 @@ MISTAKES = [
     _case(3, "landmark", "check", "cut.stl", "--unit", "m", contains="cut off"),
     _case(3, "landmark", "check", "none.stl", "--unit", "m", contains="none.stl"),
     _case(3, "landmark", "check", "frames.csv", "--unit", "m", contains="csv"),
-    _case(2, "landmark", "show", "cone", "-o", "box.stl", contains="directory"),
+    _case(2, "landmark", "show", "cone", "-o", "box.stl", contains="is not a folder"),
     _case(2, "landmark", "export", "box.stl", "-o", "x.stl", contains="catalogue"),
     _case(4, "demo", "-o", ".", contains="bank.h5"),
     _case(2, "demo", "-o", "new", "--seed", -1, contains="--seed"),
@@ -517,8 +517,9 @@ def test_what_the_mesh_library_logs_stays_off_the_screen(tmp_path):
         ["render", "--class", "cone", "--distance", "1", "-o", "x.png"],
         ["landmark", "export", "sphere", "-o", "x.obj"],
         ["landmark", "show", "cone"],
+        ["landmark", "show", "cone", "-o", "new/pictures"],
     ],
-    ids=lambda arguments: " ".join(arguments[:2]),
+    ids=lambda arguments: " ".join(arguments),
 )
 def test_a_full_disk_exits_with_5_and_leaves_nothing(run, tmp_path, monkeypatch, arguments):
     resource = pytest.importorskip("resource")  # POSIX

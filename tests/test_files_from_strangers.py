@@ -1,9 +1,12 @@
 """Files from strangers: nothing outside is opened, nothing runs away, and each ends in an answer or one line."""
 
+import contextlib
 import os
+import re
 import shutil
 import subprocess
 import sys
+import time
 import zlib
 
 import h5py
@@ -16,6 +19,10 @@ from phasemark.cli import main
 from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_bank, open_frames, read_frames
 from phasemark.data.files.guard import first_reading, refusal
 from phasemark.inputs import checksum_path
+from phasemark.inputs.toml_file import read_toml
+from phasemark.landmarks import read_mesh
+from phasemark.matcher.calibration import read_poses
+from phasemark.matcher.recordings.pose_table import read_pose_table
 from phasemark.render import preset
 
 SENSOR = preset("pmd-16x16")
@@ -246,3 +253,53 @@ def test_trials_that_their_checksum_contradicts_are_refused(sweep_folder, tmp_pa
     for command in (["sweep", "compare", str(sweep_folder), str(folder)], ["sweep", "report", str(folder)]):
         assert main(command) == 3
         assert f"{trials}: damaged" in capsys.readouterr().err
+
+
+def elapsed_s(work):
+    """Return the processor seconds that something takes to be refused, and its message."""
+    began = time.process_time()
+    with pytest.raises(InputFileError) as refused:
+        work()
+    return time.process_time() - began, str(refused.value)
+
+
+@pytest.mark.parametrize("key", ["a", '"a b"', "'a.b'", '"\\""'])
+@pytest.mark.parametrize("text", ["{} = 1\n", "[{}]\n", "[[{}]]\n", "x = {{ {} = 1 }}\n"])
+def test_a_key_of_a_hundred_thousand_tables_is_refused_at_once(tmp_path, key, text):
+    path = tmp_path / "plan.toml"
+    path.write_text("x.y = 0.5\n\n" + text.format(".".join([key] * 100_000)))
+    took_s, message = elapsed_s(lambda: read_toml(path))
+    assert message == f"{path}: line 3: a key has 32 dots or more, and no plan or sensor has any"
+    assert took_s < 5  # tomllib takes minutes
+
+
+@pytest.mark.parametrize("text", ["a" * 10**6, '"' * 10**6, '"a ' * 10**6, "a." * 15 + "a = 1", "." * 10**6])
+def test_looking_for_such_keys_takes_no_longer_than_reading(tmp_path, text):
+    path = tmp_path / "plan.toml"
+    path.write_text(text)
+    began = time.process_time()
+    with contextlib.suppress(InputFileError):
+        read_toml(path)
+    assert time.process_time() - began < 5
+
+
+@pytest.mark.parametrize("kind", ["obj", "off"])
+def test_a_polygon_of_three_hundred_thousand_corners_is_refused(kind):
+    n = 300_000
+    turn = 2 * np.pi * np.arange(n) / n
+    points = [f"{x:.6f} {y:.6f} 0" for x, y in zip(np.cos(turn), np.sin(turn), strict=True)]
+    if kind == "obj":
+        text = "v " + "\nv ".join(points) + "\nf " + " ".join(map(str, range(1, n + 1)))
+    else:
+        text = f"OFF {n} 1 0\n" + "\n".join(points) + f"\n{n} " + " ".join(map(str, range(n)))
+    took_s, message = elapsed_s(lambda: read_mesh(text.encode(), unit="m", file_type=kind))
+    assert re.fullmatch(r"mesh: 29\d{4} faces meet at one vertex, at most 4096 can be used: .*fewer corners", message)
+    assert took_s < 40  # checking its symmetry would take hours
+
+
+def test_a_quotation_mark_that_is_not_closed_does_not_swallow_the_table(tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_text('distance_m,delta_deg\n"1,30\n' + "1,30\n" * 200_000)
+    for read in (read_poses, read_pose_table):
+        with pytest.raises(InputFileError, match=r"line 2: is no line of CSV \(unexpected end of data\); a quotation"):
+            read(path)

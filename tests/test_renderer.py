@@ -1,6 +1,8 @@
 """The area integral against closed forms, against dense sampling, and against itself where it must not depend."""
 
 import math
+import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,7 @@ from oracles.images import (
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, Sensor, Views, preset
+from phasemark.render.direct import SceneMesh
 from phasemark.render.integral.intersect import make_intersector
 
 PMD = preset("pmd-16x16")
@@ -488,6 +491,38 @@ def test_a_pixel_crowded_with_crossing_needles_is_still_split_exactly(n):
         mean_of_blocks(fine.coverage, 32)[0, 7, 7], rel=1e-6
     )  # float32 rays
     assert image.phasor[0, 7, 7] == pytest.approx(mean_of_blocks(fine.phasor, 32)[0, 7, 7], rel=1e-6)
+
+
+def test_threads_that_share_a_renderer_count_all_of_its_untrusted_pixels(monkeypatch):
+    class Slow(Renderer):
+        """A renderer whose count is read long before it is written again."""
+
+        @property
+        def untrusted_pixels(self):
+            count = self.count
+            time.sleep(0.2)
+            return count
+
+        @untrusted_pixels.setter
+        def untrusted_pixels(self, count):
+            self.count = count
+
+    renderer = Slow(MESHES["cone"], PMD)
+    monkeypatch.setattr("phasemark.render.renderer.UNTRUSTED", 0)  # the state of most pixels
+    renderer.render(1.0)
+    one = renderer.count
+    assert one > 0
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(renderer.render, (1.0, 1.0)))
+    assert renderer.count == 3 * one
+
+
+@pytest.mark.parametrize("wrong", [4, -1])
+def test_a_face_that_names_no_vertex_is_named(wrong):
+    mesh = trimesh.Trimesh(np.eye(4, 3), [[0, 1, 2], [0, 1, wrong]], process=False, validate=False)
+    for make in (lambda: Renderer(mesh, PMD), lambda: SceneMesh(mesh)):
+        with pytest.raises(UsageError, match=f"a face of the mesh names vertex {wrong}, but there are 4"):
+            make()
 
 
 # --- shapes of every kind, against dense sampling ---

@@ -12,7 +12,7 @@ import typer
 from phasemark.data.commands.console import echo_facts, echo_json, echo_table, readable
 from phasemark.data.commands.inputs import class_mesh, read_landmark
 from phasemark.data.commands.options import Force, Json, MeshReading, a_class
-from phasemark.data.commands.outputs import make_folder, refuse_existing, refuse_input_files
+from phasemark.data.commands.outputs import refuse_existing, refuse_input_files
 
 if TYPE_CHECKING:
     from phasemark.landmarks import LandmarkSpec
@@ -53,6 +53,7 @@ def landmark_show(
 ) -> None:
     """Draw a landmark: a shaded figure, and a page to turn it in 3D."""
     from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.data.files.folder_marker import made_folder
     from phasemark.landmarks import mesh_figure
     from phasemark.landmarks.figures import mesh_html
 
@@ -60,9 +61,9 @@ def landmark_show(
     folder = out or Path()
     figure, page = folder / f"{name}.png", folder / f"{name}.html"
     refuse_existing([figure, page], force)
-    make_folder(folder)
-    write_atomically(figure, mesh_figure(mesh, directions=True), force=force)
-    write_atomically(page, mesh_html(mesh, readable(name)).encode(), force=force)
+    with made_folder(folder):
+        write_atomically(figure, mesh_figure(mesh, directions=True), force=force)
+        write_atomically(page, mesh_html(mesh, readable(name)).encode(), force=force)
     typer.echo(figure)
     typer.echo(page)
 

@@ -16,14 +16,6 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 
-def make_folder(path: Path) -> None:
-    """Make a folder for outputs, and those above it; one that is there already will do."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise UsageError(f"{path}: is not a directory, or a parent of it is a file") from None
-
-
 def refuse_input_files(outputs: Iterable[Path], plan: BaseModel | None = None) -> None:
     """Refuse outputs that are the same file as an argument of the running command, or as one that a plan names."""
     from phasemark.data.files.same_file import named_files, refuse_inputs

@@ -178,6 +178,35 @@ def adding_to_folder(folder: Path, content: str, adopted: Iterable[str] = ()) ->
     StorageError
         It cannot be written.
     """
+    with made_folder(folder), storage_errors(folder), exclusive(folder / LOCK, folder):
+        for name in filter(is_marker_part, os.listdir(folder)):  # of a run that was killed
+            (folder / name).unlink(missing_ok=True)
+        marked = os.path.lexists(folder / MARKER)
+        ours = OwnedFiles(folder, content, set(adopted))
+        try:
+            yield ours
+        except BaseException:
+            if not marked and not any(os.path.lexists(folder / name) for name in ours.names):
+                (folder / MARKER).unlink(missing_ok=True)
+            raise
+
+
+@contextmanager
+def made_folder(folder: Path) -> Iterator[None]:
+    """Make a folder, and those above it, for a block that writes into it; an error removes those that stay empty.
+
+    Parameters
+    ----------
+    folder : Path
+        One that is there already will do.
+
+    Raises
+    ------
+    UsageError
+        The folder is none, or lies in a file.
+    StorageError
+        It cannot be made.
+    """
     made = list(takewhile(lambda path: not os.path.lexists(path), (folder, *folder.parents)))
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -186,17 +215,7 @@ def adding_to_folder(folder: Path, content: str, adopted: Iterable[str] = ()) ->
     except OSError as error:
         raise StorageError(f"{folder}: cannot be made ({error.strerror or error})") from error
     try:
-        with storage_errors(folder), exclusive(folder / LOCK, folder):
-            for name in filter(is_marker_part, os.listdir(folder)):  # of a run that was killed
-                (folder / name).unlink(missing_ok=True)
-            marked = os.path.lexists(folder / MARKER)
-            ours = OwnedFiles(folder, content, set(adopted))
-            try:
-                yield ours
-            except BaseException:
-                if not marked and not any(os.path.lexists(folder / name) for name in ours.names):
-                    (folder / MARKER).unlink(missing_ok=True)
-                raise
+        yield
     except BaseException:
         with suppress(OSError):  # one that holds something stays, and so do those it lies in
             for path in made:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from phasemark import InputFileError, UsageError
 from phasemark.inputs import read_text
-from phasemark.inputs.table_cells import finite_number
+from phasemark.inputs.table_cells import cells_of, finite_number
 from phasemark.render import Frames
 from phasemark.render.view import wrap_delta_rad
 
@@ -215,7 +214,7 @@ def read_poses(
     if not lines:
         raise InputFileError(f"{path}: is empty; its columns must be {COLUMNS}")
     separator = ";" if ";" in lines[0][1] else "\t" if "\t" in lines[0][1] else ","
-    table = list(csv.reader((line for _, line in lines), delimiter=separator))
+    table = [cells_of(line, f"{path}, line {number}", separator) for number, line in lines]
     names = [name.strip() for name in table[0]]
     is_polar = _check_header(path, names)
     if len(table) == 1:

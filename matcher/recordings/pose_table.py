@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from phasemark import InputFileError
 from phasemark.inputs import read_text
-from phasemark.inputs.table_cells import finite_number
+from phasemark.inputs.table_cells import cells_of, finite_number
 from phasemark.render import Views
 
 _SCALE = {
@@ -78,7 +77,7 @@ def read_pose_table(path: str | os.PathLike[str]) -> PoseTable:
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
     if len(lines) < 2:
         raise InputFileError(f"{path}: must have a header and at least one pose")
-    header, *rows = csv.reader(line for _, line in lines)
+    header, *rows = [cells_of(line, f"{path}, line {number}") for number, line in lines]
     names = [name.strip() for name in header]
     prefix = _TRUTH if f"{_TRUTH}distance_m" in names else ""
     for needed in ("distance_m", "delta_deg"):

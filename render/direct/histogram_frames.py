@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
+from phasemark.inputs.numbers import real_array
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.photon_counts import draw_counts
 from phasemark.render.direct.targets import Targets, find_targets
@@ -44,7 +45,7 @@ class HistogramFrames:
     Raises
     ------
     UsageError
-        The shapes do not agree, or a count is negative, not finite or beyond what pile-up leaves.
+        The shapes do not agree, or a count is negative, not finite, complex, masked or beyond what pile-up leaves.
     """
 
     figure: ClassVar[Callable[..., Figure]]
@@ -62,7 +63,7 @@ class HistogramFrames:
             histogram = histogram_of(sensor)
         except ValueError as error:
             raise UsageError(str(error)) from None
-        array = np.array(counts, dtype=np.float64)
+        array = real_array("counts", counts)
         if array.ndim not in (3, 4, 5):
             raise UsageError(f"'counts' must have shape (n, frames, rows, cols, bins), got {array.shape}")
         array = array.reshape((1,) * (5 - array.ndim) + array.shape)
@@ -163,7 +164,6 @@ def nearest_ranges(targets: Targets, sensor: Sensor) -> Frames:
     cosine = sensor.axis_cosine() if histogram_of(sensor).reports == "z" else 1.0
     range_m = np.asarray(targets.distance_m[..., 0] / cosine)
     flags = np.where(np.isnan(range_m), int(Flag.NO_RETURN), 0).astype(np.uint8)
-    flags[range_m < 0] = int(Flag.MISSING)
     flags[..., camera_unit(sensor).dead] = int(Flag.DEAD | Flag.MISSING)
     return Frames(np.where(flags == 0, range_m, np.nan), flags=flags, sensor=sensor)
 
