@@ -7,6 +7,7 @@ import re
 FLAGS = {
     "amplitude_unit": "--amplitude-unit",
     "background": "--wall, --floor",
+    "board": "--board",
     "content": "--content",
     "fixed": "--fix",
     "flip_h": "--flip-h",
@@ -33,7 +34,7 @@ PHRASES = {
     "unverified()": "--no-verify",
 }
 """What messages name that is no parameter of the call, and what the command line has for it."""
-_WITH_VALUES = ("amplitude_unit", "content", "fixed", "quantity", "scheduler", "trusted", "unit")
+_WITH_VALUES = ("amplitude_unit", "board", "content", "fixed", "quantity", "scheduler", "trusted", "unit")
 """Parameters that messages name with a value; others may stand in what a user wrote (``--mesh n=part.stl``)."""
 _STATED = rf"(?:({'|'.join(FLAGS)})=(?:…|True\b))"
 _VALUED = rf"(?:({'|'.join(_WITH_VALUES)})=(?=\w)|(part)=(?=\d+/))"

@@ -44,6 +44,9 @@ FramesUnitWord = Literal["m", "cm", "mm"]
 QuantityWord = Literal["range", "z"]
 InvalidMeansWord = Literal["missing", "no-return"]
 Turn = Literal[0, 90, 180, 270]
+BoardWord = Literal[
+    "sparkfun", "adafruit", "adafruit-webserial", "adafruit-nost", "st-zones", "st-boxes", "esphome", "json", "tmf8828"
+]
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace an output that exists.")]
@@ -77,6 +80,10 @@ ValidStatus = Annotated[
 ]
 FlipH = Annotated[bool, typer.Option("--flip-h", help="Mirror left and right.")]
 FlipV = Annotated[bool, typer.Option("--flip-v", help="Mirror top and bottom.")]
+BoardName = Annotated[
+    BoardWord | None,
+    typer.Option("--board", help="Program of a board that printed the file, if several print the same."),
+]
 Rotate = Annotated[Turn, typer.Option("--rotate", help="Turn the image clockwise by 0, 90, 180 or 270 degrees.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue an unfinished run of the same plan.")]
 DryRun = Annotated[
@@ -109,6 +116,7 @@ class FrameReading:
     flip_h: FlipH = False
     flip_v: FlipV = False
     rotate: Rotate = 0
+    board: BoardName = None
 
     def read(self, path: Path, sensor: Sensor, *, topic: str | None = None) -> Frames:
         """Read a file of measured frames, from anywhere."""
@@ -126,6 +134,7 @@ class FrameReading:
             rotate=self.rotate,
             untrusted=True,
             topic=topic,
+            board=self.board,
         )
 
 

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError
 from phasemark.data.files.guard import EXPANSION, FREE_BYTES
+from phasemark.data.measured.board_prints import JSON
+from phasemark.data.measured.boards import HEAD_BYTES
 from phasemark.inputs.reading import read_whole
 from phasemark.render import Sensor
 from phasemark.render.direct.histogram_frames import HistogramFrames
@@ -28,7 +30,6 @@ _MOST_VALUES = 1 << 26
 _NAMES = ("histogram", "reference_histogram", "distance_m", "sensor2world", "t_ms", "t_s")
 _SECONDS = {"t_ms": 1e-3, "t_s": 1.0}
 _MOST_LISTED = 16
-_LONGEST_START = 64  # bytes that may stand before the first brace of a line of JSON
 _TARGET_COLUMNS = ("mm", "sigma_mm", "signal", "status")
 
 
@@ -69,7 +70,8 @@ def is_histogram_log(path: str | os.PathLike[str]) -> bool:
         with open(path, "rb") as file:
             if file.read(4) != b"PK\x03\x04":
                 file.seek(0)
-                return file.read(_LONGEST_START).lstrip()[:1] == b"{"
+                start = file.read(HEAD_BYTES).lstrip()
+                return start[:1] == b"{" and not JSON.match(start.decode(errors="replace"))
             with zipfile.ZipFile(file) as archive:
                 names = archive.namelist()
         return "histogram.npy" in names and "range.npy" not in names

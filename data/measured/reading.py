@@ -22,8 +22,10 @@ from phasemark.data.files.atomic_write import write_atomically
 from phasemark.data.files.guard import EXPANSION, FREE_BYTES
 from phasemark.data.files.hdf5_reading import open_hdf5
 from phasemark.data.measured.bags import read_rosbag
+from phasemark.data.measured.boards import HEAD_BYTES, MOST_LOG_BYTES, find_board, read_board_log
 from phasemark.data.measured.csv_frames import MILLISECONDS, SECONDS, SECONDS_PER_TIME_UNIT, note_disorder, parse_csv
 from phasemark.data.measured.frequency_layers import LAYERED, layers_of
+from phasemark.data.measured.orientation import Orientation
 from phasemark.inputs import opened
 from phasemark.render import Frames, Sensor
 from phasemark.render.unwrapped_frames import unwrap_frames
@@ -61,6 +63,7 @@ class _Raw:
     time_s: NDArray[np.float64] | None = None
     flat: bool = False  # frames are rows of rows · cols values
     named: bool = False  # names of columns state unit or quantity
+    valid_status: tuple[int, ...] | None = None  # of the board that printed it
 
 
 def read_frames(
@@ -76,6 +79,7 @@ def read_frames(
     rotate: int = 0,
     untrusted: bool = False,
     topic: str | None = None,
+    board: str | None = None,
 ) -> Frames:
     """Read measured frames; what kind of file it is follows from its content.
 
@@ -92,7 +96,8 @@ def read_frames(
     *PNG*, one or a folder of them in the order of their names: 16 bits, grey, 0 is invalid; codes are in the stated
     unit, or scaled by the text chunk ``metres_per_unit``. *ROS 2 bag* (its folder): images of 32FC1, metres, or
     16UC1, millimetres; 0 is invalid. Arrays are (frames, rows, cols), (n, frames, rows, cols), or (rows, cols) for
-    a single frame.
+    a single frame. *Text that a board's example program prints* (docs/formats.md has the programs): its unit, quantity,
+    valid status and order of zones are known, and a frame that is incomplete or garbled is left out with a warning.
 
     *Several modulation frequencies*: NPZ and HDF5 have ``frequency_range`` and optionally ``frequency_amplitude`` and
     ``frequency_intensity`` with an axis of the sensor's m frequencies before the rows, (frames, m, rows, cols) or (n,
@@ -123,13 +128,15 @@ def read_frames(
         Which values of ``status`` mark a valid pixel; needed if the file has it, since cameras differ. It is 5 for the
         VL53L5CX and VL53L8CX. A status that is empty or NaN is not valid.
     flip_h, flip_v : bool
-        Whether to mirror left and right, or top and bottom.
+        Whether to mirror left and right, or top and bottom; the print of a board is brought upright before.
     rotate : {0, 90, 180, 270}
         Degrees to turn the image clockwise, after mirroring.
     untrusted : bool
         Whether a child process with limits reads an HDF5 file first, unless ``FILE.sha256`` vouches for it.
     topic : str, optional
         Which images of a ROS bag, if it has several that are not ours.
+    board : str, optional
+        Program of a board that printed the text, if several print the same; otherwise it is recognised.
 
     Returns
     -------
@@ -155,7 +162,9 @@ def read_frames(
     if invalid_means not in ("missing", "no-return"):
         raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
     shape = (sensor.cols, sensor.rows) if rotate in (90, 270) else (sensor.rows, sensor.cols)
-    raw = _read(path, shape, untrusted, topic, len(sensor.frequencies_hz))
+    raw = _read(path, shape, untrusted, topic, sensor, board)
+    if board is not None and raw.valid_status is None:
+        raise UsageError(f"{path}: board=… goes with text that a board printed: leave it out")
     if unit is None and quantity is None and not raw.stated:
         raise UsageError(
             f"{path}: does not say its unit and quantity: give unit={'|'.join(METRES_PER_UNIT)} and"
@@ -184,6 +193,7 @@ def read_frames(
     if "valid" in arrays:
         valid &= arrays["valid"] != 0
     if "status" in arrays:
+        valid_status = raw.valid_status if valid_status is None else valid_status
         if valid_status is None:
             raise UsageError(
                 f"{path}: has 'status': say with valid_status=… which of its values mark a valid pixel (5 for VL53L5CX"
@@ -236,9 +246,7 @@ def _frame_times_s(raw: _Raw, shape: tuple[int, ...], path: Path) -> NDArray[np.
 
 
 def _upright(values: NDArray[Any], flip_h: bool, flip_v: bool, rotate: int) -> NDArray[Any]:
-    values = values[..., ::-1] if flip_h else values
-    values = values[..., ::-1, :] if flip_v else values
-    return np.rot90(values, -rotate // 90, axes=(-2, -1))
+    return Orientation(flip_h, rotate).apply(values[..., ::-1, :] if flip_v else values)
 
 
 def _range_limit(sensor: Sensor) -> tuple[float, str]:
@@ -363,7 +371,9 @@ def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool 
     return write_atomically(path, buffer.getvalue(), force=force)
 
 
-def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None, n_frequencies: int) -> _Raw:
+def _read(
+    path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None, sensor: Sensor, board: str | None
+) -> _Raw:
     try:
         if path.is_dir():
             return _Raw(*read_rosbag(path, topic)) if (path / "metadata.yaml").exists() else _read_pngs(path)
@@ -371,7 +381,7 @@ def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None
             start = file.read(8)
             file.seek(0)
             if not start.startswith(b"\x89HDF"):
-                return _read_open(file, start, shape, path, n_frequencies)
+                return _read_open(file, start, shape, path, sensor, board)
         return _read_hdf5(path, untrusted)
     except PhasemarkError:
         raise
@@ -382,7 +392,9 @@ def _read(path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None
         raise InputFileError(f"{path}: cannot be read ({reason})") from None
 
 
-def _read_open(file: BinaryIO, start: bytes, shape: tuple[int, int], path: Path, n_frequencies: int) -> _Raw:
+def _read_open(
+    file: BinaryIO, start: bytes, shape: tuple[int, int], path: Path, sensor: Sensor, board: str | None
+) -> _Raw:
     """Read an open file of any kind but HDF5."""
     if not start:
         raise InputFileError(f"{path}: is empty")
@@ -395,9 +407,15 @@ def _read_open(file: BinaryIO, start: bytes, shape: tuple[int, int], path: Path,
         return _read_npz(file, path)
     if start == b"\x89PNG\r\n\x1a\n":
         return _of_images([_read_png(file, path)], path)
-    if _size(file) > _MOST_BYTES:
-        raise InputFileError(f"{path}: has more than {_MOST_BYTES / 1e6:.3g} MB of text: give it in parts, or as NPZ")
-    found = parse_csv(file.read(), shape, path, n_frequencies)
+    printed_by = find_board(board, file.read(HEAD_BYTES), math.prod(shape), path)
+    most_bytes = _MOST_BYTES if printed_by is None else MOST_LOG_BYTES
+    if _size(file) > most_bytes:
+        raise InputFileError(f"{path}: has more than {most_bytes / 1e6:.3g} MB of text: give it in parts, or as NPZ")
+    if printed_by is not None:
+        log = read_board_log(file, printed_by, shape, path)
+        stated = {"unit": "mm", "quantity": printed_by.quantity or sensor.quantity}
+        return _Raw(log.arrays, stated, log.time_s, flat=True, valid_status=printed_by.valid_status)
+    found = parse_csv(file.read(), shape, path, len(sensor.frequencies_hz))
     return _Raw(found.arrays, found.stated, found.time_s, flat=True, named=found.named)
 
 

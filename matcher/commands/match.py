@@ -133,6 +133,7 @@ def _refuse_turned(reading: FrameReading) -> None:
         "--unit": reading.unit is not None, "--quantity": reading.quantity is not None,
         "--invalid-means": reading.invalid_means != "missing", "--flip-h": reading.flip_h,
         "--flip-v": reading.flip_v, "--rotate": reading.rotate != 0,
+        "--board": reading.board is not None,
     }  # fmt: skip
     for option, is_stated in stated.items():
         if is_stated:

@@ -103,6 +103,7 @@ def checksum(path: Path) -> None:
 
 KINDS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "npy": (".npy", frames), "npz": (".npz", stated_frames), "png": (".png", stated_frames), "csv": (".csv", frames),
+    "board": (".log", stated_frames),
     **{f"{kind}-plan": (".toml", plan(kind)) for kind in PLANS},
     "sensor": (".toml", Sensor.from_toml), "camera-info": (".yaml", Sensor.from_camera_info),
     "map": (".toml", read_landmark_map),
@@ -157,6 +158,22 @@ def _good_csv(folder: Path) -> list[bytes]:
     named = ["t_ms", *(f"mm_{k}" for k in range(16)), *(f"status_{k}" for k in range(16)), "truth_class"]
     line = ",".join(["0", *("1000",) * 16, *("5",) * 16, "cone"])
     return ["\n".join(rows).encode(), "\n".join([",".join(named), line, line]).encode()]
+
+
+def _good_board(folder: Path) -> list[bytes]:
+    row = "\t500" * 4 + "\n"
+    zones = "".join(f"Zone : {zone:3}, Status :   5, Distance :  500 mm\n" for zone in range(16))
+    line, cells = " -----------------" * 4 + "\n", "|   500  :      5 " * 4 + "|\n"
+    state = "[D][text_sensor:069]: 'a': Sending state '" + ",\n".join(["0.500," * 3 + "0.500"] * 4) + "'\n"
+    values = ",".join(["500"] * 16)
+    numbers = ",".join(["500"] * 77)
+    texts = (
+        "SparkFun VL53L5CX\n" + (4 * row + "\n") * 2, ("500\t" * 3 + "----\t\n") * 4 + "\n",
+        ("Print data no :   1\n" + zones) * 2,
+        4 * (line + cells) + line, 2 * state, f'{{"t_ms": 1, "distances": [{values}], "status": [{values}]}}\n' * 2,
+        f"FRAME_START\nD:{values}\nS:{values}\nFRAME_END\n", f"#Obj,{numbers}\n" * 8,
+    )  # fmt: skip
+    return [text.encode() for text in texts]
 
 
 def _good_plan(kind: str) -> Callable[[Path], list[bytes]]:
@@ -260,6 +277,7 @@ def _packed(path: Path) -> bytes:
 
 GOOD: dict[str, Callable[[Path], list[bytes]]] = {
     "npy": _good_npy, "npz": _good_npz, "png": _good_png, "csv": _good_csv,
+    "board": _good_board,
     **{f"{kind}-plan": _good_plan(kind) for kind in PLANS},
     "sensor": _good_sensor, "camera-info": _good_camera_info, "map": _good_map,
     "poses": _good_poses,
