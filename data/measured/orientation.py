@@ -28,3 +28,7 @@ class Orientation:
         """Return images, (..., rows, cols), brought upright."""
         values = values[..., ::-1] if self.flip_h else values
         return np.rot90(values, -self.rotate // 90, axes=(-2, -1))
+
+
+ORIENTATIONS = tuple(Orientation(flip_h, rotate) for flip_h in (False, True) for rotate in (0, 90, 180, 270))
+"""All of a square grid; one that is not square has those of 0° and 180°."""

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from phasemark import UsageError
+from phasemark import InputFileError, UsageError
 from phasemark.data.commands.console import LongWork, Table, echo_json, one_line, tell
 from phasemark.data.commands.inputs import note_too_far, open_any_bank
 from phasemark.data.commands.options import (
@@ -27,6 +28,7 @@ from phasemark.matcher.commands.match_table import Columns, bank_ends, match_row
 
 if TYPE_CHECKING:
     from phasemark.data import Bank
+    from phasemark.data.measured.orientation import Orientation
     from phasemark.matcher import FilteredFrames, Match, Matcher
     from phasemark.matcher.position.landmark_map import LandmarkMap
     from phasemark.matcher.recordings.direct_positions import DirectBatch, DirectPositions
@@ -48,6 +50,13 @@ def match_frames(
     moving: Annotated[
         bool, typer.Option("--moving", help="The camera moves: match every frame by itself instead of their mean.")
     ] = False,
+    learn: Annotated[
+        bool,
+        typer.Option(
+            "--learn-orientation",
+            help="With refine: learn from up to 10 frames how the image is mirrored and turned, then match.",
+        ),
+    ] = False,
     results: Results,
 ) -> None:
     """Match measured frames against a bank, and place the robot.
@@ -64,16 +73,21 @@ def match_frames(
     landmarks = place.landmarks()
     results.check()
     search.check()
+    if learn:
+        _refuse_to_learn(reading, search)
     if search.is_direct:
         _match_directly(bank, frames, reading, search, place, landmarks, moving, results)
         return
     with open_any_bank(bank) as opened:
         measured = reading.read(frames, opened.camera)
         note_too_far(opened.camera, {"--wall": search.wall})
+        matcher = search.matcher(opened)
+        if learn:
+            reading = replace(reading, **_learnt(matcher, measured, frames))
+            measured = reading.read(frames, opened.camera)
         positions = measured.each_a_position() if moving else measured
         plots = results.plots(len(positions))
         refuse_unwritable_files(results.files(plots), results.force)
-        matcher = search.matcher(opened)
         if not moving:
             _note_motion(measured, frames)
         printed = _Answers(search, place, results, landmarks, plots, moving)
@@ -141,6 +155,37 @@ def _refuse_turned(reading: FrameReading) -> None:
                 f"{option} goes with images of ranges: zones of a direct sensor's log are turned by 'zone_order' in its"
                 " [histogram] table, and its units are fixed"
             )
+
+
+def _refuse_to_learn(reading: FrameReading, search: Search) -> None:
+    """Refuse options that contradict the learning of an orientation."""
+    if search.method != "refine" or search.is_direct:
+        raise UsageError("--learn-orientation goes with --method refine, on ranges or phasors")
+    if reading.flip_h or reading.flip_v or reading.rotate:
+        raise UsageError("--learn-orientation finds how the image is turned: leave --flip-h, --flip-v and --rotate out")
+
+
+def _learnt(matcher: Matcher, measured: Frames, file: Path) -> dict[str, Any]:
+    """Return the options of reading that a recording tells, and note them."""
+    from phasemark.matcher.recordings.learnt_orientation import learn_orientation
+
+    learnt = learn_orientation(matcher, measured)
+    counted = f"{learnt.n_explained} of {learnt.n_frames} frames that show the landmark"
+    if len(learnt.left) > 1:
+        left = ", ".join(_flags_of(one) for one in learnt.left)
+        raise InputFileError(
+            f"{file}: {counted} leave {len(learnt.left)} orientations open: {left}; give the right one instead of"
+            " --learn-orientation, or a recording of a side of the landmark without symmetry"
+        )
+    odds = f"1e{learnt.log_odds[1] / math.log(10):.0f}"
+    tell(f"note: {file}: the orientation is {_flags_of(learnt.left[0])}, by {counted}, with odds of {odds} to 1")
+    return {"flip_h": learnt.left[0].flip_h, "rotate": learnt.left[0].rotate}
+
+
+def _flags_of(orientation: Orientation) -> str:
+    """Return an orientation as options."""
+    turn = f"--rotate {orientation.rotate}" if orientation.rotate or not orientation.flip_h else ""
+    return f"{'--flip-h' if orientation.flip_h else ''} {turn}".strip()
 
 
 _OUTSIDE = "outside the bank"

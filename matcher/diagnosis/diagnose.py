@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.data.bank.build_bank import rebuild_bank
+from phasemark.data.measured.orientation import Orientation
 from phasemark.matcher.diagnosis.search import SIZES, Fit, Search, fitted_wall, wider
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.matcher.frequencies import OneFrequencyBank
@@ -534,13 +535,13 @@ def _background(background: Background | Literal["auto"] | None, found: Backgrou
 
 def _transforms(frame: FilteredFrames, bank: Bank) -> Iterator[tuple[Change, FilteredFrames]]:
     """Return the frame as other settings would have read it."""
-    yield Change("flip_h", True, "the image mirrored left to right"), _moved(frame, lambda a: a[..., ::-1])
-    yield Change("flip_v", True, "the image mirrored top to bottom"), _moved(frame, lambda a: a[..., ::-1, :])
-    yield Change("rotate", 180, "the image rotated by 180°"), _moved(frame, lambda a: a[..., ::-1, ::-1])
+    yield Change("flip_h", True, "the image mirrored left to right"), frame.with_pixels(lambda a: a[..., ::-1])
+    yield Change("flip_v", True, "the image mirrored top to bottom"), frame.with_pixels(lambda a: a[..., ::-1, :])
+    yield Change("rotate", 180, "the image rotated by 180°"), frame.with_pixels(lambda a: a[..., ::-1, ::-1])
     if frame.sensor.rows == frame.sensor.cols:
         for angle in (90, 270):
             words = f"the image rotated by {angle}°"
-            yield Change("rotate", angle, words), _moved(frame, lambda a, k=-angle // 90: np.rot90(a, k, (-2, -1)))
+            yield Change("rotate", angle, words), frame.with_pixels(Orientation(rotate=angle).apply)
     cosine = frame.sensor.axis_cosine()
     yield Change("quantity", "z", "the values taken as z, along the optical axis"), _scaled(frame, 1 / cosine)
     yield Change("quantity", "range", "the values taken as ranges, along the ray"), _scaled(frame, cosine)
@@ -554,13 +555,6 @@ def _transforms(frame: FilteredFrames, bank: Bank) -> Iterator[tuple[Change, Fil
 
 
 _ARRAYS = ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
-
-
-def _moved(frame: FilteredFrames, move: Any) -> FilteredFrames:
-    moved: dict[str, Any] = {
-        name: np.ascontiguousarray(move(array)) for name in _ARRAYS if (array := getattr(frame, name)) is not None
-    }
-    return replace(frame, **moved)
 
 
 def _joined(frames: Sequence[FilteredFrames]) -> FilteredFrames:

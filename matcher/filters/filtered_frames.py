@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -129,6 +129,15 @@ class FilteredFrames:
     def __iter__(self) -> Iterator[FilteredFrames]:
         """Go through the positions, each a batch of one."""
         return (self[k] for k in range(len(self)))
+
+    def with_pixels(self, move: Callable[[NDArray[Any]], NDArray[Any]]) -> FilteredFrames:
+        """Return the frames with their pixels elsewhere: mirrored or turned images of the same camera."""
+        moved: dict[str, Any] = {
+            name: np.ascontiguousarray(move(array))
+            for name in ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
+            if (array := getattr(self, name)) is not None
+        }
+        return replace(self, by_frequency=tuple(part.with_pixels(move) for part in self.by_frequency), **moved)
 
     def without_offset(self) -> FilteredFrames:
         """Return the frames with the sensor's offsets of range and zones taken off, of the same sensor without them."""
