@@ -23,10 +23,16 @@ _MOST_FILES = 256
 _MOST_BYTES = 1 << 20
 
 
-def cache_file() -> Path | None:
-    """Return the file that holds the digests, in the user's cache folder; None if there is no cache folder."""
+def cache_folder() -> Path | None:
+    """Return the folder of this program in the user's cache folder; None if there is no cache folder."""
     folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(folder) / "phasemark" / "digests.json" if os.path.isabs(folder) else None
+    return Path(folder) / "phasemark" if os.path.isabs(folder) else None
+
+
+def cache_file() -> Path | None:
+    """Return the file that holds the digests; None if there is no cache folder."""
+    folder = cache_folder()
+    return None if folder is None else folder / "digests.json"
 
 
 def is_worth_remembering(status: os.stat_result) -> bool:

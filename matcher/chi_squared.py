@@ -27,7 +27,8 @@ def p_values_of(
     F(1, ν); their sum is given a scaled χ² of the same mean and variance.
     """
     freedom, scale = _scaled(dof, nu)
-    return np.asarray(np.where(dof > 0, special.chdtrc(freedom, cost / scale), 0.0))
+    # a cost of 0 is a difference of sums, which may come out a hair below
+    return np.asarray(np.where(dof > 0, special.chdtrc(freedom, np.maximum(cost, 0.0) / scale), 0.0))
 
 
 def largest_costs(p: float, dof: NDArray[np.integer], nu: NDArray[np.float64]) -> NDArray[np.float64]:

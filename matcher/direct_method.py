@@ -27,9 +27,7 @@ DIRECT_KINDS = ("histograms", "targets")
 """What of it a direct sensor alone measures."""
 
 
-def refuse_direct_options(
-    method: str, on: str, background: Background | Literal["auto", "unknown"] | None, pixels: str, robust: bool
-) -> None:
+def refuse_direct_options(method: str, on: str, background: Background | str | None, pixels: str, robust: bool) -> None:
     """Refuse options that do not go with histograms and targets.
 
     Raises
@@ -39,7 +37,7 @@ def refuse_direct_options(
     """
     wrong = {
         "'method' must be refine": method != "refine",
-        "'background' must be a Background, 'auto' or None": background == "unknown",
+        "'background' must be a Background, 'auto' or None": background in ("unknown", "any"),
         "'background' must be a Background or None, for targets do not tell it": on == "targets"
         and background == "auto",
         "'pixels' must be all": pixels != "all",

@@ -89,6 +89,8 @@ class Match:
         a covariance.
     background : Background or None
         What the match took to stand behind the landmark; estimated where the matcher was told to.
+    among_unknown : bool
+        Whether other things might stand before, beside and behind the landmark.
     systematic : mapping of str to ndarray
         What of `covariance` all frames of the camera share, by its cause: "calibration" and "declared". The rest is
         noise.
@@ -121,6 +123,7 @@ class Match:
     condition_number: float = math.nan
     weak_direction: Mapping[str, float] = field(default_factory=dict)
     background: Background | None = None
+    among_unknown: bool = False
     may_be_mirrored: bool | None = None
     reason: Reason = ""
     systematic: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
@@ -189,6 +192,7 @@ class Match:
             "may_be_mirrored": self.may_be_mirrored,
             "wall_m": None if self.background is None else self.background.wall_m,
             "floor_m": None if self.background is None else self.background.floor_m,
+            "among_unknown": self.among_unknown,
         }
 
     def _repr_html_(self) -> str:

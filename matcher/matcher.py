@@ -23,6 +23,7 @@ from phasemark.matcher.filters.region import read_region
 from phasemark.matcher.frequencies import OneFrequencyBank
 from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.joint_models import relative_poses
+from phasemark.matcher.likelihood.by_evidence import MatcherByEvidence
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import (
     BEARING_STD_RAD,
@@ -31,6 +32,7 @@ from phasemark.matcher.likelihood.likelihood_matcher import (
     Pixels,
 )
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
+from phasemark.matcher.likelihood.setup import check_free
 from phasemark.matcher.likelihood.systematic import SYSTEMATICS, check_systematic
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
@@ -78,13 +80,15 @@ class Matcher:
     free : sequence of str, optional
         What "refine" estimates: distance_m and delta_rad, and on request any of bearing_rad, height_m, pitch_rad and
         roll_rad; what is not free is 0. None: distance, delta and the bearing, whose Gaussian prior has mean 0 and the
-        standard deviation `bearing_std_rad` before the frame is seen. ``("distance_m", "delta_rad")`` fixes the
-        bearing at 0.
+        standard deviation `bearing_std_rad` before the frame is seen; of ranges that a chip reports pitch and roll too,
+        for its zones are wide. ``("distance_m", "delta_rad")`` fixes the bearing at 0.
     background : Background, "auto", "unknown" or None
         What stands behind the landmark. None: nothing is expected to return beside it. "auto", with "refine": wall and
         floor are estimated from each frame's own far pixels; of histograms a wall alone, its distance and brightness.
         "unknown", with "refine" on ranges: other things may stand before, beside and behind it; what the landmark does
         not explain costs a disagreement when views and classes are compared, and is left out of the test of the fit.
+        "any", with "refine": what the evidence asks for: nothing, wall and floor, or unknown things, tried in this
+        order; of ranges that a chip reports unknown things at once.
         Histograms take the albedos of a Background as guesses, targets as known.
     false_alarm : float
         Share of good frames that the test of the fit may refuse.
@@ -99,8 +103,9 @@ class Matcher:
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool
         Whether "refine" counts residuals beyond 3 σ linearly (Huber); the covariance is then the sandwich.
-    bearing_std_rad : float
+    bearing_std_rad : float, optional
         How well the mount points at the landmark, where `free` is None: the standard deviation of a Gaussian prior.
+        None: 1.5°, of ranges that a chip reports 3°.
     height_std_m, pitch_std_rad, roll_std_rad : float
         How well height, pitch and roll are known where they are free: standard deviations of Gaussian priors with mean
         0; infinite where nothing is known. Starts are looked for up to three of them away, within a quarter of the
@@ -124,6 +129,8 @@ class Matcher:
         As given.
     options : mapping
         What `free`, `background`, `on`, `pixels` and `robust` were given as.
+    free : tuple of str
+        Parameters of the view that are estimated.
 
     Raises
     ------
@@ -150,12 +157,12 @@ class Matcher:
         method: str = "nearest",
         *,
         free: Sequence[str] | None = None,
-        background: Background | Literal["auto", "unknown"] | None = None,
+        background: Background | Literal["auto", "unknown", "any"] | None = None,
         false_alarm: float = 0.01,
         on: Measured = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
-        bearing_std_rad: float = BEARING_STD_RAD,
+        bearing_std_rad: float | None = None,
         height_std_m: float = math.inf,
         pitch_std_rad: float = TILT_STD_RAD,
         roll_std_rad: float = TILT_STD_RAD,
@@ -169,7 +176,7 @@ class Matcher:
         _check_word("on", on, ("ranges", "phasors", *DIRECT_KINDS))
         _check_word("pixels", pixels, ("all", "lower"))
         if background is not None and not isinstance(background, Background):
-            _check_word("background", background, ("auto", "unknown"), "a Background, None, ")
+            _check_word("background", background, ("auto", "unknown", "any"), "a Background, None, ")
         stated = {
             "bearing_std_rad": bearing_std_rad,
             "height_std_m": height_std_m,
@@ -179,6 +186,8 @@ class Matcher:
             "tolerance_rad": tolerance_rad,
         }
         for name, value in stated.items():
+            if value is None:
+                continue
             if not value > 0:
                 raise UsageError(f"'{name}' must be positive, got {value!r}")
             widest = math.pi if name == "tolerance_rad" else math.pi / 4
@@ -202,12 +211,14 @@ class Matcher:
         self._one: OneFrequency | None = None
         self._systematic = check_systematic(systematic)
         self._direct: DirectMethod | None = None
+        self.free: tuple[str, ...] = VIEW[:2]
         if on in DIRECT_KINDS:
             refuse_direct_options(method, on, background, pixels, robust)
             behind = cast(Background | Literal["auto"] | None, background)
             known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
             if free is None:
-                known["bearing_rad"] = bearing_std_rad
+                known["bearing_rad"] = bearing_std_rad or BEARING_STD_RAD
+            self.free = VIEW[:3] if free is None else check_free(free)
             self._direct = direct_method(
                 bank,
                 on,
@@ -228,7 +239,10 @@ class Matcher:
             self._one = bank.one
         self._method: MatchMethod
         if method == "refine":
-            self._method = LikelihoodMatcher(bank, **{**arguments, "systematic": self._systematic})
+            arguments["systematic"] = self._systematic
+            chosen = MatcherByEvidence if background == "any" else LikelihoodMatcher
+            matching = chosen(bank, **arguments)
+            self._method, self.free = matching, matching.free
             return
         fixed = free is None or tuple(free) == VIEW[:2]
         if not fixed or on != "ranges" or pixels != "all" or robust or isinstance(background, str):

@@ -17,11 +17,13 @@ ROOT = Path(__file__).resolve().parents[1]
 _FOLDERS = {
     "matcher": "pixel_agreement",
     "matcher/filters": "loops",
-    "matcher/histograms": "background_search expected_targets histogram_table poisson_fit table_search target_matcher",
+    "matcher/histograms": "background_search histogram_table poisson_fit table_search target_matcher",
     "matcher/likelihood": "bank_images residuals strip_images",
     "matcher/nearest": "bank_minima cells search templates",
     "render": "background compile_cache kernel unwrapping",
-    "render/direct": "bin_counts fit_model footprints photon_counts sample_counts scene_samples targets transients",
+    "render/direct": (
+        "bin_counts expected_targets fit_model footprints photon_counts sample_counts scene_samples targets transients"
+    ),
     "render/exposure": "capture photoelectrons random_streams taps",
     "render/integral": (
         "arguments bent_edges borders circular components edge_motion edge_projection edges_in_pixels"

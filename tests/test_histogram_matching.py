@@ -16,12 +16,12 @@ from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, Matches, cramer_rao, kalman_filter
 from phasemark.matcher.direct_method import Measured
 from phasemark.matcher.histograms.cost_shape import lessened, points_about
-from phasemark.matcher.histograms.expected_targets import expected_targets
 from phasemark.matcher.histograms.poisson_fit import deviance_moments, deviance_test, frame_sums, moments_of
 from phasemark.matcher.statistics import nees, view_errors
 from phasemark.render import Background, Frames, Sensor, Views, preset
 from phasemark.render.direct import HistogramFrames, HistogramRenderer, Targets, capture_histograms
 from phasemark.render.direct.bin_counts import detected_counts, piled_up, signal_counts
+from phasemark.render.direct.expected_targets import expected_targets
 from phasemark.render.direct.footprints import footprint_grid
 from phasemark.render.direct.sample_counts import signal_of_samples
 from phasemark.render.direct.scene_samples import SceneMesh

@@ -18,7 +18,8 @@ from phasemark import UsageError, __version__
 from phasemark.data.files.atomic_write import replacing, write_atomically
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.data.seeds import stream
-from phasemark.render import Background, Flag, Frames, Renderer, Sensor, Views, capture
+from phasemark.render import Background, Flag, Frames, Sensor, Views, capture
+from phasemark.render.direct.capture import measuring_renderer, ranges_of
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.view import VIEW_FIELDS
 
@@ -94,9 +95,11 @@ def simulate_recording(
     """
     if not 1 <= len(views) <= MOST_FRAMES:
         raise UsageError(f"a simulated recording must have 1 … {MOST_FRAMES} frames, got {len(views)}")
-    renderer = Renderer(mesh, sensor, albedo=albedo)
+    renderer = measuring_renderer(mesh, sensor, albedo=albedo)
     renderer.check_in_view(views)
-    taken, image, rendered = [], None, None
+    taken: list[Frames] = []
+    image: Any = None
+    rendered = None
     for k in range(len(views)):
         view = views[k : k + 1]
         at = tuple(float(getattr(view, name)[0]) for name in VIEW_FIELDS)
@@ -105,7 +108,8 @@ def simulate_recording(
             if background is not None and background.wall_m is not None:
                 behind = replace(background, wall_m=background.wall_m + at[0] - float(views.distance_m[0]))
             image, rendered = renderer.render_views(view, background=behind), at
-        taken.append(capture(image, sensor, rng=stream(seed, "simulated recording", 0), first_frame=k))
+        shot = capture(image, sensor, rng=stream(seed, "simulated recording", 0), first_frame=k)
+        taken.append(ranges_of(shot))
 
     stamps = np.round(np.arange(len(views)) / sensor.frame_rate_hz, 3)[None]
     frames = _one_after_the_other(taken, stamps)

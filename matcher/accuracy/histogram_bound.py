@@ -13,11 +13,11 @@ from phasemark import UsageError
 from phasemark.matcher.histograms.histogram_matcher import glass_counts
 from phasemark.matcher.histograms.poisson_fit import frame_sums
 from phasemark.matcher.histograms.scene_models import FLOOR, WALL, planes_of
-from phasemark.matcher.histograms.view_signals import STEPS
 from phasemark.matcher.information import eliminated
 from phasemark.render import Background, Views
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_images import HistogramRenderer
+from phasemark.render.direct.view_signals import STEPS
 
 _ALBEDOS = {WALL: "wall_albedo", FLOOR: "floor_albedo"}
 _WALL_STEP_M = 2e-3

@@ -23,7 +23,7 @@ from phasemark.data.commands.options import (
 )
 from phasemark.data.commands.outputs import refuse_unwritable_files
 from phasemark.matcher.commands.diagnosis_flags import Given, diagnosis_text
-from phasemark.matcher.commands.match_options import Place, Results, Search
+from phasemark.matcher.commands.match_options import Landmark, Place, Results, Search
 from phasemark.matcher.commands.match_table import Columns, bank_ends, match_rows, summary
 
 if TYPE_CHECKING:
@@ -42,9 +42,13 @@ NEAREST_AT_ONCE, REFINED_AT_ONCE = 256, 64
 
 def match_frames(
     *,
-    bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank.")],
+    bank: Annotated[
+        Path,
+        typer.Argument(metavar="BANK|MESH|CLASS", help="A bank; or a landmark, of which a bank is built and kept."),
+    ],
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Measured frames: CSV, NPY, NPZ or HDF5.")],
     reading: FrameReading,
+    landmark: Landmark,
     search: Search,
     place: Place,
     moving: Annotated[
@@ -70,6 +74,7 @@ def match_frames(
     from phasemark.data.files.atomic_write import write_atomically
 
     place.check()
+    landmark.check(bank)
     landmarks = place.landmarks()
     results.check()
     search.check()
@@ -78,7 +83,7 @@ def match_frames(
     if search.is_direct:
         _match_directly(bank, frames, reading, search, place, landmarks, moving, results)
         return
-    with open_any_bank(bank) as opened:
+    with landmark.bank(bank, frames, reading) if landmark.is_for(bank) else open_any_bank(bank) as opened:
         measured = reading.read(frames, opened.camera)
         note_too_far(opened.camera, {"--wall": search.wall})
         matcher = search.matcher(opened)
@@ -159,7 +164,7 @@ def _refuse_turned(reading: FrameReading) -> None:
 
 def _refuse_to_learn(reading: FrameReading, search: Search) -> None:
     """Refuse options that contradict the learning of an orientation."""
-    if search.method != "refine" or search.is_direct:
+    if search.method == "nearest" or search.is_direct:
         raise UsageError("--learn-orientation goes with --method refine, on ranges or phasors")
     if reading.flip_h or reading.flip_v or reading.rotate:
         raise UsageError("--learn-orientation finds how the image is turned: leave --flip-h, --flip-v and --rotate out")
@@ -223,7 +228,7 @@ class _Answers:
         n, averaged = len(positions), self._search.filter()
         self._columns = Columns(
             self._counted if self._moving or n > 1 else None,
-            self._search.parameters,
+            matcher.free,
             matcher.options["background"],
             self._landmarks is not None,
         )
@@ -231,7 +236,7 @@ class _Answers:
         stamps_s = getattr(frames, "time_s", None)
         if stamps_s is not None:
             self._pose_time_s = pose_times_s(stamps_s, matcher.bank.sensor.delay_s).tolist()
-        self.estimated = EstimateTable(self._search.parameters, self._pose_time_s)
+        self.estimated = EstimateTable(matcher.free, self._pose_time_s)
         at_once = NEAREST_AT_ONCE if self._search.method == "nearest" else REFINED_AT_ONCE
         with LongWork("matching") if n > at_once else nullcontext() as progress:
             if isinstance(positions, DirectPositions):

@@ -12,8 +12,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from phasemark import UsageError
-from phasemark.data.commands.inputs import background_of
-from phasemark.data.commands.options import Floor, Force, Json, Wall, one_of
+from phasemark.data.commands.console import LongWork
+from phasemark.data.commands.inputs import background_of, read_landmark, read_sensor, sensor_of_board
+from phasemark.data.commands.options import (
+    Floor,
+    Force,
+    FrameReading,
+    Json,
+    MeshReading,
+    MeshUnitWord,
+    Origin,
+    Up,
+    Wall,
+    a_preset,
+    one_of,
+)
 from phasemark.matcher.commands.match_table import pose_facts
 
 if TYPE_CHECKING:
@@ -39,12 +52,13 @@ class Search:
         typer.Option("--filter", help="How frames are averaged: kalman or phasor-mean."),
     ] = "kalman"
     method: Annotated[
-        Literal["nearest", "refine"],
+        Literal["nearest", "refine"] | None,
         typer.Option(
             "--method",
-            help="nearest: the paper's minimum-distance classifier. refine: maximum likelihood, with covariance.",
+            help="refine: maximum likelihood, with covariance; nearest: the paper's minimum-distance classifier. refine"
+            " unless the bank's model is hard or planar.",
         ),
-    ] = "nearest"
+    ] = None
     free: Annotated[
         list[str] | None,
         typer.Option(
@@ -83,7 +97,8 @@ class Search:
         typer.Option(
             "--bearing-std",
             metavar="DEG",
-            help="With refine: standard deviation of the bearing; 1.5 unless --free or --fix is given.",
+            help="With refine: standard deviation of the bearing; 1.5, of a chip's ranges 3, unless --free or --fix is"
+            " given.",
         ),
     ] = None
     on: Annotated[
@@ -129,7 +144,7 @@ class Search:
     @property
     def near_the_axis(self) -> bool:
         """Whether the bearing is estimated with what is known of it, as nothing else is asked for."""
-        return self.method == "refine" and not self.free and not self.fix
+        return self.method != "nearest" and not self.free and not self.fix
 
     @property
     def _stated_std(self) -> dict[str, float | None]:
@@ -194,14 +209,14 @@ class Search:
     def matcher(self, bank: Bank) -> Matcher:
         """Return the matcher."""
         from phasemark.matcher import Matcher
-        from phasemark.matcher.likelihood.likelihood_matcher import BEARING_STD_RAD, TILT_STD_RAD
+        from phasemark.matcher.likelihood.likelihood_matcher import TILT_STD_RAD
 
         return Matcher(
             bank,
-            self.method,
+            self.method or ("refine" if bank.plan.model == "ray" else "nearest"),
             free=None if self.near_the_axis else self.parameters,
-            background="auto" if self.auto_background else "unknown" if self.unknown_background else self.background,
-            bearing_std_rad=BEARING_STD_RAD if self.bearing_std is None else math.radians(self.bearing_std),
+            background=self._behind(bank),
+            bearing_std_rad=None if self.bearing_std is None else math.radians(self.bearing_std),
             height_std_m=self._stated_in("height", 1.0, math.inf),
             pitch_std_rad=self._stated_in("pitch", math.radians(1.0), TILT_STD_RAD),
             roll_std_rad=self._stated_in("roll", math.radians(1.0), TILT_STD_RAD),
@@ -211,10 +226,94 @@ class Search:
             robust=self.robust,
         )
 
+    def _behind(self, bank: Bank) -> Background | Literal["auto", "unknown", "any"] | None:
+        """Return what stands behind the landmark: what is stated, or whatever the evidence asks for."""
+        if self.auto_background:
+            return "auto"
+        if self.unknown_background:
+            return "unknown"
+        chosen = self.method != "nearest" and not self.is_direct and bank.plan.model == "ray"
+        return self.background or ("any" if chosen else None)
+
     def _stated_in(self, name: str, unit: float, otherwise: float) -> float:
         """Return a prior that is stated, in the unit of the matcher, or what holds where none is."""
         std = self._stated_std.get(name)
         return otherwise if std is None else std * unit
+
+
+@dataclass(frozen=True)
+class Landmark:
+    """Options for a mesh or a class in place of a bank."""
+
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            "--sensor",
+            metavar="NAME|FILE",
+            help="Without a bank: a preset or sensor file; unless stated, that of the board that printed the frames.",
+            autocompletion=a_preset,
+        ),
+    ] = None
+    mesh_unit: Annotated[
+        MeshUnitWord | None,
+        typer.Option(
+            "--mesh-unit", metavar="UNIT", help="Unit of a mesh: m, cm, mm or inch; that of --unit unless stated."
+        ),
+    ] = None
+    up: Up = "z"
+    origin: Origin = "file"
+    no_cache: Annotated[
+        bool, typer.Option("--no-cache", help="Without a bank: build one anew, and do not keep it.")
+    ] = False
+
+    def check(self, bank: Path) -> None:
+        """Refuse options that belong to a mesh or a class beside a bank."""
+        if self.is_for(bank):
+            return
+        stated = {
+            "--sensor": self.sensor is not None, "--mesh-unit": self.mesh_unit is not None, "--up": self.up != "z",
+            "--origin": self.origin != "file", "--no-cache": self.no_cache,
+        }  # fmt: skip
+        for option, is_stated in stated.items():
+            if is_stated:
+                raise UsageError(f"{option} goes with a mesh or a class in place of a bank: {bank} has its own")
+
+    @staticmethod
+    def is_for(bank: Path) -> bool:
+        """Return whether an argument is a mesh or a class, not a bank."""
+        from phasemark.landmarks import catalog
+        from phasemark.landmarks.mesh_files import FORMATS
+
+        return str(bank) in catalog() or bank.suffix.lower().removeprefix(".") in FORMATS
+
+    def bank(self, name: Path, frames: Path, reading: FrameReading) -> Bank:
+        """Return a bank of a mesh or a class over the distances that frames ask for: a kept one, or a new one."""
+        from phasemark.data import BankPlan
+        from phasemark.data.bank.bank_cache import cached_bank
+        from phasemark.data.plans.bank_plan import MeshPlan
+        from phasemark.landmarks import catalog
+        from phasemark.matcher.recordings.bank_for_frames import distances_of_frames
+
+        camera_name = self.sensor or sensor_of_board(frames, reading.board)
+        camera = read_sensor(camera_name)
+        unit = self.mesh_unit or reading.unit
+        is_class = str(name) in catalog()
+        if is_class and (self.mesh_unit or self.up != "z" or self.origin != "file"):
+            raise UsageError(f"--mesh-unit, --up and --origin belong to a mesh: '{name}' is a class of the catalogue")
+        _, mesh = read_landmark(str(name), MeshReading(unit, self.up, self.origin))
+        measured = reading.read(frames, camera)
+        plan = BankPlan(
+            sensor=camera_name,
+            distance_m=distances_of_frames(measured, mesh),
+            classes=(str(name),) if is_class else (),
+            landmarks=(),
+            meshes=() if is_class else (
+                MeshPlan(name=name.stem, path=str(name), unit=unit, up=self.up, origin=self.origin),
+            ),
+            layout="factored" if is_class else "full",
+        ).resolve()  # fmt: skip
+        with LongWork("building a bank") as progress:
+            return cached_bank(plan, keep=not self.no_cache, progress=progress)
 
 
 @dataclass(frozen=True)

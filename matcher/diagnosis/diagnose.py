@@ -221,6 +221,7 @@ class _Setup:
         if matcher.method == "nearest":
             return cls(True, VIEW, background, {"false_alarm": matcher.false_alarm})
         unknown = told["background"] == "unknown"
+        behind = None if told["background"] == "any" else told["background"]
         options = {
             "false_alarm": matcher.false_alarm,
             "on": told["on"] if len(matcher.bank.sensor.frequencies_hz) == 1 else "ranges",
@@ -229,7 +230,7 @@ class _Setup:
         }
         # a bearing with a prior is searched again without one
         free = VIEW if told["free"] is None else check_free(told["free"])
-        return cls(False, free, None if unknown else told["background"], options)
+        return cls(False, free, None if unknown else behind, options)
 
     def matcher(self, bank: Bank, free: Sequence[str], background: Background | Literal["auto"] | None) -> Matcher:
         """Build a matcher like it by maximum likelihood."""

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from phasemark.matcher.histograms.exact_fit import SceneAt
 from phasemark.matcher.histograms.histogram_table import Table, TableGrid, build_table, cubic, signal_between
 from phasemark.matcher.histograms.scene_models import planes_of
-from phasemark.matcher.histograms.view_signals import ViewSignals
 from phasemark.render import Background, Views
 from phasemark.render.direct.footprints import histogram_of
+from phasemark.render.direct.view_signals import ViewSignals
 
 _COARSE_M = 1.0
 """Shares need no ranges: cells of a floor are not cut."""

@@ -22,13 +22,13 @@ from phasemark.matcher.histograms.scene_models import planes_of, scene_at
 from phasemark.matcher.histograms.search_plan import LandmarkSearch, SearchPlan, Start
 from phasemark.matcher.histograms.table_search import ambient_light
 from phasemark.matcher.histograms.view_answers import Explanation, FitTest, Rules, answer_of, no_answer
-from phasemark.matcher.histograms.view_signals import ViewSignals
 from phasemark.matcher.match import Match
 from phasemark.render import Background, Sensor
 from phasemark.render.direct.bin_counts import response_share
 from phasemark.render.direct.fit_model import undo_pile_up
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.direct.view_signals import ViewSignals
 from phasemark.render.view import VIEW_FIELDS
 
 _SURE_COST = 40.0

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.histograms.view_signals import ViewSignals
 from phasemark.render import Sensor, Views
 from phasemark.render.direct.footprints import histogram_of
+from phasemark.render.direct.view_signals import ViewSignals
 from phasemark.render.kernel import kernel
 from phasemark.render.view import delta_period_rad
 

@@ -24,8 +24,8 @@ from phasemark.matcher.histograms.histogram_table import response_width_m
 from phasemark.matcher.histograms.scene_models import FAINTEST, STRONGEST, BeforePlanes, scene_at
 from phasemark.matcher.histograms.search_plan import SearchPlan, Start, before_the_wall
 from phasemark.matcher.histograms.table_search import DESCENT_MARGIN
-from phasemark.matcher.histograms.view_signals import ViewSignals
 from phasemark.render import Background
+from phasemark.render.direct.view_signals import ViewSignals
 from phasemark.render.view import VIEW_FIELDS
 
 _TABLE_SCENES = 5

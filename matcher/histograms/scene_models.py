@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.histograms.exact_fit import SceneAt
-from phasemark.matcher.histograms.view_signals import ViewSignals, slopes_about, views_about
 from phasemark.render import Background, Views
+from phasemark.render.direct.view_signals import ViewSignals, slopes_about, views_about
 from phasemark.render.view import VIEW_FIELDS
 
 WALL, FLOOR = 1, 2

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from phasemark.matcher.histograms.exact_fit import Counted, Fit
 from phasemark.matcher.histograms.histogram_table import TableGrid
 from phasemark.matcher.histograms.scene_models import SceneModel
-from phasemark.matcher.histograms.view_signals import ViewSignals
 from phasemark.render import Background
+from phasemark.render.direct.view_signals import ViewSignals
 
 
 class SearchPlan(NamedTuple):

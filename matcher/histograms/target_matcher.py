@@ -22,20 +22,20 @@ from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.histograms.background_table import build_table_before, plane_light
 from phasemark.matcher.histograms.cost_shape import lessened, points_about
-from phasemark.matcher.histograms.expected_targets import ExpectedTargets, expected_targets, most_peaks
 from phasemark.matcher.histograms.histogram_matcher import check_histogram_sensor, view_limits
 from phasemark.matcher.histograms.histogram_table import build_table, plan_table
 from phasemark.matcher.histograms.scene_models import planes_of
 from phasemark.matcher.histograms.search_plan import before_the_wall
 from phasemark.matcher.histograms.table_search import grid_minima
 from phasemark.matcher.histograms.view_answers import Explanation, FitTest, Rules, answer_of, no_answer
-from phasemark.matcher.histograms.view_signals import STEPS, ViewSignals, views_about
 from phasemark.matcher.match import Match
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import Background, Views
 from phasemark.render.direct.bin_counts import detected_counts
+from phasemark.render.direct.expected_targets import ExpectedTargets, expected_targets, most_peaks
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.targets import Status, Targets
+from phasemark.render.direct.view_signals import STEPS, ViewSignals, views_about
 from phasemark.render.kernel import kernel
 from phasemark.render.view import VIEW_FIELDS
 

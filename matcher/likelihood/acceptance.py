@@ -73,7 +73,14 @@ def is_acceptable(setup: Setup, fits: Fits, k: int) -> bool:
     """Return whether a fit would be accepted if nothing else explained its frame."""
     if not fits.stands_out[k] or not fits.p_value[k] >= setup.false_alarm or not _is_in_bank(setup, fits, k):
         return False
+    if _explains_too_few(setup, fits, k):
+        return False
     return is_determined(setup, fits.std_without_one[k], setup.shapes.symmetry[fits.class_index[k]])
+
+
+def _explains_too_few(setup: Setup, fits: Fits, k: int) -> bool:
+    """Return whether a fit that may leave out returns takes too few of them to place a landmark."""
+    return bool((setup.unknown or setup.huber is not None) and fits.explained[k] < setup.fewest_explained)
 
 
 def _is_in_bank(setup: Setup, fits: Fits, k: int) -> bool:
@@ -94,7 +101,10 @@ def _answer(
     names = setup.shapes.names
     if not len(own):
         nothing = {**dict.fromkeys(names, 0.0), "none": 1.0}
-        return Match(class_name=None, accepted=False, free=setup.free, class_probability=nothing, reason="no landmark")
+        return Match(
+            class_name=None, accepted=False, free=setup.free, class_probability=nothing, among_unknown=setup.unknown,
+            reason="no landmark",
+        )  # fmt: skip
     kept = distinct(fits, own, setup.shapes.symmetry)
     best = kept[0]
     # "none" weighs as a fit that just fails a χ² test with the noise as stated, or as a scene without a landmark
@@ -128,6 +138,7 @@ def _answer(
         condition_number=condition,
         weak_direction=weak,
         background=background,
+        among_unknown=setup.unknown,
         reason=reason,
     )
 
@@ -190,7 +201,7 @@ def _reason(setup: Setup, fits: Fits, kept: list[int], weights: Sequence[NDArray
         return "no landmark"
     if fits.p_value[best] < setup.false_alarm or not fits.stands_out[best]:
         return "poor fit"
-    if (setup.unknown or setup.huber is not None) and fits.explained[best] < setup.fewest_explained:
+    if _explains_too_few(setup, fits, best):
         return "undetermined"
     symmetry = setup.shapes.symmetry[fits.class_index[best]]
     if not is_determined(setup, fits.std_without_one[best], symmetry):

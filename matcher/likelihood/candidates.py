@@ -264,16 +264,19 @@ def _finished(
     """
     policy, n = setup.policy, len(evidence.weight)
     near = least_of_frame(fits, n) if most is None else most
-    likely = np.flatnonzero(fits.cost < near[fits.frame] + policy.likely_cost)
+    blurred = most is not None and setup.reports_one_surface  # a scout among the few zones of a chip has many rivals
+    likely = np.flatnonzero(fits.cost < near[fits.frame] + (0.0 if blurred else policy.likely_cost))
     again = _of_own_places(setup, fits, likely, _apart(setup, scene))
     settings = scene.settings(setup) if scene.scout is None else _close_settings(setup, scene, evidence)
     rival = None if most is None else most[again.frame]
     final = refine(scene.final, evidence, again.frame, again.class_index, again.view, settings, rival=rival)
-    if start is not None and explains is not None and scene.scout is not None:
+    if start is not None and explains is not None and scene.scout is not None and not setup.reports_one_surface:
         promised = np.minimum(again.cost + DISAGREEMENT, explains[again.frame])
         lost = (again.cost <= explains[again.frame] + policy.close_cost) & (final.cost > promised)
         if lost.any():
             final = Fits.joined([final, _recovered(setup, scene, evidence, start, again[lost])])
+    if blurred:
+        return final
     others = fits[np.setdiff1d(np.arange(len(fits)), likely)]
     if scene.scout is not None and most is None:
         others = _shifted(others, final, fits, n)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
-from phasemark.render.view import delta_period_rad
+from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
 
 SAME_M, SAME_RAD = 2e-3, math.radians(0.2)
 """Fits of one class nearer to each other than this are one."""
@@ -150,23 +150,15 @@ def distinct(
     same_bearing_rad : float
         And of nearer bearings; by default any: a flat landmark has one heading under many bearings.
     """
-    kept: list[int] = []
-    places: list[tuple[int, float, float, float, tuple[float, float, float]]] = []
-    views, classes = fits.view[own].tolist(), fits.class_index[own].tolist()
-    for k, (distance, delta, bearing, *upright), c in zip(own.tolist(), views, classes, strict=True):
-        period = delta_period_rad(symmetry[c])
-        for other, there, angle, aside, (height, pitch, roll) in places:
-            if abs(bearing - aside) >= same_bearing_rad:
-                continue
-            if other != c or abs(distance - there) >= same_m or abs(upright[0] - height) >= same_m:
-                continue
-            if max(abs(upright[1] - pitch), abs(upright[2] - roll)) >= same_rad:
-                continue
-            if abs(math.remainder(delta - angle, period)) < same_rad:
-                break
-        else:
+    same = np.array([same_m, same_rad, same_bearing_rad, same_m, same_rad, same_rad])
+    views, classes = fits.view[own], fits.class_index[own]
+    kept, n, places, kinds = [], 0, np.empty_like(views), np.empty_like(classes)
+    for k, view, c in zip(own.tolist(), views, classes.tolist(), strict=True):
+        off = np.abs(places[:n] - view)
+        off[:, 1] = np.abs(wrap_delta_difference_rad(off[:, 1], delta_period_rad(symmetry[c])))
+        if not ((kinds[:n] == c) & (off < same).all(axis=1)).any():
             kept.append(k)
-            places.append((c, distance, delta, bearing, (upright[0], upright[1], upright[2])))
+            places[n], kinds[n], n = view, c, n + 1
     return kept
 
 

@@ -39,7 +39,7 @@ from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD, CellBounds, Turned
 from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD, first_step
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS, counts
-from phasemark.render import Background, PhasorImages, Views
+from phasemark.render import Background, PhasorImages, Renderer, Views
 from phasemark.render.phasor_images import wrap_difference_m
 
 __all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TILT_STD_RAD", "LikelihoodMatcher", "Pixels", "usual_workers"]
@@ -47,7 +47,7 @@ __all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TILT_STD_RAD", "LikelihoodMatcher"
 Pixels = Literal["all", "lower"]
 ROBUST_FROM = 3.0
 """Residual, in σ, from which Huber's loss is linear: far enough out to cost an honest frame nothing."""
-BEARING_STD_RAD, TILT_STD_RAD = math.radians(1.5), math.radians(3.0)
+BEARING_STD_RAD, ZONE_BEARING_STD_RAD, TILT_STD_RAD = math.radians(1.5), math.radians(3.0), math.radians(3.0)
 """Standard deviations of the bearing, and of pitch and roll, before a frame is seen, unless the matcher is told."""
 
 
@@ -72,7 +72,7 @@ class LikelihoodMatcher:
         on: ResidualKind = "ranges",
         pixels: Pixels = "all",
         robust: bool = False,
-        bearing_std_rad: float = BEARING_STD_RAD,
+        bearing_std_rad: float | None = None,
         height_std_m: float = math.inf,
         pitch_std_rad: float = TILT_STD_RAD,
         roll_std_rad: float = TILT_STD_RAD,
@@ -83,7 +83,11 @@ class LikelihoodMatcher:
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
         has_prior = free is None  # the default frees the bearing, with a prior
-        names = check_free((*VIEW[:2], "bearing_rad") if free is None else free)
+        chip = bank.sensor.histogram is not None
+        usual = (*VIEW[:3], "pitch_rad", "roll_rad") if chip and on == "ranges" else VIEW[:3]
+        names = check_free(usual if free is None else free)
+        if bearing_std_rad is None:
+            bearing_std_rad = ZONE_BEARING_STD_RAD if chip else BEARING_STD_RAD
         _check_choices(bank, background, on)
         known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
         if has_prior:
@@ -93,6 +97,7 @@ class LikelihoodMatcher:
         self._bank = bank
         self._systematic = systematic
         self._workers = workers or usual_workers()
+        self.free = names
         self._stated = background if isinstance(background, Background) else None
         self._auto = background == "auto"
         self._setup = Setup(
@@ -141,7 +146,7 @@ class LikelihoodMatcher:
         evidence = Evidence.from_frames(frames, self._setup.on)
         bare = bare_cost(evidence.seen, self._scene.behind)
         fits = search_views(self._setup, self._scene, evidence, evidence.seen, bare)
-        if self._setup.unknown:
+        if self._setup.unknown and not self._setup.reports_one_surface:
             fits = fit_without_borders(self._setup, self._scene, evidence, fits)
         fits = with_profiles(self._setup, self._scene, evidence, fits)
         answers = rank(self._setup, frames, fits, bare, [self._stated] * len(frames))
@@ -194,12 +199,16 @@ class LikelihoodMatcher:
         Before backgrounds that are estimated cells are made for every frame: then the views are kept.
         """
         known: dict[tuple[int, float, int], list[PhasorImages]] = {}
+        light = [self._rendered.renderer(c) for c in range(len(self._bank.classes))]
+        if self._setup.reports_one_surface:  # as the bank has them
+            meshes = [self._bank.mesh(name) for name in self._bank.classes]
+            light = [Renderer(mesh, self._bank.sensor, albedo=float(mesh.metadata["albedo"])) for mesh in meshes]
 
         def turned(class_index: int, distance_m: float, delta_rad: NDArray[np.float64]) -> list[PhasorImages]:
             key = class_index, distance_m, len(delta_rad)
             if key in known:
                 return known[key]
-            renderer, width_rad = self._rendered.renderer(class_index), self._bank.sensor.pixel_rad
+            renderer, width_rad = light[class_index], self._bank.sensor.pixel_rad
             images = [renderer.render(distance_m, delta_rad, share * width_rad) for share in _SHARES_OF_COLUMN]
             if self._auto:
                 known[key] = images
@@ -212,8 +221,10 @@ class LikelihoodMatcher:
         setup = self._setup
         fixed = setup.free == VIEW[:2]
         alone = setup.on == "ranges" and self._stated is None
-        is_exact = fixed and alone and BankModel.grid_is_fine_enough(self._bank, *_FINE_GRID)
-        has_strips = alone and not is_exact and not self._auto and setup.free in (VIEW[:2], VIEW[:3])
+        chip = setup.reports_one_surface  # its ranges jump between the nodes of a bank, and its strips need no tilt
+        is_exact = fixed and alone and not chip and BankModel.grid_is_fine_enough(self._bank, *_FINE_GRID)
+        level = setup.free in (VIEW[:2], VIEW[:3]) or (chip and "height_m" not in setup.free)
+        has_strips = alone and not is_exact and not self._auto and level
         if has_strips and StripModel.suits(self._bank, self._search.widest_columns):
             return None, StripModel(self._bank, self._search.widest_columns)
         scouts = fixed and BankModel.grid_is_fine_enough(self._bank, *_COARSE_GRID)

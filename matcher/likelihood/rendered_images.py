@@ -14,6 +14,7 @@ from phasemark.data import Bank
 from phasemark.matcher.frequencies import renderer_of
 from phasemark.matcher.likelihood.images import VIEW, ModelImages
 from phasemark.matcher.likelihood.view_cache import ViewCache
+from phasemark.matcher.pixel_agreement import MAY_RETURN_COVERAGE
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 from phasemark.render.background import Backgrounds
 
@@ -110,7 +111,7 @@ class RenderedModel:
         m, pixels, p = len(view), self.sensor.rows * self.sensor.cols, len(free)
         phasor, slope = np.empty((m, pixels), np.complex128), np.zeros((m, p, pixels), np.complex128)
         intensity, coverage = np.empty((m, pixels)), np.empty((m, pixels))
-        smooth = [name for name in free if name != "height_m"]
+        smooth = [name for name in free if name != "height_m" or self.sensor.histogram is not None]
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
             image, slopes = (
@@ -118,7 +119,9 @@ class RenderedModel:
             )
             phasor[of] = image.phasor.reshape(len(of), -1)
             intensity[of] = image.intensity.reshape(len(of), -1)
-            coverage[of] = image.coverage.reshape(len(of), -1)
+            # a chip need not see a surface that fills a zone at a slant, or far away
+            faint = np.where(image.phasor == 0, MAY_RETURN_COVERAGE, 1.0)
+            coverage[of] = np.minimum(image.coverage, faint).reshape(len(of), -1)
             for k, name in enumerate(free):
                 if slopes is not None and name in smooth:
                     slope[of, k] = slopes[:, smooth.index(name)].reshape(len(of), -1)

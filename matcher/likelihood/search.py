@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -16,7 +17,7 @@ from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.nearest.bank_minima import Starts
 from phasemark.matcher.nearest.templates import Observation
-from phasemark.matcher.pixel_agreement import MIN_RETURNS
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS
 
 __all__ = ["are_doubtful", "search_views"]
 
@@ -24,6 +25,8 @@ _REFUSED_P = 0.01
 """p-value at which views around the best fits are tried too."""
 
 
+_SLACK = 8 * DISAGREEMENT
+"""Cost by which a scout in the middle of a cell may be above a view of it, among the few zones of a chip."""
 _STARTS_AT_ONCE = 4096
 """Starts that are refined together, but for those of one frame: each has an image of it."""
 
@@ -46,7 +49,10 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     which, nu = _worth_a_search(setup, evidence, bare), evidence.scatter_freedom
     # 1, 2  bound the cost in every cell of the bank, and start in those that may hold an explanation
     cost_of = costs_on_scout(setup, scene, evidence, which)
-    starts = scene.search.of_frames(which).starts(seen[which], _limit(setup, seen[which], nu[which]), cost_of)
+    limit, search = _limit(setup, seen[which], nu[which]), scene.search.of_frames(which)
+    if setup.unknown:  # where most returns are those of other things, no view explains a frame
+        limit = search.least_bounds(seen[which], limit) + setup.rival_cost
+    starts = search.starts(seen[which], limit, cost_of)
     # 3, 4  descend from there, and refine on final images
     fits = fit_starts(setup, scene, evidence, which, starts, _most(setup, evidence[which]))
     # 5  where nothing fits, look around the best fits
@@ -76,11 +82,14 @@ def _with_rivals(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
             most = np.minimum(most, fits.cost[best] + setup.rival_cost)
         if seen is evidence.seen and evidence.on == "ranges" and setup.huber is None:
             limit = np.minimum(limit, most)
+        if setup.unknown:  # every unexplained return costs, and few are explained
+            limit, most = fits.capped[best] + setup.rival_cost, fits.cost[best] + setup.rival_cost
         near = fits.cost <= least_of_frame(fits, len(evidence.weight))[fits.frame] + setup.rival_cost
         known = fits[near & np.isin(fits.frame, which)]
         places = [(known.class_index[own], known.view[own]) for own in (known.frame == k for k in which)]
+        slack = _SLACK if setup.reports_one_surface and setup.unknown else math.inf
         starts = scene.search.of_frames(which).uncovered(
-            seen[which], limit, places, costs_on_scout(setup, scene, evidence, which)
+            seen[which], limit, places, costs_on_scout(setup, scene, evidence, which), slack
         )
         parts = [fits]
         for some in _in_parts(starts, len(which)):

@@ -22,6 +22,9 @@ from phasemark.render import Background, PhasorImages
 
 __all__ = ["Scene", "Setup", "Shapes", "check_free"]
 
+_FURTHER_ZONES = 3
+"""Zones of a chip that an answer explains beyond its number of free parameters."""
+
 
 def check_free(free: Sequence[str]) -> tuple[str, ...]:
     """Return names of free parameters in the order of the view.
@@ -125,11 +128,22 @@ class Setup:
     @property
     def rival_cost(self) -> float:
         """How much more than an answer a view far from it must cost: a single pixel must not decide between them."""
-        return DISAGREEMENT * (self.policy.pixels_against_far_view if self.unknown else 1)
+        pixels = 2 if self.reports_one_surface else self.policy.pixels_against_far_view
+        return DISAGREEMENT * (pixels if self.unknown else 1)
+
+    @property
+    def reports_one_surface(self) -> bool:
+        """Whether the ranges are those that a chip reports, of one surface each, and never between two."""
+        return self.on == "ranges" and self.bank.sensor.histogram is not None
 
     @property
     def fewest_explained(self) -> int:
-        """Returns that an answer takes where unknown things stand in view, or outliers are left out."""
+        """Returns that an answer takes where unknown things stand in view, or outliers are left out.
+
+        A chip has few zones, but each shows one surface: there are to be more of them than free parameters.
+        """
+        if self.reports_one_surface:
+            return len(self.free) + _FURTHER_ZONES
         return self.policy.explained_per_parameter * len(self.free)
 
 

@@ -99,7 +99,7 @@ class StripModel:
         return np.ones((len(view), len(self._borders)), np.bool_)
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
-        """Interpolate strips and add them up; distance, δ and bearing can be free."""
+        """Interpolate strips and add them up; pitch and roll are not seen, and their slopes are 0."""
         m, pixels = len(view), len(self._borders)
         phasor, shade = np.empty((m, pixels), np.complex128), np.empty((m, 2, pixels))
         slope = np.empty((m, 3 if free else 0, pixels), np.complex128)
@@ -121,7 +121,10 @@ class StripModel:
             upper, lower, order, place, step, windows, which, self._lit[i], self._projection, self._strips.cols,
             phasor, slope, shade,
         )  # fmt: skip
-        return ModelImages(phasor, slope[:, [VIEW.index(name) for name in free]], shade[:, 0], shade[:, 1])
+        own = [k for k, name in enumerate(free) if name in VIEW[:3]]
+        slopes = np.zeros((m, len(free), pixels), np.complex128)
+        slopes[:, own] = slope[:, [VIEW.index(free[k]) for k in own]]
+        return ModelImages(phasor, slopes, shade[:, 0], shade[:, 1])
 
     first_images = images
 

@@ -37,8 +37,8 @@ _N_MODES = 12
 """Local minima of the cells of one class that are refined, at most."""
 _CLOSE = 2, 2, 1
 """Cells, columns in the last place, within which a descent from one place stands for all: D, δ, bearing."""
-_RAISED = 3.0
-"""Factor by which the limit of a frame is raised that no view explains."""
+_RAISED, _RAISED_LITTLE = 3.0, 1.1
+"""Factors by which the limit of a frame is raised that no view explains, the second among unknown things."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,12 +167,21 @@ class Search:
             found.append(self._views(cost, [modes(cost, c, _N_MODES, *self._neighbours) for c in self._classes]))
         return _joined(found)
 
+    def least_bounds(self, seen: Observation, limit: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return limits, (n,), raised in small steps until a cell of each frame is below; arguments as in `starts`."""
+        frames, raised = _Moved(self, seen), limit.copy()
+        for f in range(len(limit)):
+            while not frames.has_cell(f, raised[f]):
+                raised[f] *= _RAISED_LITTLE
+        return raised
+
     def uncovered(
         self,
         seen: Observation,
         limit: NDArray[np.float64],
         known: Sequence[Known],
         cost_of: CostOf | None = None,
+        slack: float = math.inf,
     ) -> Starts:
         """Return views in all cells of every frame that may hold an explanation but are not close to a known one.
 
@@ -184,6 +193,8 @@ class Search:
             What explains each frame, (k,) int64 and (k, 6) float64.
         cost_of : callable, optional
             As for :meth:`starts`.
+        slack : float
+            Cells are left out whose middles cost more than the limit by this.
         """
         frames, found = _Moved(self, seen), []
         for f in range(len(limit)):
@@ -191,6 +202,7 @@ class Search:
             for c, view in zip(*known[f], strict=True):
                 cost[self._close_to(int(c), view)] = np.inf
             self._tell(cost, f, cost_of)
+            cost[cost > limit[f] + slack] = np.inf
             places = [cover(cost, c, *self._neighbours, *_CLOSE) for c in self._classes]
             found.append(self._views(cost, places))
         return _joined(found)
@@ -311,6 +323,11 @@ class SearchOfFrames:
         """Return the search for some of the frames."""
         return SearchOfFrames([self._searches[k] for k in frame], self.column_rad)
 
+    def least_bounds(self, seen: Observation, limit: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return raised limits; see :meth:`Search.least_bounds`."""
+        each = (own.least_bounds(seen[k : k + 1], limit[k : k + 1]) for k, own in enumerate(self._searches))
+        return np.concatenate([np.empty(0), *each])
+
     def starts(self, seen: Observation, limit: NDArray[np.float64], cost_of: CostOf | None = None) -> Starts:
         """Return the best modes of every frame; see :meth:`Search.starts`."""
         alone = [(seen[k : k + 1], limit[k : k + 1], _of_one(cost_of, k)) for k in range(len(self._searches))]
@@ -322,12 +339,13 @@ class SearchOfFrames:
         limit: NDArray[np.float64],
         known: Sequence[Known],
         cost_of: CostOf | None = None,
+        slack: float = math.inf,
     ) -> Starts:
         """Return views in the cells that are left; see :meth:`Search.uncovered`."""
         alone = [(slice(k, k + 1), _of_one(cost_of, k)) for k in range(len(self._searches))]
         return _joined(
             [
-                own.uncovered(seen[k], limit[k], known[k], cost)
+                own.uncovered(seen[k], limit[k], known[k], cost, slack)
                 for own, (k, cost) in zip(self._searches, alone, strict=True)
             ]
         )

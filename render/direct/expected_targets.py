@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.render import Sensor
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.targets import _median, place_to_range
 from phasemark.render.kernel import kernel
+from phasemark.render.sensor.sensor import Sensor
 
 MARGIN = 2.0
 """Factor to which brightness is known."""

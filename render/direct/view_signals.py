@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
-from phasemark.render import Background, Sensor, Views
+from phasemark.render.background import Background
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
 from phasemark.render.direct.sample_counts import signal_of_samples, signal_of_surfaces
 from phasemark.render.direct.scene_samples import SceneMesh
-from phasemark.render.view import VIEW_FIELDS
+from phasemark.render.integral.surface_mesh import SurfaceMesh
+from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.view import VIEW_FIELDS, Views
 
 STEPS: dict[str, float] = {
     "distance_m": 2e-3,
@@ -31,12 +33,17 @@ _VIEWS_AT_ONCE = 16
 
 def views_about(view: NDArray[np.float64], free: Sequence[str], wider: float = 1.0) -> Views:
     """Return a view, and those a step, or a multiple of it, above and below in each free parameter, (1 + 2 p)."""
+    return Views(*moved_about(view, free, wider).T.copy())
+
+
+def moved_about(view: NDArray[np.float64], free: Sequence[str], wider: float = 1.0) -> NDArray[np.float64]:
+    """Return the same as an array, (1 + 2 p, 6)."""
     moved = np.repeat(view[None], 2 * len(free) + 1, axis=0)
     for k, name in enumerate(free):
         column = VIEW_FIELDS.index(name)
         moved[1 + 2 * k, column] += wider * STEPS[name]
         moved[2 + 2 * k, column] -= wider * STEPS[name]
-    return Views(*moved.T.copy())
+    return moved
 
 
 def slopes_about(found: NDArray[np.float64], free: Sequence[str]) -> NDArray[np.float64]:
@@ -59,13 +66,19 @@ class ViewSignals:
     albedo : float
     """
 
-    def __init__(self, mesh: trimesh.Trimesh | None, sensor: Sensor, albedo: float = 0.8) -> None:
+    def __init__(self, mesh: SurfaceMesh | None, sensor: Sensor, albedo: float = 0.8) -> None:
         histogram_of(sensor)
         self.sensor, self.albedo = sensor, albedo
         self.vertices = np.empty((0, 3)) if mesh is None else np.asarray(mesh.vertices, dtype=np.float64)
         self._grid = footprint_grid(sensor)
         self._scene = SceneMesh(mesh)
         self._own = threading.local()  # a scene has scratch that two threads must not share
+
+    def seen_by(self, sensor: Sensor) -> ViewSignals:
+        """Return the counts of another direct sensor from the same landmark."""
+        other = copy.copy(self)
+        other.sensor, other._grid, other._own = sensor, footprint_grid(sensor), threading.local()
+        return other
 
     def counts(self, views: Views, workers: int = 1) -> NDArray[np.float64]:
         """Return the expected signal counts of one frame, (n, zones, bins).
