@@ -45,7 +45,7 @@ def distances_of_frames(frames: Frames, mesh: SurfaceMesh) -> tuple[float, ...]:
     nearest_m, farthest_m = float(np.min(ranges)), float(np.max(ranges))
     start = max(radius_m + _GAP_M, nearest_m)
     stop = min(farthest_m + radius_m, told_m)
-    if not start < stop:
+    if radius_m > farthest_m or not start < stop:
         raise UsageError(
             f"a landmark of {across_m:.3g} m cannot be in these frames: their ranges are {nearest_m:.3g} …"
             f" {farthest_m:.3g} m, and this camera tells it from {radius_m + _GAP_M:.3g} m to {told_m:.3g} m; check the"

@@ -1,0 +1,168 @@
+"""Ranges that a chip reports: rendered, simulated, and matched without any option, before whatever stands behind."""
+
+import math
+from collections import Counter
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from phasemark import UsageError
+from phasemark.data import build_bank
+from phasemark.data.measured.simulated import simulate_recording
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.matcher import Matcher, kalman_filter
+from phasemark.matcher.chi_squared import p_values_of
+from phasemark.matcher.recordings.bank_for_frames import distances_of_frames
+from phasemark.render import Background, Frames, Renderer, Views, capture, preset
+from phasemark.render.direct import HistogramRenderer
+from phasemark.render.direct.chip_renderer import ChipRenderer
+
+SENSOR = preset("vl53l5cx-8x8")
+ANGLES = "delta_rad", "bearing_rad", "pitch_rad", "roll_rad"
+# class, D, δ, bearing, pitch, roll in degrees, wall, floor
+SCENES = {
+    "nothing behind": ("cone", 0.54, 100.0, 1.0, 2.0, -1.0, None, None),
+    "a wall": ("post", 0.53, 219.9, -1.23, 1.21, -2.67, 2.58, None),
+    "a wall near by and a floor": ("cylinder", 0.61, 152.4, 3.3, -0.5, 0.3, 1.2, 0.27),
+}
+
+
+@lru_cache(maxsize=4)
+def mesh(name):
+    return build_mesh(catalog()[name])
+
+
+@lru_cache(maxsize=4)
+def bank(name):
+    return build_bank({"classes": (name,), "sensor": "vl53l5cx-8x8", "distance_m": "0.4:0.8:0.01"})
+
+
+def chip_frames(name, view, background, n_frames=15, seed=1):
+    """Return frames as the chip makes them of its own histograms, in whole millimetres."""
+    images = HistogramRenderer(mesh(name), SENSOR).render_views(view, background=background)
+    frames = capture(images, SENSOR, rng=np.random.default_rng(seed), n_frames=n_frames).ranges
+    z_m = np.round(frames.z_m, 3)
+    return Frames(z_m / SENSOR.axis_cosine(), flags=frames.flags, sensor=SENSOR)
+
+
+def view_of(name, distance, delta, bearing, pitch, roll, wall, floor):
+    view = Views.broadcast(distance, *np.radians([delta, bearing]), 0.0, *np.radians([pitch, roll]))
+    background = None if wall is None else Background(wall_m=wall, floor_m=floor)
+    return name, view, background
+
+
+@pytest.mark.parametrize("name", sorted(catalog()))
+def test_rendered_ranges_are_the_mean_of_what_the_chip_reports(name):
+    rng = np.random.default_rng(3)
+    views = Views.broadcast(rng.uniform(0.4, 1.2, 6), rng.uniform(0, 2 * np.pi, 6), rng.uniform(-0.08, 0.08, 6))
+    image = ChipRenderer(mesh(name), SENSOR).render_views(views)
+    counted = HistogramRenderer(mesh(name), SENSOR).render_views(views)
+    reported = capture(counted, SENSOR, rng=rng, n_frames=100).ranges
+    sure = (image.phasor != 0) & reported.valid.all(axis=1)
+    assert sure.sum() > 60
+    range_m = np.where(reported.valid.all(axis=1, keepdims=True), reported.range_m, 0.0)
+    mean, std = range_m.mean(axis=1)[sure], range_m.std(axis=1)[sure]
+    off = image.range_m[sure] - mean
+    # the expected target is that of the mean counts: where surfaces bend in a zone another bin may be the highest
+    assert np.quantile(np.abs(off) - std / 10 * 3, 0.95) < 1e-3
+    assert np.abs(off).max() < 0.3 * SENSOR.histogram.bin_width_m
+
+
+def test_a_zone_at_an_edge_reports_the_landmark_or_the_wall_and_nothing_between():
+    """The mean over the zone, which a chip does not report, lies between the two."""
+    wall_m = 1.5
+    views = Views.broadcast(np.full(3, 0.7), np.radians(30.0))
+    wall = Background(wall_m=wall_m)
+    simulated = simulate_recording(mesh("cylinder"), "cylinder", SENSOR, views, seed=1, background=wall)
+    z_m = simulated.frames.z_m[0][:, :]
+    light = Renderer(mesh("cylinder"), SENSOR).render_views(views[:1], background=wall)
+    mean_m = (light.range_m * SENSOR.axis_cosine())[0]
+    between = (mean_m > 0.8) & (mean_m < wall_m - 0.1)
+    assert between.sum() >= 4
+    assert ((z_m[:, between] < 0.8) | (np.abs(z_m[:, between] - wall_m) < 0.05)).all()
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_frames_of_a_chip_are_matched_without_any_option(scene):
+    name, view, background = view_of(*SCENES[scene])
+    match = Matcher(bank(name), "refine", background="any").match(kalman_filter(chip_frames(name, view, background)))[0]
+    assert match.accepted
+    assert match.class_name == name
+    assert match.among_unknown
+    assert match.free == ("distance_m", "delta_rad", "bearing_rad", "pitch_rad", "roll_rad")
+    assert match.distance_m == pytest.approx(float(view.distance_m[0]), abs=3e-3)
+    period = 2 * math.pi / match.symmetry
+    for angle in ANGLES:
+        off = math.remainder(getattr(match, angle) - float(getattr(view, angle)[0]), period)
+        assert abs(math.degrees(off)) < 1.0, angle
+
+
+@pytest.mark.soak
+def test_accepted_answers_for_frames_of_a_chip_are_right():
+    """Four classes, 0.4 to 0.8 m, wall or none, floor or none, tilts and bearings: none of 120 is grossly wrong."""
+    rng, count = np.random.default_rng(12), Counter()
+    for name in sorted(catalog()):
+        matcher = Matcher(bank(name), "refine", background="any")
+        low = -float(mesh(name).vertices[:, 2].min())
+        for seed in range(30):
+            distance, wall = rng.uniform(0.45, 0.75), rng.uniform(0.4, 2.0)
+            floor = low + 0.05 + rng.uniform(0.05, 0.2) if seed % 2 else None
+            scene = (
+                name, distance, rng.uniform(0, 360), *rng.uniform(-5, 5, 1), *rng.uniform(-3, 3, 2),
+                distance + wall if seed % 5 else None, floor,
+            )  # fmt: skip
+            _, view, background = view_of(*scene)
+            match = matcher.match(kalman_filter(chip_frames(name, view, background, seed=seed)))[0]
+            off = math.remainder(match.delta_rad - float(view.delta_rad[0]), 2 * math.pi / match.symmetry)
+            right = abs(match.distance_m - distance) < 0.03 and abs(off) < math.radians(6)
+            count[match.accepted, right] += 1
+    assert count[True, False] == 0, count
+    assert count[True, True] >= 0.6 * (count[True, True] + count[False, True]), count
+
+
+def test_a_phase_camera_takes_the_background_that_the_evidence_asks_for():
+    sensor = preset("pmd-16x16")
+    landmark = build_bank({"classes": ("cone",), "distance_m": "0.8:1.2:0.02", "delta_deg": "0:178:2"})
+    matcher = Matcher(landmark, "refine", background="any", free=("distance_m", "delta_rad"))
+    renderer = Renderer(mesh("cone"), sensor)
+    found = []
+    for background in (None, Background(wall_m=3.0)):
+        frames = capture(
+            renderer.render(1.0, 0.6, background=background), sensor, rng=np.random.default_rng(1), n_frames=50
+        )
+        found.append(matcher.match(kalman_filter(frames))[0])
+    alone, before = found
+    assert alone.accepted
+    assert alone.background is None
+    assert before.accepted
+    assert before.background.wall_m == pytest.approx(3.0, abs=0.02)
+    assert not alone.among_unknown
+    assert not before.among_unknown
+
+
+def test_a_cost_of_nothing_has_a_p_value():
+    """Sums of squares are differences of sums: one of 0 came out as −1e-13, and as no number."""
+    p = p_values_of(np.array([-1e-13, 0.0]), np.array([3.0, 3.0]), np.full(2, np.inf))
+    assert p == pytest.approx([1.0, 1.0])
+
+
+@pytest.mark.parametrize(("scale", "reason"), [(1000.0, "cannot be in these frames"), (1.0, "")])
+def test_a_landmark_that_cannot_be_in_the_frames_is_refused(scale, reason):
+    name, view, background = view_of(*SCENES["a wall"])
+    frames = chip_frames(name, view, background, n_frames=1)
+    part = mesh(name).copy()
+    part.vertices = part.vertices * scale
+    if reason:
+        with pytest.raises(UsageError, match=reason):
+            distances_of_frames(frames, part)
+    else:
+        distances = distances_of_frames(frames, part)
+        assert distances[0] < 0.53 - 0.1
+        assert distances[-1] > 0.53 + 0.2
+
+
+def test_frames_without_a_range_ask_for_no_bank():
+    nothing = Frames(np.full((1, 1, 8, 8), np.nan), sensor=SENSOR)
+    with pytest.raises(UsageError, match="no pixel of the frames has a valid range"):
+        distances_of_frames(nothing, mesh("cone"))
