@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from phasemark import InputFileError, UsageError
-from phasemark.data.commands.console import LongWork, Table, echo_json, one_line, tell
+from phasemark.data.commands.console import LongWork, Table, echo_facts, echo_json, one_line, tell
 from phasemark.data.commands.inputs import note_too_far, open_any_bank
 from phasemark.data.commands.options import (
     FrameReading,
@@ -193,6 +193,8 @@ def _flags_of(orientation: Orientation) -> str:
     return f"{'--flip-h' if orientation.flip_h else ''} {turn}".strip()
 
 
+_WIDEST = 88
+"""A single answer that is wider than this is printed one number a line."""
 _OUTSIDE = "outside the bank"
 
 
@@ -282,6 +284,10 @@ class _Answers:
                 typer.echo(json.dumps({"index": k, **answer}, ensure_ascii=False, allow_nan=False))
         else:
             rows = match_rows(answers, start, self._columns)
+            width = sum(max(len(title), len(value)) + 2 for title, value in rows[0].items())
+            if self._columns.counted is None and width > _WIDEST:
+                echo_facts(rows[0])
+                return
             self._table = self._table or Table(list(rows[0]))
             self._table.echo([list(row.values()) for row in rows])
 

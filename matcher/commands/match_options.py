@@ -227,7 +227,7 @@ class Search:
         )
 
     def _behind(self, bank: Bank) -> Background | Literal["auto", "unknown", "any"] | None:
-        """Return what stands behind the landmark: what is stated, or whatever the evidence asks for."""
+        """Return the background of the matcher: the stated one, or "any"."""
         if self.auto_background:
             return "auto"
         if self.unknown_background:
@@ -263,7 +263,7 @@ class Landmark:
     up: Up = "z"
     origin: Origin = "file"
     no_cache: Annotated[
-        bool, typer.Option("--no-cache", help="Without a bank: build one anew, and do not keep it.")
+        bool, typer.Option("--no-cache", help="Without a bank: build one again, and do not keep it.")
     ] = False
 
     def check(self, bank: Path) -> None:

@@ -115,7 +115,7 @@ def capture(
 def measuring_renderer(
     mesh: SurfaceMesh | None, sensor: Sensor, *, albedo: float = 0.8
 ) -> Renderer | HistogramRenderer:
-    """Return what renders what a sensor measures of a landmark: histograms, where the sensor describes them.
+    """Return the renderer of a landmark for a sensor: of histograms, where the sensor describes them.
 
     Parameters
     ----------

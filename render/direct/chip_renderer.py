@@ -37,7 +37,7 @@ _JUMP_M = 0.02
 def range_renderer(
     mesh: SurfaceMesh | None, sensor: Sensor, *, albedo: float = 0.8, harmonics: Sequence[int] | None = None
 ) -> Renderer:
-    """Return what renders the ranges that a sensor measures: those of its chip where the sensor describes one.
+    """Return the renderer of the ranges that a sensor measures: those of its chip where the sensor describes one.
 
     Parameters
     ----------
