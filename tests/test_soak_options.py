@@ -85,7 +85,7 @@ SMALL = {
 """Arguments with which a command does little."""
 LONG = {
     "demo": 60, "landmark design": 40, "drive": 30, "sweep run": 30, "sweep report": 30, "calibrate": 120,
-    "sensor fit-direct": 60,
+    "sensor fit-direct": 60, "warm": 120, "match": 60,
 }  # fmt: skip
 """Seconds of commands that cannot do little, while another test runs beside them."""
 CAMERA = """image_width: 16

@@ -83,8 +83,8 @@ class LikelihoodMatcher:
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
         has_prior = free is None  # the default frees the bearing, with a prior
-        chip = bank.sensor.histogram is not None
-        usual = (*VIEW[:3], "pitch_rad", "roll_rad") if chip and on == "ranges" else VIEW[:3]
+        chip = on == "ranges" and bank.sensor.histogram is not None and _is_rendered(bank)
+        usual = (*VIEW[:3], "pitch_rad", "roll_rad") if chip else VIEW[:3]
         names = check_free(usual if free is None else free)
         if bearing_std_rad is None:
             bearing_std_rad = ZONE_BEARING_STD_RAD if chip else BEARING_STD_RAD
@@ -109,6 +109,7 @@ class LikelihoodMatcher:
             on=on,
             background_is_known=self._stated is not None,
             unknown=unknown,
+            reports_one_surface=chip,
             used=pixels_of(bank, pixels).ravel(),
             huber=ROBUST_FROM if robust or unknown else None,
             false_alarm=false_alarm,
@@ -326,6 +327,12 @@ def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.floa
     wrong = (seen.returned & ~lit) | (seen.not_returned & sure)
     squared = np.minimum(seen.weight * residual**2, DISAGREEMENT)
     return np.asarray(squared.sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
+
+
+def _is_rendered(bank: Bank) -> bool:
+    """Return whether views of all landmarks of a bank are rendered: not of a slab wider than the bank's distances."""
+    vertices = [np.asarray(bank.mesh(name).vertices) for name in bank.classes]
+    return max(float(np.hypot(*own[:, :2].T).max()) for own in vertices) < float(bank.distance_m[-1])
 
 
 def _check_choices(bank: Bank, background: object, on: str) -> None:

@@ -82,6 +82,8 @@ class Setup:
         Whether a wall or floor was stated.
     unknown : bool
         Whether unknown things may stand in view.
+    reports_one_surface : bool
+        Whether ranges are compared with those that a chip reports, of one surface each, and never between two.
     used : (pixels,) bool
         Which pixels give the view.
     huber : float, optional
@@ -102,6 +104,7 @@ class Setup:
     on: ResidualKind
     background_is_known: bool
     unknown: bool
+    reports_one_surface: bool
     used: NDArray[np.bool_]
     huber: float | None
     false_alarm: float
@@ -130,11 +133,6 @@ class Setup:
         """How much more than an answer a view far from it must cost: a single pixel must not decide between them."""
         pixels = 2 if self.reports_one_surface else self.policy.pixels_against_far_view
         return DISAGREEMENT * (pixels if self.unknown else 1)
-
-    @property
-    def reports_one_surface(self) -> bool:
-        """Whether the ranges are those that a chip reports, of one surface each, and never between two."""
-        return self.on == "ranges" and self.bank.sensor.histogram is not None
 
     @property
     def fewest_explained(self) -> int:
