@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
 from typing import Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -227,7 +228,7 @@ class LikelihoodMatcher:
         level = setup.free in (VIEW[:2], VIEW[:3]) or (chip and "height_m" not in setup.free)
         has_strips = alone and not is_exact and not self._auto and level
         if has_strips and StripModel.suits(self._bank, self._search.widest_columns):
-            return None, StripModel(self._bank, self._search.widest_columns)
+            return None, _strips(self._bank, self._search.widest_columns)
         scouts = fixed and BankModel.grid_is_fine_enough(self._bank, *_COARSE_GRID)
         if not (is_exact or scouts):
             return None, None
@@ -327,6 +328,18 @@ def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.floa
     wrong = (seen.returned & ~lit) | (seen.not_returned & sure)
     squared = np.minimum(seen.weight * residual**2, DISAGREEMENT)
     return np.asarray(squared.sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
+
+
+_STRIPS: WeakKeyDictionary[Bank, dict[int, StripModel]] = WeakKeyDictionary()
+"""Strips of banks, which all matchers with a bank share: they may take gigabytes."""
+
+
+def _strips(bank: Bank, widest_columns: int) -> StripModel:
+    """Return the strips of a bank for bearings up to some columns."""
+    of_bank = _STRIPS.setdefault(bank, {})
+    if widest_columns not in of_bank:
+        of_bank[widest_columns] = StripModel(bank, widest_columns)
+    return of_bank[widest_columns]
 
 
 def _is_rendered(bank: Bank) -> bool:

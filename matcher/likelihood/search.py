@@ -50,7 +50,7 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     # 1, 2  bound the cost in every cell of the bank, and start in those that may hold an explanation
     cost_of = costs_on_scout(setup, scene, evidence, which)
     limit, search = _limit(setup, seen[which], nu[which]), scene.search.of_frames(which)
-    if setup.unknown:  # where most returns are those of other things, no view explains a frame
+    if setup.unknown and setup.reports_one_surface:  # where most zones see other things, no view explains a frame
         limit = search.least_bounds(seen[which], limit) + setup.rival_cost
     starts = search.starts(seen[which], limit, cost_of)
     # 3, 4  descend from there, and refine on final images
@@ -82,7 +82,7 @@ def _with_rivals(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
             most = np.minimum(most, fits.cost[best] + setup.rival_cost)
         if seen is evidence.seen and evidence.on == "ranges" and setup.huber is None:
             limit = np.minimum(limit, most)
-        if setup.unknown:  # every unexplained return costs, and few are explained
+        if setup.unknown and setup.reports_one_surface:  # every unexplained return costs, and few are explained
             limit, most = fits.capped[best] + setup.rival_cost, fits.cost[best] + setup.rival_cost
         near = fits.cost <= least_of_frame(fits, len(evidence.weight))[fits.frame] + setup.rival_cost
         known = fits[near & np.isin(fits.frame, which)]
