@@ -88,7 +88,7 @@ class Matcher:
         "unknown", with "refine" on ranges: other things may stand before, beside and behind it; what the landmark does
         not explain costs a disagreement when views and classes are compared, and is left out of the test of the fit.
         "any", with "refine": what the evidence asks for: nothing, wall and floor, or unknown things, tried in this
-        order; of ranges that a chip reports unknown things at once.
+        order. Of ranges that a chip reports, each of one surface, every background is unknown things.
         Histograms take the albedos of a Background as guesses, targets as known.
     false_alarm : float
         Share of good frames that the test of the fit may refuse.

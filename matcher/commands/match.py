@@ -239,7 +239,7 @@ class _Answers:
         if stamps_s is not None:
             self._pose_time_s = pose_times_s(stamps_s, matcher.bank.sensor.delay_s).tolist()
         self.estimated = EstimateTable(matcher.free, self._pose_time_s)
-        at_once = NEAREST_AT_ONCE if self._search.method == "nearest" else REFINED_AT_ONCE
+        at_once = NEAREST_AT_ONCE if matcher.method == "nearest" else REFINED_AT_ONCE
         with LongWork("matching") if n > at_once else nullcontext() as progress:
             if isinstance(positions, DirectPositions):
                 batches: Iterator[MatchedBatch | DirectBatch] = match_directly(matcher, positions, at_once=at_once)
@@ -329,7 +329,7 @@ class _Answers:
             what = f"{type(error).__name__}: {one_line(str(error))}"
             tell(f"note: frame {index} is refused, and its diagnosis failed ({what}); --no-diagnosis leaves it out")
             return
-        message = diagnosis_text(diagnosis, Given(reading, search.method == "nearest", search.fix == "bearing"))
+        message = diagnosis_text(diagnosis, Given(reading, matcher.method == "nearest", search.fix == "bearing"))
         tell(f"note: {message}")
         if self._results.as_json:
             self.answers[index]["diagnosis"] = {**diagnosis.as_dict(), "message": message}

@@ -55,8 +55,8 @@ class Search:
         Literal["nearest", "refine"] | None,
         typer.Option(
             "--method",
-            help="refine: maximum likelihood, with covariance; nearest: the paper's minimum-distance classifier. refine"
-            " unless the bank's model is hard or planar.",
+            help="nearest: the paper's minimum-distance classifier. refine: maximum likelihood, with covariance; it is"
+            " taken for the ranges of a chip, and where an option asks for it.",
         ),
     ] = None
     free: Annotated[
@@ -144,7 +144,7 @@ class Search:
     @property
     def near_the_axis(self) -> bool:
         """Whether the bearing is estimated with what is known of it, as nothing else is asked for."""
-        return self.method != "nearest" and not self.free and not self.fix
+        return not self.free and not self.fix
 
     @property
     def _stated_std(self) -> dict[str, float | None]:
@@ -154,7 +154,7 @@ class Search:
     @property
     def parameters(self) -> list[str]:
         """What is estimated."""
-        free = ["bearing"] if self.near_the_axis else self.free or ()
+        free = self.free or ()
         return ["distance_m", "delta_rad", *(_FREE[name] for name in sorted(free, key=list(_FREE).index))]
 
     def filter(self) -> Callable[[Frames], FilteredFrames]:
@@ -184,15 +184,27 @@ class Search:
                 raise UsageError(f"--{name}-std goes with --free {name}: what is not free is 0")
         if self.is_direct:
             self._check_direct()
+        for option in self._refining:
+            if self.method == "nearest":
+                raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
+
+    @property
+    def _refining(self) -> list[str]:
+        """Options that are given and belong to maximum likelihood."""
         refined = (
             ("--free", bool(self.free)), ("--on", self.on != "ranges"), ("--pixels", self.pixels != "all"),
             ("--robust", self.robust), ("--auto-background", self.auto_background),
             ("--unknown-background", self.unknown_background), ("--fix", self.fix is not None),
             ("--bearing-std", self.bearing_std is not None),
         )  # fmt: skip
-        for option, used in refined:
-            if used and self.method == "nearest":
-                raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
+        return [option for option, used in refined if used]
+
+    def method_for(self, bank: Bank) -> Literal["nearest", "refine"]:
+        """Return the method: the stated one; maximum likelihood of a chip's ranges, or where an option asks for it."""
+        if self.method is not None:
+            return self.method
+        reports = bank.sensor.histogram is not None and bank.plan.model == "ray"
+        return "refine" if reports or self._refining else "nearest"
 
     def _check_direct(self) -> None:
         """Refuse options that belong to images of ranges."""
@@ -211,10 +223,11 @@ class Search:
         from phasemark.matcher import Matcher
         from phasemark.matcher.likelihood.likelihood_matcher import TILT_STD_RAD
 
+        method = self.method_for(bank)
         return Matcher(
             bank,
-            self.method or ("refine" if bank.plan.model == "ray" else "nearest"),
-            free=None if self.near_the_axis else self.parameters,
+            method,
+            free=None if self.near_the_axis and method == "refine" else self.parameters,
             background=self._behind(bank),
             bearing_std_rad=None if self.bearing_std is None else math.radians(self.bearing_std),
             height_std_m=self._stated_in("height", 1.0, math.inf),
@@ -232,8 +245,8 @@ class Search:
             return "auto"
         if self.unknown_background:
             return "unknown"
-        chosen = self.method != "nearest" and not self.is_direct and bank.plan.model == "ray"
-        return self.background or ("any" if chosen else None)
+        chip = self.on == "ranges" and bank.sensor.histogram is not None and self.method_for(bank) == "refine"
+        return self.background or ("any" if chip else None)
 
     def _stated_in(self, name: str, unit: float, otherwise: float) -> float:
         """Return a prior that is stated, in the unit of the matcher, or what holds where none is."""

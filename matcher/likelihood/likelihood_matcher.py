@@ -90,6 +90,8 @@ class LikelihoodMatcher:
         if bearing_std_rad is None:
             bearing_std_rad = ZONE_BEARING_STD_RAD if chip else BEARING_STD_RAD
         _check_choices(bank, background, on)
+        if chip and background is not None:
+            background = "unknown"  # what stands behind the landmark changes no zone that reports the landmark
         known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
         if has_prior:
             known["bearing_rad"] = bearing_std_rad
