@@ -21,13 +21,15 @@ from phasemark.render import Background
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
 
-Measured = Literal["ranges", "phasors", "histograms", "targets"]
+Measured = Literal["ranges", "reported", "phasors", "histograms", "targets"]
 """What is matched on."""
 DIRECT_KINDS = ("histograms", "targets")
 """What of it a direct sensor alone measures."""
 
 
-def refuse_direct_options(method: str, on: str, background: Background | str | None, pixels: str, robust: bool) -> None:
+def refuse_direct_options(
+    method: str, on: str, background: Background | Literal["auto", "unknown"] | None, pixels: str, robust: bool
+) -> None:
     """Refuse options that do not go with histograms and targets.
 
     Raises
@@ -37,7 +39,7 @@ def refuse_direct_options(method: str, on: str, background: Background | str | N
     """
     wrong = {
         "'method' must be refine": method != "refine",
-        "'background' must be a Background, 'auto' or None": background in ("unknown", "any"),
+        "'background' must be a Background, 'auto' or None": background == "unknown",
         "'background' must be a Background or None, for targets do not tell it": on == "targets"
         and background == "auto",
         "'pixels' must be all": pixels != "all",

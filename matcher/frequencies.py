@@ -13,7 +13,6 @@ from phasemark.data.bank.bank_file import BankGroup
 from phasemark.matcher.one_frequency import OneFrequency, OneFrequencyRenderer, Way
 from phasemark.matcher.pixel_agreement import pixel_mask
 from phasemark.render import Background, PhasorImages, Renderer, Views
-from phasemark.render.direct.chip_renderer import range_renderer
 
 
 class _OneFrequencyGroup(BankGroup):
@@ -96,7 +95,7 @@ def renderer_of(bank: Bank, mesh: trimesh.Trimesh | None, albedo: float = 0.8) -
     albedo : float
     """
     if not isinstance(bank, OneFrequencyBank):
-        return range_renderer(mesh, bank.sensor, albedo=albedo)
+        return Renderer(mesh, bank.sensor, albedo=albedo)
     return OneFrequencyRenderer(Renderer(mesh, bank.one.camera, albedo=albedo, harmonics=()), bank.one)
 
 

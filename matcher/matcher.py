@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Literal, Protocol, cast
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from phasemark import UsageError
@@ -23,7 +25,6 @@ from phasemark.matcher.filters.region import read_region
 from phasemark.matcher.frequencies import OneFrequencyBank
 from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.joint_models import relative_poses
-from phasemark.matcher.likelihood.by_evidence import MatcherByEvidence
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import (
     BEARING_STD_RAD,
@@ -42,6 +43,9 @@ from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
 
 METHODS = ("nearest", "refine")
+_CHIP_ERROR_BINS = 0.03
+"""Error of a chip's target, in bins: rounding to millimetres, and what its estimator makes of a surface that bends
+within a zone, or of things beside it."""
 
 
 class MatchMethod(Protocol):
@@ -80,32 +84,31 @@ class Matcher:
     free : sequence of str, optional
         What "refine" estimates: distance_m and delta_rad, and on request any of bearing_rad, height_m, pitch_rad and
         roll_rad; what is not free is 0. None: distance, delta and the bearing, whose Gaussian prior has mean 0 and the
-        standard deviation `bearing_std_rad` before the frame is seen; of ranges that a chip reports pitch and roll too,
-        for its zones are wide. ``("distance_m", "delta_rad")`` fixes the bearing at 0.
+        standard deviation `bearing_std_rad` before the frame is seen; of reported ranges pitch and roll too.
+        ``("distance_m", "delta_rad")`` fixes the bearing at 0.
     background : Background, "auto", "unknown" or None
         What stands behind the landmark. None: nothing is expected to return beside it. "auto", with "refine": wall and
         floor are estimated from each frame's own far pixels; of histograms a wall alone, its distance and brightness.
         "unknown", with "refine" on ranges: other things may stand before, beside and behind it; what the landmark does
         not explain costs a disagreement when views and classes are compared, and is left out of the test of the fit.
-        "any", with "refine": what the evidence asks for: nothing, wall and floor, or unknown things, tried in this
-        order. Of ranges that a chip reports, each of one surface, every background is unknown things.
         Histograms take the albedos of a Background as guesses, targets as known.
     false_alarm : float
         Share of good frames that the test of the fit may refuse.
-    on : {"ranges", "phasors", "histograms", "targets"}
+    on : {"ranges", "reported", "phasors", "histograms", "targets"}
         What "refine" explains: ranges, or amplitude · exp(iφ) with the landmark's albedo estimated too. Phasors need
         frames with amplitudes, best from :func:`~phasemark.matcher.phasor_mean`. Of several modulation frequencies
         ranges are the unwrapped ones with their combined variance; phasors, and the phases that "nearest" compares, are
         those of every frequency, each wrapped by itself: nothing is unwrapped, and mixed pixels count. Of a direct
         sensor with a [histogram] table also the counts of every bin, Poisson, with the landmark's brightness and the
-        ambient light of every zone estimated, or the targets that its chip reports.
+        ambient light of every zone estimated, or the targets that its chip reports. "reported": its ranges
+        as its chip makes them, of the nearest surface of each zone; whatever else returns is left to unknown things.
     pixels : {"all", "lower"}
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool
         Whether "refine" counts residuals beyond 3 σ linearly (Huber); the covariance is then the sandwich.
     bearing_std_rad : float, optional
         How well the mount points at the landmark, where `free` is None: the standard deviation of a Gaussian prior.
-        None: 1.5°, of ranges that a chip reports 3°.
+        None: 1.5°, of reported ranges 3°.
     height_std_m, pitch_std_rad, roll_std_rad : float
         How well height, pitch and roll are known where they are free: standard deviations of Gaussian priors with mean
         0; infinite where nothing is known. Starts are looked for up to three of them away, within a quarter of the
@@ -157,7 +160,7 @@ class Matcher:
         method: str = "nearest",
         *,
         free: Sequence[str] | None = None,
-        background: Background | Literal["auto", "unknown", "any"] | None = None,
+        background: Background | Literal["auto", "unknown"] | None = None,
         false_alarm: float = 0.01,
         on: Measured = "ranges",
         pixels: Pixels = "all",
@@ -173,10 +176,10 @@ class Matcher:
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
         _check_word("method", method, METHODS)
-        _check_word("on", on, ("ranges", "phasors", *DIRECT_KINDS))
+        _check_word("on", on, ("ranges", "reported", "phasors", *DIRECT_KINDS))
         _check_word("pixels", pixels, ("all", "lower"))
         if background is not None and not isinstance(background, Background):
-            _check_word("background", background, ("auto", "unknown", "any"), "a Background, None, ")
+            _check_word("background", background, ("auto", "unknown"), "a Background, None, ")
         stated = {
             "bearing_std_rad": bearing_std_rad,
             "height_std_m": height_std_m,
@@ -238,10 +241,12 @@ class Matcher:
             bank = OneFrequencyBank(bank, "combined" if unwraps else "stacked")
             self._one = bank.one
         self._method: MatchMethod
+        if on == "reported" and (method != "refine" or bank.sensor.histogram is None):
+            raise UsageError('on="reported" goes with method "refine" and a direct sensor with a [histogram] table')
         if method == "refine":
             arguments["systematic"] = self._systematic
-            chosen = MatcherByEvidence if background == "any" else LikelihoodMatcher
-            matching = chosen(bank, **arguments)
+            kind = {"on": "ranges", "reported": True} if on == "reported" else {}
+            matching = LikelihoodMatcher(bank, **{**arguments, **kind})
             self._method, self.free = matching, matching.free
             return
         fixed = free is None or tuple(free) == VIEW[:2]
@@ -296,6 +301,8 @@ class Matcher:
                 f'on="{on}" takes filtered frames: match histograms on="histograms", or their targets on="targets"'
             )
         frames = self.read_out(frames).without_offset().with_pooled_noise()
+        if on == "reported":
+            frames = _with_chip_error(frames)
         return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
 
     def match_jointly(self, frames: HistogramFrames, camera2world: ArrayLike) -> Match:
@@ -377,6 +384,14 @@ def _check_word(name: str, value: object, words: tuple[str, ...], before: str = 
     if not isinstance(value, str) or value not in words:
         shown = repr(value) if isinstance(value, str) else type(value).__name__
         raise UsageError(f"'{name}' must be {before}{' or '.join(map(repr, words))}, got {shown}")
+
+
+def _with_chip_error(frames: FilteredFrames) -> FilteredFrames:
+    """Return reported ranges with what the chip's estimator leaves beside their noise, which no mean lessens."""
+    histogram = frames.sensor.histogram
+    if histogram is None or not frames.n_effective.max(initial=0.0) > 1:
+        return frames
+    return replace(frames, std_m=np.hypot(frames.std_m, _CHIP_ERROR_BINS * histogram.bin_width_m))
 
 
 def _matcher(bank: Bank, method: str, arguments: dict[str, Any]) -> Matcher:

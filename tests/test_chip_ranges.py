@@ -1,4 +1,4 @@
-"""Ranges that a chip reports: rendered, simulated, and matched without any option, before whatever stands behind."""
+"""Ranges that a chip reports: rendered, simulated, and matched before whatever stands behind the landmark."""
 
 import math
 from collections import Counter
@@ -74,7 +74,7 @@ def test_a_zone_at_an_edge_reports_the_landmark_or_the_wall_and_nothing_between(
     wall_m = 1.5
     views = Views.broadcast(np.full(3, 0.7), np.radians(30.0))
     wall = Background(wall_m=wall_m)
-    simulated = simulate_recording(mesh("cylinder"), "cylinder", SENSOR, views, seed=1, background=wall)
+    simulated = simulate_recording(mesh("cylinder"), "cylinder", SENSOR, views, seed=1, background=wall, reported=True)
     z_m = simulated.frames.z_m[0][:, :]
     light = Renderer(mesh("cylinder"), SENSOR).render_views(views[:1], background=wall)
     mean_m = (light.range_m * SENSOR.axis_cosine())[0]
@@ -84,9 +84,9 @@ def test_a_zone_at_an_edge_reports_the_landmark_or_the_wall_and_nothing_between(
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_frames_of_a_chip_are_matched_without_any_option(scene):
+def test_frames_of_a_chip_are_matched_whatever_stands_behind(scene):
     name, view, background = view_of(*SCENES[scene])
-    match = Matcher(bank(name), "refine", background="any").match(kalman_filter(chip_frames(name, view, background)))[0]
+    match = Matcher(bank(name), "refine", on="reported").match(kalman_filter(chip_frames(name, view, background)))[0]
     assert match.accepted
     assert match.class_name == name
     assert match.among_unknown
@@ -103,7 +103,7 @@ def test_accepted_answers_for_frames_of_a_chip_are_right():
     """Four classes, 0.4 to 0.8 m, wall or none, floor or none, tilts and bearings: none of 120 is grossly wrong."""
     rng, count = np.random.default_rng(12), Counter()
     for name in sorted(catalog()):
-        matcher = Matcher(bank(name), "refine", background="any")
+        matcher = Matcher(bank(name), "refine", on="reported")
         low = -float(mesh(name).vertices[:, 2].min())
         for seed in range(30):
             distance, wall = rng.uniform(0.45, 0.75), rng.uniform(0.4, 2.0)
@@ -121,24 +121,12 @@ def test_accepted_answers_for_frames_of_a_chip_are_right():
     assert count[True, True] >= 0.6 * (count[True, True] + count[False, True]), count
 
 
-def test_a_phase_camera_takes_the_background_that_the_evidence_asks_for():
-    sensor = preset("pmd-16x16")
-    landmark = build_bank({"classes": ("cone",), "distance_m": "0.8:1.2:0.02", "delta_deg": "0:178:2"})
-    matcher = Matcher(landmark, "refine", background="any", free=("distance_m", "delta_rad"))
-    renderer = Renderer(mesh("cone"), sensor)
-    found = []
-    for background in (None, Background(wall_m=3.0)):
-        frames = capture(
-            renderer.render(1.0, 0.6, background=background), sensor, rng=np.random.default_rng(1), n_frames=50
-        )
-        found.append(matcher.match(kalman_filter(frames))[0])
-    alone, before = found
-    assert alone.accepted
-    assert alone.background is None
-    assert before.accepted
-    assert before.background.wall_m == pytest.approx(3.0, abs=0.02)
-    assert not alone.among_unknown
-    assert not before.among_unknown
+def test_what_a_chip_reports_is_asked_of_a_sensor_with_a_chip_alone():
+    with pytest.raises(UsageError, match="goes with method"):
+        Matcher(bank("cone"), "nearest", on="reported")
+    with build_bank({"classes": ("cone",), "distance_m": "1.0", "delta_deg": "0"}) as phase:
+        with pytest.raises(UsageError, match=r"\[histogram\] table"):
+            Matcher(phase, "refine", on="reported")
 
 
 def test_a_cost_of_nothing_has_a_p_value():

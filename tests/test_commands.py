@@ -329,12 +329,10 @@ def _case(code, *arguments, contains):
 MISTAKES = [
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--auto-background", contains="leave --wall"),
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--free", "yaw", contains="bearing, height, pitch or roll"),
-    _case(
-        2, "match", "bank.h5", "frames.csv", *MATCH, "--method", "nearest", "--free", "bearing", contains="goes with"
-    ),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--free", "bearing", contains="goes with --method refine"),
     _case(3, "match", "none.h5", "frames.csv", *MATCH, contains="none.h5"),
     _case(3, "match", "frames.csv", "frames.csv", *MATCH, contains="not a bank"),
-    _case(2, "match", "part.STL", "frames.csv", *MATCH, contains="does not say which sensor took it: give --sensor"),
+    _case(3, "match", "part.STL", "frames.csv", *MATCH, contains="bank build --mesh part=part.STL --unit mm"),
     _case(3, "match", "cut.h5", "frames.csv", *MATCH, contains="cut.h5"),
     _case(3, "match", "bank.h5", "none.csv", *MATCH, contains="none.csv"),
     _case(3, "match", "bank.h5", "narrow.csv", *MATCH, contains="255"),

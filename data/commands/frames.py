@@ -186,6 +186,12 @@ def frames_simulate(
         float | None, typer.Option("--to-delta", metavar="DEG", help="With --moving, δ in the last frame; 40 more.")
     ] = None,
     n_frames: Annotated[int, typer.Option("--frames", min=1, help="Number of frames.")] = 20,
+    reported: Annotated[
+        bool,
+        typer.Option(
+            "--reported", help="Ranges that the sensor's chip reports, each zone one surface; not the mean over a zone."
+        ),
+    ] = False,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
@@ -219,6 +225,7 @@ def frames_simulate(
         seed=seed,
         albedo=mesh.metadata.get("albedo", 0.8),
         background=background_of(wall, floor),
+        reported=reported,
     )
     described = readable(f"landmark={name} sensor={Path(sensor).name}")
     description = f"{described} seed={seed} {'moving' if moving else 'still'}"

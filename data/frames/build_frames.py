@@ -119,7 +119,7 @@ class FrameJob:
         self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
         self._renderers = [Renderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks]
         self._histograms: list[HistogramRenderer] = []
-        if self.sensor.histogram is not None:
+        if self.plan.histograms:
             self._histograms = [
                 HistogramRenderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks
             ]
@@ -317,7 +317,7 @@ class FrameJob:
     ) -> Frames:
         """Return noisy frames of views; those of histograms leave these and their targets in `stored`."""
         plan, rng = self.plan, stream(self.plan.seed, "frames.noise", 0)
-        if not self._histograms:
+        if not plan.histograms:
             return capture(
                 image, self.sensor, rng=rng, n_frames=plan.frames_per_view, first_view=start, keep_taps=plan.keep_taps
             )
@@ -332,8 +332,6 @@ class FrameJob:
             expected.expected[members] = part.expected
         assert expected is not None
         frames = capture(expected, self.sensor, rng=rng, n_frames=plan.frames_per_view, first_view=start)
-        if not plan.histograms:
-            return frames.ranges
         stored["histogram"] = narrowed(frames.counts, "<u4", "counts")
         stored["target_distance"] = frames.targets.distance_m.astype("<f4")
         stored["target_sigma"] = frames.targets.sigma_m.astype("<f4")

@@ -18,8 +18,8 @@ from phasemark import UsageError, __version__
 from phasemark.data.files.atomic_write import replacing, write_atomically
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.data.seeds import stream
-from phasemark.render import Background, Flag, Frames, Sensor, Views, capture
-from phasemark.render.direct.capture import measuring_renderer, ranges_of
+from phasemark.render import Background, Flag, Frames, Renderer, Sensor, Views, capture
+from phasemark.render.direct import HistogramRenderer
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.view import VIEW_FIELDS
 
@@ -60,6 +60,7 @@ def simulate_recording(
     seed: int,
     albedo: float = 0.8,
     background: Background | None = None,
+    reported: bool = False,
 ) -> SimulatedRecording:
     """Simulate a recording of a landmark at the frame rate of the sensor.
 
@@ -82,6 +83,9 @@ def simulate_recording(
         Share of light that the landmark returns.
     background : Background, optional
         As seen from the first view.
+    reported : bool
+        Whether ranges are those that the chip of a sensor with a [histogram] table reports, of the nearest target of
+        every zone, and not the mean over the zone.
 
     Returns
     -------
@@ -91,11 +95,11 @@ def simulate_recording(
     Raises
     ------
     UsageError
-        There is no view or too many, or a view cannot be rendered.
+        There is no view or too many, a view cannot be rendered, or the sensor has no [histogram] table to report from.
     """
     if not 1 <= len(views) <= MOST_FRAMES:
         raise UsageError(f"a simulated recording must have 1 … {MOST_FRAMES} frames, got {len(views)}")
-    renderer = measuring_renderer(mesh, sensor, albedo=albedo)
+    renderer = (HistogramRenderer if reported else Renderer)(mesh, sensor, albedo=albedo)
     renderer.check_in_view(views)
     taken: list[Frames] = []
     image: Any = None
@@ -108,8 +112,8 @@ def simulate_recording(
             if background is not None and background.wall_m is not None:
                 behind = replace(background, wall_m=background.wall_m + at[0] - float(views.distance_m[0]))
             image, rendered = renderer.render_views(view, background=behind), at
-        shot = capture(image, sensor, rng=stream(seed, "simulated recording", 0), first_frame=k)
-        taken.append(ranges_of(shot))
+        shot: Any = capture(image, sensor, rng=stream(seed, "simulated recording", 0), first_frame=k)
+        taken.append(shot.ranges if reported else shot)
 
     stamps = np.round(np.arange(len(views)) / sensor.frame_rate_hz, 3)[None]
     frames = _one_after_the_other(taken, stamps)

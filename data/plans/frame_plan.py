@@ -208,8 +208,9 @@ class FramePlan(ScenePlan):
     keep_taps : bool
         Whether the counts of each tap are stored, too.
     histograms : bool, optional
-        Whether histograms and targets of a direct sensor with a [histogram] table are kept; `range` is that of the
-        nearest target either way. Left out, it is true for a sensor with the table.
+        Whether a direct sensor with a [histogram] table is simulated photon by photon: histograms and targets are kept,
+        and `range` is that of the nearest target. False: ranges alone, with the noise that `range_std_m` states. Left
+        out, it is true for a sensor with the table.
     splits : mapping of str to float
         Names of splits with their shares of the views, which add up to 1. All frames of a view are in one split.
 

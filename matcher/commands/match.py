@@ -75,6 +75,8 @@ def match_frames(
 
     place.check()
     landmark.check(bank)
+    if landmark.is_for(bank):
+        search = replace(search, method="refine")
     landmarks = place.landmarks()
     results.check()
     search.check()
@@ -86,6 +88,8 @@ def match_frames(
     with landmark.bank(bank, frames, reading) if landmark.is_for(bank) else open_any_bank(bank) as opened:
         measured = reading.read(frames, opened.camera)
         note_too_far(opened.camera, {"--wall": search.wall})
+        if landmark.is_for(bank):
+            search = search.as_reported(opened)
         matcher = search.matcher(opened)
         if learn:
             reading = replace(reading, **_learnt(matcher, measured, frames))
@@ -285,7 +289,7 @@ class _Answers:
         else:
             rows = match_rows(answers, start, self._columns)
             width = sum(max(len(title), len(value)) + 2 for title, value in rows[0].items())
-            if self._columns.counted is None and width > _WIDEST:
+            if self._search.on == "reported" and self._columns.counted is None and width > _WIDEST:
                 echo_facts(rows[0])
                 return
             self._table = self._table or Table(list(rows[0]))

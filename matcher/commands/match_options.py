@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -52,13 +52,12 @@ class Search:
         typer.Option("--filter", help="How frames are averaged: kalman or phasor-mean."),
     ] = "kalman"
     method: Annotated[
-        Literal["nearest", "refine"] | None,
+        Literal["nearest", "refine"],
         typer.Option(
             "--method",
-            help="nearest: the paper's minimum-distance classifier. refine: maximum likelihood, with covariance; it is"
-            " taken for the ranges of a chip, and where an option asks for it.",
+            help="nearest: the paper's minimum-distance classifier. refine: maximum likelihood, with covariance.",
         ),
-    ] = None
+    ] = "nearest"
     free: Annotated[
         list[str] | None,
         typer.Option(
@@ -97,15 +96,16 @@ class Search:
         typer.Option(
             "--bearing-std",
             metavar="DEG",
-            help="With refine: standard deviation of the bearing; 1.5, of a chip's ranges 3, unless --free or --fix is"
+            help="With refine: standard deviation of the bearing; 1.5, with --on reported 3, unless --free or --fix is"
             " given.",
         ),
     ] = None
     on: Annotated[
-        Literal["ranges", "phasors", "histograms", "targets"],
+        Literal["ranges", "reported", "phasors", "histograms", "targets"],
         typer.Option(
             "--on",
-            help="With refine: ranges, or phasors with the albedo free; of a direct sensor also histograms or targets.",
+            help="With refine: ranges, or phasors with the albedo free; of a direct sensor also reported (ranges as its"
+            " chip makes them), histograms or targets.",
         ),
     ] = "ranges"
     pixels: Annotated[
@@ -144,7 +144,7 @@ class Search:
     @property
     def near_the_axis(self) -> bool:
         """Whether the bearing is estimated with what is known of it, as nothing else is asked for."""
-        return not self.free and not self.fix
+        return self.method == "refine" and not self.free and not self.fix
 
     @property
     def _stated_std(self) -> dict[str, float | None]:
@@ -154,7 +154,7 @@ class Search:
     @property
     def parameters(self) -> list[str]:
         """What is estimated."""
-        free = self.free or ()
+        free = ["bearing"] if self.near_the_axis else self.free or ()
         return ["distance_m", "delta_rad", *(_FREE[name] for name in sorted(free, key=list(_FREE).index))]
 
     def filter(self) -> Callable[[Frames], FilteredFrames]:
@@ -184,27 +184,15 @@ class Search:
                 raise UsageError(f"--{name}-std goes with --free {name}: what is not free is 0")
         if self.is_direct:
             self._check_direct()
-        for option in self._refining:
-            if self.method == "nearest":
-                raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
-
-    @property
-    def _refining(self) -> list[str]:
-        """Options that are given and belong to maximum likelihood."""
         refined = (
             ("--free", bool(self.free)), ("--on", self.on != "ranges"), ("--pixels", self.pixels != "all"),
             ("--robust", self.robust), ("--auto-background", self.auto_background),
             ("--unknown-background", self.unknown_background), ("--fix", self.fix is not None),
             ("--bearing-std", self.bearing_std is not None),
         )  # fmt: skip
-        return [option for option, used in refined if used]
-
-    def method_for(self, bank: Bank) -> Literal["nearest", "refine"]:
-        """Return the method: the stated one; maximum likelihood of a chip's ranges, or where an option asks for it."""
-        if self.method is not None:
-            return self.method
-        reports = bank.sensor.histogram is not None and bank.plan.model == "ray"
-        return "refine" if reports or self._refining else "nearest"
+        for option, used in refined:
+            if used and self.method == "nearest":
+                raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
 
     def _check_direct(self) -> None:
         """Refuse options that belong to images of ranges."""
@@ -223,12 +211,11 @@ class Search:
         from phasemark.matcher import Matcher
         from phasemark.matcher.likelihood.likelihood_matcher import TILT_STD_RAD
 
-        method = self.method_for(bank)
         return Matcher(
             bank,
-            method,
-            free=None if self.near_the_axis and method == "refine" else self.parameters,
-            background=self._behind(bank),
+            self.method,
+            free=None if self.near_the_axis else self.parameters,
+            background="auto" if self.auto_background else "unknown" if self.unknown_background else self.background,
             bearing_std_rad=None if self.bearing_std is None else math.radians(self.bearing_std),
             height_std_m=self._stated_in("height", 1.0, math.inf),
             pitch_std_rad=self._stated_in("pitch", math.radians(1.0), TILT_STD_RAD),
@@ -239,14 +226,9 @@ class Search:
             robust=self.robust,
         )
 
-    def _behind(self, bank: Bank) -> Background | Literal["auto", "unknown", "any"] | None:
-        """Return the background of the matcher: the stated one, or "any"."""
-        if self.auto_background:
-            return "auto"
-        if self.unknown_background:
-            return "unknown"
-        chip = self.on == "ranges" and bank.sensor.histogram is not None and self.method_for(bank) == "refine"
-        return self.background or ("any" if chip else None)
+    def as_reported(self, bank: Bank) -> Search:
+        """Return the options with ranges taken as a chip reports them, where the bank's sensor has one."""
+        return replace(self, on="reported") if self.on == "ranges" and bank.sensor.histogram is not None else self
 
     def _stated_in(self, name: str, unit: float, otherwise: float) -> float:
         """Return a prior that is stated, in the unit of the matcher, or what holds where none is."""

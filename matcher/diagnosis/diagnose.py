@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from phasemark.matcher.diagnosis.search import SIZES, Fit, Search, fitted_wall, 
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.matcher.frequencies import OneFrequencyBank
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
+from phasemark.matcher.likelihood.setup import check_free
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
 from phasemark.render import Background, Sensor
@@ -204,16 +205,13 @@ def _remedy(change: Change) -> str:
     return f"a bank with distances to {value:.3g} m"
 
 
-_Behind: TypeAlias = Background | Literal["auto", "unknown"] | None
-
-
 @dataclass(frozen=True, eq=False)
 class _Setup:
     """Settings of a matcher that are needed to build another one like it."""
 
     nearest: bool
     free: tuple[str, ...]
-    background: _Behind
+    background: Background | Literal["auto"] | None
     options: Mapping[str, Any]
 
     @classmethod
@@ -223,9 +221,6 @@ class _Setup:
         if matcher.method == "nearest":
             return cls(True, VIEW, background, {"false_alarm": matcher.false_alarm})
         unknown = told["background"] == "unknown"
-        behind = None if told["background"] == "any" else told["background"]
-        if told["background"] in ("any", "unknown") and matcher.bank.sensor.histogram is not None:
-            unknown, behind = False, "unknown"  # whose zones see one surface each
         options = {
             "false_alarm": matcher.false_alarm,
             "on": told["on"] if len(matcher.bank.sensor.frequencies_hz) == 1 else "ranges",
@@ -233,10 +228,10 @@ class _Setup:
             "robust": told["robust"] or unknown,
         }
         # a bearing with a prior is searched again without one
-        free = VIEW if told["free"] is None and behind != "unknown" else matcher.free
-        return cls(False, free, None if unknown else behind, options)
+        free = VIEW if told["free"] is None else check_free(told["free"])
+        return cls(False, free, None if unknown else told["background"], options)
 
-    def matcher(self, bank: Bank, free: Sequence[str], background: _Behind) -> Matcher:
+    def matcher(self, bank: Bank, free: Sequence[str], background: Background | Literal["auto"] | None) -> Matcher:
         """Build a matcher like it by maximum likelihood."""
         return Matcher(bank, "refine", free=free, background=background, **self.options)
 
@@ -326,8 +321,8 @@ class _Trials:
         self.reference = self.plain.match(frame)[0] if setup.nearest else refused
         self.bearing_free = "bearing_rad" in setup.free
         self.with_bearing = setup.free if self.bearing_free else (*VIEW, "bearing_rad", *setup.free[2:])
-        stated = self._estimated() if setup.background == "auto" else setup.background
-        self.stated = stated if isinstance(stated, Background) else None
+        self.stated = self._estimated() if setup.background == "auto" else setup.background
+        assert self.stated is None or isinstance(self.stated, Background)
 
     def in_order(self) -> Iterator[_Found]:
         """Try changes, the cheapest first; yield those that make the frame fit, usually none."""
@@ -348,7 +343,7 @@ class _Trials:
         self,
         rough: Fit | None,
         frame: FilteredFrames,
-        background: _Behind,
+        background: Background | Literal["auto"] | None,
         before: tuple[Change, ...],
     ) -> _Found:
         """Match a frame with the bearing free, where a rough fit promises something."""
@@ -370,7 +365,7 @@ class _Trials:
 
     def _other_background(self) -> _Found:
         """Match with wall and floor estimated, or with none where some were stated."""
-        tried: list[tuple[_Behind, Background | None]] = []
+        tried: list[tuple[Background | Literal["auto"] | None, Background | None]] = []
         if isinstance(self.setup.background, Background):
             tried.append((None, None))
         estimated = self._estimated()
@@ -386,7 +381,7 @@ class _Trials:
                 scene = scene if rough is None else fitted_wall(self.frame, scene, rough.bearing_rad)
             if rough is None:
                 continue
-            stated: list[_Behind] = [background]
+            stated: list[Background | Literal["auto"] | None] = [background]
             if scene is not None and scene.wall_m is not None:
                 stated.append(scene)
             aside = abs(rough.bearing_rad) > CLEARLY_ASIDE_RAD and not self.bearing_free
@@ -466,7 +461,7 @@ class _Trials:
         frame: FilteredFrames,
         sensor: Sensor,
         free: Sequence[str],
-        background: _Behind,
+        background: Background | Literal["auto"] | None,
     ) -> Match | None:
         """Match before a small bank of one class about a rough fit; None if it is refused."""
         steps = np.arange(-_WINDOW_STEPS, _WINDOW_STEPS + 1)
@@ -525,7 +520,7 @@ def _free_bearing(match: Match, free: tuple[str, ...]) -> Change:
     return Change("free", free, f"the bearing free (bearing {math.degrees(match.bearing_rad):.2g}°)")
 
 
-def _background(background: _Behind, found: Background | None) -> Change:
+def _background(background: Background | Literal["auto"] | None, found: Background | None) -> Change:
     if background is None:
         return Change("background", None, "nothing behind the landmark")
     planes = []

@@ -33,9 +33,6 @@ _USUAL_LIMIT_RAD = 0.1
 """Phase noise where a frame does not know its own and the sensor allows no less."""
 _LEAST_POOLED = 1e-4
 """Least variance over that of the law; frames without any scatter are simulated, or frozen."""
-_CHIP_ERROR_BINS = 0.03
-"""Error of a chip's target, in bins, that no mean of frames lessens: rounding to millimetres, and what its estimator
-makes of a surface that bends within a zone, or of things beside it."""
 
 
 class PixelState(IntEnum):
@@ -176,8 +173,6 @@ class FilteredFrames:
             usual = float(special.chdtri(freedom, 0.5)) / freedom
             scale[k] = float(np.median(ratio[k][scattered])) / usual
         std = np.sqrt(np.maximum(scale, _LEAST_POOLED)) * law / np.sqrt(np.maximum(n, 1.0))
-        if self.sensor.histogram is not None:
-            std = np.hypot(std, _CHIP_ERROR_BINS * self.sensor.histogram.bin_width_m)
         return replace(self, std_m=np.where(n > 0, std, np.nan), std_from_scatter=False)
 
     def _repr_png_(self) -> bytes | None:

@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
 from typing import Literal
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,16 +81,16 @@ class LikelihoodMatcher:
         tolerance_rad: float = TOLERANCE_RAD,
         workers: int | None = None,
         policy: SearchPolicy = DEFAULT_POLICY,
+        reported: bool = False,
     ) -> None:
         has_prior = free is None  # the default frees the bearing, with a prior
-        chip = on == "ranges" and bank.sensor.histogram is not None and _is_rendered(bank)
-        usual = (*VIEW[:3], "pitch_rad", "roll_rad") if chip else VIEW[:3]
+        usual = (*VIEW[:3], "pitch_rad", "roll_rad") if reported else VIEW[:3]
         names = check_free(usual if free is None else free)
         if bearing_std_rad is None:
-            bearing_std_rad = ZONE_BEARING_STD_RAD if chip else BEARING_STD_RAD
-        _check_choices(bank, background, on)
-        if chip and background is not None:
+            bearing_std_rad = ZONE_BEARING_STD_RAD if reported else BEARING_STD_RAD
+        if reported:
             background = "unknown"  # what stands behind the landmark changes no zone that reports the landmark
+        _check_choices(bank, background, on)
         known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
         if has_prior:
             known["bearing_rad"] = bearing_std_rad
@@ -112,7 +111,7 @@ class LikelihoodMatcher:
             on=on,
             background_is_known=self._stated is not None,
             unknown=unknown,
-            reports_one_surface=chip,
+            reports_one_surface=reported,
             used=pixels_of(bank, pixels).ravel(),
             huber=ROBUST_FROM if robust or unknown else None,
             false_alarm=false_alarm,
@@ -194,7 +193,13 @@ class LikelihoodMatcher:
         """What renders the landmarks of the bank, made when it is first needed."""
         moves = set(self._setup.free) & {"bearing_rad", "pitch_rad", "roll_rad"}
         splits = self._setup.on == "phasors" and (self._auto or self._stated is not None) and bool(moves)
-        return RenderedModel(self._bank, self._stated, self._setup.policy.cache_bytes, splits_light=splits)
+        return RenderedModel(
+            self._bank,
+            self._stated,
+            self._setup.policy.cache_bytes,
+            splits_light=splits,
+            reported=self._setup.reports_one_surface,
+        )
 
     @cached_property
     def _turned(self) -> Turned | None:
@@ -230,7 +235,7 @@ class LikelihoodMatcher:
         level = setup.free in (VIEW[:2], VIEW[:3]) or (chip and "height_m" not in setup.free)
         has_strips = alone and not is_exact and not self._auto and level
         if has_strips and StripModel.suits(self._bank, self._search.widest_columns):
-            return None, _strips(self._bank, self._search.widest_columns)
+            return None, StripModel(self._bank, self._search.widest_columns)
         scouts = fixed and BankModel.grid_is_fine_enough(self._bank, *_COARSE_GRID)
         if not (is_exact or scouts):
             return None, None
@@ -330,24 +335,6 @@ def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.floa
     wrong = (seen.returned & ~lit) | (seen.not_returned & sure)
     squared = np.minimum(seen.weight * residual**2, DISAGREEMENT)
     return np.asarray(squared.sum(axis=1) + DISAGREEMENT * wrong.sum(axis=1))
-
-
-_STRIPS: WeakKeyDictionary[Bank, dict[int, StripModel]] = WeakKeyDictionary()
-"""Strips of banks, which all matchers with a bank share: they may take gigabytes."""
-
-
-def _strips(bank: Bank, widest_columns: int) -> StripModel:
-    """Return the strips of a bank for bearings up to some columns."""
-    of_bank = _STRIPS.setdefault(bank, {})
-    if widest_columns not in of_bank:
-        of_bank[widest_columns] = StripModel(bank, widest_columns)
-    return of_bank[widest_columns]
-
-
-def _is_rendered(bank: Bank) -> bool:
-    """Return whether views of all landmarks of a bank are rendered: not of a slab wider than the bank's distances."""
-    vertices = [np.asarray(bank.mesh(name).vertices) for name in bank.classes]
-    return max(float(np.hypot(*own[:, :2].T).max()) for own in vertices) < float(bank.distance_m[-1])
 
 
 def _check_choices(bank: Bank, background: object, on: str) -> None:

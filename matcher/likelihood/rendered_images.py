@@ -17,6 +17,7 @@ from phasemark.matcher.likelihood.view_cache import ViewCache
 from phasemark.matcher.pixel_agreement import MAY_RETURN_COVERAGE
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 from phasemark.render.background import Backgrounds
+from phasemark.render.direct.chip_renderer import ChipRenderer
 
 STEP = 1e-5
 """Width of a difference, metres or radians: see :meth:`~phasemark.render.Renderer.jacobian`."""
@@ -39,14 +40,22 @@ class RenderedModel:
     splits_light : bool
         Whether images know what of their phasors comes from the background, which takes a second rendering of each:
         it depends on the bearing and the tilt of the view.
+    reported : bool
+        Whether ranges are those that the chip of a direct sensor reports.
     """
 
     slopes_are_cheap = False
 
     def __init__(
-        self, bank: Bank, background: Background | None = None, cache_bytes: int = 0, *, splits_light: bool = False
+        self,
+        bank: Bank,
+        background: Background | None = None,
+        cache_bytes: int = 0,
+        *,
+        splits_light: bool = False,
+        reported: bool = False,
     ) -> None:
-        self._splits_light = splits_light
+        self._splits_light, self._reported = splits_light, reported
         self.sensor: Sensor = bank.sensor
         self.cache = ViewCache(cache_bytes)
         self._renderers = []
@@ -54,7 +63,9 @@ class RenderedModel:
         self._radius_m = 0.0
         for name in bank.classes:
             mesh = bank.mesh(name)
-            self._renderers.append(renderer_of(bank, mesh, float(mesh.metadata["albedo"])))
+            albedo = float(mesh.metadata["albedo"])
+            chip = ChipRenderer(mesh, bank.sensor, albedo=albedo) if reported else renderer_of(bank, mesh, albedo)
+            self._renderers.append(chip)
             self._radius_m = max(self._radius_m, float(np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max()))
         self._bank_end_m = float(bank.distance_m[-1])
         self._stand_before([background])
@@ -111,7 +122,7 @@ class RenderedModel:
         m, pixels, p = len(view), self.sensor.rows * self.sensor.cols, len(free)
         phasor, slope = np.empty((m, pixels), np.complex128), np.zeros((m, p, pixels), np.complex128)
         intensity, coverage = np.empty((m, pixels)), np.empty((m, pixels))
-        smooth = [name for name in free if name != "height_m" or self.sensor.histogram is not None]
+        smooth = [name for name in free if name != "height_m" or self._reported]
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
             image, slopes = (
@@ -120,7 +131,7 @@ class RenderedModel:
             phasor[of] = image.phasor.reshape(len(of), -1)
             intensity[of] = image.intensity.reshape(len(of), -1)
             # a chip need not see a surface that fills a zone at a slant, or far away
-            faint = np.where(image.phasor == 0, MAY_RETURN_COVERAGE, 1.0)
+            faint = np.where(image.phasor == 0, MAY_RETURN_COVERAGE, 1.0) if self._reported else 1.0
             coverage[of] = np.minimum(image.coverage, faint).reshape(len(of), -1)
             for k, name in enumerate(free):
                 if slopes is not None and name in smooth:

@@ -257,13 +257,8 @@ def _intervals(
     ranges, may, must = seen_by_images(phasor, coverage, bank.sensor, seen.behind, seen.rows)
     half = np.zeros(ranges.shape)
     edge = coverage.reshape(ranges.shape) < FILLED_COVERAGE
-    if bank.sensor.histogram is not None and seen.behind is not None:  # a chip reports either, and mixes none
-        own, lit, _ = seen_by_images(phasor, coverage, bank.sensor, None, seen.rows)
-        far = np.nan_to_num(seen.behind.range_m[0, slice(*seen.rows)].reshape(1, -1))
-        either = edge & lit & (far > 0)
-        ranges, half = np.where(either, (own + far) / 2, ranges), np.where(either, np.abs(far - own) / 2, half)
     if bank.sensor.pixel_rad > WIDE_PIXEL_RAD:
-        half[edge] += _FARTHER_IN * bank.sensor.pixel_rad * np.abs(ranges[edge])
+        half[edge] = _FARTHER_IN * bank.sensor.pixel_rad * np.abs(ranges[edge])
     if seen.open_edges:
         half[edge], may = _FAR_M, may | edge
     return _Intervals(ranges, half, may, must).each(lambda values: values.reshape(n_d, -1, ranges.shape[1]))

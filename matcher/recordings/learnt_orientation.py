@@ -81,7 +81,7 @@ def learn_orientation(matcher: Matcher, frames: Frames, *, n_frames: int = 10) -
     UsageError
         The matcher is of another kind.
     """
-    if matcher.method != "refine" or matcher.options["on"] not in ("ranges", "phasors"):
+    if matcher.method != "refine" or matcher.options["on"] not in ("ranges", "reported", "phasors"):
         raise UsageError("an orientation is learnt by a Matcher of the method 'refine' on ranges or phasors")
     each = frames.each_a_position()
     chosen = np.unique(np.linspace(0, len(each) - 1, min(n_frames, len(each))).round().astype(np.int64))

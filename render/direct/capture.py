@@ -9,12 +9,10 @@ import numpy as np
 
 from phasemark import UsageError
 from phasemark.render.direct.histogram_frames import HistogramFrames, capture_histograms
-from phasemark.render.direct.histogram_images import HistogramImages, HistogramRenderer
+from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.exposure import capture as phase_chain
 from phasemark.render.frames import Frames
-from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.phasor_images import PhasorImages
-from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.sensor import Sensor
 
 ON_CHIP = ("estimator", "estimator_bins", "max_targets", "threshold", "min_separation_m", "reports", "zone_order")
@@ -110,24 +108,6 @@ def capture(
         image.expected.reshape(len(image), n, bins), sensor, rng=rng, n_frames=n_frames, first_view=first_view,
         first_frame=first_frame, workers=workers,
     )  # fmt: skip
-
-
-def measuring_renderer(
-    mesh: SurfaceMesh | None, sensor: Sensor, *, albedo: float = 0.8
-) -> Renderer | HistogramRenderer:
-    """Return the renderer of a landmark for a sensor: of histograms, where the sensor describes them.
-
-    Parameters
-    ----------
-    mesh, sensor, albedo
-        As for :class:`~phasemark.render.Renderer`.
-    """
-    return (Renderer if sensor.histogram is None else HistogramRenderer)(mesh, sensor, albedo=albedo)
-
-
-def ranges_of(frames: Frames | HistogramFrames) -> Frames:
-    """Return frames of ranges; of histograms those that the chip reports, of the nearest target of every zone."""
-    return frames.ranges if isinstance(frames, HistogramFrames) else frames
 
 
 def _refuse_other_sensor(rendered: Sensor, sensor: Sensor) -> None:
