@@ -101,7 +101,7 @@ class Matcher:
         those of every frequency, each wrapped by itself: nothing is unwrapped, and mixed pixels count. Of a direct
         sensor with a [histogram] table also the counts of every bin, Poisson, with the landmark's brightness and the
         ambient light of every zone estimated, or the targets that its chip reports. "reported": its ranges
-        as its chip makes them, of the nearest surface of each zone; whatever else returns is left to unknown things.
+        as the chip makes them, of the nearest surface of each zone; all else that returns is left to unknown things.
     pixels : {"all", "lower"}
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool
