@@ -69,6 +69,22 @@ def test_rendered_ranges_are_the_mean_of_what_the_chip_reports(name):
     assert np.abs(off).max() < 0.3 * SENSOR.histogram.bin_width_m
 
 
+@pytest.mark.parametrize("background", [None, Background(wall_m=2.5)])
+def test_slopes_are_differences_of_ranges(background):
+    renderer, view, step = ChipRenderer(mesh("post"), SENSOR), Views.broadcast(0.6, 0.5, 0.03), 1e-3
+    image, slope = renderer.render_with_slopes(view, ("distance_m", "delta_rad"), background=background)
+    filled = (image.coverage[0] > 0.999) & (image.phasor[0] != 0)
+    assert filled.sum() >= 6
+    for k, move in enumerate([(step, 0.0), (0.0, step)]):
+        ends = [
+            renderer.render(0.6 + side * move[0], 0.5 + side * move[1], 0.03, background=background).range_m[0]
+            for side in (1.0, -1.0)
+        ]
+        expected = ((ends[0] - ends[1]) / (2 * step))[filled]
+        found = SENSOR.metres_per_radian * (slope[0, k] / np.where(filled, image.phasor[0], 1.0)).imag[filled]
+        np.testing.assert_allclose(found, expected, rtol=0.1, atol=0.02)
+
+
 def test_a_zone_at_an_edge_reports_the_landmark_or_the_wall_and_nothing_between():
     """The mean over the zone, which a chip does not report, lies between the two."""
     wall_m = 1.5

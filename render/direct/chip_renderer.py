@@ -28,25 +28,10 @@ from phasemark.render.renderer import Renderer, Variant
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import VIEW_FIELDS, Views
 
-__all__ = ["ChipRenderer", "range_renderer"]
+__all__ = ["ChipRenderer"]
 
 _JUMP_M = 0.02
 """Ranges on both sides of a view that differ by more are those of two surfaces: their difference is no slope."""
-
-
-def range_renderer(
-    mesh: SurfaceMesh | None, sensor: Sensor, *, albedo: float = 0.8, harmonics: Sequence[int] | None = None
-) -> Renderer:
-    """Return the renderer of the ranges that a sensor measures: those of its chip where the sensor describes one.
-
-    Parameters
-    ----------
-    mesh, sensor, albedo, harmonics
-        As for :class:`~phasemark.render.Renderer`.
-    """
-    if sensor.histogram is None:
-        return Renderer(mesh, sensor, albedo=albedo, harmonics=harmonics)
-    return ChipRenderer(mesh, sensor, albedo=albedo)
 
 
 class ChipRenderer(Renderer):
