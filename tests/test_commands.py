@@ -332,7 +332,7 @@ MISTAKES = [
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--free", "bearing", contains="goes with --method refine"),
     _case(3, "match", "none.h5", "frames.csv", *MATCH, contains="none.h5"),
     _case(3, "match", "frames.csv", "frames.csv", *MATCH, contains="not a bank"),
-    _case(3, "match", "part.STL", "frames.csv", *MATCH, contains="bank build --mesh part=part.STL --unit mm"),
+    _case(2, "match", "part.STL", "frames.csv", *MATCH, contains="does not say which sensor took it: give --sensor"),
     _case(3, "match", "cut.h5", "frames.csv", *MATCH, contains="cut.h5"),
     _case(3, "match", "bank.h5", "none.csv", *MATCH, contains="none.csv"),
     _case(3, "match", "bank.h5", "narrow.csv", *MATCH, contains="255"),

@@ -79,9 +79,9 @@ def test_a_mesh_and_a_log_of_a_board_are_all_that_a_match_takes(folder, cache, c
     ("words", "message"),
     [
         (("dock.stl", "recording.txt"), "say in which unit it is"),
-        (("dock.stl", "recording.txt", "--mesh-unit", "m"), "cannot be in these frames"),
+        (("dock.stl", "recording.txt", "--part-unit", "m"), "cannot be in these frames"),
         (("dock.stl", "plain.csv", "--unit", "mm"), "does not say which sensor took it: give --sensor"),
-        (("post", "recording.txt", "--mesh-unit", "mm"), "belong to a mesh"),
+        (("post", "recording.txt", "--part-unit", "mm"), "belong to a mesh"),
         (("bank.h5", "recording.txt", "--no-cache"), "--no-cache goes with a mesh or a class"),
         (("bank.h5", "recording.txt", "--sensor", "vl53l5cx-8x8"), "--sensor goes with a mesh or a class"),
     ],

@@ -74,9 +74,7 @@ def match_frames(
     from phasemark.data.files.atomic_write import write_atomically
 
     place.check()
-    landmark.check(bank)
-    if landmark.is_for(bank):
-        search = replace(search, method="refine")
+    search = landmark.checked(bank, search)
     landmarks = place.landmarks()
     results.check()
     search.check()
@@ -85,11 +83,10 @@ def match_frames(
     if search.is_direct:
         _match_directly(bank, frames, reading, search, place, landmarks, moving, results)
         return
-    with landmark.bank(bank, frames, reading) if landmark.is_for(bank) else open_any_bank(bank) as opened:
+    with landmark.opened(bank, frames, reading) as opened:
         measured = reading.read(frames, opened.camera)
         note_too_far(opened.camera, {"--wall": search.wall})
-        if landmark.is_for(bank):
-            search = search.as_reported(opened)
+        search = search.as_reported(opened) if landmark.is_for(bank) else search
         matcher = search.matcher(opened)
         if learn:
             reading = replace(reading, **_learnt(matcher, measured, frames))

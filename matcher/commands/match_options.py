@@ -13,7 +13,7 @@ import typer
 
 from phasemark import UsageError
 from phasemark.data.commands.console import LongWork
-from phasemark.data.commands.inputs import background_of, read_landmark, read_sensor, sensor_of_board
+from phasemark.data.commands.inputs import background_of, open_any_bank, read_landmark, read_sensor, sensor_of_board
 from phasemark.data.commands.options import (
     Floor,
     Force,
@@ -249,10 +249,10 @@ class Landmark:
             autocompletion=a_preset,
         ),
     ] = None
-    mesh_unit: Annotated[
+    part_unit: Annotated[
         MeshUnitWord | None,
         typer.Option(
-            "--mesh-unit", metavar="UNIT", help="Unit of a mesh: m, cm, mm or inch; that of --unit unless stated."
+            "--part-unit", metavar="UNIT", help="Unit of a mesh: m, cm, mm or inch; that of --unit unless stated."
         ),
     ] = None
     up: Up = "z"
@@ -261,17 +261,18 @@ class Landmark:
         bool, typer.Option("--no-cache", help="Without a bank: build one again, and do not keep it.")
     ] = False
 
-    def check(self, bank: Path) -> None:
-        """Refuse options that belong to a mesh or a class beside a bank."""
+    def checked(self, bank: Path, search: Search) -> Search:
+        """Refuse options that belong to a mesh or a class beside a bank; return how either is searched."""
         if self.is_for(bank):
-            return
+            return replace(search, method="refine")
         stated = {
-            "--sensor": self.sensor is not None, "--mesh-unit": self.mesh_unit is not None, "--up": self.up != "z",
+            "--sensor": self.sensor is not None, "--part-unit": self.part_unit is not None, "--up": self.up != "z",
             "--origin": self.origin != "file", "--no-cache": self.no_cache,
         }  # fmt: skip
         for option, is_stated in stated.items():
             if is_stated:
                 raise UsageError(f"{option} goes with a mesh or a class in place of a bank: {bank} has its own")
+        return search
 
     @staticmethod
     def is_for(bank: Path) -> bool:
@@ -281,8 +282,10 @@ class Landmark:
 
         return str(bank) in catalog() or bank.suffix.lower().removeprefix(".") in FORMATS
 
-    def bank(self, name: Path, frames: Path, reading: FrameReading) -> Bank:
-        """Return a bank of a mesh or a class over the distances that frames ask for: a kept one, or a new one."""
+    def opened(self, name: Path, frames: Path, reading: FrameReading) -> Bank:
+        """Return a bank, or that of a mesh or a class over the distances that frames ask for: a kept or a new one."""
+        if not self.is_for(name):
+            return open_any_bank(name)
         from phasemark.data import BankPlan
         from phasemark.data.bank.bank_cache import cached_bank
         from phasemark.data.plans.bank_plan import MeshPlan
@@ -291,10 +294,10 @@ class Landmark:
 
         camera_name = self.sensor or sensor_of_board(frames, reading.board)
         camera = read_sensor(camera_name)
-        unit = self.mesh_unit or reading.unit
+        unit = self.part_unit or reading.unit
         is_class = str(name) in catalog()
-        if is_class and (self.mesh_unit or self.up != "z" or self.origin != "file"):
-            raise UsageError(f"--mesh-unit, --up and --origin belong to a mesh: '{name}' is a class of the catalogue")
+        if is_class and (self.part_unit or self.up != "z" or self.origin != "file"):
+            raise UsageError(f"--part-unit, --up and --origin belong to a mesh: '{name}' is a class of the catalogue")
         _, mesh = read_landmark(str(name), MeshReading(unit, self.up, self.origin))
         measured = reading.read(frames, camera)
         plan = BankPlan(
