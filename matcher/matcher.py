@@ -176,7 +176,7 @@ class Matcher:
         policy: SearchPolicy = DEFAULT_POLICY,
     ) -> None:
         _check_word("method", method, METHODS)
-        _check_word("on", on, ("ranges", "reported", "phasors", *DIRECT_KINDS))
+        _check_word("on", on, ("ranges", "phasors", "reported", *DIRECT_KINDS))
         _check_word("pixels", pixels, ("all", "lower"))
         if background is not None and not isinstance(background, Background):
             _check_word("background", background, ("auto", "unknown"), "a Background, None, ")
