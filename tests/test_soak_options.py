@@ -50,6 +50,7 @@ SMALL = {
     "bank build": ("--class", "cone", "--distance", "1", "--delta", "0", "-o", "out.h5"),
     "bank info": ("bank.h5",),
     "bank merge": ("bank1.h5", "bank2.h5", "-o", "out.h5"),
+    "bank strangers": ("bank.h5", "--population", "1"),
     "bank verify": ("bank.h5", "--sample", "1"),
     "calibrate": ("cone", "poses.npz", "--poses", "poses.csv", "-o", "out.toml"),
     "demo": ("-o", "out"),
@@ -81,11 +82,12 @@ SMALL = {
     "sweep frames": ("sweep", "0", "0", "-o", "out.npz"),
     "sweep report": ("sweep",),
     "sweep run": ("sweep.toml", "-o", "out"),
+    "warm": (),
 }
 """Arguments with which a command does little."""
 LONG = {
     "demo": 60, "landmark design": 40, "drive": 30, "sweep run": 30, "sweep report": 30, "calibrate": 120,
-    "sensor fit-direct": 60, "warm": 120, "match": 60,
+    "sensor fit-direct": 60, "warm": 120, "match": 60, "bank strangers": 120,
 }  # fmt: skip
 """Seconds of commands that cannot do little, while another test runs beside them."""
 CAMERA = """image_width: 16

@@ -53,9 +53,13 @@ def test_what_differs_more_is_accepted_less(bank_file):
         assert rate.share.low <= rate.accepted / 10 <= rate.share.high
 
 
-def test_no_frames_are_refused(bank_file):
-    with open_bank(bank_file) as bank, pytest.raises(UsageError, match="must be at least 1, got 0"):
-        stranger_rates(Matcher(bank, "refine"), 0)
+def test_no_frames_and_more_than_memory_holds_are_refused(bank_file):
+    with open_bank(bank_file) as bank:
+        matcher = Matcher(bank, "refine")
+        with pytest.raises(UsageError, match="must be at least 1, got 0"):
+            stranger_rates(matcher, 0)
+        with pytest.raises(UsageError, match="made in memory: at most 39062 together"):
+            stranger_rates(matcher, 10**18)
 
 
 def test_the_command_prints_each_part(bank_file, capsys):

@@ -26,6 +26,8 @@ SCALES = (0.8, 0.9, 0.95, 1.05, 1.1, 1.25)
 """Sizes of copies, as shares of the landmark's."""
 CUTS = (0.1, 0.25)
 """What is cut off the top, or off the side in x', as shares of the extent."""
+_PIXELS = 10_000_000
+"""Most pixels of the frames of a part, all exposures together: some hundred bytes of memory each."""
 
 
 @dataclass(frozen=True)
@@ -84,11 +86,14 @@ def stranger_rates(matcher: Matcher, n: int, *, n_frames: int = 50, seed: int = 
     Raises
     ------
     UsageError
-        `n` is not positive.
+        `n` is not positive, or the frames of a part do not fit into memory.
     """
     if n < 1:
         raise UsageError(f"n=… must be at least 1, got {n}")
     bank, found = matcher.bank, []
+    most = _PIXELS // (bank.sensor.rows * bank.sensor.cols)
+    if n * n_frames > most:
+        raise UsageError(f"a part has {n} × {n_frames} frames, which are made in memory: at most {most} together")
     for k, name in enumerate(bank.classes):
         mesh = bank.mesh(name)
         for number, (change, part) in enumerate(changed_parts(mesh)):
