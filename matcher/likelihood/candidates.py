@@ -142,13 +142,16 @@ def _best_of(
     n: int,
     model: ImageModel | None = None,
 ) -> _Starts:
-    """Return the best n of k views each, (m, k, 6), on some model; unless it is stated on strips if there are any."""
+    """Return the best n of k views each, (m, k, 6), on some model; unless it is stated on strips if there are any.
+
+    With strips views are compared, and returned, at their best distances: how the angles fit must not be lost in that.
+    """
     m, k = views.shape[:2]
     of_each, settings = np.repeat(np.arange(m), k), scene.settings(setup)
     views = views.reshape(-1, len(VIEW))
     arguments = evidence, frame[of_each], class_index[of_each], views, settings
-    if model is None and scene.strips is not None:
-        cost, views = slid(scene.strips, *arguments, CELL_M)
+    if scene.strips is not None:
+        cost, views = slid(model or scene.strips, *arguments, CELL_M)
     else:
         cost = costs_at(model or scene.final, *arguments)
     best = (np.argsort(cost.reshape(m, k), axis=1)[:, :n] + k * np.arange(m)[:, None]).ravel()
@@ -376,7 +379,7 @@ def _surrounded(setup: Setup, fits: Fits) -> Fits:
     axes = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     parts = []
     for k in range(p):
-        for size in (-4.0, -2.0, 2.0, 4.0):
+        for size in (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0):
             view = fits.view.copy()
             view[:, columns] += size * axes[:, :, k]
             parts.append(replace(fits, view=view))

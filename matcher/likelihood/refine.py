@@ -38,6 +38,8 @@ roll is free."""
 _RECOUNT_COST = 25.0
 """Cost by which a view may grow, contradicted pixels included, after deciding again which pixels count."""
 
+_PIXELS_AT_ONCE = 1 << 20
+"""Of all candidates that are refined roughly together: their images with slopes take some hundred bytes a pixel."""
 _VIEWS_AT_ONCE = 512
 """Views whose costs are told together: their images stay in the processor's cache."""
 
@@ -79,6 +81,19 @@ def refine(
         In the order of the candidates.
     """
     limit = np.full(len(frame), np.inf) if give_up_above is None else give_up_above
+    at_once = max(_PIXELS_AT_ONCE // settings.used.size, 1)
+    if roughly and len(frame) > at_once and not model.slopes_are_cheap:
+        none = np.full(len(frame), np.inf) if rival is None else rival
+        parts = [slice(first, first + at_once) for first in range(0, len(frame), at_once)]
+        return Fits.joined(
+            [
+                refine(
+                    model, evidence, frame[own], class_index[own], view[own], settings, limit[own], none[own],
+                    roughly=True,
+                )
+                for own in parts
+            ]
+        )  # fmt: skip
     problem = Problem(model, evidence, frame, class_index, settings, limit, rival)
     start = problem.start(view)
     state = picked(start, np.arange(len(frame)))
