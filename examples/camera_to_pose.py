@@ -1,6 +1,6 @@
 """Draw the covariance ellipsoid of a pose of six numbers, as matching a recording found it.
 
-``phasemark match BANK FRAMES --method refine --free bearing --free height --free pitch --free roll --json > pose.json``
+``phasemark match BANK FRAMES --free bearing --free height --free pitch --free roll --json > pose.json``
 
 ``python examples/camera_to_pose.py pose.json --out out/pose.png``
 
@@ -108,7 +108,7 @@ def main() -> int:
     try:
         match = read_match(arguments.match)
         if match.get("covariance") is None:
-            raise InputFileError(f"{arguments.match}: the match has no covariance: give --method refine")
+            raise InputFileError(f"{arguments.match}: the match has no covariance: give")
         std = np.sqrt(np.diag(match["covariance"]))
         for name, error in zip(match["free"], std.tolist(), strict=True):
             title, unit, size = SHOWN[name]

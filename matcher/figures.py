@@ -13,6 +13,7 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match
 from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Background, Renderer, background_image, phasor_to_range_m, predicted_range_std
+from phasemark.render.direct.chip_renderer import ChipRenderer
 from phasemark.render.figures import draw_range, draw_sigma, landmark_limits_m
 from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
@@ -33,13 +34,14 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
 
 
 def model_image(
-    bank: Bank, match: Match, background: Background | None
+    bank: Bank, match: Match, background: Background | None, *, reported: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the result of :func:`model_range_m` and the share of each pixel on the landmark; (rows, cols) each."""
     name = match.class_name or match.alternatives[0].class_name
     if match.covariance is not None:
         mesh = bank.mesh(name)
-        rendered = Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"])).render(
+        made_by = ChipRenderer if reported else Renderer
+        rendered = made_by(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"])).render(
             match.distance_m,
             match.delta_rad,
             match.bearing_rad,
@@ -72,6 +74,7 @@ def match_figure(
     index: int = 0,
     *,
     title: bool = True,
+    reported: bool = False,
 ) -> Figure:
     """Draw a filtered frame beside the best model image, and their difference in standard deviations of the filter.
 
@@ -87,16 +90,20 @@ def match_figure(
     index : int
     title : bool
         Whether to write above what was found.
+    reported : bool
+        Whether ranges were matched as a chip reports them: zones that report another surface are left out.
 
     Returns
     -------
     matplotlib.figure.Figure
     """
     frames = frames.without_offset()
+    if reported:
+        frames = frames.with_pooled_noise().with_chip_error()
     measured = frames.range_m[index]
     model, coverage = np.full_like(measured, np.nan), np.zeros_like(measured)
     if math.isfinite(match.distance_m):
-        model, coverage = model_image(bank, match, background)
+        model, coverage = model_image(bank, match, background, reported=reported)
     near, far = landmark_limits_m(model, coverage)
     figure = Figure(figsize=(13.2, 4.2), layout="constrained")
     left, middle, right = figure.subplots(1, 3)

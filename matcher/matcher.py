@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Literal, Protocol, cast
 
@@ -43,9 +42,6 @@ from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
 
 METHODS = ("nearest", "refine")
-_CHIP_ERROR_BINS = 0.03
-"""Error of a chip's target, in bins: rounding to millimetres, and what its estimator makes of a surface that bends
-within a zone, or of things beside it."""
 
 
 class MatchMethod(Protocol):
@@ -86,9 +82,10 @@ class Matcher:
         roll_rad; what is not free is 0. None: distance, delta and the bearing, whose Gaussian prior has mean 0 and the
         standard deviation `bearing_std_rad` before the frame is seen; of reported ranges pitch and roll too.
         ``("distance_m", "delta_rad")`` fixes the bearing at 0.
-    background : Background, "auto", "unknown" or None
+    background : Background, "auto", "unknown", "any" or None
         What stands behind the landmark. None: nothing is expected to return beside it. "auto", with "refine": wall and
         floor are estimated from each frame's own far pixels; of histograms a wall alone, its distance and brightness.
+        "any", with "refine" on ranges or phasors: None, then "auto", then "unknown", up to what explains the frame.
         "unknown", with "refine" on ranges: other things may stand before, beside and behind it; what the landmark does
         not explain costs a disagreement when views and classes are compared, and is left out of the test of the fit.
         Histograms take the albedos of a Background as guesses, targets as known.
@@ -160,7 +157,7 @@ class Matcher:
         method: str = "nearest",
         *,
         free: Sequence[str] | None = None,
-        background: Background | Literal["auto", "unknown"] | None = None,
+        background: Background | Literal["auto", "unknown", "any"] | None = None,
         false_alarm: float = 0.01,
         on: Measured = "ranges",
         pixels: Pixels = "all",
@@ -179,7 +176,7 @@ class Matcher:
         _check_word("on", on, ("ranges", "phasors", "reported", *DIRECT_KINDS))
         _check_word("pixels", pixels, ("all", "lower"))
         if background is not None and not isinstance(background, Background):
-            _check_word("background", background, ("auto", "unknown"), "a Background, None, ")
+            _check_word("background", background, ("auto", "unknown", "any"), "a Background, None, ")
         stated = {
             "bearing_std_rad": bearing_std_rad,
             "height_std_m": height_std_m,
@@ -213,6 +210,7 @@ class Matcher:
         self._made_from = bank, method, arguments
         self._one: OneFrequency | None = None
         self._systematic = check_systematic(systematic)
+        self._by_evidence: list[Matcher] = []
         self._direct: DirectMethod | None = None
         self.free: tuple[str, ...] = VIEW[:2]
         if on in DIRECT_KINDS:
@@ -243,6 +241,10 @@ class Matcher:
         self._method: MatchMethod
         if on == "reported" and (method != "refine" or bank.sensor.histogram is None):
             raise UsageError('on="reported" goes with method "refine" and a direct sensor with a [histogram] table')
+        if method == "refine" and background == "any":
+            self._by_evidence = self._stages(arguments)
+            self.free = self._by_evidence[0].free
+            return
         if method == "refine":
             arguments["systematic"] = self._systematic
             kind = {"on": "ranges", "reported": True} if on == "reported" else {}
@@ -292,6 +294,8 @@ class Matcher:
             The frames come from another camera than the bank, or are not what is matched on.
         """
         on = self.options["on"]
+        if self._by_evidence:
+            return self._match_by_evidence(frames)
         if self._direct is not None:
             return Matches(self._direct.match(direct_frames(self.bank, on, frames)))
         if isinstance(frames, Frames):
@@ -302,7 +306,7 @@ class Matcher:
             )
         frames = self.read_out(frames).without_offset().with_pooled_noise()
         if on == "reported":
-            frames = _with_chip_error(frames)
+            frames = frames.with_chip_error()
         return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
 
     def match_jointly(self, frames: HistogramFrames, camera2world: ArrayLike) -> Match:
@@ -340,6 +344,38 @@ class Matcher:
             )
         measured = cast(HistogramFrames, direct_frames(self.bank, "histograms", frames))
         return self._direct.match_jointly(measured, relative_poses(len(measured), camera2world))
+
+    def _stages(self, arguments: dict[str, Any]) -> list[Matcher]:
+        """Return the matchers whose backgrounds are tried in turn: each takes less for known than the one before."""
+        on, several = arguments["on"], len(self.bank.sensor.frequencies_hz) > 1
+        behind: list[str | None] = [None]
+        if on == "ranges" or (on == "phasors" and not several):
+            behind.append("auto")
+        if on != "phasors":
+            behind.append("unknown")
+        if on == "reported":  # what stands behind is unknown in any case
+            behind = ["unknown"]
+        return [Matcher(self.bank, "refine", **{**arguments, "background": own}) for own in behind]
+
+    def _match_by_evidence(self, frames: FilteredFrames | HistogramFrames | Targets) -> Matches:
+        """Match frames before the first background that explains them; where none does, answer as the last but one.
+
+        Among unknown things nearly all can be left out: what they say counts where they show a landmark.
+        """
+        answers = list(self._by_evidence[0].match(frames))
+        for matcher in self._by_evidence[1:]:
+            left = [k for k, answer in enumerate(answers) if not self._explains(answer)]
+            if not left:
+                break
+            again = matcher.match(cast(FilteredFrames, frames)[np.array(left)])
+            for k, answer in zip(left, again, strict=True):
+                if answer.class_name is not None or not answer.among_unknown:
+                    answers[k] = answer
+        return Matches(answers)
+
+    def _explains(self, answer: Match) -> bool:
+        """Return whether a frame is explained, be it that other views explain it too, or that it tells too little."""
+        return answer.accepted or (answer.class_name is not None and answer.p_value >= self.false_alarm)
 
     def _of_one_frequency(self, frames: FilteredFrames, one: OneFrequency) -> FilteredFrames:
         """Return the frames that a camera of one frequency would have measured in place of the camera of several."""
@@ -384,14 +420,6 @@ def _check_word(name: str, value: object, words: tuple[str, ...], before: str = 
     if not isinstance(value, str) or value not in words:
         shown = repr(value) if isinstance(value, str) else type(value).__name__
         raise UsageError(f"'{name}' must be {before}{' or '.join(map(repr, words))}, got {shown}")
-
-
-def _with_chip_error(frames: FilteredFrames) -> FilteredFrames:
-    """Return reported ranges with what the chip's estimator leaves beside their noise, which no mean lessens."""
-    histogram = frames.sensor.histogram
-    if histogram is None or not frames.n_effective.max(initial=0.0) > 1:
-        return frames
-    return replace(frames, std_m=np.hypot(frames.std_m, _CHIP_ERROR_BINS * histogram.bin_width_m))
 
 
 def _matcher(bank: Bank, method: str, arguments: dict[str, Any]) -> Matcher:

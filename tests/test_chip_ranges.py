@@ -90,7 +90,7 @@ def test_a_zone_at_an_edge_reports_the_landmark_or_the_wall_and_nothing_between(
     wall_m = 1.5
     views = Views.broadcast(np.full(3, 0.7), np.radians(30.0))
     wall = Background(wall_m=wall_m)
-    simulated = simulate_recording(mesh("cylinder"), "cylinder", SENSOR, views, seed=1, background=wall, reported=True)
+    simulated = simulate_recording(mesh("cylinder"), "cylinder", SENSOR, views, seed=1, background=wall)
     z_m = simulated.frames.z_m[0][:, :]
     light = Renderer(mesh("cylinder"), SENSOR).render_views(views[:1], background=wall)
     mean_m = (light.range_m * SENSOR.axis_cosine())[0]

@@ -49,12 +49,14 @@ def run(capsys):
 
 
 MATCH = ["--unit", "m", "--quantity", "range", "--wall", "3"]
+NEAREST = ["--method", "nearest"]
 
 
 def test_a_frame_is_matched_and_the_robot_placed(run, folder):
     code, out, _ = run(
-        "match", folder / "bank.h5", folder / "frames.csv", *MATCH, "--landmark-xy", 2.0, 1.0, "--pan", 0, "--json"
-    )
+        "match", folder / "bank.h5", folder / "frames.csv", *MATCH, *NEAREST, "--landmark-xy", 2.0, 1.0, "--pan", 0,
+        "--json",
+    )  # fmt: skip
     assert code == 0
     (match,) = json.loads(out)["matches"]
     assert (match["class"], match["accepted"]) == ("cone", True)
@@ -85,9 +87,11 @@ def test_the_table_has_a_line_a_position(run, folder, tmp_path):
 
 def test_no_landmark_is_an_answer(run, folder, tmp_path):
     np.savetxt(tmp_path / "wall.csv", np.full((5, 256), 3.0) + np.linspace(0, 1e-3, 5)[:, None], delimiter=",")
-    code, out, _ = run("match", folder / "bank.h5", tmp_path / "wall.csv", "--unit", "m", "--quantity", "range")
-    assert code == 0
-    assert "no landmark" in out
+    for method in ("nearest", "refine"):
+        command = ["match", folder / "bank.h5", tmp_path / "wall.csv", "--unit", "m", "--quantity", "z"]
+        code, out, _ = run(*command, "--method", method)
+        assert code == 0
+        assert "no landmark" in out
 
 
 def test_the_mean_phasor_is_the_other_filter(run, folder):
@@ -329,7 +333,7 @@ def _case(code, *arguments, contains):
 MISTAKES = [
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--auto-background", contains="leave --wall"),
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--free", "yaw", contains="bearing, height, pitch or roll"),
-    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--free", "bearing", contains="goes with --method refine"),
+    _case(2, "match", "bank.h5", "frames.csv", *MATCH, *NEAREST, "--free", "bearing", contains="--method refine"),
     _case(3, "match", "none.h5", "frames.csv", *MATCH, contains="none.h5"),
     _case(3, "match", "frames.csv", "frames.csv", *MATCH, contains="not a bank"),
     _case(2, "match", "part.STL", "frames.csv", *MATCH, contains="does not say which sensor took it: give --sensor"),
@@ -489,7 +493,7 @@ def test_a_warning_is_one_note_and_no_error(run, folder, tmp_path):
     frames = np.loadtxt(folder / "frames.csv", delimiter=",")
     frames[3, 7] = -1.0
     np.savetxt(tmp_path / "frames.csv", frames, delimiter=",")
-    code, out, err = run("match", folder / "bank.h5", tmp_path / "frames.csv", *MATCH, "--json")
+    code, out, err = run("match", folder / "bank.h5", tmp_path / "frames.csv", *MATCH, *NEAREST, "--json")
     assert code == 0
     assert json.loads(out)["matches"][0]["class"] == "cone"
     assert len(err.splitlines()) == 1

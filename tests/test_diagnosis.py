@@ -161,7 +161,7 @@ def test_an_accepted_frame_has_nothing_to_diagnose(banks):
     ("options", "flag"),
     [
         (["--method", "refine", "--fix", "bearing"], ": --free bearing instead of --fix bearing"),
-        ([], "--method refine --free"),
+        (["--method", "nearest"], "--method refine --free"),
     ],
 )
 def test_the_command_names_the_option_that_makes_a_refused_frame_fit(banks, tmp_path, capsys, options, flag):
@@ -196,6 +196,7 @@ def test_a_diagnosis_that_fails_loses_no_answer(tmp_path, capsys):
     np.savez(tmp_path / "frames.npz", range=ranges, unit="m", quantity="range")
     estimates = tmp_path / "estimates.csv"
     arguments = ["match", str(tmp_path / "bank.h5"), str(tmp_path / "frames.npz"), "--wall", "1.2"]
+    arguments += ["--method", "nearest"]
     assert main([*arguments, "--json", "--estimates", str(estimates)]) == 0
     done = capsys.readouterr()
     (answer,) = json.loads(done.out)["matches"]

@@ -108,7 +108,7 @@ def saved(bank, true, path):
 
 def test_match_learns_the_orientation_and_says_which_options_it_is(banks, tmp_path, capsys):
     frames = saved(banks["handed"], Orientation(True, 90), tmp_path / "a.npz")
-    command = ["match", str(banks["handed"].path), frames, "--method", "refine", "--moving", "--json"]
+    command = ["match", str(banks["handed"].path), frames, "--on", "ranges", "--no-background", "--moving", "--json"]
     assert main([*command, "--learn-orientation"]) == 0
     learnt = capsys.readouterr()
     assert (
@@ -120,7 +120,16 @@ def test_match_learns_the_orientation_and_says_which_options_it_is(banks, tmp_pa
 
 def test_match_refuses_a_recording_that_leaves_orientations_open(banks, tmp_path, capsys):
     frames = saved(banks["box"], Orientation(), tmp_path / "a.npz")
-    command = ["match", str(banks["box"].path), frames, "--method", "refine", "--moving", "--learn-orientation"]
+    command = [
+        "match",
+        str(banks["box"].path),
+        frames,
+        "--on",
+        "ranges",
+        "--no-background",
+        "--moving",
+        "--learn-orientation",
+    ]
     assert main(command) == 3
     said = capsys.readouterr()
     assert not said.out
@@ -131,8 +140,8 @@ def test_match_refuses_a_recording_that_leaves_orientations_open(banks, tmp_path
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ([], "goes with --method refine"),
-        (["--method", "refine", "--flip-h"], "leave --flip-h, --flip-v and --rotate out"),
+        (["--method", "nearest"], "goes with --method refine"),
+        (["--flip-h"], "leave --flip-h, --flip-v and --rotate out"),
     ],
 )
 def test_options_that_contradict_the_learning_are_refused(banks, tmp_path, capsys, options, reason):

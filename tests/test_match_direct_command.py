@@ -75,7 +75,7 @@ def test_frames_of_a_sensor_at_rest_are_added_up(folder: Path, capsys: pytest.Ca
 @pytest.mark.parametrize(
     ("words", "problem"),
     [
-        (("bank.h5", "log.npz", "--on", "histograms"), "--on goes with --method refine"),
+        (("bank.h5", "log.npz", "--method", "nearest", "--on", "targets"), "--on goes with --method refine"),
         (("phase.h5", "log.npz", *FIXED, "--on", "histograms"), "take a bank of a direct sensor"),
         (("bank.h5", "targets.csv", *FIXED, "--on", "histograms"), "match it on targets"),
         (

@@ -16,7 +16,8 @@ from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.commands.match_table import bank_ends, summary
 from phasemark.matcher.recordings.estimates_table import match_in_batches
-from phasemark.render import Background, Renderer, preset
+from phasemark.render import Background, Renderer, capture, preset
+from phasemark.render.direct import HistogramRenderer
 from phasemark.render.sensor.sensor_file import sensor_toml
 
 ZONES = preset("vl53l5cx-8x8")
@@ -73,37 +74,41 @@ def rows_of(path):
 
 
 def test_every_frame_of_a_moving_camera_is_a_match_with_its_time(run, folder):
-    match = ["match", folder / "bank.h5", folder / "flight.csv", *READ, "--moving", "--method", "refine"]
-    match.append("--auto-background")  # the wall comes nearer with the landmark
+    match = ["match", folder / "bank.h5", folder / "flight.csv", *READ, "--moving", "--no-diagnosis"]
     code, out, err = run(*match, "--json")
     assert code == 0
     counted, mirrored = err.splitlines()
-    assert counted == f"note: {N} of {N} frames accepted"
-    assert "may be those of images mirrored left to right" in mirrored
     matches = json.loads(out)["matches"]
+    accepted = [one["accepted"] for one in matches]
+    assert counted.startswith(f"note: {sum(accepted)} of {N} frames accepted")
+    assert sum(accepted) >= N - 3  # of single frames a few are refused
+    assert "may be those of images mirrored left to right" in mirrored
     # 15 frames a second, in whole milliseconds
     assert [one["time_s"] for one in matches] == [round(k / 15, 3) for k in range(N)]
     truth = np.linspace(0.75, 0.6, N)
     # five standard deviations of 0.4 mm
-    np.testing.assert_allclose([one["distance_m"] for one in matches], truth, atol=0.002)
+    np.testing.assert_allclose(np.array([one["distance_m"] for one in matches])[accepted], truth[accepted], atol=0.002)
     code, out, _ = run(*match)
     header, *rows = out.splitlines()
-    titles = ["frame", "time (s)", "class", "D (m)", "δ (°)", "bearing (°)", "background", "accepted", "p"]
+    titles = ["frame", "time (s)", "class", "D (m)", "δ (°)", "bearing (°)", "pitch (°)", "roll (°)", "background"]
+    titles += ["accepted", "p"]
     assert [title.strip() for title in header.split("  ") if title] == titles
-    assert all(row.count(" ± ") == 3 and " wall 1." in row for row in rows)
+    assert [row.count(" ± ") for row in rows] == [5 * yes for yes in accepted]
+    assert all(" unknown " in row for row in rows)
     assert [row.split()[:3] for row in rows] == [[str(k), f"{k / 15:.3f}", "cylinder"] for k in range(N)]
 
 
 def test_without_moving_one_note_says_that_something_moved(run, folder):
-    code, out, err = run("match", folder / "bank.h5", folder / "flight.csv", *READ, "--no-diagnosis")
+    options = ["--method", "nearest", "--no-diagnosis"]
+    code, out, err = run("match", folder / "bank.h5", folder / "flight.csv", *READ, *options)
     assert code == 0
     header, _ = out.splitlines()  # one position needs no number
     assert header.split() == ["class", "D", "(m)", "δ", "(°)", "accepted", "p"]
     assert len(err.splitlines()) == 1
     assert err.startswith(f"note: {folder / 'flight.csv'}: the camera or the scene moved during the file")
     assert "--moving matches every frame by itself" in err
-    code, _, err = run("match", folder / "bank.h5", folder / "still.csv", *READ, *WALL)
-    assert (code, err) == (0, "")
+    code, _, err = run("match", folder / "bank.h5", folder / "still.csv", *READ)
+    assert (code, "moved" in err) == (0, False)
 
 
 def test_the_note_names_the_first_position_that_moved(run, folder, tmp_path):
@@ -125,7 +130,7 @@ def test_rows_are_printed_as_batches_finish(folder, capsys, monkeypatch):
 
     monkeypatch.setattr(Matcher, "match", watched)
     command = ["match", str(folder / "bank.h5"), str(folder / "flight.csv"), *map(str, READ), "--moving"]
-    command.append("--no-diagnosis")  # which matches too
+    command += ["--method", "nearest", "--no-diagnosis"]  # a diagnosis matches too
     assert main(command) == 0
     printed.append(capsys.readouterr().out)
     # before each batch the rows of the one before, the header with the first
@@ -166,15 +171,17 @@ def test_a_single_frame_of_a_direct_sensor_has_the_noise_that_the_sensor_states(
 
 def test_the_fit_of_frames_at_rest_passes_its_test_as_often_as_stated(run, folder, tmp_path):
     assert run("frames", "simulate", *SCENE, "--frames", 100, "--seed", 5, "-o", tmp_path / "long.csv")[0] == 0
-    match = ["match", folder / "bank.h5", tmp_path / "long.csv", *READ, *WALL, "--moving", "--method", "refine"]
+    match = ["match", folder / "bank.h5", tmp_path / "long.csv", *READ, "--moving", "--no-diagnosis"]
     assert run(*match, "--estimates", tmp_path / "e.csv")[0] == 0
     rows = rows_of(tmp_path / "e.csv")
     assert {row["class"] for row in rows} == {"cylinder"}
     # 1 % of 100 may fail: more than 6 do so once in 10⁴ runs
-    assert sum(row["accepted"] == "false" for row in rows) <= 6
-    pulls = [(float(row["distance_m"]) - 0.75) / float(row["distance_std_m"]) for row in rows]
-    assert abs(np.mean(pulls)) < 0.5  # five standard deviations of a mean of 100
-    assert 0.7 < np.std(pulls) < 1.3  # four
+    assert sum(row["reason"] == "poor fit" for row in rows) <= 6
+    accepted = [row for row in rows if row["accepted"] == "true"]
+    assert len(accepted) >= 75  # a single frame of some zones leaves much open
+    pulls = [(float(row["distance_m"]) - 0.75) / float(row["distance_std_m"]) for row in accepted]
+    assert abs(np.mean(pulls)) < 0.5  # four standard deviations of a mean of 75
+    assert 0.7 < np.std(pulls) < 1.4  # four
 
 
 def test_estimates_are_a_table_of_what_was_free(run, folder, tmp_path):
@@ -294,22 +301,38 @@ def test_a_simulated_recording_says_so_and_is_the_same_in_each_form(run, tmp_pat
 
 
 def test_a_simulated_recording_has_millimetres_status_codes_and_the_noise_of_the_sensor(run, tmp_path):
-    n = 400
-    scene = ["--class", "cylinder", "--sensor", "vl53l5cx-8x8", "--distance", 0.7, "--delta", 30]
+    n, sensor = 400, ZONES.with_(histogram=None)  # the chip of one with a table is in test_chip_ranges.py
+    (tmp_path / "mean.toml").write_text(sensor_toml(sensor, {}, header=[], otherwise="assumed"), encoding="utf-8")
+    scene = ["--class", "cylinder", "--sensor", tmp_path / "mean.toml", "--distance", 0.7, "--delta", 30]
     assert run("frames", "simulate", *scene, "--frames", n, "-o", tmp_path / "a.csv")[0] == 0
     rows = list(csv.DictReader((tmp_path / "a.csv").read_text().splitlines()[1:]))
     z_mm = np.array([[int(row[f"mm_{k}"]) for k in range(64)] for row in rows])
     status = np.array([[int(row[f"status_{k}"]) for k in range(64)] for row in rows])
     assert np.array_equal(status == 5, z_mm > 0)
     assert set(np.unique(status)) == {5, 255}  # nothing stands behind the landmark
-    image = Renderer(build_mesh(catalog()["cylinder"]), ZONES).render(0.7, math.radians(30))
+    image = Renderer(build_mesh(catalog()["cylinder"]), sensor).render(0.7, math.radians(30))
     returned = image.intensity[0].ravel() > 0
     assert np.array_equal(status[0] == 5, returned)
-    exact = (1e3 * image.range_m[0] * ZONES.axis_cosine()).ravel()[returned]
-    std = 1e3 * (ZONES.range_std_m * ZONES.axis_cosine()).ravel()[returned]
+    exact = (1e3 * image.range_m[0] * sensor.axis_cosine()).ravel()[returned]
+    std = 1e3 * (sensor.range_std_m * sensor.axis_cosine()).ravel()[returned]
     pulls = (z_mm[:, returned].mean(axis=0) - exact) / (std / math.sqrt(n))
     assert np.abs(pulls).max() < 4.5  # of at most 64: once in 2000 runs
     np.testing.assert_allclose(z_mm[:, returned].std(axis=0), np.sqrt(std**2 + 1 / 12), rtol=0.16)  # 4.5 of 1/√800
+
+
+def test_a_recording_of_a_chip_has_the_ranges_that_a_frame_set_of_its_histograms_has(run, tmp_path):
+    assert run("frames", "simulate", *SCENE, "--frames", 5, "-o", tmp_path / "a.npz")[0] == 0
+    image = HistogramRenderer(build_mesh(catalog()["cylinder"]), ZONES, albedo=0.8).render(
+        0.75, math.radians(30), background=Background(wall_m=1.5)
+    )
+    ranges = capture(image, ZONES, rng=np.random.default_rng(3), n_frames=200).ranges.range_m[0]
+    with np.load(tmp_path / "a.npz") as made:
+        seen = np.where(made["valid"], made["range"], np.nan).reshape(5, 8, 8)
+    usual, std = np.nanmedian(ranges, axis=0), np.nanstd(ranges, axis=0)
+    clear = np.isfinite(seen).all(axis=0) & np.isfinite(ranges).all(axis=0)
+    clear &= np.ptp(ranges, axis=0) < 0.05  # the zones that report one surface each time
+    assert clear.sum() > 40
+    np.testing.assert_array_less(np.abs(seen - usual)[:, clear], 6 * std[clear] + 1e-3)
 
 
 def test_a_frame_of_a_recording_is_drawn(run, folder, tmp_path):
@@ -363,7 +386,7 @@ def test_the_time_of_a_pose_has_the_delay_of_the_sensor_and_moves_repeated_stamp
     grid = ["--distance", "0.6:0.8:0.1", "--delta", "0:180:30"]
     bank = tmp_path / "late.h5"
     assert run("bank", "build", "--class", "cylinder", "--sensor", tmp_path / "late.toml", *grid, "-o", bank)[0] == 0
-    match = ["match", bank, tmp_path / "late.npz", "--no-diagnosis"]
+    match = ["match", bank, tmp_path / "late.npz", "--method", "nearest", "--no-diagnosis"]
     assert run(*match, "--moving", "--estimates", tmp_path / "moving.csv")[0] == 0
     moving = rows_of(tmp_path / "moving.csv")
     assert [float(row["time_s"]) for row in moving] == [0.0, 0.1, 0.3, 0.3]
@@ -377,7 +400,8 @@ def test_the_time_of_a_pose_has_the_delay_of_the_sensor_and_moves_repeated_stamp
 def test_the_summary_counts_reasons_and_names_the_end_of_the_bank(run, folder, tmp_path):
     assert run("frames", "simulate", *SCENE, "--moving", "--frames", 12, "--to-distance", 1.0, "--to-delta", 30,
                "-o", tmp_path / "away.csv")[0] == 0  # fmt: skip
-    match = ["match", folder / "bank.h5", tmp_path / "away.csv", *READ, *WALL, "--moving", "--no-diagnosis"]
+    match = ["match", folder / "bank.h5", tmp_path / "away.csv", *READ, "--moving", "--no-diagnosis"]
+    match += ["--method", "nearest", *WALL]
     code, out, err = run(*match)
     assert code == 0
     counted, end = err.splitlines()

@@ -186,19 +186,15 @@ def frames_simulate(
         float | None, typer.Option("--to-delta", metavar="DEG", help="With --moving, δ in the last frame; 40 more.")
     ] = None,
     n_frames: Annotated[int, typer.Option("--frames", min=1, help="Number of frames.")] = 20,
-    reported: Annotated[
-        bool,
-        typer.Option(
-            "--reported", help="Ranges that the sensor's chip reports, each zone one surface; not the mean over a zone."
-        ),
-    ] = False,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
     """Simulate a recording in the form that sensors write, with time stamps and the truth, to try match with.
 
-    The file says that it is simulated. A direct sensor writes z in millimetres and status codes (5: valid), another one
-    ranges in metres with amplitudes. The truth of each frame stands in columns truth_..., which other commands ignore.
+    The file says that it is simulated. A direct sensor with a [histogram] table reports what its chip does, in each
+    zone the nearest surface, and not a mean over the zone. It writes z in millimetres and status codes (5: valid),
+    another sensor ranges in metres with amplitudes. The truth of each frame stands in columns truth_..., which other
+    commands ignore.
     """
     from phasemark.data.measured.simulated import recording_format, simulate_recording, write_recording
 
@@ -225,7 +221,6 @@ def frames_simulate(
         seed=seed,
         albedo=mesh.metadata.get("albedo", 0.8),
         background=background_of(wall, floor),
-        reported=reported,
     )
     described = readable(f"landmark={name} sensor={Path(sensor).name}")
     description = f"{described} seed={seed} {'moving' if moving else 'still'}"

@@ -60,12 +60,12 @@ def simulate_recording(
     seed: int,
     albedo: float = 0.8,
     background: Background | None = None,
-    reported: bool = False,
 ) -> SimulatedRecording:
     """Simulate a recording of a landmark at the frame rate of the sensor.
 
-    Each frame is taken as if the camera stood still meanwhile. A wall keeps its distance behind the landmark of the
-    first view, and stands square to the line of sight of each.
+    Ranges are those that the chip of a direct sensor with a [histogram] table reports, of the nearest target of every
+    zone; of another sensor, the mean over a pixel. Each frame is taken as if the camera stood still meanwhile. A wall
+    keeps its distance behind the landmark of the first view, and stands square to the line of sight of each.
 
     Parameters
     ----------
@@ -83,9 +83,6 @@ def simulate_recording(
         Share of light that the landmark returns.
     background : Background, optional
         As seen from the first view.
-    reported : bool
-        Whether ranges are those that the chip of a sensor with a [histogram] table reports, of the nearest target of
-        every zone, and not the mean over the zone.
 
     Returns
     -------
@@ -95,11 +92,12 @@ def simulate_recording(
     Raises
     ------
     UsageError
-        There is no view or too many, a view cannot be rendered, or the sensor has no [histogram] table to report from.
+        There is no view or too many, or a view cannot be rendered.
     """
     if not 1 <= len(views) <= MOST_FRAMES:
         raise UsageError(f"a simulated recording must have 1 … {MOST_FRAMES} frames, got {len(views)}")
-    renderer = (HistogramRenderer if reported else Renderer)(mesh, sensor, albedo=albedo)
+    reports = sensor.histogram is not None
+    renderer = (HistogramRenderer if reports else Renderer)(mesh, sensor, albedo=albedo)
     renderer.check_in_view(views)
     taken: list[Frames] = []
     image: Any = None
@@ -113,7 +111,7 @@ def simulate_recording(
                 behind = replace(background, wall_m=background.wall_m + at[0] - float(views.distance_m[0]))
             image, rendered = renderer.render_views(view, background=behind), at
         shot: Any = capture(image, sensor, rng=stream(seed, "simulated recording", 0), first_frame=k)
-        taken.append(shot.ranges if reported else shot)
+        taken.append(shot.ranges if reports else shot)
 
     stamps = np.round(np.arange(len(views)) / sensor.frame_rate_hz, 3)[None]
     frames = _one_after_the_other(taken, stamps)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from phasemark.matcher.position.landmark_map import LandmarkMap
     from phasemark.matcher.recordings.direct_positions import DirectBatch, DirectPositions
     from phasemark.matcher.recordings.estimates_table import MatchedBatch
-    from phasemark.render import Background, Frames
+    from phasemark.render import Frames
 
 
 NEAREST_AT_ONCE, REFINED_AT_ONCE = 256, 64
@@ -74,7 +74,7 @@ def match_frames(
     from phasemark.data.files.atomic_write import write_atomically
 
     place.check()
-    search = landmark.checked(bank, search)
+    landmark.check(bank)
     landmarks = place.landmarks()
     results.check()
     search.check()
@@ -86,7 +86,7 @@ def match_frames(
     with landmark.opened(bank, frames, reading) as opened:
         measured = reading.read(frames, opened.camera)
         note_too_far(opened.camera, {"--wall": search.wall})
-        search = search.as_reported(opened) if landmark.is_for(bank) else search
+        search = search.for_bank(opened)
         matcher = search.matcher(opened)
         if learn:
             reading = replace(reading, **_learnt(matcher, measured, frames))
@@ -105,7 +105,7 @@ def match_frames(
         if results.as_json:
             echo_json({"bank": str(bank), "frames": str(frames), "matches": printed.answers})
         for k, path in plots.items():
-            _save_match_figure(path, *printed.drawn[k], opened, search.background, results.force)
+            _save_match_figure(path, *printed.drawn[k], opened, search, results.force)
     if not (results.as_json or results.as_jsonl):
         for path in results.files(plots):
             typer.echo(path)
@@ -362,7 +362,7 @@ def _note_motion(measured: Frames, file: Path) -> None:
 
 
 def _save_match_figure(
-    path: Path, filtered: FilteredFrames, match: Match, bank: Bank, background: Background | None, force: bool
+    path: Path, filtered: FilteredFrames, match: Match, bank: Bank, search: Search, force: bool
 ) -> None:
     """Draw one position."""
     import io as bytes_io
@@ -371,5 +371,6 @@ def _save_match_figure(
     from phasemark.matcher.figures import match_figure
 
     buffer = bytes_io.BytesIO()
-    match_figure(filtered, match, bank, background).savefig(buffer, format="png", dpi=120)
+    figure = match_figure(filtered, match, bank, search.background, reported=search.on == "reported")
+    figure.savefig(buffer, format="png", dpi=120)
     write_atomically(path, buffer.getvalue(), force=force)

@@ -55,9 +55,9 @@ class Search:
         Literal["nearest", "refine"],
         typer.Option(
             "--method",
-            help="nearest: the paper's minimum-distance classifier. refine: maximum likelihood, with covariance.",
+            help="refine: maximum likelihood, with covariance. nearest: the paper's minimum-distance classifier.",
         ),
-    ] = "nearest"
+    ] = "refine"
     free: Annotated[
         list[str] | None,
         typer.Option(
@@ -101,13 +101,14 @@ class Search:
         ),
     ] = None
     on: Annotated[
-        Literal["ranges", "reported", "phasors", "histograms", "targets"],
+        Literal["ranges", "reported", "phasors", "histograms", "targets"] | None,
         typer.Option(
             "--on",
             help="With refine: ranges, or phasors with the albedo free; of a direct sensor also reported (ranges as its"
-            " chip makes them), histograms or targets.",
+            " chip makes them), histograms or targets. Unless stated: reported where the sensor has a [histogram]"
+            " table, or ranges, also with --unknown-background and --no-background.",
         ),
-    ] = "ranges"
+    ] = None
     pixels: Annotated[
         Literal["all", "lower"],
         typer.Option("--pixels", help="With refine: pixels that are compared, all or the lower half of the rows."),
@@ -128,6 +129,14 @@ class Search:
         bool,
         typer.Option("--unknown-background", help="With refine: other things may stand before, beside and behind it."),
     ] = False
+    no_background: Annotated[
+        bool,
+        typer.Option(
+            "--no-background",
+            help="With refine: nothing returns beside it. Unless the background is stated, nothing, wall and floor, and"
+            " unknown things are tried in turn, up to what explains the frame.",
+        ),
+    ] = False
     wall: Wall = None
     floor: Floor = None
 
@@ -135,6 +144,14 @@ class Search:
     def background(self) -> Background | None:
         """What stands behind the landmark, as far as it is stated."""
         return background_of(self.wall, self.floor)
+
+    @property
+    def behind(self) -> Background | Literal["auto", "unknown", "any"] | None:
+        """Background of the matcher: what is stated, or what the frames tell."""
+        if self.auto_background or self.unknown_background:
+            return "auto" if self.auto_background else "unknown"
+        stated = self.no_background or self.background is not None
+        return self.background if stated or self.method == "nearest" or self.is_direct else "any"
 
     @property
     def is_direct(self) -> bool:
@@ -172,6 +189,11 @@ class Search:
             raise UsageError(
                 "--unknown-background takes nothing for known: leave --auto-background, --wall and --floor out"
             )
+        if self.no_background and (self.auto_background or self.unknown_background or stated):
+            raise UsageError(
+                "--no-background states that nothing returns beside the landmark: leave --auto-background,"
+                " --unknown-background, --wall and --floor out"
+            )
         if self.bearing_std is not None and (self.free or self.fix):
             raise UsageError("--bearing-std says how well the bearing is known: leave --free and --fix out")
         if self.fix and "bearing" in (self.free or ()):
@@ -185,9 +207,10 @@ class Search:
         if self.is_direct:
             self._check_direct()
         refined = (
-            ("--free", bool(self.free)), ("--on", self.on != "ranges"), ("--pixels", self.pixels != "all"),
+            ("--free", bool(self.free)), ("--on", self.on not in (None, "ranges")), ("--pixels", self.pixels != "all"),
             ("--robust", self.robust), ("--auto-background", self.auto_background),
-            ("--unknown-background", self.unknown_background), ("--fix", self.fix is not None),
+            ("--unknown-background", self.unknown_background), ("--no-background", self.no_background),
+            ("--fix", self.fix is not None),
             ("--bearing-std", self.bearing_std is not None),
         )  # fmt: skip
         for option, used in refined:
@@ -215,20 +238,22 @@ class Search:
             bank,
             self.method,
             free=None if self.near_the_axis else self.parameters,
-            background="auto" if self.auto_background else "unknown" if self.unknown_background else self.background,
+            background=self.behind,
             bearing_std_rad=None if self.bearing_std is None else math.radians(self.bearing_std),
             height_std_m=self._stated_in("height", 1.0, math.inf),
             pitch_std_rad=self._stated_in("pitch", math.radians(1.0), TILT_STD_RAD),
             roll_std_rad=self._stated_in("roll", math.radians(1.0), TILT_STD_RAD),
             false_alarm=self.false_alarm,
-            on=self.on,
+            on=self.on or "ranges",
             pixels=self.pixels,
             robust=self.robust,
         )
 
-    def as_reported(self, bank: Bank) -> Search:
-        """Return the options with ranges taken as a chip reports them, where the bank's sensor has one."""
-        return replace(self, on="reported") if self.on == "ranges" and bank.sensor.histogram is not None else self
+    def for_bank(self, bank: Bank) -> Search:
+        """Return the options with ranges as a chip reports them, where the bank's sensor has one and none is stated."""
+        from_mean = self.method == "nearest" or self.unknown_background or self.no_background
+        chip = bank.sensor.histogram is not None and not from_mean
+        return replace(self, on=self.on or ("reported" if chip else "ranges"))
 
     def _stated_in(self, name: str, unit: float, otherwise: float) -> float:
         """Return a prior that is stated, in the unit of the matcher, or what holds where none is."""
@@ -261,10 +286,10 @@ class Landmark:
         bool, typer.Option("--no-cache", help="Without a bank: build one again, and do not keep it.")
     ] = False
 
-    def checked(self, bank: Path, search: Search) -> Search:
-        """Refuse options that belong to a mesh or a class beside a bank; return how either is searched."""
+    def check(self, bank: Path) -> None:
+        """Refuse options that belong to a mesh or a class beside a bank."""
         if self.is_for(bank):
-            return replace(search, method="refine")
+            return
         stated = {
             "--sensor": self.sensor is not None, "--part-unit": self.part_unit is not None, "--up": self.up != "z",
             "--origin": self.origin != "file", "--no-cache": self.no_cache,
@@ -272,7 +297,6 @@ class Landmark:
         for option, is_stated in stated.items():
             if is_stated:
                 raise UsageError(f"{option} goes with a mesh or a class in place of a bank: {bank} has its own")
-        return search
 
     @staticmethod
     def is_for(bank: Path) -> bool:

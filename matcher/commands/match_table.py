@@ -75,7 +75,7 @@ class Columns:
     free : sequence of str
         Parameters that were estimated, as :class:`~phasemark.matcher.Match` names them.
     background : Background or str or None
-        What was stated; "auto": what each match found; "unknown"; None: no such column.
+        What was stated; "auto", "any": what each match found; "unknown"; None: no such column.
     robot : bool
         Whether the robot was placed.
     """
@@ -104,7 +104,7 @@ def _refusal(answer: dict[str, Any]) -> str:
 
 def _background(answer: dict[str, Any], background: Background | str) -> str:
     """Return the planes that a match assumed or found behind the landmark, in words."""
-    if background == "unknown":
+    if answer["among_unknown"]:
         return "unknown"
     planes: dict[str, float | None] = {}
     for name in ("wall", "floor"):

@@ -229,7 +229,9 @@ class _Setup:
         }
         # a bearing with a prior is searched again without one
         free = VIEW if told["free"] is None else check_free(told["free"])
-        return cls(False, free, None if unknown else told["background"], options)
+        # the last background that was tried in turn takes all for unknown: before that, wall and floor were estimated
+        behind = "auto" if told["background"] == "any" else None if unknown else told["background"]
+        return cls(False, free, behind, options)
 
     def matcher(self, bank: Bank, free: Sequence[str], background: Background | Literal["auto"] | None) -> Matcher:
         """Build a matcher like it by maximum likelihood."""

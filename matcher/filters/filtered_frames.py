@@ -31,6 +31,9 @@ _Number = TypeVar("_Number", bound=np.generic)
 
 _USUAL_LIMIT_RAD = 0.1
 """Phase noise where a frame does not know its own and the sensor allows no less."""
+_CHIP_ERROR_BINS = 0.03
+"""Error of a chip's target, in bins: rounding to millimetres, and what its estimator makes of a surface that bends
+within a zone, or of things beside it."""
 _LEAST_POOLED = 1e-4
 """Least variance over that of the law; frames without any scatter are simulated, or frozen."""
 
@@ -151,6 +154,13 @@ class FilteredFrames:
             sensor=sensor.with_(range_offset_m=0.0, zone_offset_m=()),
             by_frequency=tuple(part.without_offset() for part in self.by_frequency),
         )
+
+    def with_chip_error(self) -> FilteredFrames:
+        """Return reported ranges with what the chip's estimator leaves beside their noise, which no mean lessens."""
+        histogram = self.sensor.histogram
+        if histogram is None or not self.n_effective.max(initial=0.0) > 1:
+            return self
+        return replace(self, std_m=np.hypot(self.std_m, _CHIP_ERROR_BINS * histogram.bin_width_m))
 
     def with_pooled_noise(self) -> FilteredFrames:
         """Return the frames of a direct sensor with the noise of its law, scaled to the scatter of all pixels together.
