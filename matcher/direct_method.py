@@ -28,7 +28,7 @@ DIRECT_KINDS = ("histograms", "targets")
 
 
 def refuse_direct_options(
-    method: str, on: str, background: Background | Literal["auto", "unknown"] | None, pixels: str, robust: bool
+    method: str, on: str, background: Background | Literal["auto", "unknown", "any"] | None, pixels: str, robust: bool
 ) -> None:
     """Refuse options that do not go with histograms and targets.
 
@@ -39,7 +39,7 @@ def refuse_direct_options(
     """
     wrong = {
         "'method' must be refine": method != "refine",
-        "'background' must be a Background, 'auto' or None": background == "unknown",
+        "'background' must be a Background, 'auto' or None": background in ("unknown", "any"),
         "'background' must be a Background or None, for targets do not tell it": on == "targets"
         and background == "auto",
         "'pixels' must be all": pixels != "all",

@@ -132,7 +132,8 @@ def _match_directly(
         raise UsageError(f"--plot draws ranges: leave it out with --on {search.on}")
     with open_any_bank(bank) as opened:
         matcher = search.matcher(opened)
-        positions = read_positions(frames, opened.camera, search.on, moving=moving, valid_status=reading.valid_status)
+        on, valid_status = matcher.options["on"], reading.valid_status
+        positions = read_positions(frames, opened.camera, on, moving=moving, valid_status=valid_status)
         refuse_unwritable_files(results.files({}), results.force)
         tell(f"note: histograms are rendered first, a table of {format_size(matcher.table_bytes)}")
         printed = _Answers(search, place, results, landmarks, {}, moving)

@@ -230,7 +230,9 @@ class _Setup:
         # a bearing with a prior is searched again without one
         free = VIEW if told["free"] is None else check_free(told["free"])
         # the last background that was tried in turn takes all for unknown: before that, wall and floor were estimated
-        behind = "auto" if told["background"] == "any" else None if unknown else told["background"]
+        behind: Background | Literal["auto"] | None = None if unknown else told["background"]
+        if told["background"] == "any":
+            behind = "auto"
         return cls(False, free, behind, options)
 
     def matcher(self, bank: Bank, free: Sequence[str], background: Background | Literal["auto"] | None) -> Matcher:

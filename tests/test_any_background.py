@@ -1,0 +1,68 @@
+"""``background="any"``: nothing, wall and floor, and unknown things are tried in turn, up to what explains a frame."""
+
+import math
+
+import numpy as np
+import pytest
+
+from phasemark import UsageError
+from phasemark.data import BankPlan, build_bank
+from phasemark.matcher import Matcher, kalman_filter
+from phasemark.render import Background, Frames, Renderer, capture, preset
+
+SENSOR = preset("pmd-16x16")
+FIXED = ("distance_m", "delta_rad")
+VIEW = 1.013, math.radians(37.0)
+
+
+@pytest.fixture(scope="module")
+def bank():
+    plan = BankPlan(classes=("cone", "cylinder"), distance_m="0.9:1.1:0.01", delta_deg="0:180:1")
+    with build_bank(plan, workers=1) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def frames(bank):
+    """Return filtered frames of one view: with nothing behind, before a wall, and with a shelf before some of it."""
+    renderer = Renderer(bank.mesh("cone"), SENSOR, albedo=0.8)
+    rng, ranges = np.random.default_rng(8), []
+    for behind in (None, Background(wall_m=2.6), Background(wall_m=2.6)):
+        image = renderer.render(*VIEW, background=behind)
+        ranges.append(np.array(capture(image, SENSOR, rng=rng, n_frames=50).range_m[0]))
+    ranges[2][:, :3] = 0.6 + 0.02 * rng.standard_normal((50, 3, 16))
+    return kalman_filter(Frames(np.stack(ranges), sensor=SENSOR, valid=np.isfinite(np.stack(ranges))))
+
+
+def test_a_frame_is_matched_before_the_first_background_that_explains_it(bank, frames):
+    found = Matcher(bank, "refine", free=FIXED, background="any").match(frames)
+    assert found.accepted.all()
+    np.testing.assert_allclose(found.distance_m, VIEW[0], atol=2e-3)
+    np.testing.assert_allclose(found.delta_rad, VIEW[1], atol=math.radians(2.0))
+    assert found[0].background is None
+    assert not found[0].among_unknown
+    assert found[1].background.wall_m == pytest.approx(2.6, abs=0.01)
+    assert [match.among_unknown for match in found] == [False, False, True]
+    alone = [Matcher(bank, "refine", free=FIXED, background=own).match(frames) for own in (None, "auto", "unknown")]
+    for k, matches in enumerate(alone):
+        assert matches[k].as_dict() == found[k].as_dict()
+        assert not any(alone[earlier][k].accepted for earlier in range(k))
+
+
+def test_frames_that_nothing_explains_are_refused_for_what_wall_and_floor_leave(bank):
+    rng = np.random.default_rng(1)
+    noise = kalman_filter(Frames(rng.uniform(0.7, 2.0, (1, 1, 16, 16)), sensor=SENSOR))
+    (match,) = Matcher(bank, "refine", free=FIXED, background="any").match(noise)
+    assert not match.accepted
+    assert match.reason
+
+
+@pytest.mark.parametrize("on", ["histograms", "targets"])
+def test_histograms_and_targets_are_not_matched_before_any_background(bank, on):
+    with pytest.raises(UsageError, match="background"):
+        Matcher(bank, "refine", on=on, background="any")
+
+
+def test_the_nearest_image_takes_no_background_from_the_frame(bank):
+    with pytest.raises(UsageError, match="automatic background"):
+        Matcher(bank, "nearest", background="any")
