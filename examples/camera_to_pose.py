@@ -108,7 +108,7 @@ def main() -> int:
     try:
         match = read_match(arguments.match)
         if match.get("covariance") is None:
-            raise InputFileError(f"{arguments.match}: the match has no covariance: give")
+            raise InputFileError(f"{arguments.match}: the match has no covariance: give --method refine")
         std = np.sqrt(np.diag(match["covariance"]))
         for name, error in zip(match["free"], std.tolist(), strict=True):
             title, unit, size = SHOWN[name]

@@ -49,6 +49,28 @@ def test_a_frame_is_matched_before_the_first_background_that_explains_it(bank, f
         assert not any(alone[earlier][k].accepted for earlier in range(k))
 
 
+@pytest.mark.parametrize("n_frames", [1, 50])
+def test_a_floor_in_view_before_and_beside_the_landmark_is_estimated_with_the_wall(bank, n_frames):
+    rng, n = np.random.default_rng(4), 6
+    distance_m, delta_rad = rng.uniform(0.92, 1.08, n), rng.uniform(0.0, math.pi, n)
+    floor_m, wall_m = rng.uniform(0.16, 0.2, n), distance_m + rng.uniform(0.8, 2.0, n)
+    renderer, accepted = Renderer(bank.mesh("cone"), SENSOR, albedo=0.8), 0
+    matcher = Matcher(bank, "refine", free=FIXED, background="auto")
+    for k in range(n):
+        behind = Background(wall_m=wall_m[k], floor_m=floor_m[k])
+        image = renderer.render(distance_m[k], delta_rad[k], background=behind)
+        (match,) = matcher.match(kalman_filter(capture(image, SENSOR, rng=rng, n_frames=n_frames)))
+        if not match.accepted:
+            continue
+        accepted += 1
+        # 2 cm of noise in a pixel of a frame at 1 m leave 2 mm of D and of the floor, and 1 cm of the wall
+        scale = 6 / math.sqrt(n_frames)
+        assert match.distance_m == pytest.approx(distance_m[k], abs=scale * 0.002 + 2e-4)
+        assert match.background.floor_m == pytest.approx(floor_m[k], abs=scale * 0.002 + 2e-4)
+        assert match.background.wall_m == pytest.approx(wall_m[k], abs=scale * 0.02 + 2e-3)
+    assert accepted >= n - 1
+
+
 def test_frames_that_nothing_explains_are_refused_for_what_wall_and_floor_leave(bank):
     rng = np.random.default_rng(1)
     noise = kalman_filter(Frames(rng.uniform(0.7, 2.0, (1, 1, 16, 16)), sensor=SENSOR))

@@ -499,7 +499,7 @@ def test_a_match_tells_weights_condition_and_weak_direction(bank, renderers):
         ({"on": np.ones((16, 16))}, "'on' must be 'ranges' or 'phasors' or .*, got ndarray$"),
         ({"pixels": "upper"}, "'pixels' must be 'all' or 'lower', got 'upper'$"),
         ({"pixels": np.ones((16, 16), bool)}, "'pixels' must be 'all' or 'lower', got ndarray$"),
-        ({"background": "wall"}, "'background' must be a Background, None, 'auto' or 'unknown', got 'wall'$"),
+        ({"background": "wall"}, "'background' must be a Background, None, 'auto' or 'unknown' or 'any', got 'wall'$"),
         ({"background": np.ones((16, 16))}, "'background' must be a Background, None, .* got ndarray$"),
         ({"background": 4.0}, "'background' must be a Background, None, .* got float$"),
         ({"method": np.ones(2)}, "'method' must be 'nearest' or 'refine', got ndarray$"),

@@ -218,6 +218,13 @@ def test_a_prior_puts_the_pose_near_it_first(right, prior_covariance):
     assert len(sorted_) == 4
 
 
+def test_a_match_that_tells_a_direction_by_no_width_at_all_has_a_distance_to_the_prior():
+    # 1e20 m² along one direction alone: in a sum the prior's own widths are rounded away
+    covariance = 1e20 * np.outer([0.8, 0.6], [0.8, 0.6])
+    pose = poses_of(match=match_of(covariance=covariance), prior=(0.0, 0.0, 0.0), prior_covariance=np.eye(3))[0]
+    assert 0 < pose.mahalanobis <= math.hypot(*xyh(pose))
+
+
 def test_the_distance_to_the_prior_is_in_standard_deviations_of_prior_and_pose_together():
     pose = poses_of(match=match_of(covariance=np.diag([4e-6, 9e-6])))[0]
     prior_covariance = np.array([[0.04, 0.01, 0], [0.01, 0.09, 0.001], [0, 0.001, 0.01]])

@@ -52,12 +52,13 @@ class Search:
         typer.Option("--filter", help="How frames are averaged: kalman or phasor-mean."),
     ] = "kalman"
     method: Annotated[
-        Literal["nearest", "refine"],
+        Literal["nearest", "refine"] | None,
         typer.Option(
             "--method",
-            help="refine: maximum likelihood, with covariance. nearest: the paper's minimum-distance classifier.",
+            help="refine: maximum likelihood, with covariance. nearest: the paper's minimum-distance classifier. Unless"
+            " stated: refine, or nearest where the bank knows no mixed pixels.",
         ),
-    ] = "refine"
+    ] = None
     free: Annotated[
         list[str] | None,
         typer.Option(
@@ -161,7 +162,7 @@ class Search:
     @property
     def near_the_axis(self) -> bool:
         """Whether the bearing is estimated with what is known of it, as nothing else is asked for."""
-        return self.method == "refine" and not self.free and not self.fix
+        return self.method != "nearest" and not self.free and not self.fix
 
     @property
     def _stated_std(self) -> dict[str, float | None]:
@@ -236,7 +237,7 @@ class Search:
 
         return Matcher(
             bank,
-            self.method,
+            self.method or "refine",
             free=None if self.near_the_axis else self.parameters,
             background=self.behind,
             bearing_std_rad=None if self.bearing_std is None else math.radians(self.bearing_std),
@@ -250,10 +251,11 @@ class Search:
         )
 
     def for_bank(self, bank: Bank) -> Search:
-        """Return the options with ranges as a chip reports them, where the bank's sensor has one and none is stated."""
-        from_mean = self.method == "nearest" or self.unknown_background or self.no_background
+        """Return the options with what is not stated: the method, and ranges as a chip reports them where one did."""
+        method = self.method or ("refine" if bank.plan.model == "ray" else "nearest")
+        from_mean = method == "nearest" or self.unknown_background or self.no_background
         chip = bank.sensor.histogram is not None and not from_mean
-        return replace(self, on=self.on or ("reported" if chip else "ranges"))
+        return replace(self, method=method, on=self.on or ("reported" if chip else "ranges"))
 
     def _stated_in(self, name: str, unit: float, otherwise: float) -> float:
         """Return a prior that is stated, in the unit of the matcher, or what holds where none is."""

@@ -29,6 +29,10 @@ CLEARLY_BEHIND_M = 0.4
 NEAREST_WALL_M = 0.05
 """Nothing nearer is taken for a wall or a floor."""
 _FEWEST = 6
+_FLOOR, _RECEDES, _ROUGHNESS_M = (3, 3), 1.25, 3e-3
+"""A floor fills three pixels in each of three rows or more; in one row it is farther than in another by a quarter."""
+_HEIGHTS = 256
+"""Most heights at which a floor is tried."""
 _BACKGROUND_STEP_M = 1e-3
 """Width of a difference between two places of a wall or floor."""
 _BACKGROUND_STEPS = 30
@@ -99,42 +103,77 @@ def estimate_surroundings(
     nothing = np.zeros(ranges.size, np.bool_)
     if returned.sum() < _FEWEST:
         return Surroundings(None, nothing, nothing)
-    forward = sensor.axis_cosine() * ranges
-    nearest = float(np.nanpercentile(forward, 5))
-    far = returned & (forward > nearest + CLEARLY_BEHIND_M)
-    lonely = far & _inner(far)  # away from the landmark: not mixed
-    pure = lonely if lonely.sum() >= _FEWEST else far
-    if not far.any():
-        return Surroundings(None, nothing, nothing)
     ray = _level_rays(sensor)
+    floor_m, on_floor = _floor_in_rows(ranges, frames.std_m[index], ray) if tilt_known else (None, nothing)
+    on_floor = on_floor.reshape(ranges.shape)
+    forward = sensor.axis_cosine() * ranges
+    standing = returned & ~on_floor
+    nearest = float(np.nanpercentile(forward[standing], 5)) if standing.any() else math.inf
+    far = standing & (forward > nearest + CLEARLY_BEHIND_M)
+    lonely = far & _inner(far | on_floor)  # away from the landmark: not mixed
+    pure = lonely if lonely.sum() >= _FEWEST else far
+    if not (far | on_floor).any():
+        return Surroundings(None, nothing, nothing)
     azimuth = math.radians(sensor.bearing_offset_deg)
-    if not bearing_known:
-        azimuth = float(np.arctan2(ray[1], ray[0])[returned & ~far].mean())
+    if not bearing_known and (standing & ~far).any():
+        azimuth = float(np.arctan2(ray[1], ray[0])[standing & ~far].mean())
     facing = math.cos(azimuth) * ray[0] + math.sin(azimuth) * ray[1]
     forward = ranges * facing
     down = -ray[2]
     above = pure & (down <= 0)
-    wall_m = _weighted_middle(forward[above] if above.sum() >= 3 else forward[pure])
+    wall_m = None
+    if far.any():
+        wall_m = _weighted_middle(forward[above] if above.sum() >= 3 else forward[pure])
     drop = down * ranges
-    short = pure & (down > 0) & (forward < wall_m - 0.1)
-    floor_m = None
-    if short.sum() >= _FEWEST:
+    short = pure & (down > 0) & (forward < (wall_m or 0.0) - 0.1)
+    if floor_m is None and short.sum() >= _FEWEST:
         height = drop[short]
         if not tilt_known:
             height = height - _slope_of(height, (ray * ranges)[:2, short])
         middle = float(np.median(height))
         if middle > NEAREST_WALL_M and np.median(np.abs(height - middle)) < 0.02 * middle:
             floor_m = middle
-    albedo = _USUAL_ALBEDO
+    albedo = floor_albedo = _USUAL_ALBEDO
     if frames.amplitude_e is not None:
-        unit = sensor.contrast * sensor.signal_e
-        lit = pure & ~short
-        # a wall across the line of sight: |S| = ρ cos θ / r², cos θ that of the ray
-        bright = frames.amplitude_e[index] / unit * ranges**2 / facing
-        if lit.any():
-            albedo = float(np.clip(np.median(bright[lit]) / landmark_scale, 1e-3, 1.0))
-    background = Background(wall_m=wall_m, floor_m=floor_m, wall_albedo=albedo, floor_albedo=albedo)
+        # a plane whose normal is θ off the line of sight: |S| = ρ cos θ / r²
+        bright = frames.amplitude_e[index] / (sensor.contrast * sensor.signal_e) * ranges**2 / landmark_scale
+        albedo = _albedo_of((bright / facing)[pure & ~short])
+        floor_albedo = albedo if not on_floor.any() else _albedo_of((bright / np.maximum(down, 1e-3))[on_floor])
+    pure = pure | (on_floor & _inner(far | on_floor))
+    far = far | on_floor
+    background = Background(wall_m=wall_m, floor_m=floor_m, wall_albedo=albedo, floor_albedo=floor_albedo)
     return Surroundings(background, (far | ~_inner(~far) & returned).ravel(), pure.ravel())
+
+
+def _floor_in_rows(
+    ranges: NDArray[np.float64], std_m: NDArray[np.float64], ray: NDArray[np.float64]
+) -> tuple[float | None, NDArray[np.bool_]]:
+    """Return how far below the lens a level floor lies, and which pixels show it, (rows, cols).
+
+    What stands upright is lower in each row below; a floor is as low in all of them, and nearer.
+    """
+    down = -ray[2]
+    seen = np.isfinite(ranges) & (down > 0)
+    drop, forward = np.where(seen, down * ranges, np.inf), ray[0] * ranges
+    tolerance = 4 * down * np.nan_to_num(std_m) + _ROUGHNESS_M
+    heights = np.sort(drop[seen & (drop > NEAREST_WALL_M)])
+    best, on_floor = None, np.zeros(ranges.shape, np.bool_)
+    for height in heights[:: max(1, len(heights) // _HEIGHTS)]:
+        agrees = np.abs(drop - height) < tolerance
+        rows = np.flatnonzero(agrees.sum(axis=1) >= _FLOOR[0])
+        if agrees.sum() <= on_floor.sum() or len(rows) < _FLOOR[1]:
+            continue
+        middle = [float(np.median(forward[row][agrees[row]])) for row in rows]
+        if max(middle) > _RECEDES * min(middle):
+            best, on_floor = float(height), agrees
+    if best is not None:
+        best = _weighted_middle(drop[on_floor])
+    return best, on_floor
+
+
+def _albedo_of(brightness: NDArray[np.float64]) -> float:
+    """Return the albedo of the pixels that see a plane alone; the usual one where none does."""
+    return float(np.clip(np.median(brightness), 1e-3, 1.0)) if brightness.size else _USUAL_ALBEDO
 
 
 def _slope_of(height: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:

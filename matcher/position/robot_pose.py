@@ -305,7 +305,13 @@ def _mahalanobis(
     difference = np.array([*difference[:2], _wrap(difference[2])])
     total = prior if pose is None else prior + pose
     try:
-        squared = float(difference @ np.linalg.solve(total, difference))
+        if pose is None or np.linalg.matrix_rank(prior) < len(prior):
+            squared = float(difference @ np.linalg.solve(total, difference))
+        else:  # beside the widths of a refused match, any number of metres, those of a prior are rounded away in a sum
+            whitened = np.linalg.inv(np.linalg.cholesky(prior))
+            widths, axes = np.linalg.eigh(whitened @ pose @ whitened.T)
+            along = axes.T @ whitened @ difference
+            squared = float((along**2 / (1 + np.maximum(widths, 0.0))).sum())
     except np.linalg.LinAlgError:
         message = "'prior_covariance' leaves a direction without any width: give each one a variance"
         raise UsageError(message) from None
