@@ -241,7 +241,11 @@ class Matcher:
         self._method: MatchMethod
         if on == "reported" and (method != "refine" or bank.sensor.histogram is None):
             raise UsageError('on="reported" goes with method "refine" and a direct sensor with a [histogram] table')
-        if method == "refine" and background == "any":
+        if on == "reported" and (background == "auto" or isinstance(background, Background)):
+            raise UsageError(
+                "on=\"reported\" takes what stands behind the landmark for unknown: leave 'background' out"
+            )
+        if method == "refine" and background == "any" and on != "reported":
             self._by_evidence = self._stages(arguments)
             self.free = self._by_evidence[0].free
             return
@@ -353,8 +357,6 @@ class Matcher:
             behind.append("auto")
         if on != "phasors":
             behind.append("unknown")
-        if on == "reported":  # what stands behind is unknown in any case
-            behind = ["unknown"]
         return [Matcher(self.bank, "refine", **{**arguments, "background": own}) for own in behind]
 
     def _match_by_evidence(self, frames: FilteredFrames | HistogramFrames | Targets) -> Matches:

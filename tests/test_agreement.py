@@ -116,6 +116,13 @@ def test_only_the_final_covariance_excuses_pixels_that_a_view_contradicts(thin_b
     assert found.wrong_accepted == 0
 
 
+def test_a_lost_view_is_looked_for_at_its_best_distance(thin_bank):
+    # around the scout's view, at its own distance, all angles led to one side minimum, and the back was accepted
+    found = count(thin_bank("frame", "vl53l5cx-8x8"), "plain", 100, 1, np.random.default_rng([5, 1]))
+    assert found.wrong_accepted == 0
+    assert found.right >= 94
+
+
 def test_the_nearest_image_is_ambiguous_where_another_one_explains_a_frame_as_well(thin_bank):
     # near the camera a face of the bracket's plate, its back and a face of its arm look alike
     found = count(thin_bank("bracket", "pmd-16x16"), "nearest", 60, 1, np.random.default_rng([3, 7]))

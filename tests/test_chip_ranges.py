@@ -140,6 +140,9 @@ def test_accepted_answers_for_frames_of_a_chip_are_right():
 def test_what_a_chip_reports_is_asked_of_a_sensor_with_a_chip_alone():
     with pytest.raises(UsageError, match="goes with method"):
         Matcher(bank("cone"), "nearest", on="reported")
+    for behind in ("auto", Background(wall_m=2.0)):
+        with pytest.raises(UsageError, match="takes what stands behind the landmark for unknown"):
+            Matcher(bank("cone"), "refine", on="reported", background=behind)
     with build_bank({"classes": ("cone",), "distance_m": "1.0", "delta_deg": "0"}) as phase:
         with pytest.raises(UsageError, match=r"\[histogram\] table"):
             Matcher(phase, "refine", on="reported")

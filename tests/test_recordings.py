@@ -107,8 +107,9 @@ def test_without_moving_one_note_says_that_something_moved(run, folder):
     assert len(err.splitlines()) == 1
     assert err.startswith(f"note: {folder / 'flight.csv'}: the camera or the scene moved during the file")
     assert "--moving matches every frame by itself" in err
-    code, _, err = run("match", folder / "bank.h5", folder / "still.csv", *READ)
+    code, _, err = run("match", folder / "bank.h5", folder / "still.csv", *READ, *WALL)
     assert (code, "moved" in err) == (0, False)
+    assert err.startswith("note: of ranges as a chip reports them what stands behind the landmark is unknown")
 
 
 def test_the_note_names_the_first_position_that_moved(run, folder, tmp_path):

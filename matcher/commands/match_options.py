@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from phasemark import UsageError
-from phasemark.data.commands.console import LongWork
+from phasemark.data.commands.console import LongWork, tell
 from phasemark.data.commands.inputs import background_of, open_any_bank, read_landmark, read_sensor, sensor_of_board
 from phasemark.data.commands.options import (
     Floor,
@@ -149,8 +149,10 @@ class Search:
     @property
     def behind(self) -> Background | Literal["auto", "unknown", "any"] | None:
         """Background of the matcher: what is stated, or what the frames tell."""
-        if self.auto_background or self.unknown_background:
-            return "auto" if self.auto_background else "unknown"
+        if self.unknown_background or self.on == "reported":
+            return "unknown"
+        if self.auto_background:
+            return "auto"
         stated = self.no_background or self.background is not None
         return self.background if stated or self.method == "nearest" or self.is_direct else "any"
 
@@ -255,7 +257,13 @@ class Search:
         method = self.method or ("refine" if bank.plan.model == "ray" else "nearest")
         from_mean = method == "nearest" or self.unknown_background or self.no_background
         chip = bank.sensor.histogram is not None and not from_mean
-        return replace(self, method=method, on=self.on or ("reported" if chip else "ranges"))
+        found = replace(self, method=method, on=self.on or ("reported" if chip else "ranges"))
+        if found.on == "reported" and (self.auto_background or self.no_background or self.background is not None):
+            tell(
+                "note: of ranges as a chip reports them what stands behind the landmark is unknown; --on ranges takes"
+                " --auto-background, --no-background, --wall and --floor"
+            )
+        return found
 
     def _stated_in(self, name: str, unit: float, otherwise: float) -> float:
         """Return a prior that is stated, in the unit of the matcher, or what holds where none is."""

@@ -231,7 +231,9 @@ class _Setup:
         free = VIEW if told["free"] is None else check_free(told["free"])
         # the last background that was tried in turn takes all for unknown: before that, wall and floor were estimated
         behind: Background | Literal["auto"] | None = None if unknown else told["background"]
-        if told["background"] == "any":
+        if told["on"] == "reported":  # which takes all for unknown
+            behind = None
+        elif told["background"] == "any":
             behind = "auto"
         return cls(False, free, behind, options)
 
@@ -369,6 +371,8 @@ class _Trials:
 
     def _other_background(self) -> _Found:
         """Match with wall and floor estimated, or with none where some were stated."""
+        if self.setup.options.get("on") == "reported":
+            return []
         tried: list[tuple[Background | Literal["auto"] | None, Background | None]] = []
         if isinstance(self.setup.background, Background):
             tried.append((None, None))
