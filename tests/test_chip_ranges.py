@@ -6,10 +6,12 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+import trimesh
 
 from phasemark import UsageError
 from phasemark.data import build_bank
 from phasemark.data.measured.simulated import simulate_recording
+from phasemark.data.plans.bank_plan import MeshPlan
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.chi_squared import p_values_of
@@ -135,6 +137,23 @@ def test_accepted_answers_for_frames_of_a_chip_are_right():
             count[match.accepted, right] += 1
     assert count[True, False] == 0, count
     assert count[True, True] >= 0.6 * (count[True, True] + count[False, True]), count
+
+
+def test_a_part_of_two_boxes_is_found_by_a_tilted_camera_over_a_floor(tmp_path):
+    """Most zones see wall and floor: the bound of the right cell was 50 above that of others, and it was not tried."""
+    plate = trimesh.creation.box((0.2, 0.16, 0.02), trimesh.transformations.translation_matrix((0, 0, -0.07)))
+    arm = trimesh.creation.box((0.06, 0.12, 0.16), trimesh.transformations.translation_matrix((-0.05, 0.01, 0.01)))
+    trimesh.boolean.union([plate, arm]).export(tmp_path / "dock.stl")
+    part = MeshPlan(name="dock", path=str(tmp_path / "dock.stl"), unit="m")
+    grid = {"distance_m": "0.5:0.8:0.02", "delta_deg": "0:360:4", "layout": "full"}
+    with build_bank({"sensor": "vl53l5cx-8x8", "meshes": (part,), **grid}) as opened:
+        view = Views.broadcast(0.62, *np.radians([25.0, 2.0]), 0.0, *np.radians([1.5, -1.0]))
+        behind = Background(wall_m=1.3, floor_m=0.3)
+        recorded = simulate_recording(opened.mesh("dock"), "dock", SENSOR, view[np.zeros(20, np.int64)], seed=0, background=behind)
+        (match,) = Matcher(opened, "refine", on="reported").match(kalman_filter(recorded.frames))
+    assert match.accepted
+    assert match.distance_m == pytest.approx(0.62, abs=2e-3)
+    assert match.delta_rad == pytest.approx(math.radians(25.0), abs=math.radians(1.5))
 
 
 def test_what_a_chip_reports_is_asked_of_a_sensor_with_a_chip_alone():

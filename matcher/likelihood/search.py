@@ -26,7 +26,8 @@ _REFUSED_P = 0.01
 
 
 _SLACK = 8 * DISAGREEMENT
-"""Cost by which a scout in the middle of a cell may be above a view of it, among the few zones of a chip."""
+"""Cost by which a scout in the middle of a cell may be above a view of it, among the few zones of a chip, and by which
+the bound of another cell may be below that of the right one, whose views are level."""
 _STARTS_AT_ONCE = 4096
 """Starts that are refined together, but for those of one frame: each has an image of it."""
 
@@ -51,7 +52,7 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     cost_of = costs_on_scout(setup, scene, evidence, which)
     limit, search = _limit(setup, seen[which], nu[which]), scene.search.of_frames(which)
     if setup.unknown and setup.reports_one_surface:  # where most zones see other things, no view explains a frame
-        limit = search.least_bounds(seen[which], limit) + setup.rival_cost
+        limit = search.least_bounds(seen[which], limit) + setup.rival_cost + _SLACK
     starts = search.starts(seen[which], limit, cost_of)
     # 3, 4  descend from there, and refine on final images
     fits = fit_starts(setup, scene, evidence, which, starts, _most(setup, evidence[which]))
