@@ -149,7 +149,9 @@ def test_a_part_of_two_boxes_is_found_by_a_tilted_camera_over_a_floor(tmp_path):
     with build_bank({"sensor": "vl53l5cx-8x8", "meshes": (part,), **grid}) as opened:
         view = Views.broadcast(0.62, *np.radians([25.0, 2.0]), 0.0, *np.radians([1.5, -1.0]))
         behind = Background(wall_m=1.3, floor_m=0.3)
-        recorded = simulate_recording(opened.mesh("dock"), "dock", SENSOR, view[np.zeros(20, np.int64)], seed=0, background=behind)
+        recorded = simulate_recording(
+            opened.mesh("dock"), "dock", SENSOR, view[np.zeros(20, np.int64)], seed=0, background=behind
+        )
         (match,) = Matcher(opened, "refine", on="reported").match(kalman_filter(recorded.frames))
     assert match.accepted
     assert match.distance_m == pytest.approx(0.62, abs=2e-3)
