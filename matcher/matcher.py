@@ -42,6 +42,8 @@ from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
 
 METHODS = ("nearest", "refine")
+_LEAST = 1e-9
+"""Least standard deviation or tolerance, metres or radians: the square of a smaller one is lost in rounding."""
 
 
 class MatchMethod(Protocol):
@@ -190,6 +192,8 @@ class Matcher:
                 continue
             if not value > 0:
                 raise UsageError(f"'{name}' must be positive, got {value!r}")
+            if value < _LEAST:
+                raise UsageError(f"'{name}' must be at least {_LEAST:g}, got {value!r}: leave out of 'free' what is 0")
             widest = math.pi if name == "tolerance_rad" else math.pi / 4
             if name.endswith("_rad") and widest < value < math.inf:
                 raise UsageError(

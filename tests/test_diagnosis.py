@@ -48,7 +48,9 @@ def moved(frames, move):
 
 
 def diagnosis_of(bank, frames, background=None):
-    return diagnose(Matcher(bank, "refine", free=("distance_m", "delta_rad"), background=background), frames)
+    return diagnose(
+        Matcher(bank, "refine", free=("distance_m", "delta_rad"), background=background), frames, seconds=120.0
+    )
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -123,6 +125,28 @@ def test_a_landmark_outside_the_bank_is_found_at_its_distance(banks, distance_m)
     found = diagnosis_of(banks["pmd-16x16"], frames_of("pmd-16x16", distance_m, 0.7))
     assert [change.parameter for change in found.changes] == ["distance_m"]
     assert found.changes[0].value == pytest.approx(distance_m, abs=3e-3)  # five standard deviations
+
+
+@pytest.mark.parametrize(("parameter", "value"), [("pitch_rad", -0.052), ("roll_rad", 0.07), ("height_m", 0.03)])
+def test_a_tilted_or_lifted_camera_is_diagnosed_with_what_was_not_free(banks, parameter, value):
+    view = {"height_m": 0.0, "pitch_rad": 0.0, "roll_rad": 0.0, parameter: value}
+    found = diagnosis_of(banks["pmd-16x16"], frames_of("pmd-16x16", *CONE_VIEW, 0.0, *view.values()))
+    (change,) = [one for one in (*found.changes, *found.alternatives) if parameter in one.value]
+    assert change.parameter == "free"
+    assert change.words.startswith(f"the {parameter.split('_')[0]} free (")
+    if change == found.changes[0]:
+        assert getattr(found.match, parameter) == pytest.approx(value, abs=5e-3)
+
+
+def test_a_thing_beside_the_landmark_is_diagnosed_as_unknown(banks):
+    frames = frames_of("pmd-16x16", *CONE_VIEW)
+    for name in ARRAYS:
+        if (values := getattr(frames, name)) is not None:
+            values[..., :3] = values[0, 12, 8]
+    frames.range_m[..., :3] = 0.8
+    found = diagnosis_of(banks["pmd-16x16"], frames)
+    assert [(change.parameter, change.value) for change in found.changes] == [("background", "unknown")]
+    assert found.match.distance_m == pytest.approx(CONE_VIEW[0], abs=5e-3)
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -203,6 +203,7 @@ def test_the_bound_of_a_prior_free_fit_grows_with_every_free_number(renderers):
         ({"free": VIEW[1:]}, "'free' must name distance_m and delta_rad"),
         ({"free": VIEW, "pitch_std_rad": 0.0}, "'pitch_std_rad' must be positive"),
         ({"free": VIEW, "height_std_m": -1.0}, "'height_std_m' must be positive"),
+        ({"free": VIEW, "roll_std_rad": 1e-320}, "'roll_std_rad' must be at least 1e-09"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(bank, options, words):

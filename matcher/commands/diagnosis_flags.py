@@ -38,10 +38,14 @@ def _flags(change: Change, given: Given) -> str:
     if change.parameter == "method":
         return refine.strip()
     if change.parameter == "free":
-        return f"{refine}--free bearing" + (" instead of --fix bearing" if given.bearing_fixed else "")
+        names = [name.removesuffix("_rad").removesuffix("_m") for name in value[2:]]
+        instead = " instead of --fix bearing" if given.bearing_fixed and "bearing" in names else ""
+        return refine + " ".join(f"--free {name}" for name in names) + instead
+    if change.parameter == "on":
+        return f"{refine}--on {value}"
     if change.parameter == "background":
-        if value == "auto":
-            return f"{refine}--auto-background"
+        if isinstance(value, str):
+            return f"{refine}--{value}-background"
         if value is None:
             return f"{refine}without --wall and --floor".strip()
         planes = ((f"--{name}", getattr(value, f"{name}_m")) for name in ("wall", "floor"))

@@ -322,7 +322,7 @@ class _Answers:
         search = self._search
         # among the frames of a moving camera some do not show the landmark: that needs no diagnosis
         some_right = self._moving and self._n_accepted
-        if self._refused is None or self._results.no_diagnosis or search.unknown_background or some_right:
+        if self._refused is None or self._results.no_diagnosis or some_right:
             return
         index, filtered = self._refused
         try:

@@ -27,10 +27,12 @@ from phasemark.matcher.likelihood.background_estimate import estimate_surroundin
 from phasemark.matcher.likelihood.setup import check_free
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
-from phasemark.render import Background, Sensor
+from phasemark.matcher.recordings.bank_for_frames import distances_of_frames
+from phasemark.render import Background, Frames, Sensor
 
 Parameter = Literal[
     "method",
+    "on",
     "free",
     "bearing_offset_deg",
     "background",
@@ -43,7 +45,6 @@ Parameter = Literal[
     "distance_m",
 ]
 VIEW = ("distance_m", "delta_rad")
-BEARING = (*VIEW, "bearing_rad")
 FEWEST_RETURNS = 3
 """Fewer returns give no view."""
 FEWEST_DOF = 3
@@ -56,6 +57,8 @@ WORTH_A_MATCH = 60.0
 """Cost above what noise explains up to which a rough fit is matched: two pixels that contradict it, and a little."""
 CLEARLY_ASIDE_RAD = math.radians(0.5)
 """Before a background a rough fit knows the bearing better than that."""
+_MIXING = 0.5
+"""Least share of pixels that return where something stands behind the landmark, so that zones see two surfaces."""
 _FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
 _WINDOW_M, _WINDOW_RAD = 0.01, math.radians(1.0)
 _WINDOW_STEPS = 4
@@ -68,7 +71,7 @@ class Change:
     Parameters
     ----------
     parameter : str
-        "method" and "free" and "background" of :class:`~phasemark.matcher.Matcher`; "flip_h", "flip_v", "rotate" and
+        "method", "on", "free" and "background" of :class:`~phasemark.matcher.Matcher`; "flip_h", "flip_v", "rotate" and
         "quantity" of :func:`phasemark.data.read_frames`, applied after those given; "unit_factor", by which the ranges
         are multiplied; "bearing_offset_deg" and "half_angle_deg" of the sensor the bank is built for; "distance_m",
         which the bank does not reach.
@@ -112,6 +115,8 @@ class Diagnosis:
         How many pixels returned.
     stopped : bool
         Whether time was up before every change was tried.
+    among_unknown : bool
+        Whether it was matched among unknown things, so that neither background nor field of view was changed.
     """
 
     index: int
@@ -121,6 +126,7 @@ class Diagnosis:
     alternatives: tuple[Change, ...] = ()
     n_returned: int = 0
     stopped: bool = False
+    among_unknown: bool = False
 
     @property
     def enough_alone(self) -> bool:
@@ -141,8 +147,9 @@ class Diagnosis:
                 return f"{head}: {self.n_returned} of its pixels return, and {FEWEST_RETURNS} are needed"
             if self.stopped:
                 return f"{head}: none of the changes tried makes it fit, and time was up before all were tried"
+            also = "" if self.among_unknown else ", background, field of view"
             return (
-                f"{head}: no change of bearing, background, orientation, unit, quantity, field of view or distance"
+                f"{head}: no change of bearing, orientation, unit, quantity, distance{also}, pitch, roll or height"
                 " makes it fit: it may show another landmark, or none"
             )
 
@@ -186,10 +193,8 @@ def _remedy(change: Change) -> str:
     value = change.value
     if change.parameter == "method":
         return "method='refine'"
-    if change.parameter == "free":
-        return f"free={value!r}"
-    if change.parameter == "background":
-        return f"background={value!r}"
+    if change.parameter in ("on", "free", "background"):
+        return f"{change.parameter}={value!r}"
     if change.parameter in ("flip_h", "flip_v"):
         return f"{change.parameter} the other way round"
     if change.parameter == "rotate":
@@ -205,13 +210,27 @@ def _remedy(change: Change) -> str:
     return f"a bank with distances to {value:.3g} m"
 
 
+_Behind = Background | Literal["auto", "unknown"] | None
+
+
 @dataclass(frozen=True, eq=False)
 class _Setup:
-    """Settings of a matcher that are needed to build another one like it."""
+    """Settings of a matcher that are needed to build another one like it.
+
+    Parameters
+    ----------
+    nearest : bool
+    free : tuple of str
+        What is estimated; None of `default` stands for it where their priors count.
+    default : tuple of str or None
+    background : Background, "auto", "unknown" or None
+    options : mapping
+    """
 
     nearest: bool
     free: tuple[str, ...]
-    background: Background | Literal["auto"] | None
+    default: tuple[str, ...] | None
+    background: _Behind
     options: Mapping[str, Any]
 
     @classmethod
@@ -219,27 +238,36 @@ class _Setup:
         """Copy the options of a matcher; only this function knows them all."""
         told = matcher.options
         if matcher.method == "nearest":
-            return cls(True, VIEW, background, {"false_alarm": matcher.false_alarm})
-        unknown = told["background"] == "unknown"
+            return cls(True, VIEW, None, background, {"false_alarm": matcher.false_alarm})
         options = {
             "false_alarm": matcher.false_alarm,
             "on": told["on"] if len(matcher.bank.sensor.frequencies_hz) == 1 else "ranges",
             "pixels": told["pixels"],
-            "robust": told["robust"] or unknown,
+            "robust": told["robust"],
         }
-        # a bearing with a prior is searched again without one
-        free = VIEW if told["free"] is None else check_free(told["free"])
-        # the last background that was tried in turn takes all for unknown: before that, wall and floor were estimated
-        behind: Background | Literal["auto"] | None = None if unknown else told["background"]
-        if told["on"] == "reported":  # which takes all for unknown
-            behind = None
-        elif told["background"] == "any":
-            behind = "auto"
-        return cls(False, free, behind, options)
+        # before unknown things was tried last of all: the fits before that tell more
+        behind: _Behind = "auto" if told["background"] == "any" else told["background"]
+        if told["on"] == "reported":
+            behind = "unknown"
+        default = matcher.free if behind == "unknown" and told["free"] is None else None
+        # elsewhere a bearing with a prior is searched again without one
+        free = default or (VIEW if told["free"] is None else check_free(told["free"]))
+        return cls(False, free, default, behind, options)
 
-    def matcher(self, bank: Bank, free: Sequence[str], background: Background | Literal["auto"] | None) -> Matcher:
+    @property
+    def among_unknown(self) -> bool:
+        """Whether unknown things may stand in view, which a rough fit takes for parts of the landmark."""
+        return self.background == "unknown"
+
+    @property
+    def bearing_is_free(self) -> bool:
+        """Whether the bearing is estimated without a prior."""
+        return "bearing_rad" in self.free and self.default is None
+
+    def matcher(self, bank: Bank, free: Sequence[str], background: _Behind, **options: Any) -> Matcher:
         """Build a matcher like it by maximum likelihood."""
-        return Matcher(bank, "refine", free=free, background=background, **self.options)
+        told = None if free == self.default else free
+        return Matcher(bank, "refine", free=told, background=background, **{**self.options, **options})
 
 
 def diagnose(
@@ -248,13 +276,15 @@ def diagnose(
     index: int = 0,
     *,
     background: Background | None = None,
-    seconds: float = 10.0,
+    seconds: float = 20.0,
 ) -> Diagnosis:
     """Find the cheapest change of settings that makes a refused frame fit.
 
-    Single changes are tried in the order of what they cost the user: a free bearing, another background, the image
-    turned or mirrored, another quantity or unit, another field of view, a distance the bank does not reach. Then
-    pairs of a bearing with one of the others. It takes 1 to 3 s of processor time on usual views.
+    Single changes are tried in the order of what they cost the user: a free bearing, another background, ranges as the
+    chip reports them, the image turned or mirrored, another quantity or unit, a distance the bank does not reach,
+    pitch, roll and height, another field of view, unknown things in view. Then pairs of a bearing with one of the
+    others. Of a matcher among unknown things background and field of view are left as they are. It takes 1 to 5 s of
+    processor time on usual views.
 
     Parameters
     ----------
@@ -294,7 +324,8 @@ def diagnose(
     if refused.accepted:
         raise UsageError(f"frame {index} is accepted: there is nothing to diagnose")
     n_returned = int((frame.state == PixelState.RETURN).sum())
-    nothing = Diagnosis(index, refused, n_returned=n_returned)
+    setup = _Setup.of(matcher, background)
+    nothing = Diagnosis(index, refused, n_returned=n_returned, among_unknown=setup.among_unknown)
     end = time.monotonic() + seconds
     if n_returned < FEWEST_RETURNS or matcher.bank.plan.model != "ray":
         return nothing
@@ -303,7 +334,7 @@ def diagnose(
         bank = OneFrequencyBank(bank, "combined")
         frame = bank.one.frames(frame)
     with ExitStack() as stack:
-        trials = _Trials(bank, _Setup.of(matcher, background), frame, refused, stack)
+        trials = _Trials(bank, setup, frame, refused, stack)
         for found in trials.in_order():
             if found:
                 (changes, match), *others = found
@@ -325,31 +356,77 @@ class _Trials:
         self.search = Search(bank)
         self.plain = setup.matcher(bank, setup.free, setup.background)
         self.reference = self.plain.match(frame)[0] if setup.nearest else refused
-        self.bearing_free = "bearing_rad" in setup.free
-        self.with_bearing = setup.free if self.bearing_free else (*VIEW, "bearing_rad", *setup.free[2:])
-        self.stated = self._estimated() if setup.background == "auto" else setup.background
+        self.bearing_free = setup.bearing_is_free
+        self.with_bearing = check_free(tuple(dict.fromkeys((*setup.free, "bearing_rad"))))
+        self.stated = self._estimated() if isinstance(setup.background, str) else setup.background
         assert self.stated is None or isinstance(self.stated, Background)
 
     def in_order(self) -> Iterator[_Found]:
         """Try changes, the cheapest first; yield those that make the frame fit, usually none."""
         if self.setup.nearest and self.reference.accepted:
             yield [((_METHOD,), self.reference)]
+        if self.setup.among_unknown:
+            yield self._freed(("bearing_rad",))
+            yield self._transformed()
+            yield self._outside_among_unknown()
+            yield self._tilted()
+            return
         rough = self._rough(self.frame, self.stated)
         outside = rough is not None and not self._inside(rough.distance_m)
         if not self.bearing_free and not outside:
             yield self._bearing(rough, self.frame, self.setup.background, ())
         yield self._other_background()
+        yield self._reported()
         yield self._transformed()
         yield self._outside(rough)
+        yield self._tilted()
         yield self._field_of_view()
+        yield self._among_unknown()
         if not self.bearing_free and rough is None:
             yield self._transformed_with_bearing()
+
+    def _freed(self, names: Sequence[str]) -> _Found:
+        """Match with more of the view free."""
+        free = check_free(tuple(dict.fromkeys((*self.setup.free, *names))))
+        if free == self.setup.free and self.setup.default is None:
+            return []
+        match = self._matched(free, self.setup.background)
+        return [] if match is None else [((_free(match, free, self.setup.free),), match)]
+
+    def _tilted(self) -> _Found:
+        """Match with pitch, roll or height free, or with all of them."""
+        names = [name for name in ("pitch_rad", "roll_rad", "height_m") if name not in self.setup.free]
+        single = [found for name in names for found in self._freed((name,))]
+        return single or (self._freed(names) if len(names) > 1 else [])
+
+    def _reported(self) -> _Found:
+        """Match as ranges that a chip reports, where the sensor is one and zones may see a background too."""
+        if self.bank.sensor.histogram is None or self.setup.options.get("on", "ranges") != "ranges":
+            return []
+        if (self.frame.state == PixelState.RETURN).mean() < _MIXING:
+            return []
+        match = Matcher(self.bank, "refine", on="reported", false_alarm=self.plain.false_alarm).match(self.frame)[0]
+        change = Change("on", "reported", "ranges as the chip reports them, of the nearest surface of each zone")
+        return [((change,), match)] if self._counts(match) and self._inside(match.distance_m) else []
+
+    def _among_unknown(self) -> _Found:
+        """Match among unknown things."""
+        if self.setup.options.get("on", "ranges") != "ranges":
+            return []
+        match = self._matched(self.setup.free, "unknown", robust=False)
+        change = Change("background", "unknown", "other things before, beside or behind the landmark")
+        return [] if match is None else [((change,), match)]
+
+    def _matched(self, free: Sequence[str], background: _Behind, **options: Any) -> Match | None:
+        """Match with other settings; None if it is refused or outside the bank."""
+        match = self.setup.matcher(self.bank, free, background, **options).match(self.frame)[0]
+        return match if self._counts(match) and self._inside(match.distance_m) else None
 
     def _bearing(
         self,
         rough: Fit | None,
         frame: FilteredFrames,
-        background: Background | Literal["auto"] | None,
+        background: _Behind,
         before: tuple[Change, ...],
     ) -> _Found:
         """Match a frame with the bearing free, where a rough fit promises something."""
@@ -357,7 +434,7 @@ class _Trials:
             return []
         match = self.setup.matcher(self.bank, self.with_bearing, background).match(frame)[0]
         if self._counts(match) and self._inside(match.distance_m):
-            return [((*before, _free_bearing(match, self.with_bearing)), match)]
+            return [((*before, _free(match, self.with_bearing, self.setup.free)), match)]
         # the matcher's own search of bearings may miss what a camera stated to look there finds
         sensor = self._turned(rough)
         turned = self._match_window(rough, frame, sensor, self.with_bearing, background)
@@ -371,9 +448,7 @@ class _Trials:
 
     def _other_background(self) -> _Found:
         """Match with wall and floor estimated, or with none where some were stated."""
-        if self.setup.options.get("on") == "reported":
-            return []
-        tried: list[tuple[Background | Literal["auto"] | None, Background | None]] = []
+        tried: list[tuple[_Behind, Background | None]] = []
         if isinstance(self.setup.background, Background):
             tried.append((None, None))
         estimated = self._estimated()
@@ -389,7 +464,7 @@ class _Trials:
                 scene = scene if rough is None else fitted_wall(self.frame, scene, rough.bearing_rad)
             if rough is None:
                 continue
-            stated: list[Background | Literal["auto"] | None] = [background]
+            stated: list[_Behind] = [background]
             if scene is not None and scene.wall_m is not None:
                 stated.append(scene)
             aside = abs(rough.bearing_rad) > CLEARLY_ASIDE_RAD and not self.bearing_free
@@ -430,19 +505,33 @@ class _Trials:
             sensor = self._turned(rough) if free == self.with_bearing else self.bank.sensor
             found = self._match_window(rough, self.frame, sensor, free, self.setup.background)
             if found is not None and not self._inside(found.distance_m):
-                match = found
-                first, last = float(self.bank.distance_m[0]), float(self.bank.distance_m[-1])
-                where = (
-                    f"before its first, {first:.3g} m" if match.distance_m < first else f"beyond its last, {last:.3g} m"
-                )
-                change = Change(
-                    "distance_m", match.distance_m, f"a bank that reaches {match.distance_m:.3g} m, {where}"
-                )
+                change = self._distance(found.distance_m)
                 if free == self.setup.free:
-                    return [((change,), match)]
-                match = self._turned_back(match, sensor)
-                return [((change, _free_bearing(match, self.with_bearing)), match)]
+                    return [((change,), found)]
+                match = self._turned_back(found, sensor)
+                return [((change, _free(match, self.with_bearing, self.setup.free)), match)]
         return []
+
+    def _outside_among_unknown(self) -> _Found:
+        """Match before images at all distances that the frame asks for."""
+        returned = np.where(self.frame.state == PixelState.RETURN, self.frame.range_m, np.nan)
+        seen = Frames(returned[:, None], sensor=self.frame.sensor)
+        with suppress(UsageError):  # the landmark cannot be in the frame
+            meshes = [self.bank.mesh(name) for name in self.bank.classes]
+            distance_m = sorted({d for mesh in meshes for d in distances_of_frames(seen, mesh)})
+            wide = self.stack.enter_context(
+                rebuild_bank(self.bank, distance_m=distance_m, delta_deg=np.degrees(self.bank.delta_rad).tolist())
+            )
+            match = self.setup.matcher(wide, self.setup.free, self.setup.background).match(self.frame)[0]
+            if self._counts(match) and not self._inside(match.distance_m):
+                return [((self._distance(match.distance_m),), match)]
+        return []
+
+    def _distance(self, distance_m: float) -> Change:
+        """Return the change to a bank that reaches a distance."""
+        first, last = float(self.bank.distance_m[0]), float(self.bank.distance_m[-1])
+        where = f"before its first, {first:.3g} m" if distance_m < first else f"beyond its last, {last:.3g} m"
+        return Change("distance_m", distance_m, f"a bank that reaches {distance_m:.3g} m, {where}")
 
     def _field_of_view(self) -> _Found:
         """Match before images of a camera with another field of view."""
@@ -469,7 +558,7 @@ class _Trials:
         frame: FilteredFrames,
         sensor: Sensor,
         free: Sequence[str],
-        background: Background | Literal["auto"] | None,
+        background: _Behind,
     ) -> Match | None:
         """Match before a small bank of one class about a rough fit; None if it is refused."""
         steps = np.arange(-_WINDOW_STEPS, _WINDOW_STEPS + 1)
@@ -524,11 +613,20 @@ def _is_promising(fit: Fit) -> bool:
 _METHOD = Change("method", "refine", "views between the bank's images")
 
 
-def _free_bearing(match: Match, free: tuple[str, ...]) -> Change:
-    return Change("free", free, f"the bearing free (bearing {math.degrees(match.bearing_rad):.2g}°)")
+def _free(match: Match, free: Sequence[str], before: Sequence[str]) -> Change:
+    """Return the change that frees parameters, with what is found of those that were not free."""
+    added = [name for name in free if name not in before] or ["bearing_rad"]
+    found = [
+        f"{name.removesuffix('_m')} {getattr(match, name):.3f} m"
+        if name.endswith("_m")
+        else f"{name.removesuffix('_rad')} {math.degrees(getattr(match, name)):.2g}°"
+        for name in added
+    ]
+    words = " and ".join(name.removesuffix("_rad").removesuffix("_m") for name in added)
+    return Change("free", tuple(free), f"the {words} free ({', '.join(found)})")
 
 
-def _background(background: Background | Literal["auto"] | None, found: Background | None) -> Change:
+def _background(background: _Behind, found: Background | None) -> Change:
     if background is None:
         return Change("background", None, "nothing behind the landmark")
     planes = []
