@@ -51,9 +51,7 @@ def _flags(change: Change, given: Given) -> str:
         planes = ((f"--{name}", getattr(value, f"{name}_m")) for name in ("wall", "floor"))
         return refine + " ".join(f"{option} {metres:.4f}" for option, metres in planes if metres is not None)
     if change.parameter in ("flip_h", "flip_v"):
-        horizontal = (change.parameter == "flip_h") != turned
-        option = "--flip-h" if horizontal else "--flip-v"
-        return f"without {option}" if (given.reading.flip_h if horizontal else given.reading.flip_v) else option
+        return _flip((change.parameter == "flip_h") != turned, given.reading)
     if change.parameter == "rotate":
         angle = (given.reading.rotate + value) % 360
         return f"--rotate {angle}" if angle else "without --rotate"
@@ -71,3 +69,9 @@ def _flags(change: Change, given: Given) -> str:
     if change.parameter == "bearing_offset_deg":
         return f"a bank of a sensor file with bearing_offset_deg = {value:.3g}, or the camera turned"
     return f"phasemark bank build --distance with a grid that has {value:.2f} m"
+
+
+def _flip(horizontal: bool, reading: FrameReading) -> str:
+    """Return the option that mirrors the frames once more."""
+    option = "--flip-h" if horizontal else "--flip-v"
+    return f"without {option}" if (reading.flip_h if horizontal else reading.flip_v) else option
