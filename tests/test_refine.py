@@ -258,6 +258,19 @@ def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, ren
         assert match.delta_rad == pytest.approx(delta, abs=math.radians(0.3))
 
 
+@pytest.mark.parametrize("wall_m", [None, 2.2])
+def test_what_stands_behind_is_found_and_then_costs_few_views_more(bank, renderers, wall_m):
+    behind, rng = None if wall_m is None else Background(wall_m=wall_m), np.random.default_rng(8)
+    matcher, plain = Matcher(bank, "refine", background="auto"), Matcher(bank, "refine")
+    for name in NAMES:
+        view = Views.broadcast(rng.uniform(0.8, 1.4), rng.uniform(0, 3))
+        frames = noisy_frames(renderers[name], SENSOR, view, TrialSetup(background=behind, n_frames=5), rng)
+        found = matcher.match(frames)[0]
+        assert len(found.alternatives) < 100  # with edges that may show anything, up to thousands
+        if behind is None:
+            assert [own.cost for own in found.alternatives] == [own.cost for own in plain.match(frames)[0].alternatives]
+
+
 @pytest.mark.parametrize("free", [VIEW[:2], VIEW[:3]])
 def test_frames_before_several_backgrounds_are_matched_together_as_one_by_one(bank, renderers, free):
     behind = [Background(wall_m=2.6), None, Background(wall_m=3.4, floor_m=0.45), Background(wall_m=3.0)] * 2

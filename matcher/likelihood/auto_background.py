@@ -59,11 +59,20 @@ class AutoBackground:
     whole_scene : callable
         Returns one whose search compares all pixels, over all bearings, since what was taken for background may be
         landmark: images of the bank are made before each background.
+    open_scene : callable
+        Returns the scene without a background whose search leaves open whether there is one.
     """
 
-    def __init__(self, setup: Setup, rendered: RenderedModel, scene: _SceneOf, whole_scene: _SceneOf) -> None:
+    def __init__(
+        self,
+        setup: Setup,
+        rendered: RenderedModel,
+        scene: _SceneOf,
+        whole_scene: _SceneOf,
+        open_scene: Callable[[], Scene],
+    ) -> None:
         self._setup, self._rendered = setup, rendered
-        self._scene, self._whole_scene = scene, whole_scene
+        self._scene, self._whole_scene, self._open_scene = scene, whole_scene, open_scene
 
     def search(self, frames: FilteredFrames, evidence: Evidence, bare: NDArray[np.float64]) -> _Standing:
         """Return the background of each frame, and what explains the frames before them.
@@ -123,6 +132,11 @@ class AutoBackground:
                 seen = without_background(seen, [around[k] for k in which])
             fits = search_views(self._setup, self._scene(behind), some, seen, bare[which])
             parts.append(_numbered(fits, which))
+            doubtful = np.flatnonzero(are_doubtful(self._setup, fits, len(which)))
+            if not behind and doubtful.size:  # each pixel at an edge may see a background that none sees alone
+                few, again = some[doubtful], which[doubtful]
+                fits = search_views(self._setup, self._open_scene(), few, few.seen, bare[again])
+                parts.append(_numbered(fits, again))
         return backgrounds, Fits.joined(parts)
 
     def _surroundings(self, frames: FilteredFrames, k: int) -> Surroundings:

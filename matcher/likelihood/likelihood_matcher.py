@@ -153,23 +153,25 @@ class LikelihoodMatcher:
             fits = fit_without_borders(self._setup, self._scene, evidence, fits)
         fits = with_profiles(self._setup, self._scene, evidence, fits)
         answers = rank(self._setup, frames, fits, bare, [self._stated] * len(frames))
-        answers = self._with_mirror(evidence, answers)
+        answers = self._with_mirror(evidence, answers, self._search)
         return self._with_shared_errors(frames, evidence, answers)
 
     def _match_auto(self, frames: FilteredFrames) -> list[Match]:
         """Match frames, each before what stands behind it."""
-        auto = AutoBackground(self._setup, self._rendered, self._scene_before, self._whole_scene_before)
+        auto = AutoBackground(
+            self._setup, self._rendered, self._scene_before, self._whole_scene_before, self._open_scene
+        )
         evidence = Evidence.from_frames(frames, self._setup.on)
         bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(evidence))
         backgrounds, fits = auto.search(frames, evidence, bare)
         answers: list[Match] = []
-        found_all = self._with_mirror(evidence, rank(self._setup, frames, fits, bare, backgrounds))
-        for k, found in enumerate(found_all):
-            one = slice(k, k + 1)
-            answers.extend(self._with_shared_errors(frames[one], evidence[one], [found]))
+        for k, found in enumerate(rank(self._setup, frames, fits, bare, backgrounds)):
+            one, search = slice(k, k + 1), self._search if backgrounds[k] is None else self._open_search
+            mirrored = self._with_mirror(evidence[one], [found], search)
+            answers.extend(self._with_shared_errors(frames[one], evidence[one], mirrored))
         return answers
 
-    def _with_mirror(self, evidence: Evidence, answers: list[Match]) -> list[Match]:
+    def _with_mirror(self, evidence: Evidence, answers: list[Match], search: Search) -> list[Match]:
         """Say of accepted answers whether their frames may be mirrored left to right, by the bounds of the cells."""
         accepted = np.array([k for k, answer in enumerate(answers) if answer.accepted], np.int64)
         some, seen = [answers[k] for k in accepted], evidence.seen[accepted]
@@ -177,7 +179,7 @@ class LikelihoodMatcher:
         # what an answer leaves to unknown things costs the other view, too
         left = np.maximum(seen.returned.sum(axis=1) - dof - len(self._setup.free), 0)
         limit = largest_costs(self._setup.false_alarm, dof, evidence.scatter_freedom[accepted]) + DISAGREEMENT * left
-        found = self._search.may_explain(seen.mirrored(self._bank.sensor.cols), limit)
+        found = search.may_explain(seen.mirrored(self._bank.sensor.cols), limit)
         for k, answer, mirrored in zip(accepted, some, found, strict=True):
             answers[k] = replace(answer, may_be_mirrored=bool(mirrored))
         return answers
@@ -233,7 +235,7 @@ class LikelihoodMatcher:
         chip = setup.reports_one_surface  # its ranges jump between the nodes of a bank, and its strips need no tilt
         is_exact = fixed and alone and not chip and BankModel.grid_is_fine_enough(self._bank, *_FINE_GRID)
         level = setup.free in (VIEW[:2], VIEW[:3]) or (chip and "height_m" not in setup.free)
-        has_strips = alone and not is_exact and not self._auto and level
+        has_strips = alone and not is_exact and level
         if has_strips and StripModel.suits(self._bank, self._search.widest_columns):
             return None, StripModel(self._bank, self._search.widest_columns)
         scouts = fixed and BankModel.grid_is_fine_enough(self._bank, *_COARSE_GRID)
@@ -259,7 +261,12 @@ class LikelihoodMatcher:
         for c in range(len(self._setup.shapes.names)):
             Background(floor_m=floor_m).check_behind(self._rendered.renderer(c).topology.vertices, view)
 
-    def _new_search(self, behind: PhasorImages | None) -> Search:
+    @cached_property
+    def _open_search(self) -> Search:
+        """A search that leaves open what stands behind the landmark."""
+        return self._new_search(None, open_edges=True)
+
+    def _new_search(self, behind: PhasorImages | None, *, open_edges: bool = False) -> Search:
         """Return a search before some background, over all bearings that are looked for where they are free."""
         setup, bank = self._setup, self._bank
         stride = (
@@ -273,7 +280,7 @@ class LikelihoodMatcher:
             behind,
             aside=setup.bearing_is_free,
             upward=not known,
-            open_edges=self._auto and behind is None,
+            open_edges=open_edges,
             turned=self._turned if setup.bearing_is_free else None,
         )
         layers = layers_of(bank)
@@ -287,6 +294,10 @@ class LikelihoodMatcher:
             setup.prior_std_of("bearing_rad") or math.inf,
         )
 
+    def _open_scene(self) -> Scene:
+        """Return the scene without a background whose search leaves open whether there is one."""
+        return replace(self._scene, search=self._open_search, closed_search=lambda _: self._search)
+
     def _scene_before(self, backgrounds: Sequence[Background]) -> Scene:
         """Return the scene of estimated backgrounds; see :class:`AutoBackground`."""
         if not backgrounds:
@@ -298,12 +309,15 @@ class LikelihoodMatcher:
             behind=behind,
             final=self._rendered.with_background(*backgrounds),
             scout=self._scout.before(behind) if isinstance(self._scout, BankModel) else None,
+            search=self._open_search,
+            closed_search=lambda k: self._new_search(background_of(self._bank, backgrounds[k])),
         )
 
     def _whole_scene_before(self, backgrounds: Sequence[Background]) -> Scene:
         """Return the same, searched in images of the bank before each background."""
         searches = [self._new_search(background_of(self._bank, own)) for own in backgrounds]
-        return replace(self._scene_before(backgrounds), search=SearchOfFrames(searches, self._scene.search.column_rad))
+        search = SearchOfFrames(searches, self._search.column_rad)
+        return replace(self._scene_before(backgrounds), search=search, closed_search=None)
 
     def _bare_wall_cost(self, evidence: Evidence) -> NDArray[np.float64]:
         """Return how badly a wall at its best distance explains all of each frame, (n,)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from phasemark.matcher.likelihood.candidates import costs_on_scout, fit_neighbou
 from phasemark.matcher.likelihood.fits import BETTER_COST, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
-from phasemark.matcher.nearest.bank_minima import Starts
+from phasemark.matcher.nearest.bank_minima import Known, Search, Starts
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS
 
@@ -25,6 +25,8 @@ _REFUSED_P = 0.01
 """p-value at which views around the best fits are tried too."""
 
 
+_MANY_STARTS = 30
+"""Starts of a frame that take longer than cells before its own background."""
 _SLACK = 8 * DISAGREEMENT
 """Cost by which a scout in the middle of a cell may be above a view of it, among the few zones of a chip, and by which
 the bound of another cell may be below that of the right one, whose views are level."""
@@ -79,25 +81,45 @@ def _with_rivals(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
             return fits
         which = fits.frame[best]
         limit, most = _limit(setup, seen[which], evidence.scatter_freedom[which]), _most(setup, evidence[which])
+        closed_limit = _limit(setup, evidence.seen[which], evidence.scatter_freedom[which])
         if setup.huber is None:
             most = np.minimum(most, fits.cost[best] + setup.rival_cost)
-        if seen is evidence.seen and evidence.on == "ranges" and setup.huber is None:
-            limit = np.minimum(limit, most)
+        if evidence.on == "ranges" and setup.huber is None:
+            closed_limit = np.minimum(closed_limit, most)
+        if seen is evidence.seen:
+            limit = closed_limit
         if setup.unknown and setup.reports_one_surface:  # every unexplained return costs, and few are explained
             limit, most = fits.capped[best] + setup.rival_cost, fits.cost[best] + setup.rival_cost
         near = fits.cost <= least_of_frame(fits, len(evidence.weight))[fits.frame] + setup.rival_cost
         known = fits[near & np.isin(fits.frame, which)]
         places = [(known.class_index[own], known.view[own]) for own in (known.frame == k for k in which)]
         slack = _SLACK if setup.reports_one_surface and setup.unknown else math.inf
-        starts = scene.search.of_frames(which).uncovered(
-            seen[which], limit, places, costs_on_scout(setup, scene, evidence, which), slack
-        )
+        cost_of = costs_on_scout(setup, scene, evidence, which)
+        starts = scene.search.of_frames(which).uncovered(seen[which], limit, places, cost_of, slack)
+        if scene.closed_search is not None:
+            starts = _closed(scene.closed_search, evidence.seen, which, closed_limit, places, starts)
         parts = [fits]
         for some in _in_parts(starts, len(which)):
             own = known[np.isin(known.frame, which[some])]
             parts.append(fit_starts(setup, scene, evidence, which[some], starts.of_frames(some), most[some], own))
         before, fits = least_of_frame(fits, len(evidence.weight)), Fits.joined(parts)
         which = np.flatnonzero(least_of_frame(fits, len(evidence.weight)) < before - BETTER_COST)
+
+
+def _closed(
+    search_of: Callable[[int], Search],
+    seen: Observation,
+    which: NDArray[np.int64],
+    limit: NDArray[np.float64],
+    places: Sequence[Known],
+    starts: Starts,
+) -> Starts:
+    """Return starts, those of frames with many of them from cells before their own backgrounds, all pixels compared."""
+    parts = [starts.of_frames(np.array([k])) for k in range(len(which))]
+    for k in np.flatnonzero(np.bincount(starts.frame, minlength=len(which)) > _MANY_STARTS):
+        own = which[k : k + 1]
+        parts[k] = search_of(int(own[0])).uncovered(seen[own], limit[[k]], [places[int(k)]])
+    return Starts.joined(parts)
 
 
 def _in_parts(starts: Starts, n: int) -> Iterator[NDArray[np.int64]]:

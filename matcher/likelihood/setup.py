@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -161,6 +161,9 @@ class Scene:
         What finds the way to it where that is slow.
     search : Search
         Minima of the bank.
+    closed_search : callable, optional
+        Returns the search of one frame, by its number, before what stands behind the landmark there, where that of all
+        leaves it open; None where it does not.
     """
 
     backgrounds: Sequence[Background]
@@ -168,6 +171,7 @@ class Scene:
     final: ImageModel
     scout: ImageModel | None
     search: Search | SearchOfFrames
+    closed_search: Callable[[int], Search] | None = None
 
     def without_scout(self) -> Scene:
         """Return the scene with images alone that the answer is taken from."""

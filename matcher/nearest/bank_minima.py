@@ -37,7 +37,9 @@ _N_MODES = 12
 """Local minima of the cells of one class that are refined, at most."""
 _CLOSE = 2, 2, 1
 """Cells, columns in the last place, within which a descent from one place stands for all: D, δ, bearing."""
-_RAISED, _RAISED_LITTLE = 3.0, 1.1
+_MOST_TOLD = 8192
+"""Cells whose costs are told more exactly where a descent starts: where more may hold an explanation, none is good."""
+_RAISED, _RAISED_LITTLE = 1.5, 1.1
 """Factors by which the limit of a frame is raised that no view explains, the second among unknown things."""
 
 
@@ -62,6 +64,15 @@ class Starts:
         """Return the starts of some frames, which are numbered in their order; `frame` rises."""
         own = np.isin(self.frame, frame)
         return Starts(np.searchsorted(frame, self.frame[own]), self.class_index[own], self.view[own], self.cost[own])
+
+    @staticmethod
+    def joined(parts: Sequence[Starts]) -> Starts:
+        """Return the starts of single frames as those of all."""
+        if not parts:
+            return _NO_STARTS
+        frame = np.repeat(np.arange(len(parts)), [len(own.frame) for own in parts])
+        names = ("class_index", "view", "cost")
+        return Starts(frame, *(np.concatenate([getattr(own, name) for own in parts]) for name in names))
 
 
 _NO_STARTS = Starts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, len(VIEW_FIELDS))), np.empty(0))
@@ -163,9 +174,11 @@ class Search:
             own = limit[f]
             while not np.isfinite(cost := frames.costs(f, own)).any():
                 own *= _RAISED
+            if cost_of is not None and np.isfinite(cost).sum() > _MOST_TOLD:
+                cost[cost > np.partition(cost, _MOST_TOLD, axis=None)[_MOST_TOLD]] = np.inf
             self._tell(cost, f, cost_of)
             found.append(self._views(cost, [modes(cost, c, _N_MODES, *self._neighbours) for c in self._classes]))
-        return _joined(found)
+        return Starts.joined(found)
 
     def least_bounds(self, seen: Observation, limit: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return limits, (n,), raised in small steps until a cell of each frame is below; arguments as in `starts`."""
@@ -205,7 +218,7 @@ class Search:
             cost[cost > limit[f] + slack] = np.inf
             places = [cover(cost, c, *self._neighbours, *_CLOSE) for c in self._classes]
             found.append(self._views(cost, places))
-        return _joined(found)
+        return Starts.joined(found)
 
     def may_explain(self, seen: Observation, limit: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether any cell may hold an explanation of each frame, (n,); arguments as for :meth:`starts`."""
@@ -331,7 +344,7 @@ class SearchOfFrames:
     def starts(self, seen: Observation, limit: NDArray[np.float64], cost_of: CostOf | None = None) -> Starts:
         """Return the best modes of every frame; see :meth:`Search.starts`."""
         alone = [(seen[k : k + 1], limit[k : k + 1], _of_one(cost_of, k)) for k in range(len(self._searches))]
-        return _joined([own.starts(*frame) for own, frame in zip(self._searches, alone, strict=True)])
+        return Starts.joined([own.starts(*frame) for own, frame in zip(self._searches, alone, strict=True)])
 
     def uncovered(
         self,
@@ -343,7 +356,7 @@ class SearchOfFrames:
     ) -> Starts:
         """Return views in the cells that are left; see :meth:`Search.uncovered`."""
         alone = [(slice(k, k + 1), _of_one(cost_of, k)) for k in range(len(self._searches))]
-        return _joined(
+        return Starts.joined(
             [
                 own.uncovered(seen[k], limit[k], known[k], cost, slack)
                 for own, (k, cost) in zip(self._searches, alone, strict=True)
@@ -354,16 +367,6 @@ class SearchOfFrames:
 def _of_one(cost_of: CostOf | None, k: int) -> CostOf | None:
     """Return the costs of frame `k` as those of the first."""
     return None if cost_of is None else lambda f, class_index, view: cost_of(f + k, class_index, view)
-
-
-def _joined(parts: Sequence[Starts]) -> Starts:
-    """Return the starts of single frames as those of all."""
-    if not parts:
-        return _NO_STARTS
-    frame = np.repeat(np.arange(len(parts)), [len(own.frame) for own in parts])
-    return Starts(
-        frame, *(np.concatenate([getattr(own, name) for own in parts]) for name in ("class_index", "view", "cost"))
-    )
 
 
 @njit(cache=True, nogil=True)

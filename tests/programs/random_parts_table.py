@@ -64,9 +64,11 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "stranger-default": {},
     "mirrored": {"free": FIXED},
     "mirrored-default": {},
+    "auto-default": {"background": "auto"},
+    "auto-nothing": {"background": "auto"},
 }
 """Options of the matcher. New settings go to the end: the place of one is part of the seed of its frames."""
-SCENES = {"wall": WALL, "auto": WALL}
+SCENES = {"wall": WALL, "auto": WALL, "auto-default": WALL}
 """What truly stands behind the landmark; nothing in the settings that are not here."""
 THINGS = "post", "second", "behind", "before", "board"
 """What stands in view besides, by the last word of the setting: see :func:`things_in_view`."""
@@ -242,7 +244,8 @@ def costs_of(
     method = matcher._method
     assert isinstance(method, LikelihoodMatcher)
     setup = method._setup
-    scene = method._scene_before([SCENES[case.setting]]) if method._auto else method._scene
+    behind = [SCENES[case.setting]] if case.setting in SCENES else []
+    scene = method._scene_before(behind) if method._auto else method._scene
     evidence = Evidence.from_frames(matcher.read_out(frames).without_offset().with_pooled_noise(), setup.on)
     texts = []
     for name, view in views:
