@@ -95,6 +95,9 @@ class LikelihoodMatcher:
         if has_prior:
             known["bearing_rad"] = bearing_std_rad
         prior = tuple(known.get(name, math.inf) for name in names)
+        tolerance = {name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW}
+        if reported and has_prior:  # pitch and roll are free because no mounting is level, and not to be found
+            tolerance |= dict.fromkeys(VIEW[4:], math.inf)
         unknown = background == "unknown"
         self._bank = bank
         self._systematic = systematic
@@ -115,7 +118,7 @@ class LikelihoodMatcher:
             used=pixels_of(bank, pixels).ravel(),
             huber=ROBUST_FROM if robust or unknown else None,
             false_alarm=false_alarm,
-            tolerance={name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW},
+            tolerance=tolerance,
             widest_rad=policy.prior_sigma * bearing_std_rad if has_prior else math.inf,
             policy=policy,
         )

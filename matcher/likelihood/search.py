@@ -54,7 +54,7 @@ def search_views(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     cost_of = costs_on_scout(setup, scene, evidence, which)
     limit, search = _limit(setup, seen[which], nu[which]), scene.search.of_frames(which)
     if setup.unknown and setup.reports_one_surface:  # where most zones see other things, no view explains a frame
-        limit = search.least_bounds(seen[which], limit) + setup.rival_cost + _SLACK
+        limit = np.full(len(which), np.inf)
     starts = search.starts(seen[which], limit, cost_of)
     # 3, 4  descend from there, and refine on final images
     fits = fit_starts(setup, scene, evidence, which, starts, _most(setup, evidence[which]))

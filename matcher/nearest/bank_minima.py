@@ -37,10 +37,11 @@ _N_MODES = 12
 """Local minima of the cells of one class that are refined, at most."""
 _CLOSE = 2, 2, 1
 """Cells, columns in the last place, within which a descent from one place stands for all: D, δ, bearing."""
-_MOST_TOLD = 8192
-"""Cells whose costs are told more exactly where a descent starts: where more may hold an explanation, none is good."""
-_RAISED, _RAISED_LITTLE = 1.5, 1.1
-"""Factors by which the limit of a frame is raised that no view explains, the second among unknown things."""
+_MOST_TOLD = 512
+"""Cells of a class under a shift whose costs are told more exactly where a descent starts."""
+_RAISED = 1.5
+"""Factor by which the limit of a frame is raised that no view explains."""
+
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,26 +168,19 @@ class Search:
         limit : (n,) float64
             Cost up to which a view explains a frame. Where no cell is below, the limit of the frame is raised.
         cost_of : callable, optional
-            Returns the costs of views of some classes of a frame, more exactly than the cells tell them.
+            Returns the costs of views of some classes of a frame, whatever their elevation, more exactly than the
+            cells tell them.
         """
         frames, found = _Moved(self, seen), []
         for f in range(len(limit)):
             own = limit[f]
             while not np.isfinite(cost := frames.costs(f, own)).any():
                 own *= _RAISED
-            if cost_of is not None and np.isfinite(cost).sum() > _MOST_TOLD:
-                cost[cost > np.partition(cost, _MOST_TOLD, axis=None)[_MOST_TOLD]] = np.inf
-            self._tell(cost, f, cost_of)
+            if cost_of is not None:
+                cost[[up != 0 for up, _ in self.shifts]] = np.inf
+                self._tell(_least(cost), f, cost_of)
             found.append(self._views(cost, [modes(cost, c, _N_MODES, *self._neighbours) for c in self._classes]))
         return Starts.joined(found)
-
-    def least_bounds(self, seen: Observation, limit: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return limits, (n,), raised in small steps until a cell of each frame is below; arguments as in `starts`."""
-        frames, raised = _Moved(self, seen), limit.copy()
-        for f in range(len(limit)):
-            while not frames.has_cell(f, raised[f]):
-                raised[f] *= _RAISED_LITTLE
-        return raised
 
     def uncovered(
         self,
@@ -336,11 +330,6 @@ class SearchOfFrames:
         """Return the search for some of the frames."""
         return SearchOfFrames([self._searches[k] for k in frame], self.column_rad)
 
-    def least_bounds(self, seen: Observation, limit: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return raised limits; see :meth:`Search.least_bounds`."""
-        each = (own.least_bounds(seen[k : k + 1], limit[k : k + 1]) for k, own in enumerate(self._searches))
-        return np.concatenate([np.empty(0), *each])
-
     def starts(self, seen: Observation, limit: NDArray[np.float64], cost_of: CostOf | None = None) -> Starts:
         """Return the best modes of every frame; see :meth:`Search.starts`."""
         alone = [(seen[k : k + 1], limit[k : k + 1], _of_one(cost_of, k)) for k in range(len(self._searches))]
@@ -367,6 +356,14 @@ class SearchOfFrames:
 def _of_one(cost_of: CostOf | None, k: int) -> CostOf | None:
     """Return the costs of frame `k` as those of the first."""
     return None if cost_of is None else lambda f, class_index, view: cost_of(f + k, class_index, view)
+
+
+def _least(cost: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Set all costs (shift, class, D, δ) infinite but the least of each class under each shift; return them."""
+    for own in cost.reshape(*cost.shape[:2], -1).reshape(-1, math.prod(cost.shape[2:])):
+        if len(own) > _MOST_TOLD:
+            own[own > np.partition(own, _MOST_TOLD)[_MOST_TOLD]] = np.inf
+    return cost
 
 
 @njit(cache=True, nogil=True)
