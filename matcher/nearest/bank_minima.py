@@ -43,7 +43,6 @@ _RAISED = 1.5
 """Factor by which the limit of a frame is raised that no view explains."""
 
 
-
 @dataclass(frozen=True, eq=False)
 class Starts:
     """Candidates of n frames; (k,) arrays, those of a frame together, best first.
