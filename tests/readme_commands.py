@@ -126,9 +126,7 @@ def run_page(page: Path, folder: Path) -> Iterator[str]:
         if block.twin:
             _check_twin(block, page)
             continue
-        for name in block.given:
-            if not (folder / name).exists():
-                GIVEN[name](folder / name)
+        _give(block, folder)
         if block.language == "python":
             _run_here(lambda text=block.text: _execute(text), folder, f"{page.name}:{block.line}", warn="error")
             yield block.text
@@ -147,6 +145,7 @@ def printed_and_expected(page: Path, folder: Path) -> Iterator[tuple[str, str, s
     for block in read_blocks(page.read_text(encoding="utf-8")):
         if "prints" not in block.directives:
             continue
+        _give(block, folder)
         for part in re.split(r"^\$ ", block.text.replace("\\\n", " "), flags=re.MULTILINE)[1:]:
             command, _, expected = part.partition("\n")
             printed = io.StringIO()
@@ -155,6 +154,14 @@ def printed_and_expected(page: Path, folder: Path) -> Iterator[tuple[str, str, s
             with contextlib.chdir(folder), contextlib.redirect_stdout(printed):
                 assert main(words[1:]) == 0, command
             yield command, printed.getvalue().rstrip(), expected.rstrip()
+
+
+def _give(block: Block, folder: Path) -> None:
+    """Write the files that a block is given, unless they are there."""
+    for name in block.given:
+        if not (folder / name).exists():
+            (folder / name).parent.mkdir(exist_ok=True)
+            GIVEN[name](folder / name)
 
 
 def _check_twin(block: Block, page: Path) -> None:
@@ -326,6 +333,7 @@ GIVEN: dict[str, Callable[[Path], None]] = {
     "board_2m.npz": _write_board,
     "board_3m.npz": _write_board,
     "camera_info.yaml": _write_camera_info,
+    "examples/simulated_cone.csv": _copy_example,
     "large.toml": _write_large_sensor,
     "measured.csv": _write_measured,
     "my_part.stl": _write_part,

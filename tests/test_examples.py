@@ -15,6 +15,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from phasemark.cli import main
+
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "real_recording.py"
 NOISE_M = 0.004
 TAN = np.tan(np.radians(22.5))
@@ -400,3 +402,16 @@ def test_the_zone_sensor_is_fitted_and_objects_are_located_by_histograms(tmp_pat
         assert rows[16]["median_mm"] < rows[1]["median_mm"]
         assert rows[16]["bound_mm"] < rows[4]["bound_mm"] < rows[1]["bound_mm"]
     assert {path.name for path in tmp_path.glob("*.png")} == {"histograms.png", "error.png"}
+
+
+def test_the_simulated_recording_is_what_its_command_writes(tmp_path):
+    kept = EXAMPLE.parent / "simulated_cone.csv"
+    stated = (EXAMPLE.parent.parent / "docs" / "tutorials.md").read_text(encoding="utf-8")
+    options = stated.split("`examples/simulated_cone.csv` is one that it wrote, with `")[1].split("`")[0].split()
+    command = ["frames", "simulate", *options, "--sensor", "vl53l5cx-8x8", "--out", str(tmp_path / "again.csv")]
+    assert main(command) == 0
+    here, there = (path.read_text(encoding="utf-8").splitlines() for path in (kept, tmp_path / "again.csv"))
+    assert here[:2] == there[:2]
+    assert here[0].startswith("# simulated by phasemark")
+    rows = [[[cell or "nan" for cell in line.split(",")[:129]] for line in lines[2:]] for lines in (here, there)]
+    np.testing.assert_allclose(*np.array(rows, np.float64), atol=1.5)  # another processor may round a millimetre apart

@@ -77,6 +77,11 @@ def test_answers_do_not_depend_on_how_many_images_are_read_together(path, backgr
         together = Matcher(bank, "refine", background=background).match(frames)
         small_parts(monkeypatch, 1 << 16)
         matcher = Matcher(bank, "refine", background=background)
-    apart = matcher.match(frames)  # the bank is closed: everything was read
+        apart = matcher.match(frames)
+    closed = matcher.match(frames)  # everything was read but images before a wall that is found, which save time
     assert [one.as_dict() for one in apart] == [one.as_dict() for one in together]
     assert apart.accepted.all()
+    assert closed.accepted.all()
+    np.testing.assert_allclose(closed.distance_m, apart.distance_m, atol=1e-5)
+    if background != "auto":
+        assert [one.as_dict() for one in closed] == [one.as_dict() for one in together]

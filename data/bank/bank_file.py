@@ -294,6 +294,11 @@ class Bank:
         """Copy and pickle a bank as the file that it is: it is opened again."""
         return open_bank, (self.path.absolute(),)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether the file can be read."""
+        return bool(self._file)
+
     def close(self) -> None:
         """Close the file; arrays read before stay usable."""
         self._file.close()

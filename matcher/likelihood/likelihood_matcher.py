@@ -125,6 +125,7 @@ class LikelihoodMatcher:
         stated = () if self._stated is None else (self._stated,)
         behind = background_of(bank, self._stated) if self._stated is not None else None
         self._search = self._new_search(behind)
+        self._open_search = self._new_search(None, open_edges=True) if self._auto else self._search
         self._exact, self._scout = self._bank_models(behind)
         if self._auto or self._exact is None:
             self._check_distances()
@@ -264,11 +265,6 @@ class LikelihoodMatcher:
         for c in range(len(self._setup.shapes.names)):
             Background(floor_m=floor_m).check_behind(self._rendered.renderer(c).topology.vertices, view)
 
-    @cached_property
-    def _open_search(self) -> Search:
-        """A search that leaves open what stands behind the landmark."""
-        return self._new_search(None, open_edges=True)
-
     def _new_search(self, behind: PhasorImages | None, *, open_edges: bool = False) -> Search:
         """Return a search before some background, over all bearings that are looked for where they are free."""
         setup, bank = self._setup, self._bank
@@ -306,6 +302,10 @@ class LikelihoodMatcher:
         if not backgrounds:
             return self._scene
         behind = background_of(self._bank, *backgrounds)
+
+        def closed_search(k: int) -> Search:
+            return self._new_search(background_of(self._bank, backgrounds[k]))
+
         return replace(
             self._scene,
             backgrounds=backgrounds,
@@ -313,7 +313,7 @@ class LikelihoodMatcher:
             final=self._rendered.with_background(*backgrounds),
             scout=self._scout.before(behind) if isinstance(self._scout, BankModel) else None,
             search=self._open_search,
-            closed_search=lambda k: self._new_search(background_of(self._bank, backgrounds[k])),
+            closed_search=closed_search if self._bank.is_open else None,
         )
 
     def _whole_scene_before(self, backgrounds: Sequence[Background]) -> Scene:

@@ -39,7 +39,7 @@ _CLOSE = 2, 2, 1
 """Cells, columns in the last place, within which a descent from one place stands for all: D, δ, bearing."""
 _MOST_TOLD = 512
 """Cells of a class under a shift whose costs are told more exactly where a descent starts."""
-_RAISED = 1.5
+_RAISED = 3.0
 """Factor by which the limit of a frame is raised that no view explains."""
 
 
