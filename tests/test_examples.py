@@ -414,4 +414,5 @@ def test_the_simulated_recording_is_what_its_command_writes(tmp_path):
     assert here[:2] == there[:2]
     assert here[0].startswith("# simulated by phasemark")
     rows = [[[cell or "nan" for cell in line.split(",")[:129]] for line in lines[2:]] for lines in (here, there)]
-    np.testing.assert_allclose(*np.array(rows, np.float64), atol=1.5)  # another processor may round a millimetre apart
+    values = np.array(rows, np.float64)
+    np.testing.assert_allclose(values[0], values[1], atol=1.5)  # another processor may round a millimetre apart

@@ -83,7 +83,7 @@ def summed_information(name: str, views: Views, n_poses: int) -> np.ndarray:
 
 def variances(name: str, views: Views, n_poses: int) -> np.ndarray:
     """Return the variances of the bound, (n, 2)."""
-    return np.einsum("npp->np", np.linalg.inv(summed_information(name, views, n_poses)))
+    return np.asarray(np.einsum("npp->np", np.linalg.inv(summed_information(name, views, n_poses))))
 
 
 def bounds_around(found: Matches, n_poses: int) -> np.ndarray:
