@@ -76,7 +76,9 @@ def _with_rivals(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
     while True:
         best = best_of_frame(fits)
         best = best[np.isin(fits.frame[best], which)]
-        if not (setup.unknown and setup.reports_one_surface):  # few zones lead few descents to the best view
+        if setup.unknown and setup.reports_one_surface:  # few zones lead few descents to the best view
+            best = best[fits.p_value[best] >= setup.false_alarm]
+        else:
             best = best[[is_acceptable(setup, fits, int(k)) for k in best]]
         if not best.size:
             return fits
