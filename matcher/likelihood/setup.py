@@ -22,7 +22,7 @@ from phasemark.render import Background, PhasorImages
 
 __all__ = ["Scene", "Setup", "Shapes", "check_free"]
 
-_FURTHER_ZONES = 2
+_FURTHER_ZONES = 3
 """Zones of a chip that an answer explains beyond its number of free parameters."""
 
 
@@ -131,8 +131,8 @@ class Setup:
     @property
     def rival_cost(self) -> float:
         """How much more than an answer a view far from it must cost: a single pixel must not decide between them."""
-        among_unknown = self.unknown and not self.reports_one_surface
-        return DISAGREEMENT * (self.policy.pixels_against_far_view if among_unknown else 1)
+        pixels = 2 if self.reports_one_surface else self.policy.pixels_against_far_view
+        return DISAGREEMENT * (pixels if self.unknown else 1)
 
     @property
     def fewest_explained(self) -> int:
