@@ -104,7 +104,7 @@ class Matcher:
     pixels : {"all", "lower"}
         Which pixels give "refine" the view. All of them tell the class.
     robust : bool
-        Whether "refine" counts residuals beyond 3 σ linearly (Huber); the covariance is then the sandwich.
+        Whether "refine" counts residuals beyond 3 σ linearly (Huber); the covariance is then the jackknife's.
     bearing_std_rad : float, optional
         How well the mount points at the landmark, where `free` is None: the standard deviation of a Gaussian prior.
         None: 1.5°, of reported ranges 3°.

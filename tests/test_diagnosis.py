@@ -15,7 +15,9 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.data.plans import MeshPlan
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, diagnose, kalman_filter
+from phasemark.matcher.diagnosis import Diagnosis
 from phasemark.matcher.diagnosis.search import _Seen
+from phasemark.matcher.match import Candidate, Match
 from phasemark.render import Background, Frames, Renderer, capture, preset
 
 PRESETS = ("vl53l5cx-8x8", "pmd-16x16")
@@ -228,3 +230,21 @@ def test_a_diagnosis_that_fails_loses_no_answer(tmp_path, capsys):
     assert len(estimates.read_text().splitlines()) == 2
     *_, note = done.err.splitlines()
     assert note.startswith("note: frame 0 is refused, and its diagnosis failed (UsageError: the bank ends at 1 m")
+
+
+def test_what_a_landmark_in_few_pixels_leaves_open_is_said():
+    # 3 σ are three times the roots of the diagonal
+    wide = np.diag([0.02, math.radians(4.0)]) ** 2
+    open_view = Match("cone", False, 1.0, 0.5, covariance=wide, chi2=3.0, dof=2, reason="undetermined")
+    assert Diagnosis(3, open_view, n_returned=9).message() == (
+        "frame 3 is refused (undetermined, chi2/dof 1.5): it shows cone, in too few pixels to place it"
+        " (3 σ of D 0.06 m, of δ 12°): go nearer, or take more exposures"
+    )
+    # an explanation a degree away is the same, a quarter turn is another, and half a turn of a box is none
+    turns = [math.radians(angle) for angle in (1.0, 180.0, 90.0)]
+    others = tuple(Candidate("cone", 1.0, 0.5 + turn, 3.0, 0.1) for turn in turns)
+    twofold = Match("cone", False, 1.0, 0.5, alternatives=others, symmetry=2, reason="ambiguous")
+    assert Diagnosis(0, twofold, n_returned=9).message() == (
+        "frame 0 is refused (ambiguous): it may show cone at 1.000 m and 28.6° or cone at 1.000 m and 118.6°;"
+        " nearer, or with more exposures, it may tell"
+    )

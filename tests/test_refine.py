@@ -20,6 +20,7 @@ from phasemark.matcher.filters import noise_free
 from phasemark.matcher.filters.filtered_frames import PixelState
 from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.contradictions import whole_cost
+from phasemark.matcher.likelihood.descent import descend
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher
 from phasemark.matcher.likelihood.problem import DescentSettings, Problem
@@ -182,7 +183,8 @@ def test_a_model_given_a_background_has_the_limits_of_one_built_with_it(bank, ba
 @pytest.mark.parametrize("huber", [None, 2.0])
 @pytest.mark.parametrize("on", ["ranges", "phasors"])
 def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, renderers, on, huber):
-    # the oracle sums again without each pixel; a robust covariance grows by the ratio of the inverse informations
+    # the oracle sums again without each pixel; a robust covariance is that of the steps from there (the jackknife), and
+    # grows by the ratio of the inverse informations
     free = VIEW[:2]
     image = renderers["cone"].render(1.02, 0.5)
     evidence = Evidence.from_frames(
@@ -195,23 +197,34 @@ def test_the_deviation_without_one_pixel_is_that_of_sums_without_it(bank, render
     )  # fmt: skip
     state = problem.start(np.array([[1.02, 0.5, 0.0, 0.0, 0.0, 0.0]]))
     p = len(problem.columns)
-    covariance = view_covariance(problem, state.sums)
-    found = std_without_one_pixel(problem, state, np.array([0]), state.images.slope, state.sums.information, covariance)
+    state = descend(problem, state, 1e-9)
+    covariance = view_covariance(problem, state)
+    found = std_without_one_pixel(problem, state, covariance)
 
-    def variance(use):
+    def sums_of(use):
         sums = gauss_newton_sums(
             state.images.phasor, state.images.slope, evidence, np.zeros(1, np.int64), use[None], huber
         )
-        return np.diag(np.linalg.inv(sums.information[0]))[:2]
+        return np.linalg.inv(sums.information[0]), sums.gradient[0]
+
+    def variance(use):
+        return np.diag(sums_of(use)[0])[:2]
 
     assert state.sums.information.shape == (1, p, p)
     whole = variance(state.use[0])
-    without = []
+    without, moved = [], np.zeros((p, p))
     for pixel in np.flatnonzero(state.use[0]):
         use = state.use[0].copy()
         use[pixel] = False
         without.append(variance(use))
-    expected = np.sqrt(np.diag(covariance[0]) * np.max(without, axis=0) / whole)
+        inverse, gradient = sums_of(use)
+        moved += np.outer(inverse @ gradient, inverse @ gradient)
+    if huber is not None:
+        np.testing.assert_allclose(covariance[0], moved[:2, :2], rtol=1e-2)
+    growth = np.sqrt(np.max(without, axis=0) / whole)
+    if huber is not None:  # two standard deviations without a pixel, three of the jackknife
+        growth = np.maximum(2 / 3 * growth, 1)
+    expected = np.sqrt(np.diag(covariance[0])) * growth
     np.testing.assert_allclose(found[0], expected, rtol=1e-6)
 
 

@@ -43,6 +43,7 @@ ROWS: dict[str, tuple[int, float, TrialSetup, dict[str, Any]]] = {
         TrialSetup(background=WALL, nuisances=("wall_m",)),
         {"free": FIXED, "background": "auto"},
     ),
+    "robust": (5000, 1.05, TrialSetup(), {"free": FIXED, "robust": True}),
 }
 MOST_OUTLIERS = {"bearing, wall": (0.012, 0.020)}
 """Largest shares of errors beyond 5 σ of the bound, and of that or of the match's own covariance."""

@@ -25,10 +25,11 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.matcher.frequencies import OneFrequencyBank
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
 from phasemark.matcher.likelihood.setup import check_free
-from phasemark.matcher.match import Match
+from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Candidate, Match
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.recordings.bank_for_frames import distances_of_frames
 from phasemark.render import Background, Frames, Sensor
+from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
 
 Parameter = Literal[
     "method",
@@ -145,6 +146,8 @@ class Diagnosis:
         if not self.changes:
             if self.n_returned < FEWEST_RETURNS:
                 return f"{head}: {self.n_returned} of its pixels return, and {FEWEST_RETURNS} are needed"
+            if self.refused.reason in ("undetermined", "ambiguous"):
+                return f"{head}: {self._what_is_open()}"
             if self.stopped:
                 return f"{head}: none of the changes tried makes it fit, and time was up before all were tried"
             also = "" if self.among_unknown else ", background, field of view"
@@ -180,12 +183,35 @@ class Diagnosis:
             "message": self.message(),
         }
 
+    def _what_is_open(self) -> str:
+        """Tell which number a frame that the landmark explains leaves open."""
+        match, name = self.refused, self.refused.class_name
+        if match.reason == "ambiguous" and match.alternatives:
+            others = [one for one in match.alternatives if _are_apart(match, one)]
+            seen = " or ".join(
+                f"{one.class_name} at {one.distance_m:.3f} m and {math.degrees(one.delta_rad):.1f}°"
+                for one in (match, (others or match.alternatives)[0])
+            )
+            return f"it may show {seen}; nearer, or with more exposures, it may tell"
+        known = ""
+        if match.covariance is not None:
+            std = 3 * np.sqrt(np.diag(match.covariance))
+            known = f" (3 σ of D {std[0]:.2g} m, of δ {math.degrees(std[1]):.2g}°)"
+        return f"it shows {name}, in too few pixels to place it{known}: go nearer, or take more exposures"
+
     def _why(self) -> str:
         match = self.refused
         reason = getattr(match, "reason", None) or ("no landmark" if match.class_name is None else "poor fit")
         if math.isfinite(match.chi2) and match.dof > 0:
             return f"{reason}, chi2/dof {match.chi2 / match.dof:.3g}"
         return str(reason)
+
+
+def _are_apart(match: Match, other: Candidate) -> bool:
+    """Return whether an answer and another explanation of its frame are not the same to within the usual tolerance."""
+    turn_rad = abs(wrap_delta_difference_rad(other.delta_rad - match.delta_rad, delta_period_rad(match.symmetry or 1)))
+    apart_m = abs(other.distance_m - match.distance_m)
+    return other.class_name != match.class_name or apart_m > TOLERANCE_M or float(turn_rad) > TOLERANCE_RAD
 
 
 def _remedy(change: Change) -> str:

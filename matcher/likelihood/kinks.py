@@ -54,7 +54,7 @@ def look_beside(problem: Problem, state: State) -> State:
     rise = (there.sums.cost - np.einsum("mp,mp->m", gradient, step)).reshape(len(near), -1)
     rise -= state.sums.cost[near, None]
     # expected rise beside a single minimum: offset² / var(δ); a rise far below that shows another minimum
-    expected_rise = sides**2 / np.einsum("mpp->mp", view_covariance(problem, state.sums))[near, d][:, None]
+    expected_rise = sides**2 / np.einsum("mpp->mp", view_covariance(problem, state))[near, d][:, None]
     best = np.argmin(rise - _PARABOLA_SHARE * expected_rise, axis=1)
     parabola = np.take_along_axis(expected_rise, best[:, None], axis=1)[:, 0]
     most = np.minimum(_PROMISING_COST, _PARABOLA_SHARE * parabola)

@@ -228,7 +228,6 @@ class Problem:
             sums.capped + cost,
             sums.gradient - self.prior_weight * theta[:, self.columns],
             sums.information + square,
-            sums.scatter + square,
         )
 
     def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:

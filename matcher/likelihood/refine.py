@@ -212,7 +212,7 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     # 1  count contradicted pixels within three standard deviations, by the covariance of the descent's own slopes
     nowhere = np.empty(0, np.intp)
     near = _near_solutions(problem, state) if look_around or problem.model.slopes_are_cheap else nowhere
-    sums, covariance = _sums_of_all_pixels(problem, state), view_covariance(problem, state.sums)
+    sums, covariance = _sums_of_all_pixels(problem, state), view_covariance(problem, state)
     pixels = _judged_pixels(problem, state, near, covariance)
     # 2  take the covariance of solutions that may still win from wide differences
     competitive = near[(sums.cost + _further_cost(pixels))[near] <= problem.rival[near] + DISAGREEMENT]
@@ -267,7 +267,7 @@ def _uncertainty(
     For the solutions in `near`, slopes are differenced over half a standard deviation; for the others the deviations
     are infinite.
     """
-    covariance = view_covariance(problem, state.sums)
+    covariance = view_covariance(problem, state)
     without_one = np.full((len(state.theta), len(problem.settings.free)), np.inf)
     if near.size:
         there = problem.some(near)
@@ -278,10 +278,9 @@ def _uncertainty(
                 wide = slopes_around(there, state, near, capped_std(problem, covariance[near]))
             slope = state.images.slope[near] if wide is None else wide
             images = replace(state.images[near], slope=slope)
-            sums = there.summed(state.theta[near], state.use[near], images).sums
-            if wide is not None:
-                covariance[near] = view_covariance(problem, sums)
-        without_one[near] = std_without_one_pixel(there, state, near, slope, sums.information, covariance[near])
+            smooth = there.summed(state.theta[near], state.use[near], images)
+            covariance[near] = view_covariance(there, smooth)
+        without_one[near] = std_without_one_pixel(there, smooth, covariance[near])
     return covariance, without_one
 
 

@@ -123,15 +123,12 @@ class Sums:
         Jᵀ W r.
     information : (m, p, p) float64
         Jᵀ W J.
-    scatter : (m, p, p) float64
-        Jᵀ W² r² J with Huber's bounded residuals: what the middle of the sandwich is made of. 0 without a robust loss.
     """
 
     cost: NDArray[np.float64]
     capped: NDArray[np.float64]
     gradient: NDArray[np.float64]
     information: NDArray[np.float64]
-    scatter: NDArray[np.float64]
 
 
 def gauss_newton_sums(
@@ -161,13 +158,13 @@ def gauss_newton_sums(
     """
     m, p = slope.shape[:2]
     cost, capped, gradient = np.zeros(m), np.zeros(m), np.zeros((m, p))
-    information, scatter = np.zeros((m, p, p)), np.zeros((m, p, p))
+    information = np.zeros((m, p, p))
     kernel = _sum_ranges if evidence.on == "ranges" else _sum_phasors
     kernel(
         phasor, slope, evidence.value, evidence.weight, frame, use, evidence.sensor.metres_per_radian,
-        np.inf if huber is None else huber, cost, capped, gradient, information, scatter,
+        np.inf if huber is None else huber, cost, capped, gradient, information,
     )  # fmt: skip
-    return Sums(cost, capped, gradient, information, scatter)
+    return Sums(cost, capped, gradient, information)
 
 
 def range_residuals(
@@ -220,7 +217,7 @@ def _angle(across, along):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _sum_rows(n, residual, weight, rows, huber, k, cost, capped, gradient, information, scatter):  # type: ignore[no-untyped-def]
+def _sum_rows(n, residual, weight, rows, huber, k, cost, capped, gradient, information):  # type: ignore[no-untyped-def]
     """Add n residuals with their rows of the Jacobian, (p, n), to the sums of model k."""
     p = len(rows)
     total, most = 0.0, 0.0
@@ -242,22 +239,18 @@ def _sum_rows(n, residual, weight, rows, huber, k, cost, capped, gradient, infor
             along += weight[i] * residual[i] * rows[a, i]
         gradient[k, a] += along
         for b in range(a, p):
-            product, spread = 0.0, 0.0
+            product = 0.0
             for i in range(n):
                 product += weight[i] * rows[a, i] * rows[b, i]
             information[k, a, b] += product
-            if huber < np.inf:
-                for i in range(n):
-                    spread += (weight[i] * residual[i]) ** 2 * rows[a, i] * rows[b, i]
-            scatter[k, a, b] += spread
     for a in range(p):
         for b in range(a):
-            information[k, a, b], scatter[k, a, b] = information[k, b, a], scatter[k, b, a]
+            information[k, a, b] = information[k, b, a]
 
 
 @_compiled
 def _sum_ranges(  # type: ignore[no-untyped-def]
-    phasor, slope, value, weight, frame, use, metres_per_radian, huber, cost, capped, gradient, information, scatter
+    phasor, slope, value, weight, frame, use, metres_per_radian, huber, cost, capped, gradient, information
 ):
     m, p, pixels = slope.shape
     rows, residual, weights, picked = (
@@ -287,12 +280,12 @@ def _sum_ranges(  # type: ignore[no-untyped-def]
             for i in range(n):
                 s, d = phasor[k, picked[i]], slope[k, a, picked[i]]
                 rows[a, i] = share[i] * (s.real * d.imag - s.imag * d.real)
-        _sum_rows(n, residual, weights, rows, huber, k, cost, capped, gradient, information, scatter)
+        _sum_rows(n, residual, weights, rows, huber, k, cost, capped, gradient, information)
 
 
 @_compiled
 def _sum_phasors(  # type: ignore[no-untyped-def]
-    phasor, slope, value, weight, frame, use, metres_per_radian, huber, cost, capped, gradient, information, scatter
+    phasor, slope, value, weight, frame, use, metres_per_radian, huber, cost, capped, gradient, information
 ):
     m, p, pixels = slope.shape
     rows, residual, weights = np.empty((p, 2 * pixels)), np.empty(2 * pixels), np.empty(2 * pixels)
@@ -311,4 +304,4 @@ def _sum_phasors(  # type: ignore[no-untyped-def]
             for i in range(n):
                 d = slope[k, a, picked[i]]
                 rows[a, 2 * i], rows[a, 2 * i + 1] = d.real, d.imag
-        _sum_rows(2 * n, residual, weights, rows, huber, k, cost, capped, gradient, information, scatter)
+        _sum_rows(2 * n, residual, weights, rows, huber, k, cost, capped, gradient, information)

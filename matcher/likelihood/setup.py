@@ -130,9 +130,12 @@ class Setup:
 
     @property
     def rival_cost(self) -> float:
-        """How much more than an answer a view far from it must cost: a single pixel must not decide between them."""
-        pixels = 2 if self.reports_one_surface else self.policy.pixels_against_far_view
-        return DISAGREEMENT * (pixels if self.unknown else 1)
+        """How much more than an answer a view far from it must cost: a single pixel must not decide between them.
+
+        Of the few zones of a chip one may.
+        """
+        many = self.unknown and not self.reports_one_surface
+        return DISAGREEMENT * (self.policy.pixels_against_far_view if many else 1)
 
     @property
     def fewest_explained(self) -> int:

@@ -2,26 +2,85 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
-from phasemark.matcher.likelihood.residuals import Sums, range_residuals, robust_weight
+from phasemark.matcher.likelihood.residuals import range_residuals, robust_weight
 
 _SLOPE_WIDTH = 0.05
 """Least half width, in natural units, over which final slopes are differenced, so that a kink narrower than this does
 not make the covariance."""
+_LEAST_LEFT, _NOTHING_LEFT = 1e-2, 1e-12
+"""Least shares of a residual that a fit leaves: below the first it shows no error of its pixel, and below the other the
+pixel alone tells a direction."""
+_SHARE_WITHOUT_ONE = 2 / 3
 
 
-def view_covariance(problem: Problem, sums: Sums) -> NDArray[np.float64]:
-    """Return the covariance of the view, (m, p, p): inverse information, or the sandwich."""
+def view_covariance(problem: Problem, state: State) -> NDArray[np.float64]:
+    """Return the covariances of views, (m, p, p): inverse information, with a robust loss the jackknife's.
+
+    The jackknife (HC3 of MacKinnon & White, J. Econometrics 29, 1985) adds up by how much the view moves without each
+    of the pixels. It asks nothing of the noise, and the residuals of a few pixels, which a fit makes small, do not
+    make it small.
+    """
     p = len(problem.settings.free)
-    covariance = covariance_of(sums.information, problem.scale)
+    covariance = covariance_of(state.sums.information, problem.scale)
     if problem.settings.huber is not None:
-        covariance = covariance @ sums.scatter @ covariance
+        pixels = _influences(problem, state, covariance)
+        shift = np.einsum("kaqr,kqrs,kqs->kaq", pixels.moved, pixels.inverse_left(_LEAST_LEFT), pixels.residual)
+        of_prior = covariance * problem.prior_weight
+        covariance = shift @ shift.transpose(0, 2, 1) + of_prior @ covariance
     return np.ascontiguousarray(covariance[:, :p, :p])
+
+
+class _Influences(NamedTuple):
+    """Influence of single pixels on solutions.
+
+    Parameters
+    ----------
+    moved : (m, p, pixels, 1 or 2) float64
+        By how much a residual of one standard deviation moves the parameters.
+    left : (m, pixels, 1 or 2, 1 or 2) float64
+        Share of a residual that a fit leaves: the unit matrix less the leverage.
+    residual : (m, pixels, 1 or 2) float64
+        In standard deviations, with the weight of the robust loss.
+    """
+
+    moved: NDArray[np.float64]
+    left: NDArray[np.float64]
+    residual: NDArray[np.float64]
+
+    def inverse_left(self, least: float) -> NDArray[np.float64]:
+        """Return the inverse of what is left, of pixels that leave less than a share `least` in any direction of it."""
+        left = self.left
+        if left.shape[-1] == 1:
+            return 1 / np.maximum(left, least)
+        values, vectors = np.linalg.eigh(left)
+        return np.asarray((vectors / np.maximum(values, least)[..., None, :]) @ vectors.swapaxes(-1, -2))
+
+
+def _influences(problem: Problem, state: State, inverse: NDArray[np.float64]) -> _Influences:
+    """Return the influence of single pixels on solutions of a known inverse information, (m, p, p)."""
+    phasor, weight = state.images.phasor, problem.evidence.weight[problem.frame]
+    use = state.use & problem.settings.used & (weight > 0) & (phasor != 0)
+    slope = state.images.slope
+    if problem.evidence.on == "ranges":
+        turn = np.divide(1.0, phasor, out=np.zeros_like(phasor), where=use)
+        rows = problem.evidence.sensor.metres_per_radian * (slope * turn[:, None]).imag[..., None]
+        residual = range_residuals(phasor, problem.evidence, problem.frame)[..., None]
+    else:
+        difference = problem.evidence.value[problem.frame] - phasor
+        rows = np.stack([slope.real, slope.imag], axis=-1)
+        residual = np.stack([difference.real, difference.imag], axis=-1)
+    root = np.sqrt(robust_weight(residual, (weight * use)[..., None], problem.settings.huber))
+    rows = rows * root[:, None]
+    moved = np.einsum("kab,kbqr->kaqr", inverse, rows)
+    return _Influences(moved, np.eye(rows.shape[3]) - np.einsum("kaqr,kaqs->kqrs", rows, moved), residual * root)
 
 
 def capped_std(problem: Problem, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -97,40 +156,20 @@ def slopes_along_axes(
     return np.concatenate([slope, state.images.slope[which, -1:]], axis=1)
 
 
-def std_without_one_pixel(
-    problem: Problem,
-    state: State,
-    which: NDArray[np.integer],
-    slope: NDArray[np.complex128],
-    information: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the largest standard deviations without any one pixel, (k, p), by the Woodbury formula.
+def std_without_one_pixel(problem: Problem, state: State, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the largest standard deviations without any one pixel, (m, p), by the Woodbury formula.
 
-    The formula holds for the inverse information. A sandwich covariance grows by the same ratio.
+    The formula holds for the inverse information. A jackknife grows by the same ratio; but it has counted already what
+    each pixel does, and two standard deviations without one are compared with three of it.
     """
     p = covariance.shape[1]
-    phasor, weight = state.images.phasor[which], problem.evidence.weight[problem.frame]
-    use = state.use[which] & problem.settings.used & (weight > 0) & (phasor != 0)
-    turn = np.divide(1.0, phasor, out=np.zeros_like(phasor), where=use)
-    value = problem.evidence.value[problem.frame]
-    if problem.evidence.on == "ranges":
-        rows = problem.evidence.sensor.metres_per_radian * (slope * turn[:, None]).imag[..., None]
-        residual = range_residuals(phasor, problem.evidence, problem.frame)[..., None]
-    else:
-        rows = np.stack([slope.real, slope.imag], axis=-1)
-        residual = np.stack([(value - phasor).real, (value - phasor).imag], axis=-1)
-    root = np.sqrt(robust_weight(residual, (weight * use)[..., None], problem.settings.huber))
-    rows = rows * root[:, None]  # (k, p, pixels, 1 or 2)
-    inverse = covariance_of(information, problem.scale)
-    moved = np.einsum("kab,kbqr->kaqr", inverse, rows)
-    kept = (1 + 1e-12) * np.eye(rows.shape[3]) - np.einsum("kaqr,kaqs->kqrs", rows, moved)
+    inverse = covariance_of(state.sums.information, problem.scale)
+    pixels = _influences(problem, state, inverse)
+    moved = pixels.moved[:, :p]
     # a pixel that alone tells a direction leaves nothing known of it
-    determinant = kept[..., 0, 0]
-    if kept.shape[-1] == 2:
-        determinant = determinant * kept[..., 1, 1] - kept[..., 0, 1] * kept[..., 1, 0]
-    kept[~(determinant > 1e-14)] = 1e-12 * np.eye(rows.shape[3])
-    moved = moved[:, :p]
-    more = np.einsum("kaqr,kqrs,kaqs->kaq", moved, np.linalg.inv(kept), moved).max(axis=2)
+    more = np.einsum("kaqr,kqrs,kaqs->kaq", moved, pixels.inverse_left(_NOTHING_LEFT), moved).max(axis=2)
     own = np.einsum("kaa->ka", inverse)[:, :p]
-    return np.asarray(np.sqrt(np.einsum("kaa->ka", covariance) * (own + more) / own))
+    growth = np.sqrt((own + more) / own)
+    if problem.settings.huber is not None:
+        growth = np.maximum(growth * _SHARE_WITHOUT_ONE, 1.0)
+    return np.asarray(np.sqrt(np.einsum("kaa->ka", covariance)) * growth)

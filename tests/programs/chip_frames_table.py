@@ -4,8 +4,10 @@ usage: python -m programs.chip_frames_table --sensor vl53l5cx-8x8 --frames 20 --
 
 Each part, four landmarks of the catalogue and a bracket, is seen from random views at 0.4 to 1.2 m, up to 5° aside and
 up to 3° tilted, before a wall 0.3 to 2 m behind it or none, and above a floor or none. Of each it prints how many
-answers are right, within 3 cm and 6°, how many of them are accepted, and how many wrong ones are; and of the frames
-whose view the information of their zones determines, how many are accepted.
+answers are right, within 3 cm and 6°, how many of them are accepted, of how many of these D, δ and bearing lie in their
+95 % ellipsoid, and how many wrong ones are accepted; and of the frames whose view the information of their zones
+determines, how many are accepted. With --strangers frames are matched with another of the parts, and it prints how many
+are accepted.
 """
 
 import argparse
@@ -17,6 +19,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import trimesh
+from scipy.stats import chi2
 
 from phasemark.data import Bank, BankPlan, build_bank
 from phasemark.data.plans import MeshPlan
@@ -82,6 +85,15 @@ def is_determined(match: Match) -> bool:
     return bool((3 * np.sqrt(np.diag(match.covariance))[:3] <= [GROSS_M, GROSS_RAD, GROSS_RAD]).all())
 
 
+def is_in_ellipsoid(match: Match, view: Views) -> bool:
+    """Return whether distance, angle and bearing lie in the ellipsoid that holds 95 % of them."""
+    if match.covariance is None:
+        return False
+    turn = math.remainder(match.delta_rad - float(view.delta_rad[0]), 2 * math.pi / max(match.symmetry or 1, 1))
+    error = [match.distance_m - float(view.distance_m[0]), turn, match.bearing_rad - float(view.bearing_rad[0])]
+    return bool(error @ np.linalg.solve(match.covariance[:3, :3], error) <= chi2.ppf(0.95, 3))
+
+
 def count(bank: Bank, mesh: trimesh.Trimesh, exposures: int, n: int, rng: np.random.Generator) -> Counter[str]:
     """Match n random frames of one part, and count."""
     matcher, renderer, counts = (
@@ -98,11 +110,14 @@ def count(bank: Bank, mesh: trimesh.Trimesh, exposures: int, n: int, rng: np.ran
         right, determined = is_right(match, view), is_determined(match)
         counts["frames"] += 1
         counts["right"] += right
+        counts["accepted"] += match.accepted
         counts["right accepted"] += right and match.accepted
+        counts["in their ellipsoid"] += right and match.accepted and is_in_ellipsoid(match, view)
         counts["determined"] += right and determined
         counts["determined accepted"] += right and determined and match.accepted
         counts["wrong accepted"] += match.accepted and not right
-        counts[match.reason or "accepted"] += 1
+        if match.reason:
+            counts[match.reason] += 1
     return counts
 
 
@@ -112,17 +127,20 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=20, help="of each part")
     parser.add_argument("--exposures", type=int, default=1)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--strangers", action="store_true", help="match with another part")
     options = parser.parse_args()
     meshes = {name: build_mesh(spec) for name, spec in catalog().items()} | {"bracket": bracket()}
-    total: Counter[str] = Counter()
-    for k, (name, mesh) in enumerate(meshes.items()):
-        with TemporaryDirectory() as folder, bank_of(name, mesh, options.sensor, Path(folder)) as bank:
+    names, total = list(meshes), Counter[str]()
+    for k, name in enumerate(names):
+        of = names[(k + options.strangers) % len(names)]
+        with TemporaryDirectory() as folder, bank_of(of, meshes[of], options.sensor, Path(folder)) as bank:
             begun, rng = time.perf_counter(), np.random.default_rng([options.seed, k])
-            counts = count(bank, mesh, options.exposures, options.frames, rng)
+            counts = count(bank, meshes[name], options.exposures, options.frames, rng)
         print(f"{name}: {dict(counts)}; {(time.perf_counter() - begun) / options.frames:.1f} s a frame", flush=True)
         total += counts
-    most = binomial_interval(total["wrong accepted"], total["frames"]).high
-    print(f"all: {dict(total)}; wrong accepted at most {most:.2%}")
+    wrong = "accepted" if options.strangers else "wrong accepted"
+    most = binomial_interval(total[wrong], total["frames"]).high
+    print(f"all: {dict(total)}; {wrong}: at most {most:.2%}")
 
 
 if __name__ == "__main__":
