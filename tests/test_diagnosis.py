@@ -122,6 +122,16 @@ def test_another_field_of_view_is_found_with_its_angle(banks):
     assert found.changes[0].value[0] == pytest.approx(wide.half_angle_h_deg, rel=0.015)
 
 
+def test_another_field_of_view_is_found_where_the_pan_is_not_exact(banks):
+    sensor = preset("pmd-16x16")
+    narrow = sensor.with_(
+        half_angle_h_deg=0.88 * sensor.half_angle_h_deg, half_angle_v_deg=0.88 * sensor.half_angle_v_deg
+    )
+    frames = replace(frames_of("pmd-16x16", *CONE_VIEW, math.radians(0.5), sensor=narrow), sensor=sensor)
+    found = diagnose(Matcher(banks["pmd-16x16"], "refine"), frames, seconds=120.0)
+    assert "half_angle_deg" in [change.parameter for change in (*found.changes, *found.alternatives)]
+
+
 @pytest.mark.parametrize("distance_m", [0.7, 1.4])
 def test_a_landmark_outside_the_bank_is_found_at_its_distance(banks, distance_m):
     found = diagnosis_of(banks["pmd-16x16"], frames_of("pmd-16x16", distance_m, 0.7))

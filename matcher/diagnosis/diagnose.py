@@ -251,6 +251,8 @@ class _Setup:
     default : tuple of str or None
     background : Background, "auto", "unknown" or None
     options : mapping
+    is_default : bool
+        Whether the matcher frees what one frees by itself.
     """
 
     nearest: bool
@@ -258,6 +260,7 @@ class _Setup:
     default: tuple[str, ...] | None
     background: _Behind
     options: Mapping[str, Any]
+    is_default: bool = False
 
     @classmethod
     def of(cls, matcher: Matcher, background: Background | None) -> _Setup:
@@ -278,7 +281,7 @@ class _Setup:
         default = matcher.free if behind == "unknown" and told["free"] is None else None
         # elsewhere a bearing with a prior is searched again without one
         free = default or (VIEW if told["free"] is None else check_free(told["free"]))
-        return cls(False, free, default, behind, options)
+        return cls(False, free, default, behind, options, told["free"] is None)
 
     @property
     def among_unknown(self) -> bool:
@@ -290,7 +293,7 @@ class _Setup:
         """Whether the bearing is estimated without a prior."""
         return "bearing_rad" in self.free and self.default is None
 
-    def matcher(self, bank: Bank, free: Sequence[str], background: _Behind, **options: Any) -> Matcher:
+    def matcher(self, bank: Bank, free: Sequence[str] | None, background: _Behind, **options: Any) -> Matcher:
         """Build a matcher like it by maximum likelihood."""
         told = None if free == self.default else free
         return Matcher(bank, "refine", free=told, background=background, **{**self.options, **options})
@@ -561,11 +564,13 @@ class _Trials:
 
     def _field_of_view(self) -> _Found:
         """Match before images of a camera with another field of view."""
-        fit = self.search.best(self.frame, self.stated, sizes=SIZES, bearing=self.bearing_free)
+        aside = self.bearing_free or self.setup.is_default
+        fit = self.search.best(self.frame, self.stated, sizes=SIZES, bearing=aside)
         if fit is None or not _is_promising(fit):
             return []
         sensor = wider(self.bank.sensor, fit.size)
-        match = self._match_window(fit, self.frame, sensor, self.setup.free, self.setup.background)
+        free = None if self.setup.is_default else self.setup.free
+        match = self._match_window(fit, self.frame, sensor, free, self.setup.background)
         if match is None or not self._inside(match.distance_m):
             return []
         angles = (sensor.half_angle_h_deg, sensor.half_angle_v_deg)
@@ -583,7 +588,7 @@ class _Trials:
         rough: Fit,
         frame: FilteredFrames,
         sensor: Sensor,
-        free: Sequence[str],
+        free: Sequence[str] | None,
         background: _Behind,
     ) -> Match | None:
         """Match before a small bank of one class about a rough fit; None if it is refused."""
