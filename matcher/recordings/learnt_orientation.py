@@ -26,6 +26,8 @@ from phasemark.render import Frames
 DECISIVE_ODDS = 1e4
 """Odds against an orientation from which it is excluded."""
 _MOST_ODDS = 1e3
+_AT_ONCE = 3
+"""Frames that are matched before orientations are given up that no further frame would bring back."""
 _UNEXPLAINED = ("no landmark", "poor fit", "outside the bank")
 
 
@@ -88,15 +90,26 @@ def learn_orientation(matcher: Matcher, frames: Frames, *, n_frames: int = 10) -
     filtered = kalman_filter(each[chosen])
     square = frames.sensor.rows == frames.sensor.cols
     orientations = [one for one in ORIENTATIONS if square or one.rotate in (0, 180)]
-    matches = [list(matcher.match(filtered.with_pixels(one.apply))) for one in orientations]
-    explained = np.array([[match.reason not in _UNEXPLAINED for match in row] for row in matches])
-    cost = _costs(matches)
-    cost -= cost.min(axis=0)
-    of_use = explained.any(axis=0)
-    doubt = np.minimum(cost[:, of_use] / 2, math.log(_MOST_ODDS)).sum(axis=1)
-    order = np.argsort(doubt, kind="stable")
-    log_odds = (doubt - doubt.min())[order] / _misfit(matches[order[0]])
-    return LearntOrientation(tuple(orientations[k] for k in order), log_odds, len(chosen), int(of_use.sum()))
+    doubt = log_odds = np.zeros(len(orientations))
+    left, n_explained = np.arange(len(orientations)), 0
+    fits: list[list[Match]] = [[] for _ in orientations]
+    rounds = math.ceil(len(chosen) / _AT_ONCE)
+    for start in range(rounds):
+        some = filtered[start::rounds]
+        matches = [list(matcher.match(some.with_pixels(orientations[k].apply))) for k in left]
+        explained = np.array([[match.reason not in _UNEXPLAINED for match in row] for row in matches])
+        cost = _costs(matches)
+        of_use = explained.any(axis=0)
+        n_explained += int(of_use.sum())
+        cost = cost[:, of_use] - cost[:, of_use].min(axis=0)
+        doubt[left] += np.minimum(cost / 2, math.log(_MOST_ODDS)).sum(axis=1)
+        for k, row in zip(left, matches, strict=True):
+            fits[k] += row
+        doubt[left] -= doubt[left].min()
+        log_odds = doubt / _misfit(fits[left[doubt[left].argmin()]])
+        left = left[log_odds[left] < math.log(DECISIVE_ODDS * _MOST_ODDS)]
+    order = np.argsort(log_odds, kind="stable")
+    return LearntOrientation(tuple(orientations[k] for k in order), log_odds[order], len(chosen), n_explained)
 
 
 def _costs(matches: Sequence[Sequence[Match]]) -> NDArray[np.float64]:
