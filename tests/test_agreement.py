@@ -110,6 +110,7 @@ def test_pixels_that_are_counted_anew_do_not_let_a_view_slide_away(tmp_path):
     assert count(bank, "bearing", 30, 1, np.random.default_rng([11, 5])).wrong_accepted == 0
 
 
+@pytest.mark.soak
 def test_only_the_final_covariance_excuses_pixels_that_a_view_contradicts(thin_bank):
     # another face ended two columns before the one that was seen, and its first covariance, far too wide, excused both
     found = count(thin_bank("bracket", "pmd-16x16"), "bearing", 100, 10, np.random.default_rng([7, 10]))

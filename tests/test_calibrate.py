@@ -438,6 +438,7 @@ def matched(folder, capsys, sensor, albedo, truth):
     )
 
 
+@pytest.mark.soak
 def test_with_the_calibrated_sensor_distance_side_and_heading_are_at_the_bound(folder, written, tmp_path, capsys):
     """The whole mounting goes into the file: nothing is left to carry by hand but the landmark's albedo."""
     _, truth = folder

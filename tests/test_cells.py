@@ -113,7 +113,7 @@ def test_a_limit_leaves_out_the_cells_above_it_and_no_other(prisms):
     np.testing.assert_array_equal(kept.ravel()[clear], (bound <= 200.0)[clear])
 
 
-@pytest.mark.parametrize("sides", [5, 6])
+@pytest.mark.parametrize("sides", [5, pytest.param(6, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("setting", ["fixed", "bearing", "wall"])
 def test_a_prism_is_never_accepted_a_face_off(prisms, sides, setting):
     bank = prisms[sides]

@@ -140,7 +140,7 @@ def errors_of(matches, views):
     return np.stack([matches.distance_m - views.distance_m, delta, matches.bearing_rad - views.bearing_rad], axis=1)
 
 
-@pytest.mark.parametrize("background", [None, Background(wall_m=3.0)])
+@pytest.mark.parametrize("background", [None, pytest.param(Background(wall_m=3.0), marks=pytest.mark.soak)])
 def test_matching_on_phasors_reaches_the_bound_and_its_covariance_is_honest(bank, background):
     renderer, image = scene(bank, background)
     frames = take(image, TWO.with_(max_phase_std_rad=None), 50)
@@ -200,7 +200,9 @@ def test_ranges_before_a_wall_count_mixed_pixels_and_their_covariance_is_honest(
         Matcher(bank, "refine", background=wall).match(alone)
 
 
-@pytest.mark.parametrize("background", [None, Background(wall_m=3.0)], ids=["alone", "wall"])
+@pytest.mark.parametrize(
+    "background", [None, pytest.param(Background(wall_m=3.0), marks=pytest.mark.soak)], ids=["alone", "wall"]
+)
 def test_all_six_numbers_are_found_on_phasors_of_two_frequencies(bank, background):
     rng, n = np.random.default_rng(12), 8
     tilts = [rng.normal(0, width, n) for width in (0.03, 0.03, 0.04, 0.06)]

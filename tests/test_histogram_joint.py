@@ -119,6 +119,7 @@ def check_sum(n: int, n_poses: int, seed: int) -> None:
     assert found.accepted.sum() >= binom.ppf(1e-4, n, 0.99)
 
 
+@pytest.mark.soak
 def test_the_information_of_two_frames_adds() -> None:
     check_sum(40, 2, 1)
 

@@ -67,7 +67,7 @@ def test_mirroring_first_and_turning_then_is_undone_by_the_inverse(orientation):
     assert len({str(one.apply(image)) for one in ORIENTATIONS}) == 8
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_orientation_of_a_part_without_symmetry_is_learnt(banks, seed):
     bank = banks["handed" if seed % 2 else "stone"]
     true = ORIENTATIONS[(3 * seed + 1) % 8]
@@ -84,7 +84,7 @@ def test_a_symmetric_box_leaves_the_mirrored_orientation_open(banks):
 
 def test_frames_that_nothing_explains_decide_nothing(banks):
     rng = np.random.default_rng(0)
-    frames = Frames(rng.uniform(0.3, 1.5, (6, 1, 8, 8)), sensor=SENSOR)
+    frames = Frames(rng.uniform(0.3, 1.5, (3, 1, 8, 8)), sensor=SENSOR)
     learnt = learn_orientation(Matcher(banks["handed"], "refine", free=VIEW), frames)
     assert len(learnt.left) == 8
     assert learnt.n_explained == 0

@@ -153,7 +153,7 @@ def test_every_pixel_of_two_hundred_random_views_is_right_at_every_frequency(lan
     assert max(error for error, _, _ in worst) <= 1.5 * EPSILON, wrong
 
 
-@pytest.mark.parametrize("splits", [2, 3, 4])
+@pytest.mark.parametrize("splits", [3, *(pytest.param(n, marks=pytest.mark.soak) for n in (2, 4))])
 def test_finer_boxes_do_not_make_pixels_beside_limbs_worse(splits):
     rng = np.random.default_rng(6)
     for landmark in catalog():

@@ -68,7 +68,9 @@ def test_templates_do_not_depend_on_how_many_images_are_read_together(path, opti
         np.testing.assert_array_equal(getattr(apart, name), getattr(together, name))
 
 
-@pytest.mark.parametrize("background", [None, WALL, "auto"], ids=["alone", "wall", "auto"])
+@pytest.mark.parametrize(
+    "background", [None, WALL, pytest.param("auto", marks=pytest.mark.soak)], ids=["alone", "wall", "auto"]
+)
 def test_answers_do_not_depend_on_how_many_images_are_read_together(path, background, monkeypatch):
     with open_bank(path) as bank:
         renderer = Renderer(bank.mesh("cone"), bank.camera, albedo=0.8)

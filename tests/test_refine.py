@@ -284,7 +284,7 @@ def test_what_stands_behind_is_found_and_then_costs_few_views_more(bank, rendere
             assert [own.cost for own in found.alternatives] == [own.cost for own in plain.match(frames)[0].alternatives]
 
 
-@pytest.mark.parametrize("free", [VIEW[:2], VIEW[:3]])
+@pytest.mark.parametrize("free", [VIEW[:2], pytest.param(VIEW[:3], marks=pytest.mark.soak)])
 def test_frames_before_several_backgrounds_are_matched_together_as_one_by_one(bank, renderers, free):
     behind = [Background(wall_m=2.6), None, Background(wall_m=3.4, floor_m=0.45), Background(wall_m=3.0)] * 2
     rng = np.random.default_rng(7)
@@ -411,7 +411,7 @@ def test_a_stranger_on_the_same_box_is_refused(bank, name, free, n):
 @pytest.mark.parametrize("scene", ["wall", "empty"])
 def test_a_scene_without_a_landmark_is_none(bank, background, scene):
     behind = Background(wall_m=3.0) if scene == "wall" else None
-    image = Renderer(None, SENSOR).render(np.ones(5), background=behind)
+    image = Renderer(None, SENSOR).render(np.ones(2), background=behind)
     frames = kalman_filter(capture(image, SENSOR, rng=np.random.default_rng(9), n_frames=50))
     matches = Matcher(bank, "refine", background=behind if background == "known" else background).match(frames)
     assert not matches.accepted.any()

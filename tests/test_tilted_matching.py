@@ -125,7 +125,7 @@ def test_before_a_wall_heights_and_pitches_that_cancel_are_not_said_to_be_known(
     assert squares.max() < 60
 
 
-@pytest.mark.parametrize("albedo", [0.8, 0.56])
+@pytest.mark.parametrize("albedo", [0.56, pytest.param(0.8, marks=pytest.mark.soak)])
 def test_phasors_before_a_wall_are_at_the_bound_with_a_free_tilt_and_albedo(bank, albedo):
     """What the wall returns moves through the image with bearing, pitch and roll, and has a brightness of its own."""
     wall, n = Background(wall_m=3.0), 16

@@ -11,6 +11,8 @@ from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.render import Renderer, Views, capture
 
+MORE_THINGS = ("second", 8), ("behind", 5), ("board", 0)
+
 
 @pytest.fixture(scope="module")
 def parts():
@@ -43,7 +45,10 @@ def answers(parts, setting, n=24, seed=5):
     return mirrored, wrong, reasons
 
 
-@pytest.mark.parametrize(("things", "least"), [("post", 5), ("second", 8), ("behind", 5), ("before", 0), ("board", 0)])
+@pytest.mark.parametrize(
+    ("things", "least"),
+    [("post", 5), ("before", 0), *(pytest.param(*more, marks=pytest.mark.soak) for more in MORE_THINGS)],
+)
 def test_unknown_things_are_not_taken_for_a_landmark(parts, things, least):
     accepted, wrong, _ = answers(parts, f"unknown-{things}")
     assert not wrong
