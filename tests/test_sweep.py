@@ -16,6 +16,7 @@ from phasemark.cli import main
 from phasemark.data.commands import console
 from phasemark.data.files.folder_marker import MARKER
 from phasemark.matcher.plan_kinds import plan_schema
+from phasemark.matcher.sweep.job import Round, SweepJob
 from phasemark.matcher.sweep.plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, read_sweep_plan
 from phasemark.matcher.sweep.report import write_report
 from phasemark.matcher.sweep.run import read_sweep, run_sweep, sweep_folder
@@ -87,6 +88,28 @@ def test_truths_lie_off_the_grid_within_their_spread(reference):
     nominal = np.repeat([0.95, 1.05], 100)
     assert np.abs(truth[:, 0] - nominal).max() <= 0.005
     assert len(np.unique(truth[:, 0])) == 200
+
+
+def test_a_sensor_with_a_chip_is_simulated_and_explained_as_its_chip_reports(tmp_path):
+    chip = plan(
+        sensor="vl53l5cx-8x8", trials=4, methods=[Method(name="likely")], bank_distance_m=(0.5, 0.7),
+        axes={"distance_m": [0.6], "delta_deg": [40.0], "wall_m": [1.6], "n_frames": [8]},
+    )  # fmt: skip
+    trials = run_sweep(chip, tmp_path, workers=1)
+    assert trials.accepted.all()
+    assert np.abs(trials.estimate[:, 0, 0] - trials.truth[:, 0]).max() < 5e-3
+    # zones at an edge see both, and no mean of them: the cone ends 0.2 m behind its axis
+    job = SweepJob(chip, Round(0, (0,), 0, 4))
+    z_m = job.raw_frames(0, job.image(0, job.views(0, 0, 4)), 0).z_m
+    assert ((z_m < 0.8) | (z_m > 1.55) | np.isnan(z_m)).all()
+    assert ((z_m < 0.8).mean() > 0.2) & ((z_m > 1.55).mean() > 0.2)
+
+
+def test_what_a_chip_reports_is_not_asked_of_a_camera(tmp_path):
+    with pytest.raises(
+        UsageError, match=r"method 'chip', condition 0, .*: on=\"reported\" goes with .* \[histogram\] table"
+    ):
+        run_sweep(plan(methods=[Method(name="chip", on="reported")]), tmp_path)
 
 
 def test_rounds_go_on_until_the_rmse_is_known(tmp_path):

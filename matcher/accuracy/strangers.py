@@ -20,7 +20,8 @@ from phasemark.data.seeds import stream
 from phasemark.matcher.filters.filtered_frames import kalman_filter
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.statistics import Interval, binomial_interval
-from phasemark.render import Renderer, Views, capture
+from phasemark.render import Views
+from phasemark.render.direct.capture import capture_ranges
 
 SCALES = (0.8, 0.9, 0.95, 1.05, 1.1, 1.25)
 """Sizes of copies, as shares of the landmark's."""
@@ -70,7 +71,7 @@ def stranger_rates(matcher: Matcher, n: int, *, n_frames: int = 50, seed: int = 
     Parameters
     ----------
     matcher : Matcher
-        Of the method `refine`, on ranges of a camera.
+        Of the method `refine`, on ranges of a camera, or on those that a chip reports.
     n : int
         Frames of each part, at random distances and angles of the bank, with nothing behind.
     n_frames : int
@@ -97,10 +98,11 @@ def stranger_rates(matcher: Matcher, n: int, *, n_frames: int = 50, seed: int = 
     for k, name in enumerate(bank.classes):
         mesh = bank.mesh(name)
         for number, (change, part) in enumerate(changed_parts(mesh)):
-            renderer = Renderer(part, bank.sensor, albedo=float(mesh.metadata["albedo"]))
-            images = renderer.render_views(_views(bank, n, max(SCALES) * _radius_m(mesh), seed, k))
+            views = _views(bank, n, max(SCALES) * _radius_m(mesh), seed, k)
             rng = stream(seed, f"strangers of class {k}", number)
-            matches = matcher.match(kalman_filter(capture(images, bank.sensor, rng=rng, n_frames=n_frames)))
+            albedo = float(mesh.metadata["albedo"])
+            frames = capture_ranges(part, bank.sensor, views, albedo=albedo, rng=rng, n_frames=n_frames)
+            matches = matcher.match(kalman_filter(frames))
             accepted = int(matches.accepted.sum())
             found.append(StrangerRate(name, change, n, accepted, binomial_interval(accepted, n)))
     return found

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -31,7 +31,8 @@ def bank_strangers(
     from phasemark.matcher.accuracy.strangers import stranger_rates
 
     with open_any_bank(bank) as opened, LongWork("matching strangers"):
-        matcher = Matcher(opened, "refine", workers=workers)
+        on: Literal["ranges", "reported"] = "ranges" if opened.sensor.histogram is None else "reported"
+        matcher = Matcher(opened, "refine", on=on, workers=workers)
         rates = stranger_rates(matcher, population, n_frames=n_frames, seed=seed)
     if as_json:
         echo_json([rate.as_dict() for rate in rates])

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from phasemark import PhasemarkError, UsageError
@@ -32,13 +33,14 @@ from phasemark.data.shards.build import Place
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, noise_free, phasor_mean
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.pixel_agreement import counts
 from phasemark.matcher.sweep.plan import Method, SweepPlan
 from phasemark.render import Background, Frames, PhasorImages, Renderer, Sensor, Views, capture
+from phasemark.render.direct.capture import capture_ranges
+from phasemark.render.direct.chip_renderer import ChipRenderer
 
 FORMAT = "phasemark-trials"
 SCHEMA_VERSION = 1
@@ -193,6 +195,8 @@ class SweepJob:
         for method in self.plan.methods:
             if method.on == "phasors" and self.sensor.kind == "direct":
                 raise UsageError(f"method '{method.name}': on=\"phasors\" needs amplitudes, and the sensor is direct")
+            if method.on == "reported" and self.sensor.histogram is None:
+                raise UsageError(f"method '{method.name}': on=\"reported\" needs a sensor with a [histogram] table")
         for number, n in zip(self.of.conditions, self.items, strict=True):
             try:
                 sensor = self.true_sensor(number)
@@ -214,10 +218,11 @@ class SweepJob:
         frames: dict[tuple[str, str], FilteredFrames] = {}
         bounds: dict[tuple[Any, ...], NDArray[np.float64]] = {}
         for m, method in enumerate(self.plan.methods):
-            kind = (method.on, method.filter)
+            on = self.explained(method)
+            kind = (on, method.filter)
             if kind not in frames:
                 frames[kind] = self.frames(number, method, image, first)
-            what = (method.on, method.parameters, method.pixels)
+            what = (on, method.parameters, method.pixels)
             if what not in bounds and self.is_stranger(number):
                 bounds[what] = np.full((len(views), p, p), np.nan)
             elif what not in bounds:
@@ -230,6 +235,12 @@ class SweepJob:
                 out[name][:, m] = narrowed(values, out[name].dtype.str, name)
         confusion = self.confusion(number, views, first)
         return [truth.astype("<f8"), confusion.astype("<f8"), *(out[name] for name, *_ in own)]
+
+    def explained(self, method: Method) -> Literal["ranges", "phasors", "reported"]:
+        """Return what of the frames a method explains."""
+        if method.on is None and method.method == "refine" and self.sensor.histogram is not None:
+            return "reported"
+        return method.on or "ranges"
 
     def views(self, number: int, first: int, stop: int) -> Views:
         """Return the true views of some trials of a condition."""
@@ -263,21 +274,29 @@ class SweepJob:
         return self.believed_sensor(number).with_(**changes)
 
     def renderer(self, number: int, sensor: Sensor, *, dimension_error: float | None = None) -> Renderer:
-        """Return the renderer of a condition's true landmark; the latest are kept, for analysing a mesh takes time."""
+        """Return the renderer of a condition's true landmark; the latest are kept, for analysing a mesh takes time.
+
+        Of a sensor with a [histogram] table it renders the ranges that its chip reports.
+        """
         condition = self.all_conditions[number]
         if dimension_error is None:
             dimension_error = condition.dimension_error
         key = (condition.class_name, dimension_error, condition.albedo, sensor.harmonic_orders)
         with self._guard:
             if key not in self._renderers:
-                mesh = self.objects[condition.class_name].mesh
-                if dimension_error:
-                    mesh = mesh.copy()
-                    mesh.vertices *= 1 + dimension_error
-                self._renderers[key] = Renderer(mesh, sensor, albedo=condition.albedo)
+                kind = Renderer if sensor.histogram is None else ChipRenderer
+                self._renderers[key] = kind(self._mesh(number, dimension_error), sensor, albedo=condition.albedo)
                 if len(self._renderers) > _RENDERERS_KEPT:
                     self._renderers.pop(next(iter(self._renderers)))
             return self._renderers[key].seen_by(sensor)
+
+    def _mesh(self, number: int, dimension_error: float) -> trimesh.Trimesh:
+        """Return the landmark of a condition, built larger than its plan by a share."""
+        mesh = self.objects[self.all_conditions[number].class_name].mesh
+        if dimension_error:
+            mesh = mesh.copy()
+            mesh.vertices *= 1 + dimension_error
+        return mesh
 
     def background(self, number: int) -> Background | None:
         """Return the true background of a condition."""
@@ -290,17 +309,23 @@ class SweepJob:
 
     def frames(self, number: int, method: Method, image: PhasorImages, first: int) -> FilteredFrames:
         """Return the filtered frames of some trials, as a method gets them; `first` is the first one's number."""
-        seen = self.raw_frames(number, image, first, on=method.on)
+        seen = self.raw_frames(number, image, first, on_phasors=method.on == "phasors")
         return (phasor_mean if method.filter == "phasor-mean" else kalman_filter)(seen)
 
-    def raw_frames(self, number: int, image: PhasorImages, first: int, *, on: ResidualKind = "ranges") -> Frames:
+    def raw_frames(self, number: int, image: PhasorImages, first: int, *, on_phasors: bool = False) -> Frames:
         """Return the frames of some trials, (n, n_frames, rows, cols), with the sensor that a method believes in."""
         true, believed = self.true_sensor(number), self.believed_sensor(number)
-        if on == "phasors":
+        if on_phasors:
             true, believed = (sensor.with_(max_phase_std_rad=None) for sensor in (true, believed))
         rng = stream(self.plan.seed, "sweep.noise", number)
-        n_frames = self.all_conditions[number].n_frames
-        frames = capture(image, true, rng=rng, n_frames=n_frames, first_view=first)
+        condition = self.all_conditions[number]
+        if true.histogram is not None:  # what the chip makes of its counts
+            frames = capture_ranges(
+                self._mesh(number, condition.dimension_error), true, image.views, albedo=condition.albedo,
+                background=self.background(number), rng=rng, n_frames=condition.n_frames, first_view=first,
+            )  # fmt: skip
+        else:
+            frames = capture(image, true, rng=rng, n_frames=condition.n_frames, first_view=first)
         return frames if true == believed else frames.taken_by(believed)
 
     def bound(self, number: int, method: Method, image: PhasorImages) -> NDArray[np.float64]:
@@ -311,7 +336,8 @@ class SweepJob:
         free = method.parameters
         found = cramer_rao(
             self.renderer(number, self.true_sensor(number).with_(modulation="sine", harmonics=())), image.views,
-            free=free, n_frames=self.all_conditions[number].n_frames, on=method.on, pixels=method.pixels,
+            free=free, n_frames=self.all_conditions[number].n_frames,
+            on="phasors" if method.on == "phasors" else "ranges", pixels=method.pixels,
             background=self.background(number),
         )  # fmt: skip
         return _spread(found.covariance, free, len(image), self.plan.n_numbers)
@@ -354,7 +380,10 @@ class SweepJob:
             if wall_m not in self._references:
                 background = Background(wall_m=wall_m) if wall_m else None
                 bank = self._bank(Method(name="reference"))
-                self._references[wall_m] = Matcher(bank, "refine", free=VIEW[:2], background=background, workers=1)
+                on = self.explained(Method(name="reference"))
+                self._references[wall_m] = Matcher(
+                    bank, "refine", free=VIEW[:2], background=None if on == "reported" else background, on=on, workers=1
+                )
             return self._references[wall_m]
 
     def matcher(self, number: int, m: int) -> Callable[[FilteredFrames], Sequence[Match]]:
@@ -375,9 +404,10 @@ class SweepJob:
             background = "auto"
         if method.method == "nearest":
             return Matcher(bank, background=background, false_alarm=method.false_alarm).match
+        on = self.explained(method)
         return Matcher(
-            bank, "refine", free=method.parameters, background=background, false_alarm=method.false_alarm,
-            on=method.on, pixels=method.pixels, workers=1,
+            bank, "refine", free=method.parameters, background=None if on == "reported" else background,
+            false_alarm=method.false_alarm, on=on, pixels=method.pixels, workers=1,
         ).match  # fmt: skip
 
     def bank(self, m: int) -> Bank:
@@ -395,12 +425,12 @@ class SweepJob:
     def _match(self, number: int, m: int, frames: FilteredFrames, first: int) -> Matches:
         method = self.plan.methods[m]
         where = f"method '{method.name}', condition {number}, trials {first} … {first + len(frames) - 1}"
-        match = self.matcher(number, m)
         if method.is_program:
+            match = self.matcher(number, m)
             matches = _matches_of_plugin(match, method.method, frames, where, VIEW[: self.plan.n_numbers])
         else:
             try:
-                matches = Matches(match(frames))
+                matches = Matches(self.matcher(number, m)(frames))
             except PhasemarkError as error:
                 raise type(error)(f"{where}: {error}") from None
         for k, one in enumerate(matches):

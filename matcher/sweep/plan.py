@@ -127,8 +127,10 @@ class Method(PlanModel):
         from filtered frames to a sequence of matches.
     filter : {"kalman", "phasor-mean"}
         How the frames of one measurement become one image: a Kalman filter of each pixel's range, or the mean phasor.
-    on : {"ranges", "phasors"}
-        What ``refine`` explains: ranges, or phasors, of which frames are taken without a validity threshold.
+    on : {"ranges", "phasors", "reported"}, optional
+        What ``refine`` explains: ranges, or phasors, of which frames are taken without a validity threshold. A sensor
+        with a [histogram] table gives the ranges that its chip reports: unless stated they are explained as such,
+        "reported", among unknown things, whatever `knows` says.
     pixels : {"all", "lower"}
         Which pixels ``refine`` compares: all, or the lower half of the rows.
     free : sequence of {"bearing", "height", "pitch", "roll"}
@@ -146,7 +148,7 @@ class Method(PlanModel):
     name: Annotated[str, Field(min_length=1, max_length=60)]
     method: Annotated[str, Field(pattern=r"^(nearest|refine|[A-Za-z_][\w.]*:[A-Za-z_]\w*)$")] = "refine"
     filter: Literal["kalman", "phasor-mean"] = "kalman"
-    on: Literal["ranges", "phasors"] = "ranges"
+    on: Literal["ranges", "phasors", "reported"] | None = None
     pixels: Literal["all", "lower"] = "all"
     free: tuple[Literal["bearing", "height", "pitch", "roll"], ...] = ()
     knows: Literal["wall", "auto", "nothing"] = "wall"
@@ -165,7 +167,7 @@ class Method(PlanModel):
     def _fits_together(self) -> Self:
         if self.method == "refine" and self.bank_model != "ray":
             raise UsageError(f"methods: '{self.name}' refines, which needs 'bank_model' ray, got {self.bank_model}")
-        if self.method == "nearest" and (self.free or self.on != "ranges" or self.pixels != "all"):
+        if self.method == "nearest" and (self.free or self.on not in (None, "ranges") or self.pixels != "all"):
             raise UsageError(
                 f"methods: 'free', 'on' and 'pixels' belong to method refine, but '{self.name}' is nearest"
             )

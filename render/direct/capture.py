@@ -8,12 +8,16 @@ from typing import overload
 import numpy as np
 
 from phasemark import UsageError
+from phasemark.render.background import Background
 from phasemark.render.direct.histogram_frames import HistogramFrames, capture_histograms
-from phasemark.render.direct.histogram_images import HistogramImages
+from phasemark.render.direct.histogram_images import HistogramImages, HistogramRenderer
 from phasemark.render.exposure import capture as phase_chain
 from phasemark.render.frames import Frames
+from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.view import Views
 
 ON_CHIP = ("estimator", "estimator_bins", "max_targets", "threshold", "min_separation_m", "reports", "zone_order")
 """Fields of [histogram] that say what becomes of counts, not what is counted."""
@@ -108,6 +112,43 @@ def capture(
         image.expected.reshape(len(image), n, bins), sensor, rng=rng, n_frames=n_frames, first_view=first_view,
         first_frame=first_frame, workers=workers,
     )  # fmt: skip
+
+
+def capture_ranges(
+    mesh: SurfaceMesh,
+    sensor: Sensor,
+    views: Views,
+    *,
+    albedo: float = 0.8,
+    background: Background | None = None,
+    rng: np.random.Generator,
+    n_frames: int = 1,
+    first_view: int = 0,
+) -> Frames:
+    """Take frames of a landmark as its sensor gives them; with a table [histogram], as its chip reports them.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+    sensor : Sensor
+    views : Views
+        n of them.
+    albedo : float
+        Of the landmark.
+    background : Background or None
+    rng, n_frames, first_view
+        As for :func:`capture`.
+
+    Returns
+    -------
+    Frames
+        (n, n_frames, rows, cols).
+    """
+    if sensor.histogram is None:
+        image = Renderer(mesh, sensor, albedo=albedo).render_views(views, background=background)
+        return capture(image, sensor, rng=rng, n_frames=n_frames, first_view=first_view)
+    counted = HistogramRenderer(mesh, sensor, albedo=albedo).render_views(views, background=background)
+    return capture(counted, sensor, rng=rng, n_frames=n_frames, first_view=first_view).ranges
 
 
 def _refuse_other_sensor(rendered: Sensor, sensor: Sensor) -> None:
