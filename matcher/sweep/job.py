@@ -237,7 +237,7 @@ class SweepJob:
         return [truth.astype("<f8"), confusion.astype("<f8"), *(out[name] for name, *_ in own)]
 
     def explained(self, method: Method) -> Literal["ranges", "phasors", "reported"]:
-        """Return what of the frames a method explains."""
+        """Return the quantity of the frames that a method explains."""
         if method.on is None and method.method == "refine" and self.sensor.histogram is not None:
             return "reported"
         return method.on or "ranges"

@@ -129,7 +129,7 @@ class Method(PlanModel):
         How the frames of one measurement become one image: a Kalman filter of each pixel's range, or the mean phasor.
     on : {"ranges", "phasors", "reported"}, optional
         What ``refine`` explains: ranges, or phasors, of which frames are taken without a validity threshold. A sensor
-        with a [histogram] table gives the ranges that its chip reports: unless stated they are explained as such,
+        with a [histogram] table gives the ranges that its chip reports, and unless stated these are explained:
         "reported", among unknown things, whatever `knows` says.
     pixels : {"all", "lower"}
         Which pixels ``refine`` compares: all, or the lower half of the rows.
