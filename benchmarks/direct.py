@@ -13,12 +13,13 @@ import numpy as np
 
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Matcher
-from phasemark.render import Views, capture, preset
+from phasemark.matcher import Matcher, kalman_filter
+from phasemark.render import Background, Views, capture, preset
 from phasemark.render.direct import HistogramRenderer
+from phasemark.render.direct.capture import capture_ranges
 
 SENSOR = "vl53l5cx-8x8"
-N_FRAMES = 400
+N_FRAMES, N_SINGLE = 400, 30
 
 
 def direct(seed: int, median_seconds: Callable[..., float]) -> dict[str, Any]:
@@ -54,4 +55,28 @@ def direct(seed: int, median_seconds: Callable[..., float]) -> dict[str, Any]:
                     add(what, median_seconds(lambda m=matcher: m.match(frames), 3))
                     rows[-1]["first frame (s)"] = round(first, 1)
     rows[0]["first frame (s)"] = rows[1]["first frame (s)"] = ""
+    add(
+        "one frame as the chip reports it, alone, from array to pose",
+        float(np.median(seconds_of_single_frames(rng))),
+        1,
+    )
+    rows[-1]["first frame (s)"] = ""
     return {"rows": rows}
+
+
+def seconds_of_single_frames(rng: np.random.Generator) -> list[float]:
+    """Return how long frames of a cone before a wall take by themselves, in one thread, as the chip reports them."""
+    sensor, n = preset(SENSOR), N_SINGLE
+    aside, up = rng.normal(0, 0.03, (2, n))
+    views = Views.broadcast(rng.uniform(0.45, 0.9, n), rng.uniform(0.0, 2 * math.pi, n), aside, 0.0, up)
+    wall = Background(wall_m=2.0)
+    frames = capture_ranges(build_mesh(catalog()["cone"]), sensor, views, background=wall, rng=rng)
+    seconds = []
+    with build_bank(BankPlan(sensor=SENSOR, classes=("cone",), distance_m="0.3:1.2:0.01")) as bank:
+        matcher = Matcher(bank, "refine", on="reported", workers=1)
+        matcher.match(kalman_filter(frames[:1]))
+        for k in range(n):
+            start = time.perf_counter()
+            matcher.match(kalman_filter(frames[k : k + 1]))
+            seconds.append(time.perf_counter() - start)
+    return seconds
