@@ -15,7 +15,7 @@ from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
-from phasemark.matcher.accuracy.trials import TrialSetup, noisy_frames, run_trials
+from phasemark.matcher.accuracy.trials import Trials, TrialSetup, noisy_frames, run_trials
 from phasemark.matcher.filters import noise_free
 from phasemark.matcher.filters.filtered_frames import PixelState
 from phasemark.matcher.likelihood.bank_images import BankModel
@@ -114,6 +114,7 @@ def test_the_error_of_distance_and_angle_is_the_bound_and_the_covariance_says_so
     errors = [run_trials(match, renderers[name], name, TrialSetup(), 125, rng) for name in NAMES]
     for trials in errors:
         assert (trials.found == trials.class_name).all()
+    assert Trials.joined(errors).summary().class_errors.value == 0
     scaled = np.concatenate([t.scaled[~t.outlier] for t in errors])
     summaries = [t.summary() for t in errors]
     n = len(scaled)

@@ -86,8 +86,8 @@ class Trials:
 
     Parameters
     ----------
-    class_name : str
-        The true class.
+    class_name : (n,) object
+        The true classes.
     views : Views
         The truth.
     free : tuple of str
@@ -106,7 +106,7 @@ class Trials:
         p-value of the fit.
     """
 
-    class_name: str
+    class_name: NDArray[np.object_]
     views: Views
     free: tuple[str, ...]
     error: NDArray[np.float64]
@@ -156,7 +156,7 @@ class Trials:
         first = parts[0]
         arrays: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ("error", "bound", "covariance", "found", "accepted", "p_value")
+            for name in ("class_name", "error", "bound", "covariance", "found", "accepted", "p_value")
         }
         views = Views(*(np.concatenate([getattr(part.views, name) for part in parts]) for name in VIEW))
         return replace(first, views=views, **arrays)
@@ -379,7 +379,7 @@ def _judged(
     if covariance is not None and matches.free != free:
         raise UsageError(f"the matcher estimates {', '.join(matches.free)}, and 'free' of the setup is {free!r}")
     return Trials(
-        class_name=class_name,
+        class_name=np.full(len(views), class_name, object),
         views=views,
         free=free,
         error=error,
