@@ -110,6 +110,8 @@ def test_what_a_chip_reports_is_not_asked_of_a_camera(tmp_path):
         UsageError, match=r"method 'chip', condition 0, .*: on=\"reported\" goes with .* \[histogram\] table"
     ):
         run_sweep(plan(methods=[Method(name="chip", on="reported")]), tmp_path)
+    with pytest.raises(UsageError, match=r"method 'chip': on=\"reported\" needs a sensor with a \[histogram\] table"):
+        SweepJob(plan(methods=[Method(name="chip", on="reported")]), Round(0, (0,), 0, 1)).check_views()
 
 
 def test_rounds_go_on_until_the_rmse_is_known(tmp_path):

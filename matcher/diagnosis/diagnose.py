@@ -187,7 +187,7 @@ class Diagnosis:
         """Tell which number a frame that the landmark explains leaves open."""
         match, name = self.refused, self.refused.class_name
         if match.reason == "ambiguous" and match.alternatives:
-            others = [one for one in match.alternatives if _are_apart(match, one)]
+            others = [candidate for candidate in match.alternatives if _are_apart(match, candidate)]
             seen = " or ".join(
                 f"{one.class_name} at {one.distance_m:.3f} m and {math.degrees(one.delta_rad):.1f}°"
                 for one in (match, (others or match.alternatives)[0])

@@ -217,7 +217,7 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     # 2  take the covariance of solutions that may still win from wide differences
     competitive = near[(sums.cost + _further_cost(pixels))[near] <= problem.rival[near] + DISAGREEMENT]
     competitive = competitive if look_around else nowhere
-    covariance, without_one = _uncertainty(problem, state, competitive)
+    covariance, without_one = _uncertainty(problem, state, competitive, covariance)
     # 3  count contradicted pixels again, by that covariance: it may excuse more of them, or fewer
     if competitive.size:
         pixels = _judged_pixels(problem, state, near, covariance)
@@ -260,14 +260,13 @@ def _near_solutions(problem: Problem, state: State) -> NDArray[np.intp]:
 
 
 def _uncertainty(
-    problem: Problem, state: State, near: NDArray[np.intp]
+    problem: Problem, state: State, near: NDArray[np.intp], covariance: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return covariances, (m, p, p), and the largest deviations without any one pixel, (m, p).
 
-    For the solutions in `near`, slopes are differenced over half a standard deviation; for the others the deviations
-    are infinite.
+    Covariances by the descent's own slopes are given, and changed in place: for the solutions in `near`, slopes are
+    differenced over half a standard deviation. For the others the deviations are infinite.
     """
-    covariance = view_covariance(problem, state)
     without_one = np.full((len(state.theta), len(problem.settings.free)), np.inf)
     if near.size:
         there = problem.some(near)

@@ -218,7 +218,7 @@ class SweepJob:
         frames: dict[tuple[str, str], FilteredFrames] = {}
         bounds: dict[tuple[Any, ...], NDArray[np.float64]] = {}
         for m, method in enumerate(self.plan.methods):
-            on = self.explained(method)
+            on = "phasors" if method.on == "phasors" else "ranges"  # of a chip those that it reports
             kind = (on, method.filter)
             if kind not in frames:
                 frames[kind] = self.frames(number, method, image, first)
