@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
+from phasemark.matcher.estimate.acceptance import Rules, with_parts
 from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher, check_histogram_sensor, refuse_other_sensor
 from phasemark.matcher.histograms.target_matcher import TargetMatcher
-from phasemark.matcher.histograms.view_answers import Rules
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import usual_workers
 from phasemark.matcher.likelihood.setup import check_free
-from phasemark.matcher.likelihood.systematic import declared_covariance
-from phasemark.render import Background
+from phasemark.matcher.likelihood.shared_errors import with_motion
+from phasemark.matcher.likelihood.systematic import Systematic, declared_covariance
+from phasemark.matcher.match import Match
+from phasemark.render import Background, Sensor
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
 
@@ -28,9 +31,12 @@ DIRECT_KINDS = ("histograms", "targets")
 
 
 def refuse_direct_options(
-    method: str, on: str, background: Background | Literal["auto", "unknown", "any"] | None, pixels: str, robust: bool
-) -> None:
+    method: str, on: str, background: Background | Literal["auto", "unknown", "any"] | None, pixels: str, robust: bool,
+    calibration: bool, policy: bool,
+) -> None:  # fmt: skip
     """Refuse options that do not go with histograms and targets.
+
+    `calibration` and `policy` are whether that was asked for.
 
     Raises
     ------
@@ -44,6 +50,8 @@ def refuse_direct_options(
         and background == "auto",
         "'pixels' must be all": pixels != "all",
         "'robust' must be False": robust,
+        "'systematic' must be without 'calibration', which is carried into ranges and phasors alone": calibration,
+        "'policy' must be None, for it steers the search in ranges and phasors alone": policy,
     }
     for problem, is_wrong in wrong.items():
         if is_wrong:
@@ -60,7 +68,6 @@ def direct_method(
     false_alarm: float,
     tolerance_m: float,
     tolerance_rad: float,
-    declared: bool,
     workers: int | None,
 ) -> HistogramMatcher | TargetMatcher:
     """Return a matcher of histograms or targets with a bank.
@@ -77,8 +84,6 @@ def direct_method(
         Standard deviations of parameters before a frame is seen; nothing is known of the others.
     false_alarm, tolerance_m, tolerance_rad, workers
         As for :class:`~phasemark.matcher.Matcher`.
-    declared : bool
-        Whether what the sensor declares of a pose is added to covariances.
 
     Raises
     ------
@@ -87,17 +92,10 @@ def direct_method(
     """
     check_histogram_sensor(bank)
     names = check_free(VIEW[:3] if free is None else free)
-    rules = Rules(
-        names=tuple(bank.classes),
-        symmetry=tuple(int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes),
-        false_alarm=false_alarm,
-        tolerance={name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW},
-        systematic=declared_covariance(bank.camera, names) if declared else np.zeros((len(names), len(names))),
-    )
+    rules = Rules.of_bank(bank, names, false_alarm, tolerance_m, tolerance_rad)
     prior_std = [known.get(name, math.inf) for name in names]
     common: dict[str, Any] = {
-        "free": names, "prior_std": prior_std, "rules": rules, "background": background,
-        "workers": workers or usual_workers(),
+        "prior_std": prior_std, "rules": rules, "background": background, "workers": workers or usual_workers(),
     }  # fmt: skip
     return HistogramMatcher(bank, **common) if on == "histograms" else TargetMatcher(bank, **common)
 
@@ -117,3 +115,31 @@ def direct_frames(bank: Bank, on: str, frames: object) -> HistogramFrames | Targ
         return frames
     takes = "HistogramFrames" if on == "histograms" else "Targets, or HistogramFrames"
     raise UsageError(f'on="{on}" takes {takes}, got {type(frames).__name__}')
+
+
+def with_direct_errors(
+    rules: Rules,
+    systematic: Collection[Systematic],
+    sensor: Sensor,
+    time_s: NDArray[np.float64] | None,
+    answers: list[Match],
+) -> list[Match]:
+    """Return answers whose covariances hold what the sensor declares and what the jitter of stamps makes of motion.
+
+    Parameters
+    ----------
+    rules : Rules
+    systematic : collection of {"calibration", "declared", "motion"}
+    sensor : Sensor
+        Of the frames.
+    time_s : (n, frames) float64, optional
+        Stamps of the positions' frames.
+    answers : list of Match
+        One for each position; refused as "undetermined" where they no longer are within the tolerance.
+    """
+    declared = declared_covariance(sensor, rules.free)
+    if "declared" in systematic and declared.any():
+        answers = [with_parts(rules, match, {"declared": declared}) for match in answers]
+    if "motion" not in systematic or time_s is None:
+        return answers
+    return with_motion(rules.free, sensor.systematic_time_s, time_s.mean(axis=1), answers)

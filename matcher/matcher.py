@@ -18,12 +18,14 @@ from phasemark.matcher.direct_method import (
     direct_frames,
     direct_method,
     refuse_direct_options,
+    with_direct_errors,
 )
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.region import read_region
 from phasemark.matcher.frequencies import OneFrequencyBank
 from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.joint_models import relative_poses
+from phasemark.matcher.histograms.target_matcher import TargetMatcher
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import (
     BEARING_STD_RAD,
@@ -51,17 +53,6 @@ class MatchMethod(Protocol):
 
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Return one answer for each of n filtered frames, whose range offset was taken off."""
-
-
-class DirectMethod(Protocol):
-    """Interface of a method that matches the histograms or the targets of a direct sensor."""
-
-    @property
-    def table_bytes(self) -> int:
-        """How much memory the table takes that is rendered when frames come first."""
-
-    def match(self, frames: Any) -> list[Match]:
-        """Return one answer for each of n positions."""
 
 
 class Matcher:
@@ -112,18 +103,18 @@ class Matcher:
         How well height, pitch and roll are known where they are free: standard deviations of Gaussian priors with mean
         0; infinite where nothing is known. Starts are looked for up to three of them away, within a quarter of the
         image.
-    systematic : collection of {"calibration", "declared", "motion"}
+    systematic : collection of {"calibration", "declared", "motion"}, optional
         Which errors that all frames of the camera share are added to the covariance of "refine": what the calibration
         of the frames' sensor leaves, what the sensor declares of a pose, and what the jitter of its stamps makes of
-        the camera's motion. All unless stated.
+        the camera's motion. None: all; of histograms and targets all but what a calibration leaves.
     tolerance_m, tolerance_rad : float
         How far off an accepted answer may be. An answer is refused as "undetermined" where the frame leaves a free
         length or angle open by more than this, and as "ambiguous" where another class, or a view farther away than
         this, explains the frame too.
     workers : int, optional
         Threads that render (None: one for each processor), where "refine" renders; the answer does not depend on it.
-    policy : SearchPolicy
-        How wide and how long "refine" searches: see :class:`~phasemark.matcher.SearchPolicy`.
+    policy : SearchPolicy, optional
+        How wide and how long "refine" searches in ranges and phasors: see :class:`~phasemark.matcher.SearchPolicy`.
 
     Attributes
     ----------
@@ -168,11 +159,11 @@ class Matcher:
         height_std_m: float = math.inf,
         pitch_std_rad: float = TILT_STD_RAD,
         roll_std_rad: float = TILT_STD_RAD,
-        systematic: Collection[str] = SYSTEMATICS,
+        systematic: Collection[str] | None = None,
         tolerance_m: float = TOLERANCE_M,
         tolerance_rad: float = TOLERANCE_RAD,
         workers: int | None = None,
-        policy: SearchPolicy = DEFAULT_POLICY,
+        policy: SearchPolicy | None = None,
     ) -> None:
         _check_word("method", method, METHODS)
         _check_word("on", on, ("ranges", "phasors", "reported", *DIRECT_KINDS))
@@ -213,12 +204,13 @@ class Matcher:
         }  # fmt: skip
         self._made_from = bank, method, arguments
         self._one: OneFrequency | None = None
-        self._systematic = check_systematic(systematic)
+        self._systematic = check_systematic(SYSTEMATICS if systematic is None else systematic)
         self._by_evidence: list[Matcher] = []
-        self._direct: DirectMethod | None = None
+        self._direct: HistogramMatcher | TargetMatcher | None = None
         self.free: tuple[str, ...] = VIEW[:2]
         if on in DIRECT_KINDS:
-            refuse_direct_options(method, on, background, pixels, robust)
+            calibration = systematic is not None and "calibration" in self._systematic
+            refuse_direct_options(method, on, background, pixels, robust, calibration, policy is not None)
             behind = cast(Background | Literal["auto"] | None, background)
             known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
             if free is None:
@@ -233,7 +225,6 @@ class Matcher:
                 false_alarm=false_alarm,
                 tolerance_m=tolerance_m,
                 tolerance_rad=tolerance_rad,
-                declared="declared" in self._systematic,
                 workers=workers,
             )
             return
@@ -254,11 +245,13 @@ class Matcher:
             self.free = self._by_evidence[0].free
             return
         if method == "refine":
-            arguments["systematic"] = self._systematic
             kind = {"on": "ranges", "reported": True} if on == "reported" else {}
-            matching = LikelihoodMatcher(bank, **{**arguments, **kind})
+            own = {"systematic": self._systematic, "policy": policy or DEFAULT_POLICY, **kind}
+            matching = LikelihoodMatcher(bank, **{**arguments, **own})
             self._method, self.free = matching, matching.free
             return
+        if systematic is not None or policy is not None:
+            raise UsageError("'systematic' and 'policy' belong to method 'refine', not 'nearest'")
         fixed = free is None or tuple(free) == VIEW[:2]
         if not fixed or on != "ranges" or pixels != "all" or robust or isinstance(background, str):
             raise UsageError(
@@ -305,7 +298,7 @@ class Matcher:
         if self._by_evidence:
             return self._match_by_evidence(frames)
         if self._direct is not None:
-            return Matches(self._direct.match(direct_frames(self.bank, on, frames)))
+            return Matches(self._matched_directly(self._direct, frames))
         if isinstance(frames, Frames):
             raise UsageError("frames must be filtered first: kalman_filter(frames)")
         if not isinstance(frames, FilteredFrames):
@@ -351,7 +344,16 @@ class Matcher:
                 "'background' must have no wall in match_jointly, for its distance changes with the pose: give \"auto\""
             )
         measured = cast(HistogramFrames, direct_frames(self.bank, "histograms", frames))
-        return self._direct.match_jointly(measured, relative_poses(len(measured), camera2world))
+        found = self._direct.match_jointly(measured, relative_poses(len(measured), camera2world))
+        return with_direct_errors(self._direct.rules, self._systematic, frames.sensor, None, [found])[0]
+
+    def _matched_directly(self, method: HistogramMatcher | TargetMatcher, frames: object) -> list[Match]:
+        """Return answers for histograms or targets, with what all frames of the sensor share."""
+        found = method.match(direct_frames(self.bank, self.options["on"], frames))  # type: ignore[arg-type]
+        sensor, time_s = self.bank.camera, None
+        if isinstance(frames, HistogramFrames):
+            sensor, time_s = frames.sensor, frames.time_s
+        return with_direct_errors(method.rules, self._systematic, sensor, time_s, found)
 
     def _stages(self, arguments: dict[str, Any]) -> list[Matcher]:
         """Return the matchers whose backgrounds are tried in turn: each takes less for known than the one before."""

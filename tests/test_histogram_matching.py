@@ -13,10 +13,12 @@ from scipy.stats import binom, chi2, kstest, norm, poisson
 from phasemark import UsageError
 from phasemark.data import Bank, BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Matcher, Matches, cramer_rao, kalman_filter
+from phasemark.matcher import Matcher, Matches, SearchPolicy, cramer_rao, kalman_filter
 from phasemark.matcher.direct_method import Measured
+from phasemark.matcher.estimate.acceptance import Rules
 from phasemark.matcher.histograms.cost_shape import lessened, points_about
 from phasemark.matcher.histograms.poisson_fit import deviance_moments, deviance_test, frame_sums, moments_of
+from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
 from phasemark.matcher.statistics import nees, view_errors
 from phasemark.render import Background, Frames, Sensor, Views, preset
 from phasemark.render.direct import HistogramFrames, HistogramRenderer, Targets, capture_histograms
@@ -26,6 +28,7 @@ from phasemark.render.direct.footprints import footprint_grid
 from phasemark.render.direct.sample_counts import signal_of_samples
 from phasemark.render.direct.scene_samples import SceneMesh
 from phasemark.render.direct.transients import range_axis, zone_transients
+from phasemark.render.view import VIEW_FIELDS
 
 SENSOR = "vl53l5cx-8x8"
 CLASSES = ("cylinder", "cone", "sphere")
@@ -253,6 +256,76 @@ def test_the_answers_do_not_depend_on_threads_or_on_what_else_is_matched() -> No
     together = Matcher(bank_of(), "refine", free=FREE, on="histograms", workers=2).match(frames)
     np.testing.assert_array_equal(alone.distance_m, together.distance_m)
     np.testing.assert_array_equal(alone.covariance, together.covariance)
+
+
+def declaring(frames: HistogramFrames, time_s: np.ndarray | None = None, **declared: float) -> HistogramFrames:
+    return HistogramFrames(frames.counts, sensor=frames.sensor.with_(**declared), time_s=time_s)
+
+
+@pytest.mark.parametrize("on", ["histograms", "targets"])
+def test_what_a_sensor_declares_is_in_the_covariance_that_acceptance_reads(on: Measured) -> None:
+    frames = frames_of("cone", Views.broadcast([1.05, 1.12], [0.4, 0.9]), np.random.default_rng(15), n_frames=4)
+    plain, matcher = matcher_of(on=on).match(frames), matcher_of(on=on)
+    assert plain.accepted.all()
+    little = matcher.match(declaring(frames, systematic_distance_m=0.004))
+    assert little.accepted.all()
+    np.testing.assert_allclose(little.covariance - plain.covariance, [np.diag([0.004**2, 0.0])] * 2, atol=1e-12)
+    much = matcher.match(declaring(frames, systematic_distance_m=0.02))  # 3 σ is 6 cm, twice the tolerance
+    assert [match.reason for match in much] == ["undetermined"] * 2
+    unasked = Matcher(bank_of(), "refine", free=FREE, on=on, systematic=("motion",), workers=1)
+    assert unasked.match(declaring(frames, systematic_distance_m=0.02)).accepted.all()
+
+
+def test_jitter_of_stamps_counts_as_motion_of_a_sensor_that_moves() -> None:
+    distance_m, jitter_s = np.linspace(1.06, 1.12, 4), 0.01
+    frames = frames_of("cone", Views.broadcast(distance_m, 0.4), np.random.default_rng(15), n_frames=4)
+    time_s = 0.04 * np.arange(4)[:, None] + 0.01 * np.arange(4)  # half a metre a second
+    found = matcher_of().match(declaring(frames, time_s, systematic_time_s=jitter_s))
+    part = np.array([match.systematic["motion"][0, 0] for match in found])
+    np.testing.assert_allclose(part, (0.5 * jitter_s) ** 2, rtol=0.2)  # a speed from four distances
+
+
+@pytest.mark.parametrize("on", ["histograms", "targets"])
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"policy": SearchPolicy()}, "'policy' must be None"),
+        ({"systematic": ("declared", "calibration")}, "'systematic' must be without 'calibration'"),
+    ],
+)
+def test_an_option_without_effect_is_refused(on: Measured, option: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        Matcher(bank_of(), "refine", on=on, **option)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="'systematic' and 'policy' belong to method 'refine', not 'nearest'"):
+        Matcher(bank_of(), **option)  # type: ignore[arg-type]
+
+
+def test_a_landmark_beyond_the_bank_is_not_accepted() -> None:
+    views = Views.broadcast([1.27, 1.28, 1.30], [0.4, 0.9, 1.4])  # the bank ends at 1.15 m
+    found = matcher_of().match(frames_of("cone", views, np.random.default_rng(16), n_frames=4))
+    assert not found.accepted.any()
+    assert {match.reason for match in found} <= {"outside the bank", "poor fit"}
+
+
+def test_a_class_weighs_as_the_volume_of_its_posterior() -> None:
+    rules = Rules(
+        names=("narrow", "wide"), symmetry=(1, 1), distance_m=np.array([0.5, 1.5]), free=FREE, false_alarm=0.01,
+        delta_rad=np.linspace(0, 2 * np.pi, 36, endpoint=False), tolerance=dict.fromkeys(VIEW_FIELDS, 0.1),
+    )  # fmt: skip
+    narrow, wide = np.array([[4e6, 2e3], [2e3, 9e2]]), np.array([[1e5, 0.0], [0.0, 4e2]])
+    view = np.array([1.0, 0.3, 0.0, 0.0, 0.0, 0.0])
+    found = [Explanation(0, view, 20.0, narrow), Explanation(1, view, 21.0, wide)]
+    share = answer_from(rules, found, FitTest(20.0, 20, 0.5), 1e4, 1e4).class_probability
+
+    def evidence(cost: float, information: np.ndarray) -> float:
+        # the integral of the likelihood over both parameters, by sums over ten standard deviations
+        root = np.linalg.cholesky(np.linalg.inv(information))
+        x = np.linspace(-10, 10, 401)
+        cells = (x[1] - x[0]) ** 2 * np.exp(-0.5 * (x[:, None] ** 2 + x**2)).sum()
+        return math.exp(-cost / 2) * cells * abs(np.linalg.det(root))
+
+    want = evidence(20.0, narrow) / evidence(21.0, wide)
+    assert share["narrow"] / share["wide"] == pytest.approx(want, rel=2e-3)  # narrower by 2π / |R I R| than the ranges
 
 
 def test_information_is_that_of_the_slowest_rise_of_the_cost() -> None:

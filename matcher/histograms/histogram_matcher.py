@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
+from phasemark.matcher.estimate.acceptance import Rules, no_answer
 from phasemark.matcher.histograms.alone_search import AloneSearch
 from phasemark.matcher.histograms.exact_fit import Counted, Fit, fit_view, search_of
 from phasemark.matcher.histograms.histogram_table import TableGrid, plan_table
@@ -21,7 +22,7 @@ from phasemark.matcher.histograms.poisson_fit import deviance_test, doubtful_dev
 from phasemark.matcher.histograms.scene_models import planes_of, scene_at
 from phasemark.matcher.histograms.search_plan import LandmarkSearch, SearchPlan, Start
 from phasemark.matcher.histograms.table_search import ambient_light
-from phasemark.matcher.histograms.view_answers import Explanation, FitTest, Rules, answer_of, no_answer
+from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
 from phasemark.matcher.match import Match
 from phasemark.render import Background, Sensor
 from phasemark.render.direct.bin_counts import response_share
@@ -51,10 +52,8 @@ class HistogramMatcher:
     bank : Bank
         Its meshes and the span of its grid are used. Its images are not: histograms are rendered when the first frames
         come, which takes some seconds and :attr:`table_bytes` of memory.
-    free : tuple of str
-        Parameters of the view, in its order; distance_m and delta_rad among them.
     prior_std : sequence of float
-        Standard deviation of each before a frame is seen, about 0; infinite where nothing is known.
+        Standard deviation of each free parameter before a frame is seen, about 0; infinite where nothing is known.
     rules : Rules
         When an answer is accepted.
     background : Background, "auto" or None
@@ -65,12 +64,12 @@ class HistogramMatcher:
     """
 
     def __init__(
-        self, bank: Bank, *, free: tuple[str, ...], prior_std: Sequence[float], rules: Rules,
+        self, bank: Bank, *, prior_std: Sequence[float], rules: Rules,
         background: Background | Literal["auto"] | None = None, workers: int = 1,
     ) -> None:  # fmt: skip
         self.sensor = bank.camera
         check_histogram_sensor(bank)
-        self._free, self._rules, self._workers = free, rules, workers
+        self.rules, self._workers, free = rules, workers, rules.free
         prior = np.array(prior_std, dtype=np.float64)
         meshes = [bank.mesh(name) for name in bank.classes]
         self.signals = [ViewSignals(mesh, self.sensor, float(mesh.metadata["albedo"])) for mesh in meshes]
@@ -113,7 +112,7 @@ class HistogramMatcher:
         with ThreadPoolExecutor(self._workers) as pool:
             looked = list(pool.map(self._looked, counted))
         starts, bare = zip(*looked, strict=True)
-        return match_together(self.search, self._plan, self._rules, counted, starts, sum(bare), first2camera)
+        return match_together(self.search, self._plan, self.rules, counted, starts, sum(bare), first2camera)
 
     def _looked(self, frame: Counted) -> tuple[list[Start], float]:
         """Return where fits of a frame begin, and what it costs without a landmark."""
@@ -128,7 +127,7 @@ class HistogramMatcher:
     def _match(self, frame: Counted) -> Match:
         starts, bare = self._looked(frame)
         if not starts:
-            return no_answer(self._rules, self._free)
+            return no_answer(self.rules)
         least = starts[0].cost
         fits: list[tuple[int, Fit]] = []
         offset, margin, n_tried = 0.0, _SURE_COST, 0
@@ -139,9 +138,9 @@ class HistogramMatcher:
             hopeless = min((fit.cost for _, fit in fits), default=math.inf) + _SURE_COST
             known = [fit.view for other, fit in fits if other == start.class_index]
             model, plan = self.search.model(start.class_index), self._plan
-            search = search_of(self._free, plan.prior_std, plan.limits, _SCENES, model.nuisances)
+            search = search_of(plan.free, plan.prior_std, plan.limits, _SCENES, model.nuisances)
             fit = fit_view(
-                scene_at(model, self._free), frame, start.state, start.bright, start.ambient, search, hopeless, known
+                scene_at(model, plan.free), frame, start.state, start.bright, start.ambient, search, hopeless, known
             )
             if fit is None:
                 continue
@@ -155,11 +154,11 @@ class HistogramMatcher:
         ]
         best_class, best = min(fits, key=lambda pair: pair[1].cost)
         mean, variance = moments_of(best.level)
-        free = len(self._free) + self.search.model(best_class).nuisances.shape[1] + 1 + len(best.ambient)
+        free = len(self.rules.free) + self.search.model(best_class).nuisances.shape[1] + 1 + len(best.ambient)
         test = FitTest(*deviance_test(best.deviance, mean, variance, free))
-        doubt = best.cost - best.deviance + doubtful_deviance(mean, variance, free, self._rules.false_alarm)
+        doubt = best.cost - best.deviance + doubtful_deviance(mean, variance, free, self.rules.false_alarm)
         behind = self.search.background_of(best)
-        return answer_of(self._rules, self._free, found, test, bare, doubt, behind)
+        return answer_from(self.rules, found, test, bare, doubt, behind)
 
 
 def check_histogram_sensor(bank: Bank) -> None:

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from phasemark.matcher.estimate.acceptance import Rules, no_answer
 from phasemark.matcher.histograms.exact_fit import Counted, Fit, fit_view, search_of
 from phasemark.matcher.histograms.joint_models import JointModel, view_in_first, views_from
 from phasemark.matcher.histograms.poisson_fit import deviance_of, deviance_test, doubtful_deviance, moments_of
 from phasemark.matcher.histograms.scene_models import scene_at
 from phasemark.matcher.histograms.search_plan import LandmarkSearch, SearchPlan, Start
-from phasemark.matcher.histograms.view_answers import Explanation, FitTest, Rules, answer_of, no_answer
+from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
 from phasemark.matcher.match import Match
 from phasemark.render import Views
 from phasemark.render.view import VIEW_FIELDS
@@ -51,7 +52,7 @@ def match_together(
     """
     begin = _begin(plan, starts, first2camera, len(rules.names))
     if not begin:
-        return no_answer(rules, plan.free)
+        return no_answer(rules)
     joint = joined(frames)
     models = [JointModel([search.model(c)] * len(frames), first2camera) for c in range(len(rules.names))]
     tried = search_of(plan.free, plan.prior_std, plan.limits, 1, models[0].nuisances)
@@ -80,7 +81,7 @@ def match_together(
     apart = _best_apart(search, frames, models[best_class], first2camera, best, range(len(rules.names)))
     test = _test(best, joint, free, apart, len(_OWN) * len(frames) - len(plan.free))
     doubt = best.cost - best.deviance + doubtful_deviance(*moments_of(best.level), free, rules.false_alarm)
-    return answer_of(rules, plan.free, found, test, bare, doubt)
+    return answer_from(rules, found, test, bare, doubt)
 
 
 def joined(frames: Sequence[Counted]) -> Counted:

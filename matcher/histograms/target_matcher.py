@@ -20,6 +20,7 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.data import Bank
+from phasemark.matcher.estimate.acceptance import Rules, no_answer
 from phasemark.matcher.histograms.background_table import build_table_before, plane_light
 from phasemark.matcher.histograms.cost_shape import lessened, points_about
 from phasemark.matcher.histograms.histogram_matcher import check_histogram_sensor, view_limits
@@ -27,7 +28,7 @@ from phasemark.matcher.histograms.histogram_table import build_table, plan_table
 from phasemark.matcher.histograms.scene_models import planes_of
 from phasemark.matcher.histograms.search_plan import before_the_wall
 from phasemark.matcher.histograms.table_search import grid_minima
-from phasemark.matcher.histograms.view_answers import Explanation, FitTest, Rules, answer_of, no_answer
+from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
 from phasemark.matcher.match import Match
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import Background, Views
@@ -86,21 +87,21 @@ class TargetMatcher:
 
     Parameters
     ----------
-    bank, free, prior_std, rules, workers
+    bank, prior_std, rules, workers
         As for :class:`~phasemark.matcher.histograms.histogram_matcher.HistogramMatcher`.
     background : Background, optional
         What stands behind the landmark; albedos are as stated, for targets do not tell them.
     """
 
     def __init__(
-        self, bank: Bank, *, free: tuple[str, ...], prior_std: Sequence[float], rules: Rules,
+        self, bank: Bank, *, prior_std: Sequence[float], rules: Rules,
         background: Background | None = None, workers: int = 1,
     ) -> None:  # fmt: skip
         self.sensor = bank.camera
         check_histogram_sensor(bank)
-        self._free, self._rules, self._workers = free, rules, workers
+        self._free, self.rules, self._workers = rules.free, rules, workers
         self._weight = 1 / np.array(prior_std, dtype=np.float64) ** 2
-        self._columns = [VIEW_FIELDS.index(name) for name in free]
+        self._columns = [VIEW_FIELDS.index(name) for name in rules.free]
         meshes = [bank.mesh(name) for name in bank.classes]
         self.signals = [ViewSignals(mesh, self.sensor, float(mesh.metadata["albedo"])) for mesh in meshes]
         self.grid = plan_table(self.signals, bank.distance_m, bank.delta_rad, math.gcd(*rules.symmetry))
@@ -190,7 +191,7 @@ class TargetMatcher:
 
     def _match(self, frame: Reported) -> Match:
         if not len(frame.zone):
-            return no_answer(self._rules, self._free)
+            return no_answer(self.rules)
         fits = [self._fit(frame, c, view) for c, view in self._starts(frame)]
         fits += self._beside(frame, fits)
         best_index = int(np.argmin([comparison.cost for _, _, comparison in fits]))
@@ -204,8 +205,8 @@ class TargetMatcher:
         p_fit = float(special.chdtrc(dof, best.chi2)) if dof > 0 else 0.0
         p_count = float(special.pdtrc(best.n_wrong - 1, max(expected, 0.05))) if best.n_wrong else 1.0
         test = FitTest(best.chi2, max(dof, 0), min(1.0, 2 * min(p_fit, p_count)))
-        doubt = best.cost - best.chi2 + float(special.chdtri(max(dof, 1), self._rules.false_alarm))
-        return answer_of(self._rules, self._free, found, test, bare, doubt, self._background)
+        doubt = best.cost - best.chi2 + float(special.chdtri(max(dof, 1), self.rules.false_alarm))
+        return answer_from(self.rules, found, test, bare, doubt, self._background)
 
     def _bare_cost(self, frame: Reported) -> float:
         """Return what a scene without a landmark costs."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.matcher.estimate.fits import BETTER_COST, MOST_REFINED, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.likelihood.background_estimate import (
     Surroundings,
@@ -16,7 +17,6 @@ from phasemark.matcher.likelihood.background_estimate import (
     without_background,
 )
 from phasemark.matcher.likelihood.candidates import fit_views
-from phasemark.matcher.likelihood.fits import BETTER_COST, MOST_REFINED, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.kinks import CLOSE_BY_RAD
 from phasemark.matcher.likelihood.profiles import with_profiles
@@ -175,7 +175,7 @@ class AutoBackground:
         best = best_of_frame(own)
         n = _OTHER_ANGLES
         source = np.repeat(best, n - 1)
-        period = np.array([delta_period_rad(self._setup.shapes.symmetry[c]) for c in own.class_index[source]])
+        period = np.array([delta_period_rad(self._setup.rules.symmetry[c]) for c in own.class_index[source]])
         view = own.view[source]
         view[:, 1] += np.tile(np.arange(1, n), len(best)) * period / n
         scene = self._scene(_standing(backgrounds, which))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.likelihood.fits import (
+from phasemark.matcher.estimate.fits import (
     MOST_REFINED,
     SAME_M,
     SAME_RAD,
@@ -216,7 +216,7 @@ def _beside(
     A descent stops at side minima, where an edge of the landmark has left a pixel.
     """
     settings = scene.settings(setup) if roughly else _close_settings(setup, scene, evidence)
-    which = distinct_of_frames(fits, np.flatnonzero(stuck), setup.shapes.symmetry)
+    which = distinct_of_frames(fits, np.flatnonzero(stuck), setup.rules.symmetry)
     if not which.size:
         return fits[:0]
     views = _around(setup, scene, fits.view[which])
@@ -235,7 +235,7 @@ def _elsewhere(setup: Setup, fits: Fits, known: Fits, apart: tuple[float, ...]) 
 
 def _of_own_places(setup: Setup, fits: Fits, which: NDArray[np.int64], apart: tuple[float, ...]) -> Fits:
     """Return those of some fits that came to places apart from each other, the best at each."""
-    return fits[distinct_of_frames(fits, which, setup.shapes.symmetry, *apart)]
+    return fits[distinct_of_frames(fits, which, setup.rules.symmetry, *apart)]
 
 
 def fit_views(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
@@ -296,7 +296,7 @@ def _recovered(setup: Setup, scene: Scene, evidence: Evidence, start: _Starts, l
         own, class_index = lost.frame, lost.class_index
         views = _surrounded(setup, lost).view.reshape(-1, len(lost), len(VIEW)).transpose(1, 0, 2)
     else:
-        n = len(setup.shapes.names)
+        n = len(setup.rules.names)
         also = np.isin(start[0] * n + start[1], lost.frame * n + lost.class_index)
         own, class_index, views = start[0][also], start[1][also], _spread(setup, scene, start[2][also])
     best = _best_of(setup, scene, evidence, own, class_index, views, _BEST_BESIDE, model=scene.final)
@@ -365,7 +365,7 @@ def _most_likely(setup: Setup, fits: Fits, ordered: list[int]) -> NDArray[np.int
     for k in ordered:
         same = [j for j in chosen if fits.frame[j] == fits.frame[k]]
         if len(same) < MOST_REFINED:
-            own = distinct(fits, np.array([*same, k]), setup.shapes.symmetry)
+            own = distinct(fits, np.array([*same, k]), setup.rules.symmetry)
             if len(own) > len(same):
                 chosen.append(int(k))
     return np.array(chosen, np.int64)

@@ -10,10 +10,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.matcher.estimate.fits import BETTER_COST
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.contradictions import whole_cost
 from phasemark.matcher.likelihood.descent import SETTLED_COST, descend
-from phasemark.matcher.likelihood.fits import BETTER_COST
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Sums

@@ -12,13 +12,15 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.chi_squared import largest_costs
+from phasemark.matcher.estimate.acceptance import Rules, rank
+from phasemark.matcher.estimate.fits import Fits
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.frequencies import background_of, layers_of, pixels_of
-from phasemark.matcher.likelihood.acceptance import rank
 from phasemark.matcher.likelihood.auto_background import AutoBackground
 from phasemark.matcher.likelihood.background_estimate import NEAREST_WALL_M
 from phasemark.matcher.likelihood.bank_images import BankModel
@@ -28,7 +30,7 @@ from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.likelihood.search import search_views
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
-from phasemark.matcher.likelihood.setup import Scene, Setup, Shapes, check_free
+from phasemark.matcher.likelihood.setup import Scene, Setup, check_free
 from phasemark.matcher.likelihood.shared_errors import with_motion, with_shared_errors
 from phasemark.matcher.likelihood.strip_images import StripModel
 from phasemark.matcher.likelihood.systematic import Systematic
@@ -54,6 +56,11 @@ BEARING_STD_RAD, ZONE_BEARING_STD_RAD, TILT_STD_RAD = math.radians(1.5), math.ra
 _FINE_GRID, _COARSE_GRID = (0.011, math.radians(1.1)), (0.022, math.radians(2.2))
 """Widest steps of a bank, metres and radians, on which interpolated images are at the bound, and on which they lead to
 the solution."""
+_FEWEST_PER_PARAMETER, _FURTHER_ZONES = 6, 3
+"""Returns that each free parameter takes among unknown things or outliers; zones of a chip, which are few but show one
+surface each, that an answer explains beyond its number of free parameters."""
+_AGAINST_FAR_VIEW = 4
+"""Unexplained pixels that must stand against a far view of the same landmark among unknown things; of zones, one."""
 _SHARES_OF_COLUMN = -0.5, -0.25, 0.25, 0.5
 _PIXELS_AT_ONCE = 1 << 20
 """Of all frames that are matched together. Each takes up to a kilobyte, for every candidate has an image of it."""
@@ -95,9 +102,6 @@ class LikelihoodMatcher:
         if has_prior:
             known["bearing_rad"] = bearing_std_rad
         prior = tuple(known.get(name, math.inf) for name in names)
-        tolerance = {name: tolerance_m if name.endswith("_m") else tolerance_rad for name in VIEW}
-        if reported and has_prior:  # pitch and roll are free because no mounting is level, and not to be found
-            tolerance |= dict.fromkeys(VIEW[4:], math.inf)
         unknown = background == "unknown"
         self._bank = bank
         self._systematic = systematic
@@ -105,10 +109,22 @@ class LikelihoodMatcher:
         self.free = names
         self._stated = background if isinstance(background, Background) else None
         self._auto = background == "auto"
+        huber = ROBUST_FROM if robust or unknown else None
+        fewest = _FEWEST_PER_PARAMETER * len(names)
+        if reported:
+            fewest = len(names) + _FURTHER_ZONES
+        rules = Rules.of_bank(bank, names, false_alarm, tolerance_m, tolerance_rad)
+        if reported and has_prior:  # pitch and roll are free because no mounting is level, and not to be found
+            rules = replace(rules, tolerance={**rules.tolerance, **dict.fromkeys(VIEW[4:], math.inf)})
+        rules = replace(
+            rules,
+            among_unknown=unknown,
+            rival_cost=DISAGREEMENT * (_AGAINST_FAR_VIEW if unknown and not reported else 1),
+            fewest_explained=0 if huber is None else fewest,
+        )
         self._setup = Setup(
             bank=bank,
-            shapes=Shapes.of_bank(bank),
-            free=names,
+            rules=rules,
             prior_std=prior if has_prior or min(prior) < math.inf else (),
             bearing_has_prior=has_prior,
             on=on,
@@ -116,9 +132,7 @@ class LikelihoodMatcher:
             unknown=unknown,
             reports_one_surface=reported,
             used=pixels_of(bank, pixels).ravel(),
-            huber=ROBUST_FROM if robust or unknown else None,
-            false_alarm=false_alarm,
-            tolerance=tolerance,
+            huber=huber,
             widest_rad=policy.prior_sigma * bearing_std_rad if has_prior else math.inf,
             policy=policy,
         )
@@ -146,7 +160,9 @@ class LikelihoodMatcher:
             with ThreadPoolExecutor(self._workers) as pool:
                 found = list(pool.map(match, parts))
         answers = [answer for some in found for answer in some]
-        return with_motion(self._setup, self._systematic, frames, answers)
+        if "motion" not in self._systematic:
+            return answers
+        return with_motion(self.free, frames.sensor.systematic_time_s, frames.time_s, answers)
 
     def _match_stated(self, frames: FilteredFrames) -> list[Match]:
         """Match frames before the background that was stated, or none."""
@@ -156,7 +172,7 @@ class LikelihoodMatcher:
         if self._setup.unknown and not self._setup.reports_one_surface:
             fits = fit_without_borders(self._setup, self._scene, evidence, fits)
         fits = with_profiles(self._setup, self._scene, evidence, fits)
-        answers = rank(self._setup, frames, fits, bare, [self._stated] * len(frames))
+        answers = rank(self._setup.rules, fits, self._doubt(fits), bare, [self._stated] * len(frames))
         answers = self._with_mirror(evidence, answers, self._search)
         return self._with_shared_errors(frames, evidence, answers)
 
@@ -169,11 +185,16 @@ class LikelihoodMatcher:
         bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(evidence))
         backgrounds, fits = auto.search(frames, evidence, bare)
         answers: list[Match] = []
-        for k, found in enumerate(rank(self._setup, frames, fits, bare, backgrounds)):
+        for k, found in enumerate(rank(self._setup.rules, fits, self._doubt(fits), bare, backgrounds)):
             one, search = slice(k, k + 1), self._search if backgrounds[k] is None else self._open_search
             mirrored = self._with_mirror(evidence[one], [found], search)
             answers.extend(self._with_shared_errors(frames[one], evidence[one], mirrored))
         return answers
+
+    def _doubt(self, fits: Fits) -> NDArray[np.float64]:
+        """Return the costs of fits that just fail a χ² test with the noise as stated, (m,)."""
+        edge = special.chdtri(np.maximum(fits.dof, 1), self._setup.rules.false_alarm)
+        return np.asarray(edge + DISAGREEMENT * fits.unexplained)
 
     def _with_mirror(self, evidence: Evidence, answers: list[Match], search: Search) -> list[Match]:
         """Say of accepted answers whether their frames may be mirrored left to right, by the bounds of the cells."""
@@ -182,7 +203,8 @@ class LikelihoodMatcher:
         dof = np.array([answer.dof for answer in some])
         # what an answer leaves to unknown things costs the other view, too
         left = np.maximum(seen.returned.sum(axis=1) - dof - len(self._setup.free), 0)
-        limit = largest_costs(self._setup.false_alarm, dof, evidence.scatter_freedom[accepted]) + DISAGREEMENT * left
+        false_alarm = self._setup.rules.false_alarm
+        limit = largest_costs(false_alarm, dof, evidence.scatter_freedom[accepted]) + DISAGREEMENT * left
         found = search.may_explain(seen.mirrored(self._bank.sensor.cols), limit)
         for k, answer, mirrored in zip(accepted, some, found, strict=True):
             answers[k] = replace(answer, may_be_mirrored=bool(mirrored))
@@ -262,7 +284,7 @@ class LikelihoodMatcher:
     def _check_floor(self, floor_m: float) -> None:
         """Check that the landmarks of the bank do not reach below a floor that was stated."""
         view = Views.broadcast(float(self._bank.distance_m[-1])).in_camera(self._bank.sensor)
-        for c in range(len(self._setup.shapes.names)):
+        for c in range(len(self._setup.rules.names)):
             Background(floor_m=floor_m).check_behind(self._rendered.renderer(c).topology.vertices, view)
 
     def _new_search(self, behind: PhasorImages | None, *, open_edges: bool = False) -> Search:

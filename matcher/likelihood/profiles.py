@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.likelihood.acceptance import is_acceptable
-from phasemark.matcher.likelihood.fits import Fits, best_of_frame
+from phasemark.matcher.estimate.acceptance import TOLERATED_SIGMA, is_acceptable
+from phasemark.matcher.estimate.fits import Fits, best_of_frame
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import Evidence
@@ -36,15 +36,15 @@ def with_profiles(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) ->
     tolerance t, its deviation is that with which it is refused, or t / √r if that is larger.
     """
     best = best_of_frame(fits)
-    best = best[[is_acceptable(setup, fits, int(k)) for k in best]]
+    best = best[[is_acceptable(setup.rules, fits, int(k)) for k in best]]
     std = fits.std_without_one.copy()
     for name in VIEW[:2]:
-        column, tolerance = setup.free.index(name), setup.tolerance[name]
-        symmetry = np.array([setup.shapes.symmetry[c] for c in fits.class_index[best]])
+        column, tolerance = setup.free.index(name), setup.rules.tolerance[name]
+        symmetry = np.array([setup.rules.symmetry[c] for c in fits.class_index[best]])
         which = best if name == "distance_m" else best[math.pi > tolerance * symmetry]
         for side in (-tolerance, tolerance):
             rise = np.maximum(_rise(setup, scene, evidence, fits[which], column, side), 1e-12)
-            refused = 1.001 * tolerance / setup.policy.tolerated_sigma
+            refused = 1.001 * tolerance / TOLERATED_SIGMA
             wide = np.where(rise < _RISE, np.maximum(refused, tolerance / np.sqrt(rise)), 0.0)
             std[which, column] = np.maximum(std[which, column], wide)
     return replace(fits, std_without_one=std)
@@ -69,6 +69,6 @@ def _rise(
         scene.final, evidence, fits.frame, fits.class_index, view, settings, give_up_above=enough, roughly=True
     )
     grid, own = (setup.bank.distance_m, setup.bank.delta_rad), VIEW.index(setup.free[column])
-    periods = [delta_period_rad(setup.shapes.symmetry[c]) for c in fits.class_index]
+    periods = [delta_period_rad(setup.rules.symmetry[c]) for c in fits.class_index]
     inside = np.array([is_in_range(*grid, one, period) for one, period in zip(view, periods, strict=True)], np.bool_)
     return np.where(inside & (held.view[:, own] == view[:, own]), held.cost - fits.cost, np.inf)

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.chi_squared import p_values_of, worse_of_two
+from phasemark.matcher.estimate.fits import Fits
 from phasemark.matcher.information import covariance_of, eliminated
 from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels, whole_cost
 from phasemark.matcher.likelihood.descent import ROUGH_COST, SETTLED_COST, descend
-from phasemark.matcher.likelihood.fits import Fits
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.kinks import look_beside, settle
 from phasemark.matcher.likelihood.outline import stands_out

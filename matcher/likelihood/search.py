@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy import special
 
 from phasemark.matcher.chi_squared import largest_costs
-from phasemark.matcher.likelihood.acceptance import is_acceptable
+from phasemark.matcher.estimate.acceptance import is_acceptable
+from phasemark.matcher.estimate.fits import BETTER_COST, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.candidates import costs_on_scout, fit_neighbouring_views, fit_starts
-from phasemark.matcher.likelihood.fits import BETTER_COST, Fits, best_of_frame, least_of_frame
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.nearest.bank_minima import Known, Search, Starts
@@ -77,23 +77,23 @@ def _with_rivals(setup: Setup, scene: Scene, evidence: Evidence, seen: Observati
         best = best_of_frame(fits)
         best = best[np.isin(fits.frame[best], which)]
         if setup.unknown and setup.reports_one_surface:  # few zones lead few descents to the best view
-            best = best[fits.p_value[best] >= setup.false_alarm]
+            best = best[fits.p_value[best] >= setup.rules.false_alarm]
         else:
-            best = best[[is_acceptable(setup, fits, int(k)) for k in best]]
+            best = best[[is_acceptable(setup.rules, fits, int(k)) for k in best]]
         if not best.size:
             return fits
         which = fits.frame[best]
         limit, most = _limit(setup, seen[which], evidence.scatter_freedom[which]), _most(setup, evidence[which])
         closed_limit = _limit(setup, evidence.seen[which], evidence.scatter_freedom[which])
         if setup.huber is None:
-            most = np.minimum(most, fits.cost[best] + setup.rival_cost)
+            most = np.minimum(most, fits.cost[best] + setup.rules.rival_cost)
         if evidence.on == "ranges" and setup.huber is None:
             closed_limit = np.minimum(closed_limit, most)
         if seen is evidence.seen:
             limit = closed_limit
         if setup.unknown and setup.reports_one_surface:  # every unexplained return costs, and few are explained
-            limit, most = fits.capped[best] + setup.rival_cost, fits.cost[best] + setup.rival_cost
-        near = fits.cost <= least_of_frame(fits, len(evidence.weight))[fits.frame] + setup.rival_cost
+            limit, most = fits.capped[best] + setup.rules.rival_cost, fits.cost[best] + setup.rules.rival_cost
+        near = fits.cost <= least_of_frame(fits, len(evidence.weight))[fits.frame] + setup.rules.rival_cost
         known = fits[near & np.isin(fits.frame, which)]
         places = [(known.class_index[own], known.view[own]) for own in (known.frame == k for k in which)]
         slack = _SLACK if setup.reports_one_surface and setup.unknown else math.inf
@@ -135,13 +135,13 @@ def _in_parts(starts: Starts, n: int) -> Iterator[NDArray[np.int64]]:
 
 def _limit(setup: Setup, seen: Observation, nu: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the bound up to which a cell may hold an explanation: a rival of the worst fit that is accepted."""
-    return largest_costs(setup.false_alarm, seen.returned.sum(axis=1), nu) + setup.rival_cost
+    return largest_costs(setup.rules.false_alarm, seen.returned.sum(axis=1), nu) + setup.rules.rival_cost
 
 
 def _most(setup: Setup, evidence: Evidence) -> NDArray[np.float64]:
     """Return the cost up to which a view explains a frame."""
     residuals = evidence.per_pixel * np.count_nonzero(evidence.weight, axis=1)
-    return largest_costs(setup.false_alarm, residuals, evidence.scatter_freedom) + setup.rival_cost
+    return largest_costs(setup.rules.false_alarm, residuals, evidence.scatter_freedom) + setup.rules.rival_cost
 
 
 def are_doubtful(setup: Setup, fits: Fits, n: int, p: float | None = None) -> NDArray[np.bool_]:
@@ -157,5 +157,5 @@ def _worth_a_search(setup: Setup, evidence: Evidence, bare: NDArray[np.float64])
     """Return which frames have enough returns to place a landmark, and are not explained without one."""
     returned = evidence.seen.returned
     enough = (returned & setup.used).sum(axis=1) >= MIN_RETURNS
-    explained = bare <= special.chdtri(np.maximum(returned.sum(axis=1), 1), setup.false_alarm)
+    explained = bare <= special.chdtri(np.maximum(returned.sum(axis=1), 1), setup.rules.false_alarm)
     return np.flatnonzero(enough & ~explained)

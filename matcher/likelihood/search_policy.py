@@ -1,6 +1,6 @@
 """The numbers that steer the search for the most likely view: how wide, how long, and when it is enough.
 
-The first decide which minima of the likelihood are found, and at what cost; the last decide what is accepted.
+They decide which minima of the likelihood are found, and at what cost, not what is accepted.
 ``python benchmarks/run.py policy`` halves and doubles each of them and tells how answers and rendered views change.
 """
 
@@ -14,7 +14,7 @@ from phasemark import UsageError
 __all__ = ["DEFAULT_POLICY", "SearchPolicy"]
 
 _MAY_BE_ZERO = ("cache_bytes",)
-_PROBABILITIES = ("doubtful_p", "ambiguity")
+_PROBABILITIES = ("doubtful_p",)
 
 
 @dataclass(frozen=True)
@@ -41,17 +41,8 @@ class SearchPolicy:
         An explanation whose cost is larger by this has no probability worth telling.
     close_cost : float
         A fit whose cost is above its frame's best by more will not become the best: its surroundings are not looked at.
-
     doubtful_p : float
         p-value at which a fit before an estimated background is doubted, and wall, floor and view move together.
-    explained_per_parameter : int
-        Returns that each free parameter takes among unknown things.
-    pixels_against_far_view : int
-        Unexplained pixels that must stand against a far view of the same landmark among unknown things.
-    tolerated_sigma : float
-        Standard deviations that must lie within the tolerance of an accepted answer.
-    ambiguity : float
-        Largest probability that an accepted answer leaves to other classes.
 
     Raises
     ------
@@ -66,12 +57,7 @@ class SearchPolicy:
     margin_cost: float = 500.0
     likely_cost: float = 100.0
     close_cost: float = 50.0
-
     doubtful_p: float = 0.05
-    explained_per_parameter: int = 6
-    pixels_against_far_view: int = 4
-    tolerated_sigma: float = 3.0
-    ambiguity: float = 1e-3
 
     def __repr__(self) -> str:
         """Name the fields that differ from their defaults."""

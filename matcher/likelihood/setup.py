@@ -11,19 +11,17 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
+from phasemark.matcher.estimate.acceptance import Rules
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import SearchPolicy
 from phasemark.matcher.likelihood.strip_images import StripModel
 from phasemark.matcher.nearest.bank_minima import Search, SearchOfFrames
-from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts
+from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Background, PhasorImages
 
-__all__ = ["Scene", "Setup", "Shapes", "check_free"]
-
-_FURTHER_ZONES = 3
-"""Zones of a chip that an answer explains beyond its number of free parameters."""
+__all__ = ["Scene", "Setup", "check_free"]
 
 
 def check_free(free: Sequence[str]) -> tuple[str, ...]:
@@ -44,35 +42,14 @@ def check_free(free: Sequence[str]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
-    """Landmarks of a bank as the search needs them, in the order of its classes.
-
-    Parameters
-    ----------
-    names : tuple of str
-    symmetry : tuple of int
-        Rotations within a turn that the bank takes for one.
-    """
-
-    names: tuple[str, ...]
-    symmetry: tuple[int, ...]
-
-    @classmethod
-    def of_bank(cls, bank: Bank) -> Shapes:
-        """Collect the symmetries of the meshes of a bank."""
-        return cls(tuple(bank.classes), tuple(int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes))
-
-
-@dataclass(frozen=True, eq=False)
 class Setup:
     """Free parameters of a matcher, and the rules of its search.
 
     Parameters
     ----------
     bank : Bank
-    shapes : Shapes
-    free : tuple of str
-        Parameters of the view.
+    rules : Rules
+        When an answer is accepted.
     prior_std : tuple of float
         Standard deviation of each before the frame is seen, infinite where nothing is known; empty without a prior.
     bearing_has_prior : bool
@@ -88,17 +65,13 @@ class Setup:
         Which pixels give the view.
     huber : float, optional
         Residual, in σ, beyond which the loss is linear.
-    false_alarm : float
-    tolerance : dict of str to float
-        How far off an accepted answer may be, by parameter.
     widest_rad : float
         Widest bearing that is searched.
     policy : SearchPolicy
     """
 
     bank: Bank
-    shapes: Shapes
-    free: tuple[str, ...]
+    rules: Rules
     prior_std: tuple[float, ...]
     bearing_has_prior: bool
     on: ResidualKind
@@ -107,10 +80,13 @@ class Setup:
     reports_one_surface: bool
     used: NDArray[np.bool_]
     huber: float | None
-    false_alarm: float
-    tolerance: dict[str, float]
     widest_rad: float
     policy: SearchPolicy
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Parameters of the view."""
+        return self.rules.free
 
     @property
     def bearing_is_free(self) -> bool:
@@ -127,25 +103,6 @@ class Setup:
         if name not in self.free:
             return 0.0
         return self.prior_std[self.free.index(name)] if self.prior_std else math.inf
-
-    @property
-    def rival_cost(self) -> float:
-        """How much more than an answer a view far from it must cost: a single pixel must not decide between them.
-
-        Of the few zones of a chip one may.
-        """
-        many = self.unknown and not self.reports_one_surface
-        return DISAGREEMENT * (self.policy.pixels_against_far_view if many else 1)
-
-    @property
-    def fewest_explained(self) -> int:
-        """Returns that an answer takes where unknown things stand in view, or outliers are left out.
-
-        A chip has few zones, but each shows one surface: there are to be more of them than free parameters.
-        """
-        if self.reports_one_surface:
-            return len(self.free) + _FURTHER_ZONES
-        return self.policy.explained_per_parameter * len(self.free)
 
 
 @dataclass(frozen=True, eq=False)

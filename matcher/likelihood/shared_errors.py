@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.estimate.acceptance import with_part, with_parts
 from phasemark.matcher.filters.stamps import spread_stamps
 from phasemark.matcher.information import covariance_of
-from phasemark.matcher.likelihood.acceptance import is_determined
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals
@@ -62,53 +60,46 @@ def with_shared_errors(
         for k in known:
             parts[k]["declared"] = declared
     if "calibration" in systematic and calibrated_fields(sensor):
-        for c, name in enumerate(setup.shapes.names):
+        for c, name in enumerate(setup.rules.names):
             which = [k for k in known if answers[k].class_name == name]
             if which:
                 carried = _carried(setup, rendered(), sensor, evidence, c, which, [answers[k] for k in which])
                 for k, part in zip(which, carried, strict=True):
                     parts[k]["calibration"] = part
-    return [_with_parts(setup, match, part) if part else match for match, part in zip(answers, parts, strict=True)]
+    return [with_parts(setup.rules, match, part) if part else match for match, part in zip(answers, parts, strict=True)]
 
 
 def with_motion(
-    setup: Setup, systematic: Collection[Systematic], frames: FilteredFrames, answers: list[Match]
+    free: tuple[str, ...], jitter_s: float, time_s: NDArray[np.float64] | None, answers: list[Match]
 ) -> list[Match]:
     """Add what the jitter of the stamps makes of the motion of the camera.
 
     What a frame shows is as certain as before, so that no further answer is refused.
+
+    Parameters
+    ----------
+    free : tuple of str
+        Parameters of the view.
+    jitter_s : float
+        Standard deviation of the stamps.
+    time_s : (n,) float64, optional
+        Stamps.
+    answers : list of Match
+        One for each of n frames.
     """
-    jitter_s = frames.sensor.systematic_time_s
-    if "motion" not in systematic or jitter_s == 0 or frames.time_s is None:
+    if jitter_s == 0 or time_s is None:
         return answers
-    view, std = (np.full((len(answers), len(setup.free)), np.nan) for _ in range(2))
+    view, std = (np.full((len(answers), len(free)), np.nan) for _ in range(2))
     for k, match in enumerate(answers):
         if match.covariance is not None and match.class_name is not None:
-            view[k] = [getattr(match, name) for name in setup.free]
+            view[k] = [getattr(match, name) for name in free]
             std[k] = np.sqrt(np.diag(match.covariance))
     period = np.array([delta_period_rad(match.symmetry) for match in answers])
-    rate = rates_of_views(spread_stamps(frames.time_s), view, std, period, setup.free.index("delta_rad"))
+    rate = rates_of_views(spread_stamps(time_s), view, std, period, free.index("delta_rad"))
     return [
-        match if match.covariance is None or not one.any() else _with_part(match, "motion", part)
+        with_part(match, "motion", part) if one.any() else match
         for match, one, part in zip(answers, rate, jitter_s**2 * rate[:, :, None] * rate[:, None], strict=True)
     ]
-
-
-def _with_parts(setup: Setup, match: Match, parts: dict[str, NDArray[np.float64]]) -> Match:
-    """Return a match whose covariance holds further parts; refused if they leave it undetermined."""
-    for name, part in parts.items():
-        match = _with_part(match, name, part)
-    assert match.covariance is not None
-    reason = match.reason
-    if not reason and not is_determined(setup, np.sqrt(np.diag(match.covariance)), match.symmetry):
-        reason = "undetermined"
-    return replace(match, reason=reason, accepted=not reason)
-
-
-def _with_part(match: Match, name: str, part: NDArray[np.float64]) -> Match:
-    """Return a match whose covariance holds a further part."""
-    assert match.covariance is not None
-    return replace(match, covariance=match.covariance + part, systematic={**match.systematic, name: part})
 
 
 def _carried(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.likelihood.fits import Fits, distinct_of_frames, least_of_frame
+from phasemark.matcher.estimate.fits import Fits, distinct_of_frames, least_of_frame
 from phasemark.matcher.likelihood.images import ImageModel
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals
@@ -26,8 +26,8 @@ def fit_without_borders(setup: Setup, scene: Scene, evidence: Evidence, fits: Fi
     policy, model = setup.policy, scene.final
     least = least_of_frame(fits, len(evidence.weight))
     close = np.isfinite(fits.cost) & (fits.cost < least[fits.frame] + policy.margin_cost)
-    close &= fits.explained >= setup.fewest_explained
-    modes = distinct_of_frames(fits, np.flatnonzero(close), setup.shapes.symmetry)
+    close &= fits.explained >= setup.rules.fewest_explained
+    modes = distinct_of_frames(fits, np.flatnonzero(close), setup.rules.symmetry)
     some = fits[modes]
     kept = np.ones_like(evidence.seen.returned)
     np.logical_and.at(kept, some.frame, _inside(setup, model, evidence, some))
@@ -54,7 +54,7 @@ def _inside(setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits) -> 
     kept = np.ones(other.shape, np.bool_)
     for strange in (other, other | ~returned):  # beside pixels without a return too, where enough are left
         inside = ~_beside(strange.reshape(shape)).reshape(other.shape) | other
-        enough = (inside & returned & ~other).sum(axis=1) >= setup.fewest_explained
+        enough = (inside & returned & ~other).sum(axis=1) >= setup.rules.fewest_explained
         kept[enough] = inside[enough]
     return kept
 
