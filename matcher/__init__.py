@@ -8,7 +8,9 @@ if TYPE_CHECKING:
     from phasemark.matcher.accuracy.cramer_rao import cramer_rao
     from phasemark.matcher.calibration.calibration import calibrate
     from phasemark.matcher.diagnosis.diagnose import diagnose
-    from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelKalman, kalman_filter, phasor_mean
+    from phasemark.matcher.filters.filtered_frames import FilteredFrames
+    from phasemark.matcher.filters.kalman_filters import PixelKalman, kalman_filter
+    from phasemark.matcher.filters.mean_phasor import phasor_mean
     from phasemark.matcher.likelihood.search_policy import SearchPolicy
     from phasemark.matcher.match import Match, Matches
     from phasemark.matcher.matcher import Matcher

@@ -9,7 +9,8 @@ import numpy as np
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher.filters.filtered_frames import kalman_filter, phasor_mean
+from phasemark.matcher.filters.kalman_filters import kalman_filter
+from phasemark.matcher.filters.mean_phasor import phasor_mean
 from phasemark.matcher.matcher import Matcher
 from phasemark.render import Background, Renderer, Views, capture, preset
 from phasemark.render.direct import HistogramRenderer, capture_histograms

@@ -33,7 +33,7 @@ from phasemark.matcher.drive import (
 )
 from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
 from phasemark.matcher.drive.odometry import OdometryModel, Reading, World, motion_jacobian, motion_noise, moved
-from phasemark.matcher.filters.filtered_frames import kalman_filter
+from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
 from phasemark.matcher.position import Placement
 from phasemark.matcher.statistics import nees

@@ -21,7 +21,7 @@ from phasemark.cli import main
 from phasemark.data import build_bank, read_frames
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
 from phasemark.landmarks.spec import Box, Cylinder
-from phasemark.matcher.filters.filtered_frames import kalman_filter
+from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.sweep.answer import answer, answer_cells
 from phasemark.matcher.sweep.compare import compare_cells
 from phasemark.matcher.sweep.examples import sweep_frames

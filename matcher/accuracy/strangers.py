@@ -17,7 +17,7 @@ import trimesh
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.data.seeds import stream
-from phasemark.matcher.filters.filtered_frames import kalman_filter
+from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.statistics import Interval, binomial_interval
 from phasemark.render import Views

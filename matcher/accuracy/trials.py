@@ -14,7 +14,9 @@ from scipy import special
 from phasemark import UsageError
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
 from phasemark.matcher.accuracy.pose_errors import PoseReport, pose_report, views_as_poses
-from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, phasor_mean
+from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.filters.kalman_filters import kalman_filter
+from phasemark.matcher.filters.mean_phasor import phasor_mean
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.match import Matches

@@ -37,13 +37,9 @@ from phasemark.matcher.calibration.pose_track import LONGEST_GAP_S, PoseTrack
 from phasemark.matcher.calibration.recording_fit import Recorded, Recording, prior_std
 from phasemark.matcher.calibration.result import Calibration
 from phasemark.matcher.chi_squared import p_values_of, scatter_freedom
-from phasemark.matcher.filters.filtered_frames import (
-    FilteredFrames,
-    PixelState,
-    assumed_std_m,
-    kalman_filter,
-    phasor_mean,
-)
+from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState, assumed_std_m
+from phasemark.matcher.filters.kalman_filters import kalman_filter
+from phasemark.matcher.filters.mean_phasor import phasor_mean
 from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind

@@ -22,7 +22,8 @@ from phasemark.data.files.json_text import finite_or_none
 from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter
+from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher

@@ -20,7 +20,7 @@ from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
 from phasemark.matcher.drive.odometry import OdometryModel, World, moved
 from phasemark.matcher.drive.plan import DrivePlan
 from phasemark.matcher.drive.pose_filter import PoseFilter
-from phasemark.matcher.filters.filtered_frames import kalman_filter
+from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.position.landmark_map import MappedLandmark

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.data.measured.orientation import ORIENTATIONS, Orientation
-from phasemark.matcher.filters.filtered_frames import kalman_filter
+from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.pixel_agreement import DISAGREEMENT

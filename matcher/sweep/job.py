@@ -31,7 +31,9 @@ from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
-from phasemark.matcher.filters.filtered_frames import FilteredFrames, kalman_filter, noise_free, phasor_mean
+from phasemark.matcher.filters.filtered_frames import FilteredFrames, noise_free
+from phasemark.matcher.filters.kalman_filters import kalman_filter
+from phasemark.matcher.filters.mean_phasor import phasor_mean
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY
 from phasemark.matcher.match import Match, Matches
