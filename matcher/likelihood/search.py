@@ -1,4 +1,4 @@
-"""The search for the most likely views of a batch of frames: docs/matching.md."""
+"""The search for the most likely views of a batch of frames: docs/matching_method.md."""
 
 from __future__ import annotations
 
