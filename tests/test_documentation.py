@@ -111,7 +111,7 @@ REPORTED = {
 
 
 def test_every_test_that_a_promise_names_exists():
-    page = (ROOT / "docs" / "promises.md").read_text(encoding="utf-8")
+    page = (ROOT / "tests" / "promises.md").read_text(encoding="utf-8")
     named = re.findall(r"`(test_\w+\.py)(?:::(test_\w+))?`", page)
     assert len(named) > 15
     for file, test in named:
@@ -120,7 +120,7 @@ def test_every_test_that_a_promise_names_exists():
 
 
 def test_every_command_that_writes_has_its_promises(commands):
-    page = (ROOT / "docs" / "promises.md").read_text(encoding="utf-8")
+    page = (ROOT / "tests" / "promises.md").read_text(encoding="utf-8")
     found = commands["commands"](commands["typer"].main.get_command(commands["app"]), "phasemark")
     writing = {path.removeprefix("phasemark ") for path, command in found if writes(command)} | {"sweep report"}
     assert {path for path in writing if f"`{path}" not in page} == set()
