@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -11,12 +12,15 @@ import typer
 from phasemark.cli import app
 
 PAGE = Path(__file__).parent / "commands.md"
+HEADER = ("| option | default | meaning |", "|---|---|---|")
+TITLE = "Options of several commands"
+ANCHOR = TITLE.lower().replace(" ", "-")
 TYPES = {str: "TEXT", int: "INTEGER", float: "NUMBER", Path: "PATH"}
 INTRODUCTION = """\
 # Every command
 
 Generated from the program by `python docs/commands.py`; do not edit. `phasemark COMMAND --help` prints the same for one
-command, and [the tour by task](tour.md) shows them at work. Results go to standard output, messages and progress
+command; [the tour by task](tour.md) shows them at work. Results go to standard output, messages and progress
 to standard error; [exit codes](errors.md) say what went wrong.
 
 `phasemark` alone says what to do first, `phasemark --version` prints the version, and `phasemark --install-completion`
@@ -55,9 +59,18 @@ def kind(option: Any) -> str:
     return TYPES[next(iter(get_args(annotation)), annotation)]
 
 
+def options(command: Any) -> list[Any]:
+    """Return the options of a command that its help shows."""
+    return [one for one in command.params if one.param_type_name == "option" and not one.hidden]
+
+
+def option_names(option: Any) -> str:
+    """Return the words that state an option."""
+    return ", ".join(f"`{name}`" for name in (*option.opts, *option.secondary_opts))
+
+
 def option_row(option: Any) -> str:
     """Return one line of the table of options."""
-    names = ", ".join(f"`{name}`" for name in (*option.opts, *option.secondary_opts))
     takes = "" if option.is_flag else f" `{cell(option.metavar or kind(option))}`"
     if option.required:
         default = "required"
@@ -65,13 +78,23 @@ def option_row(option: Any) -> str:
         default = ""
     else:
         default = f"`{option.default}`"
-    return f"| {names}{takes} | {default} | {cell(option.help or '')} |"
+    return f"| {option_names(option)}{takes} | {default} | {cell(option.help or '')} |"
 
 
-def section(path: str, command: Any) -> str:
-    """Return what the page says of one command."""
+def shared_rows(found: list[tuple[str, Any]]) -> list[str]:
+    """Return the lines of options that several commands have; of a name with several meanings the most frequent one."""
+    of_commands = [option for _, command in found for option in options(command) if not option.required]
+    rows = Counter((option_names(option), option_row(option)) for option in of_commands)
+    shared: dict[str, str] = {}
+    for (names, row), count in rows.most_common():
+        if count > 1:
+            shared.setdefault(names, row)
+    return [shared[names] for names in sorted(shared)]
+
+
+def section(path: str, command: Any, shared: list[str]) -> str:
+    """Return what the page says of one command; options with a shared line are named only."""
     arguments = [one for one in command.params if one.param_type_name == "argument"]
-    options = [one for one in command.params if one.param_type_name == "option" and not one.hidden]
     words = [one.metavar or one.name.upper() for one in arguments]
     paragraphs = [" ".join(part.split()) for part in (command.help or "").split("\n\n")]
     lines = [f"## {path}", "", f"    {' '.join([path, *words, '[OPTIONS]'])}", ""]
@@ -84,8 +107,12 @@ def section(path: str, command: Any) -> str:
             for word, one in zip(words, arguments, strict=True)
         ]
         lines.append("")
-    if options:
-        lines += ["| option | default | meaning |", "|---|---|---|", *map(option_row, options), ""]
+    own = [row for row in map(option_row, options(command)) if row not in shared]
+    if own:
+        lines += [*HEADER, *own, ""]
+    named = [option_names(option) for option in options(command) if option_row(option) in shared]
+    if named:
+        lines += [f"{'Also' if own else 'Options'} [explained above](#{ANCHOR}): {'; '.join(named)}.", ""]
     return "\n".join(lines)
 
 
@@ -93,7 +120,9 @@ def page() -> str:
     """Return the whole page."""
     found = list(commands(typer.main.get_command(app), "phasemark"))
     index = [f"- [`{path}`](#{path.replace(' ', '-')})" for path, _ in found]
-    return "\n".join([INTRODUCTION, *index, "", *(section(path, command) for path, command in found)])
+    shared = shared_rows(found)
+    common = [f"## {TITLE}", "", *HEADER, *shared, ""]
+    return "\n".join([INTRODUCTION, *index, "", *common, *(section(*one, shared) for one in found)])
 
 
 def main() -> None:

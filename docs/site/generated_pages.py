@@ -8,6 +8,7 @@ import inspect
 import itertools
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from markdown_dialect import without_roles
-from public_names import described_at, public_names
+from public_names import ROOMS, described_at, public_names
 
 import phasemark
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
@@ -46,7 +47,7 @@ def first_line(thing: object) -> str:
 
 
 def reference_page(*, linked: bool) -> str:
-    """Return the page that lists all public names.
+    """Return the page that lists all public names: those of the rooms with their meanings, the others by module.
 
     Parameters
     ----------
@@ -63,18 +64,26 @@ def reference_page(*, linked: bool) -> str:
         "Generated from the package by `make pages`; do not edit. What may be imported from where. "
         f"`import phasemark as pm` also gives {first_script_names()}. "
         "Anything else is internal and may change. The site has a page for each of these modules, with parameters, "
-        "results and errors of every name.",
+        "results and errors of every name; `help(NAME)` in Python prints the same.",
         "",
     ]
+
+    def label(module: str, name: str) -> str:
+        return f"[`{name}`]({reference_path(module)}#{described_at(module, name)})" if linked else f"`{name}`"
+
+    modules = ["## Modules within the rooms", "", "| module | contents | names |", "|---|---|---|"]
     for module, names in public_names().items():
         thing = importlib.import_module(module)
-        heading = f"[{module}]({reference_path(module)})" if linked else module
-        lines += [f"## {heading}", "", first_line(thing), "", "| name | what it is |", "|---|---|"]
-        for name in names:
-            label = f"[`{name}`]({reference_path(module)}#{described_at(module, name)})" if linked else f"`{name}`"
-            lines.append(f"| {label} | {_described(thing, name)} |")
-        lines.append("")
-    return "\n".join(lines)
+        if module in ROOMS:
+            heading = f"[{module}]({reference_path(module)})" if linked else module
+            lines += [f"## {heading}", "", first_line(thing), "", "| name | what it is |", "|---|---|"]
+            lines += [f"| {label(module, name)} | {_described(thing, name)} |" for name in names]
+            lines.append("")
+        else:
+            place = f"[`{module}`]({reference_path(module)})" if linked else f"`{module}`"
+            named = ", ".join(label(module, name) for name in names)
+            modules.append(f"| {place} | {first_line(thing)} | {named} |")
+    return "\n".join([*lines, *modules, ""])
 
 
 def _described(module: ModuleType, name: str) -> str:
@@ -240,6 +249,9 @@ def _axes_table() -> list[str]:
     return [*lines, ""]
 
 
+KEYS_HEADER = ("| key | takes | default | meaning |", "|---|---|---|---|")
+
+
 def plans_page() -> str:
     """Return the page of plans: every key of every kind, with an example."""
     lines = [
@@ -251,18 +263,24 @@ def plans_page() -> str:
         "",
     ]
     tables: dict[str, dict[str, Any]] = {}
-    for kind in KINDS:
-        schema = plan_schema(kind)
-        lines += [f"## A plan of kind `{kind}`", "", "| key | takes | default | meaning |", "|---|---|---|---|"]
-        lines += [*_rows(schema, schema), "", f"The example of kind `{kind}`:", "", "```toml"]
+    schemas = {kind: plan_schema(kind) for kind in KINDS}
+    counts = Counter(row for schema in schemas.values() for row in _rows(schema, schema))
+    shared = [row for row, count in counts.items() if count > 1]
+    lines += ["## Keys of several kinds of plan", "", *KEYS_HEADER, *shared, ""]
+    for kind, schema in schemas.items():
+        rows = list(_rows(schema, schema))
+        lines += [f"## A plan of kind `{kind}`", "", *KEYS_HEADER, *(row for row in rows if row not in shared), ""]
+        named = [row.split()[1] for row in rows if row in shared]
+        if named:
+            lines += [f"Also [explained above](#keys-of-several-kinds-of-plan): {', '.join(named)}.", ""]
+        lines += [f"The example of kind `{kind}`:", "", "```toml"]
         lines += [plan_example(kind).rstrip(), "```", ""]
         tables.update(schema.get("$defs", {}))
     tables[Distribution.__name__] = Distribution.model_json_schema()
     lines += ["## Tables within plans", "", *_axes_table()]
     for name, model in sorted(tables.items()):
         if model.get("properties"):
-            lines += [f"### {name}", "", "| key | takes | default | meaning |", "|---|---|---|---|"]
-            lines += [*_rows({}, model), ""]
+            lines += [f"### {name}", "", *KEYS_HEADER, *_rows({}, model), ""]
         else:
             lines += [f"### {name}", "", _type({}, model), ""]
     return "\n".join(lines)
