@@ -9,82 +9,83 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
-
 from phasemark import UsageError
 from phasemark.data.commands.build import build_or_estimate, merge_shards
-from phasemark.data.commands.console import echo_facts, echo_json, tell
+from phasemark.data.commands.command import Shown
+from phasemark.data.commands.console import echo_facts, tell
 from phasemark.data.commands.inputs import name_and_file, open_any_bank
 from phasemark.data.commands.options import (
     Building,
+    ClassName,
     Force,
     Json,
     MeshReading,
     MeshUnitWord,
+    Out,
     Resume,
-    a_class,
-    a_preset,
+    SensorName,
+    Shards,
 )
 
 if TYPE_CHECKING:
     from phasemark.data import BankPlan
     from phasemark.data.plans.bank_plan import MeshPlan
 
+Grid = Annotated[str, Shown(metavar="START:STOP:STEP")]
+
 
 def bank_build(
+    plan_file: Path | None = None,
     *,
-    out: Annotated[Path, typer.Option("-o", "--out", help="The bank to write; its checksum goes beside it.")],
-    plan_file: Annotated[
-        Path | None, typer.Argument(metavar="[PLAN]", help="A plan (.toml); options override it.")
-    ] = None,
-    classes: Annotated[
-        list[str] | None, typer.Option("--class", help="A class of the catalogue; repeatable.", autocompletion=a_class)
-    ] = None,
-    meshes: Annotated[list[str] | None, typer.Option("--mesh", metavar="NAME=FILE", help="Repeatable.")] = None,
+    out: Out,
+    classes: Annotated[list[ClassName] | None, Shown("--class")] = None,
+    meshes: Annotated[list[str] | None, Shown("--mesh", metavar="NAME=FILE")] = None,
     mesh_reading: MeshReading,
-    symmetry: Annotated[
-        int | None,
-        typer.Option(
-            "--symmetry", help="Number of turns that leave the mesh as it is; found from the mesh unless stated."
-        ),
-    ] = None,
-    sensor: Annotated[
-        str | None,
-        typer.Option("--sensor", metavar="NAME|FILE", help="A preset or sensor file.", autocompletion=a_preset),
-    ] = None,
-    distance: Annotated[str | None, typer.Option("--distance", metavar="START:STOP:STEP", help="Metres.")] = None,
-    delta: Annotated[str | None, typer.Option("--delta", metavar="START:STOP:STEP", help="Degrees.")] = None,
-    model: Annotated[
-        Literal["ray", "hard", "planar"] | None,
-        typer.Option(
-            "--model",
-            help="ray: the exact integral; hard: centre rays, nothing mixed; or planar: the paper's own generator.",
-        ),
-    ] = None,
-    albedo: Annotated[
-        float | None, typer.Option("--albedo", help="Share of light that the landmarks return, in place of their own.")
-    ] = None,
-    full: Annotated[
-        bool,
-        typer.Option("--full", help="Store every class at every D and δ; without it only where a landmark needs it."),
-    ] = False,
-    region: Annotated[
-        str | None,
-        typer.Option(
-            "--region",
-            metavar="whole|landmark|R0:R1,C0:C1",
-            help="Pixels to keep: all, those that a landmark can reach, or rows R0 … R1 and columns C0 … C1.",
-        ),
-    ] = None,
-    margin: Annotated[
-        float | None, typer.Option("--margin", help="Degrees around the landmark that --region landmark keeps too.")
-    ] = None,
-    binning: Annotated[
-        int | None, typer.Option("--binning", metavar="N", help="Blocks of N × N pixels become one pixel.")
-    ] = None,
+    symmetry: int | None = None,
+    sensor: SensorName | None = None,
+    distance: Grid | None = None,
+    delta: Grid | None = None,
+    model: Literal["ray", "hard", "planar"] | None = None,
+    albedo: float | None = None,
+    full: bool = False,
+    region: Annotated[str | None, Shown(metavar="whole|landmark|R0:R1,C0:C1")] = None,
+    margin: float | None = None,
+    binning: Annotated[int | None, Shown(metavar="N")] = None,
     building: Building,
 ) -> None:
-    """Build a bank of noise-free model images."""
+    """Build a bank of noise-free model images.
+
+    Parameters
+    ----------
+    plan_file
+        A plan (.toml); options override it.
+    out
+        The bank to write; its checksum goes beside it.
+    classes
+        A class of the catalogue; repeatable.
+    meshes
+        Repeatable.
+    symmetry
+        Number of turns that leave the mesh as it is; found from the mesh unless stated.
+    sensor
+        A preset or sensor file.
+    distance
+        Metres.
+    delta
+        Degrees.
+    model
+        ray: the exact integral; hard: centre rays, nothing mixed; or planar: the paper's own generator.
+    albedo
+        Share of light that the landmarks return, in place of their own.
+    full
+        Store every class at every D and δ; without it only where a landmark needs it.
+    region
+        Pixels to keep: all, those that a landmark can reach, or rows R0 … R1 and columns C0 … C1.
+    margin
+        Degrees around the landmark that --region landmark keeps too.
+    binning
+        Blocks of N × N pixels become one pixel.
+    """
     from phasemark.data import BankPlan, build_bank
     from phasemark.data.plans.bank_plan import read_bank_plan
     from phasemark.landmarks import catalog
@@ -139,25 +140,35 @@ def _completed(plan: BankPlan, layout_stated: bool) -> BankPlan:
 
 
 def bank_info(
-    bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank.")],
+    bank: Path,
+    *,
     as_json: Json = False,
 ) -> None:
-    """Print the content of a bank."""
+    """Print the content of a bank.
+
+    Parameters
+    ----------
+    bank
+        A bank.
+    """
     with open_any_bank(bank) as opened:
-        info = opened.info()
-    if as_json:
-        echo_json(info)
-    else:
-        echo_facts(info)
+        echo_facts(opened.info(), as_json=as_json)
 
 
 def bank_merge(
-    shards: Annotated[list[Path], typer.Argument(metavar="SHARD...", help="All parts that --shard has built.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The bank to write.")],
+    shards: Shards,
+    *,
+    out: Out,
     resume: Resume = False,
     force: Force = False,
 ) -> None:
-    """Put the parts of a bank together."""
+    """Put the parts of a bank together.
+
+    Parameters
+    ----------
+    out
+        The bank to write.
+    """
     merge_shards(shards, out, resume, force)
 
 

@@ -1,24 +1,34 @@
-"""Commands that note which files they were given to read, and whose options may come in groups.
+"""Commands whose options are made from their signatures and docstrings, and which note the files they are to read.
 
-A group is a frozen dataclass whose fields are annotated as options. A command that has it as a parameter takes each
-field as an option of its own, in the place of the group, and gets one object.
+A parameter before ``*`` becomes an argument, one behind it an option. Its name makes the metavar or the flag, without a
+suffix ``_file`` or ``_name``; its description in the docstring is the help. :class:`Shown` has further settings.
+
+A group is a frozen dataclass whose fields become options in the same way. A command that has it as a parameter takes
+each field as an option of its own, in the place of the group, and gets one object; its docstring may describe fields in
+other words than the group does.
 """
 
 # Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
-from inspect import Parameter, Signature, signature
+from inspect import Parameter, Signature, getdoc, signature
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
 from typer.core import TyperCommand
+from typer.models import ParameterInfo
 
+_DESCRIPTION = re.compile(r"^(\w+)\n((?: +.+\n?)+)", re.MULTILINE)
+"""A parameter in a docstring, and its description."""
+_SUFFIX = re.compile(r"(?<!_or)_(?:file|name)$|_$")
+"""End of a parameter's name that its flag or metavar does not have."""
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 OUTPUTS = ("out", "plot", "estimates")
@@ -53,6 +63,23 @@ class Commands(typer.Typer):
         return added
 
 
+class Shown:
+    """Settings of an option beyond its name, type, default and docstring: ``Annotated[float, Shown(metavar="M")]``.
+
+    Parameters
+    ----------
+    *flags : str
+        In place of the flag that the name makes.
+    help : str
+        For parameters that no docstring describes.
+    **settings
+        Further arguments of ``typer.Option`` or ``typer.Argument``.
+    """
+
+    def __init__(self, *flags: str, **settings: Any) -> None:
+        self.settings = {**settings, "param_decls": flags} if flags else settings
+
+
 @dataclass(frozen=True)
 class Without:
     """Options of a group that a command does not have: ``Annotated[Group, Without("field")]``."""
@@ -66,17 +93,20 @@ class Without:
 def _with_options_of_groups(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function with a parameter for each field of those of its parameters that are groups."""
     hints = get_type_hints(function, include_extras=True)
+    text, described = _described(function)
     parameters: list[Parameter] = []
     groups: dict[str, tuple[type, list[str]]] = {}
     for name, parameter in signature(function).parameters.items():
         group, left_out = _group_of(hints[name])
         if group is None:
-            parameters.append(_option(name, hints[name], parameter.default))
+            make = typer.Option if parameter.kind is Parameter.KEYWORD_ONLY else typer.Argument
+            parameters.append(_parameter(name, hints[name], parameter.default, described, make))
             continue
+        kinds, of_group = get_type_hints(group, include_extras=True), _described(group)[1] | described
         options = [field for field in fields(group) if field.name not in left_out]
-        kinds = get_type_hints(group, include_extras=True)
-        default = {field.name: Parameter.empty if field.default is MISSING else field.default for field in options}
-        parameters += [_option(field.name, kinds[field.name], default[field.name]) for field in options]
+        for field in options:
+            default = Parameter.empty if field.default is MISSING else field.default
+            parameters.append(_parameter(field.name, kinds[field.name], default, of_group))
         groups[name] = group, [field.name for field in options]
 
     @wraps(function)
@@ -86,13 +116,41 @@ def _with_options_of_groups(function: Callable[..., Any]) -> Callable[..., Any]:
         return function(**values)
 
     del command.__wrapped__  # or its parameters would be those of the function
+    command.__doc__ = text
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     command.__signature__ = Signature(parameters)  # type: ignore[attr-defined]  # what typer reads
     return command
 
 
-def _option(name: str, kind: Any, default: Any) -> Parameter:
-    return Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=default)
+def _described(documented: Any) -> tuple[str, dict[str, str]]:
+    """Return the docstring of a function or group, and apart from it the descriptions of its parameters."""
+    text, _, listed = (getdoc(documented) or "").partition("\n\nParameters\n----------\n")
+    return text, {name: " ".join(lines.split()) for name, lines in _DESCRIPTION.findall(listed)}
+
+
+def _settings(kind: Any) -> dict[str, Any]:
+    """Return the settings in the annotations of a type; outer annotations replace inner ones."""
+    found: dict[str, Any] = {}
+    for part in get_args(kind):
+        found |= part.settings if isinstance(part, Shown) else _settings(part)
+    return found
+
+
+def _parameter(name: str, kind: Any, default: Any, described: Mapping[str, str], make: Any = typer.Option) -> Parameter:
+    """Return a parameter as typer reads it; `make` is typer.Option or typer.Argument."""
+    if any(isinstance(one, ParameterInfo) for one in get_args(kind)):
+        return Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=default)
+    word = _SUFFIX.sub("", name)
+    if make is typer.Argument:
+        metavar = word.upper().replace("_OR_", "|") + ("..." if get_origin(kind) is list else "")
+        settings: dict[str, Any] = {"metavar": f"[{metavar}]" if default is None else metavar, "param_decls": ()}
+    else:
+        settings = {"param_decls": ("--" + word.replace("_", "-"),)}
+    settings |= _settings(kind)
+    if name in described:
+        settings["help"] = described[name]
+    shown = make(... if default is Parameter.empty else default, *settings.pop("param_decls"), **settings)
+    return Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=shown)
 
 
 def _group_of(kind: Any) -> tuple[Any, tuple[str, ...]]:

@@ -83,8 +83,11 @@ def duration(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def echo_facts(facts: Mapping[str, Any]) -> None:
-    """Print one fact a line, names aligned."""
+def echo_facts(facts: Mapping[str, Any], *, as_json: bool = False) -> None:
+    """Print one fact a line, names aligned; or all of them as JSON."""
+    if as_json:
+        echo_json(facts)
+        return
     rows = []
     for key, value in facts.items():
         if isinstance(value, Mapping):

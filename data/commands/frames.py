@@ -70,6 +70,7 @@ def frames_build(
 
 
 def frames_info(
+    *,
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
     as_json: Json = False,
 ) -> None:
@@ -80,6 +81,7 @@ def frames_info(
 
 
 def frames_verify(
+    *,
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, its checksum beside it.")],
     sample: Sample = 16,
     seed: Seed = 0,
@@ -94,6 +96,7 @@ def frames_verify(
 
 
 def frames_merge(
+    *,
     shards: Annotated[list[Path], typer.Argument(metavar="SHARD...", help="All parts that --shard has built.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The frame set to write.")],
     resume: Resume = False,
@@ -104,6 +107,7 @@ def frames_merge(
 
 
 def frames_export(
+    *,
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
     to: Annotated[
         ExportFormat,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from phasemark.landmarks import LandmarkSpec
 
 
-def landmark_list(as_json: Json = False) -> None:
+def landmark_list(*, as_json: Json = False) -> None:
     """List the landmarks of the catalogue."""
     from phasemark.landmarks import catalog
 
@@ -69,6 +69,7 @@ def landmark_show(
 
 
 def landmark_export(
+    *,
     name: Annotated[str, typer.Argument(metavar="NAME", help="A class of the catalogue.", autocompletion=a_class)],
     out: Annotated[Path, typer.Option("-o", "--out", help="The file; .stl, .ply, .obj or .off.")],
     force: Force = False,

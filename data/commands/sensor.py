@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from phasemark.render.sensor.camera_info import CameraInfo
 
 
-def sensor_list(as_json: Json = False) -> None:
+def sensor_list(*, as_json: Json = False) -> None:
     """List the shipped presets."""
     from phasemark.render import preset, preset_names
 
@@ -82,6 +82,7 @@ def _in_mhz(sensor: Sensor) -> str:
 
 
 def sensor_show(
+    *,
     name_or_file: Annotated[
         str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=a_preset)
     ],
@@ -180,6 +181,7 @@ def _write_picture(sensor: Sensor, picture: Path, force: bool) -> None:
 
 
 def sensor_import(
+    *,
     camera_info: Annotated[Path, typer.Argument(metavar="CAMERA_INFO", help="A camera_info of ROS 1 or ROS 2, .yaml.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
     like: Annotated[

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 
 def sensor_characterise(
+    *,
     name_or_file: Annotated[
         str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=a_preset)
     ],

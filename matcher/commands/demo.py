@@ -15,6 +15,7 @@ from phasemark.data.commands.outputs import output_folder, refuse_existing
 
 
 def demo_report(
+    *,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, the tables and the bank.")] = Path(
         "out/demo"
     ),

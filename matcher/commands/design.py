@@ -17,6 +17,7 @@ from phasemark.data.commands.outputs import output_folder
 
 
 def landmark_design(
+    *,
     plan_file: Annotated[
         Path | None,
         typer.Argument(metavar="[PLAN]", help="A plan (.toml); without it four landmarks for the PMD camera."),

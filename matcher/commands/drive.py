@@ -17,6 +17,7 @@ from phasemark.data.commands.outputs import output_folder
 
 
 def drive_robot(
+    *,
     plan_file: Annotated[
         Path | None, typer.Argument(metavar="[PLAN]", help="A plan (.toml); without it a tour of 20 m.")
     ] = None,

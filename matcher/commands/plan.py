@@ -17,6 +17,7 @@ PlanKind = Literal["bank", "frames", "sweep", "drive", "design"]
 
 
 def plan_example(
+    *,
     kind: Annotated[PlanKind, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.")],
 ) -> None:
     """Print a plan with comments; it can be used as it is."""
@@ -26,6 +27,7 @@ def plan_example(
 
 
 def plan_schema(
+    *,
     kind: Annotated[PlanKind, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.")],
 ) -> None:
     """Print the JSON Schema of a kind of plan, for editors and other programs."""
@@ -35,6 +37,7 @@ def plan_schema(
 
 
 def plan_check(
+    *,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A plan (.toml).")],
     kind: Annotated[
         PlanKind | None,

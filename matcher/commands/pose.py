@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 
 def pose_report_command(
+    *,
     measured: Annotated[Path, typer.Argument(metavar="ESTIMATES", help="What match --estimates wrote, CSV.")],
     truth: Annotated[
         Path,

@@ -15,6 +15,7 @@ from phasemark.data.commands.options import Json, Seed, Workers
 
 
 def bank_strangers(
+    *,
     bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank.")],
     population: Annotated[int, typer.Option("--population", min=1, help="Frames of each part.")] = 20,
     n_frames: Annotated[int, typer.Option("--frames", min=1, help="Exposures averaged in each frame.")] = 50,

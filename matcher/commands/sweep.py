@@ -17,6 +17,7 @@ from phasemark.data.commands.outputs import refuse_existing, refuse_input_files
 
 
 def sweep_run(
+    *,
     plan: Annotated[
         str,
         typer.Argument(
@@ -68,6 +69,7 @@ def sweep_run(
 
 
 def sweep_report(
+    *,
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A sweep's folder.")],
     as_json: Json = False,
 ) -> None:
@@ -88,6 +90,7 @@ def sweep_report(
 
 
 def sweep_frames_again(
+    *,
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A sweep's folder.")],
     condition: Annotated[
         int, typer.Argument(metavar="CONDITION", help="Number of the condition in trials.csv.", min=0)
@@ -108,6 +111,7 @@ def sweep_frames_again(
 
 
 def sweep_compare(
+    *,
     first: Annotated[Path, typer.Argument(metavar="DIR1", help="A sweep's folder.")],
     second: Annotated[Path, typer.Argument(metavar="DIR2", help="Folder of the other sweep.")],
     everything: Annotated[bool, typer.Option("--all", help="Show differences that may be chance, too.")] = False,

@@ -15,6 +15,7 @@ from phasemark.data.commands.options import Json, Sample, Seed
 
 
 def bank_verify(
+    *,
     bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank, its checksum beside it.")],
     population: Annotated[
         int | None, typer.Option("--population", min=1, help="Number of random views to match against the bank.")

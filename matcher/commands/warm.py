@@ -22,6 +22,7 @@ class Work(StrEnum):
 
 
 def warm_kernels(
+    *,
     works: Annotated[
         list[Work] | None,
         typer.Option(
