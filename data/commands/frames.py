@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -13,36 +12,39 @@ import typer
 
 from phasemark import UsageError
 from phasemark.data.commands.build import build_or_estimate, merge_shards
-from phasemark.data.commands.command import Without
-from phasemark.data.commands.console import LongWork, echo_facts, echo_json, readable
-from phasemark.data.commands.inputs import (
-    background_of,
-    open_frame_set,
-    read_class_or_mesh,
-    read_sensor,
-    refuse_unless_one,
-)
+from phasemark.data.commands.command import Shown, Without
+from phasemark.data.commands.console import LongWork, echo_facts, readable
+from phasemark.data.commands.inputs import ClassOrMesh, background_of, open_frame_set, read_sensor
 from phasemark.data.commands.options import (
     Building,
+    Count,
+    Degrees,
     Floor,
     Force,
     FrameReading,
+    Index,
     Json,
-    MeshReading,
-    Pitch,
+    Metres,
+    Out,
     QuantityWord,
     Resume,
-    Roll,
     Sample,
     Seed,
     SensorName,
+    Shards,
+    View,
     Wall,
-    a_class,
 )
-from phasemark.data.commands.outputs import refuse_existing, refuse_input_files, refuse_unwritable_files
+from phasemark.data.commands.outputs import (
+    refuse_existing,
+    refuse_input_files,
+    refuse_other_files,
+    refuse_unwritable_files,
+    write_figure,
+)
 
 if TYPE_CHECKING:
-    from phasemark.render import Sensor, Views
+    from phasemark.render import Sensor
 
 ExportFormat = Literal["npz", "csv", "jsonl", "png16", "ply", "bop", "rosbag"]
 
@@ -51,16 +53,19 @@ _RECORDED_PIXELS = 5_000_000
 
 
 def frames_build(
-    *,
-    plan_file: Annotated[Path, typer.Argument(metavar="PLAN", help="A plan (.toml); options override it.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The frame set to write; its checksum goes beside it.")],
-    seed: Annotated[
-        int | None, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")
-    ] = None,
-    views: Annotated[int | None, typer.Option("--views", min=1, help="Number of views.")] = None,
-    building: Building,
+    plan_file: Path, *, out: Out, seed: Seed | None = None, views: Count | None = None, building: Building
 ) -> None:
-    """Build a set of noisy frames with their truth."""
+    """Build a set of noisy frames with their truth.
+
+    Parameters
+    ----------
+    plan_file
+        A plan (.toml); options override it.
+    out
+        The frame set to write; its checksum goes beside it.
+    views
+        Number of views.
+    """
     from phasemark.data import FramePlan, build_frames, read_plan
 
     plan = read_plan(plan_file, FramePlan)
@@ -69,65 +74,68 @@ def frames_build(
     build_or_estimate(build_frames, plan, out, building)
 
 
-def frames_info(
-    *,
-    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
-    as_json: Json = False,
-) -> None:
-    """Print the content of a frame set."""
+def frames_info(frames: Path, *, as_json: Json = False) -> None:
+    """Print the content of a frame set.
+
+    Parameters
+    ----------
+    frames
+        A frame set.
+    """
     with open_frame_set(frames) as opened:
-        info = opened.info()
-    echo_json(info) if as_json else echo_facts(info)
+        echo_facts(opened.info(), as_json=as_json)
 
 
-def frames_verify(
-    *,
-    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set, its checksum beside it.")],
-    sample: Sample = 16,
-    seed: Seed = 0,
-    as_json: Json = False,
-) -> None:
-    """Check a frame set: checksum, schema, values, and random views rendered and captured again."""
+def frames_verify(frames: Path, *, sample: Sample = 16, seed: Seed = 0, as_json: Json = False) -> None:
+    """Check a frame set: checksum, schema, values, and random views rendered and captured again.
+
+    Parameters
+    ----------
+    frames
+        A frame set, its checksum beside it.
+    """
     from phasemark.data.verify import verify_frames
 
     with LongWork("verifying"):
         report = verify_frames(frames, sample=sample, seed=seed)
-    echo_json(report) if as_json else echo_facts(report)
+    echo_facts(report, as_json=as_json)
 
 
-def frames_merge(
-    *,
-    shards: Annotated[list[Path], typer.Argument(metavar="SHARD...", help="All parts that --shard has built.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The frame set to write.")],
-    resume: Resume = False,
-    force: Force = False,
-) -> None:
-    """Put the parts of a frame set together; the bytes are those of a single run."""
+def frames_merge(shards: Shards, *, out: Out, resume: Resume = False, force: Force = False) -> None:
+    """Put the parts of a frame set together; the bytes are those of a single run.
+
+    Parameters
+    ----------
+    out
+        The frame set to write.
+    """
     merge_shards(shards, out, resume, force)
 
 
 def frames_export(
+    frames: Path,
     *,
-    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="A frame set.")],
-    to: Annotated[
-        ExportFormat,
-        typer.Option("--to", metavar="FORMAT", help="npz, csv, jsonl, png16, ply, bop or rosbag."),
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The file (npz, csv, jsonl) or folder to write.")],
-    quantity: Annotated[
-        QuantityWord | None,
-        typer.Option("--quantity", help="range or z, in npz, csv and png16; BOP and ROS have z."),
-    ] = None,
-    content: Annotated[
-        Literal["range", "targets", "histogram"] | None,
-        typer.Option(
-            "--content",
-            help="Of histograms: range (of the nearest target), targets (npz, csv) or histogram (npz, jsonl).",
-        ),
-    ] = None,
+    to: Annotated[ExportFormat, Shown(metavar="FORMAT")],
+    out: Out,
+    quantity: QuantityWord | None = None,
+    content: Literal["range", "targets", "histogram"] | None = None,
     force: Force = False,
 ) -> None:
-    """Write a frame set for other programs."""
+    """Write a frame set for other programs.
+
+    Parameters
+    ----------
+    frames
+        A frame set.
+    to
+        npz, csv, jsonl, png16, ply, bop or rosbag.
+    out
+        The file (npz, csv, jsonl) or folder to write.
+    quantity
+        range or z, in npz, csv and png16; BOP and ROS have z.
+    content
+        Of histograms: range (of the nearest target), targets (npz, csv) or histogram (npz, jsonl).
+    """
     refuse_input_files([out])
     with open_frame_set(frames) as opened:
         from phasemark.data.export import export_frames
@@ -136,19 +144,28 @@ def frames_export(
 
 
 def frames_import(
+    file: Path,
     *,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV, NPY, NPZ, HDF5, PNG; a folder of PNG, a bag.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The measured frames as .npz, range along the ray, metres.")],
+    out: Out,
     sensor: SensorName = "pmd-16x16",
     reading: FrameReading,
-    topic: Annotated[str | None, typer.Option("--topic", help="Which images of a ROS bag.")] = None,
+    topic: str | None = None,
     force: Force = False,
 ) -> None:
-    """Convert measured frames to one form: range along the ray, in metres, upright."""
+    """Convert measured frames to one form: range along the ray, in metres, upright.
+
+    Parameters
+    ----------
+    file
+        CSV, NPY, NPZ, HDF5, PNG; a folder of PNG, a bag.
+    out
+        The measured frames as .npz, range along the ray, metres.
+    topic
+        Which images of a ROS bag.
+    """
     from phasemark.data.measured.reading import write_measured
 
-    if out.suffix.lower() != ".npz":
-        raise UsageError(f"the output must be a .npz file, got '{out}'")
+    refuse_other_files(out, ".npz", "the output")
     refuse_existing([out], force)
     frames = reading.read(file, read_sensor(sensor), topic=topic)
     typer.echo(write_measured(frames, out, force=force))
@@ -156,40 +173,16 @@ def frames_import(
 
 def frames_simulate(
     *,
-    out: Annotated[Path, typer.Option("-o", "--out", help="The recording to write: .csv, .npz or .h5.")],
-    class_name: Annotated[
-        str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=a_class)
-    ] = None,
-    mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
-    mesh_reading: MeshReading,
+    out: Out,
+    landmark: ClassOrMesh,
     sensor: SensorName = "pmd-16x16",
-    distance: Annotated[
-        float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis, in the first frame.")
-    ] = 1.0,
-    delta: Annotated[
-        float, typer.Option("--delta", metavar="DEG", help="Side δ from which the landmark is seen in the first frame.")
-    ] = 0.0,
-    bearing: Annotated[
-        float, typer.Option("--bearing", metavar="DEG", help="Azimuth of the landmark in the camera frame.")
-    ] = 0.0,
-    height: Annotated[
-        float, typer.Option("--height", metavar="M", help="Height of the landmark's origin above the lens.")
-    ] = 0.0,
-    pitch: Pitch = 0.0,
-    roll: Roll = 0.0,
+    view: View,
     wall: Wall = None,
     floor: Floor = None,
-    moving: Annotated[
-        bool, typer.Option("--moving/--still", help="Change D and δ evenly until the last frame.")
-    ] = False,
-    to_distance: Annotated[
-        float | None,
-        typer.Option("--to-distance", metavar="M", help="With --moving, D in the last frame; 0.8 of the first."),
-    ] = None,
-    to_delta: Annotated[
-        float | None, typer.Option("--to-delta", metavar="DEG", help="With --moving, δ in the last frame; 40 more.")
-    ] = None,
-    n_frames: Annotated[int, typer.Option("--frames", min=1, help="Number of frames.")] = 20,
+    moving: Annotated[bool, Shown("--moving/--still")] = False,
+    to_distance: Metres | None = None,
+    to_delta: Degrees | None = None,
+    n_frames: Annotated[Count, Shown("--frames")] = 20,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
@@ -199,10 +192,29 @@ def frames_simulate(
     zone the nearest surface, and not a mean over the zone. It writes z in millimetres and status codes (5: valid),
     another sensor ranges in metres with amplitudes. The truth of each frame stands in columns truth_..., which other
     commands ignore.
+
+    Parameters
+    ----------
+    out
+        The recording to write: .csv, .npz or .h5.
+    distance
+        Distance D to the landmark's axis, in the first frame.
+    delta
+        Side δ from which the landmark is seen in the first frame.
+    moving
+        Change D and δ evenly until the last frame.
+    to_distance
+        With --moving, D in the last frame; 0.8 of the first.
+    to_delta
+        With --moving, δ in the last frame; 40 more.
+    n_frames
+        Number of frames.
     """
+    import numpy as np
+
     from phasemark.data.measured.simulated import recording_format, simulate_recording, write_recording
 
-    refuse_unless_one(class_name, mesh_file, mesh_reading, "record")
+    landmark.check("record")
     for option, value in (("--to-distance", to_distance), ("--to-delta", to_delta)):
         if value is not None and not moving:
             raise UsageError(f"{option} goes with --moving: a camera at rest keeps its view")
@@ -210,13 +222,11 @@ def frames_simulate(
     camera = read_sensor(sensor)
     _refuse_many_frames(n_frames, camera)
     refuse_unwritable_files([out], force)
-    name, mesh = read_class_or_mesh(class_name, mesh_file, mesh_reading)
-    last = (
-        (0.8 * distance if to_distance is None else to_distance, delta + 40.0 if to_delta is None else to_delta)
-        if moving
-        else (distance, delta)
-    )
-    views = _views_between((distance, delta), last, n_frames, bearing, height, pitch, roll)
+    name, mesh = landmark.read()
+    distance_m = 0.8 * view.distance if to_distance is None else to_distance
+    delta_deg = view.delta + 40.0 if to_delta is None else to_delta
+    way = np.linspace(0.0, 1.0, n_frames) * moving
+    views = view.views(view.distance + way * (distance_m - view.distance), view.delta + way * (delta_deg - view.delta))
     recording = simulate_recording(
         mesh,
         readable(name),
@@ -231,26 +241,6 @@ def frames_simulate(
     typer.echo(write_recording(recording, out, description=description, force=force))
 
 
-def _views_between(
-    first: tuple[float, float],
-    last: tuple[float, float],
-    n: int,
-    bearing_deg: float,
-    height_m: float,
-    pitch_deg: float,
-    roll_deg: float,
-) -> Views:
-    """Return views whose distance (m) and δ (degrees) change evenly from the first to the last."""
-    import numpy as np
-
-    from phasemark.render import Views
-
-    way = np.linspace(0.0, 1.0, n)
-    distance_m, delta_deg = (start + way * (end - start) for start, end in zip(first, last, strict=True))
-    bearing, pitch, roll = (math.radians(angle) for angle in (bearing_deg, pitch_deg, roll_deg))
-    return Views.broadcast(distance_m, np.radians(delta_deg), bearing, height_m, pitch, roll)
-
-
 def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
     """Refuse a recording that is too large to be made in memory."""
     if n_frames * camera.rows * camera.cols > _RECORDED_PIXELS:
@@ -262,25 +252,29 @@ def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
 
 
 def frames_show(
+    frames: Path,
     *,
-    frames: Annotated[
-        Path, typer.Argument(metavar="FRAMES", help="A frame set, measured frames, or a log of histograms.")
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The figure, .png.")],
-    index: Annotated[int, typer.Option("--index", min=0, help="Number of the frame.")] = 0,
+    out: Out,
+    index: Index = 0,
     sensor: SensorName = "pmd-16x16",
     reading: Annotated[FrameReading, Without("invalid_means", "flip_h", "flip_v", "rotate")],
     force: Force = False,
 ) -> None:
-    """Draw one frame."""
-    import io as bytes_io
+    """Draw one frame.
 
-    from phasemark.data.files.atomic_write import write_atomically
+    Parameters
+    ----------
+    frames
+        A frame set, measured frames, or a log of histograms.
+    out
+        The figure, .png.
+    index
+        Number of the frame.
+    """
     from phasemark.data.frames.frame_set_file import is_frame_set
     from phasemark.data.measured.histogram_logs import is_histogram_log, read_histograms
 
-    if out.suffix.lower() != ".png":
-        raise UsageError(f"the figure must be a .png file, got '{out}'")
+    refuse_other_files(out, ".png")
     refuse_existing([out], force)
     if is_frame_set(frames):
         with open_frame_set(frames) as opened:
@@ -298,9 +292,7 @@ def frames_show(
         measured = reading.read(frames, read_sensor(sensor))
         _refuse_index(index, len(measured) * measured.n_frames)
         figure = measured.plot(*divmod(index, measured.n_frames))
-    buffer = bytes_io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=120)
-    typer.echo(write_atomically(out, buffer.getvalue(), force=force))
+    typer.echo(write_figure(out, figure, force))
 
 
 def _title(index: int, sample: Mapping[str, Any]) -> str:

@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 from phasemark import InputFileError, UsageError
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import tell
-from phasemark.data.commands.options import MeshReading
+from phasemark.data.commands.options import ClassName, MeshReading, MeshUnit, Origin, Up
 from phasemark.inputs import vouching_begun
 from phasemark.inputs.numbers import in_words
 
@@ -99,20 +101,35 @@ def _class_spec(name: str) -> LandmarkSpec:
     return specs[name]
 
 
-def read_class_or_mesh(class_name: str | None, mesh: str | None, reading: MeshReading) -> tuple[str, SurfaceMesh]:
-    """Return the name and mesh that one of --class and --mesh names."""
-    if class_name is not None:
-        return class_name, class_surface(class_name)
-    name, path = name_and_file(mesh or "")
-    return name, read_landmark(path, reading)[1]
+@dataclass(frozen=True)
+class ClassOrMesh:
+    """Options that name one landmark: a class of the catalogue, or a mesh file.
 
+    Parameters
+    ----------
+    mesh_file
+        A mesh file.
+    """
 
-def refuse_unless_one(class_name: str | None, mesh: str | None, reading: MeshReading, doing: str) -> None:
-    """Refuse both or none of --class and --mesh, and a unit without a mesh."""
-    if (class_name is None) == (mesh is None):
-        raise UsageError(f"say what to {doing}: either --class NAME or --mesh NAME=FILE")
-    if class_name is not None and reading.unit is not None:
-        raise UsageError("--unit belongs to --mesh: the catalogue is in metres")
+    class_name: ClassName | None = None
+    mesh_file: Annotated[str | None, Shown(metavar="NAME=FILE")] = None
+    unit: MeshUnit = None
+    up: Up = "z"
+    origin: Origin = "file"
+
+    def check(self, doing: str) -> None:
+        """Refuse both or none of --class and --mesh, and a unit without a mesh."""
+        if (self.class_name is None) == (self.mesh_file is None):
+            raise UsageError(f"say what to {doing}: either --class NAME or --mesh NAME=FILE")
+        if self.class_name is not None and self.unit is not None:
+            raise UsageError("--unit belongs to --mesh: the catalogue is in metres")
+
+    def read(self) -> tuple[str, SurfaceMesh]:
+        """Return name and mesh."""
+        if self.class_name is not None:
+            return self.class_name, class_surface(self.class_name)
+        name, path = name_and_file(self.mesh_file or "")
+        return name, read_landmark(path, MeshReading(self.unit, self.up, self.origin))[1]
 
 
 def name_and_file(text: str) -> tuple[str, str]:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from phasemark.data.commands.command import Shown
 
 if TYPE_CHECKING:
-    from phasemark.render import Frames, Sensor
+    from numpy.typing import ArrayLike
+
+    from phasemark.render import Frames, Sensor, Views
 
 _ORIGIN_HELP = "What becomes the origin: file (its own), base (centre of its foot) or center (of its bounding box)."
 
@@ -64,8 +67,6 @@ Origin = Annotated[OriginWord, Shown(help=_ORIGIN_HELP)]
 MeshUnit = Annotated[MeshUnitWord | None, Shown(help="Unit of the mesh file: m, cm, mm or inch.")]
 Wall = Annotated[Metres | None, Shown(help="Distance of a wall behind the landmark.")]
 Floor = Annotated[Metres | None, Shown(help="How far a floor lies below the lens.")]
-Pitch = Annotated[Degrees, Shown(help="The camera's pitch, positive looking down.")]
-Roll = Annotated[Degrees, Shown(help="The camera's roll.")]
 Resume = Annotated[bool, Shown(help="Continue an unfinished run of the same plan.")]
 Sample = Annotated[Index, Shown(help="Number of random items that are rendered again.")]
 Workers = Annotated[Count | None, Shown(help="Threads; the result does not depend on it.")]
@@ -118,6 +119,43 @@ class MeshReading:
     unit: MeshUnit = None
     up: Up = "z"
     origin: Origin = "file"
+
+
+@dataclass(frozen=True)
+class View:
+    """Options for the place of the landmark before the camera.
+
+    Parameters
+    ----------
+    distance
+        Distance D to the landmark's axis.
+    delta
+        Side δ from which the landmark is seen.
+    bearing
+        Azimuth of the landmark in the camera frame.
+    height
+        Height of the landmark's origin above the lens.
+    pitch
+        The camera's pitch, positive looking down.
+    roll
+        The camera's roll.
+    """
+
+    distance: Metres = 1.0
+    delta: Degrees = 0.0
+    bearing: Degrees = 0.0
+    height: Metres = 0.0
+    pitch: Degrees = 0.0
+    roll: Degrees = 0.0
+
+    def views(self, distance_m: ArrayLike, delta_deg: ArrayLike) -> Views:
+        """Return views at some distances and angles δ, otherwise as stated."""
+        import numpy as np
+
+        from phasemark.render import Views
+
+        bearing, pitch, roll = (math.radians(angle) for angle in (self.bearing, self.pitch, self.roll))
+        return Views.broadcast(distance_m, np.radians(delta_deg), bearing, self.height, pitch, roll)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from phasemark import OutputExistsError, UsageError
 from phasemark.data.commands.command import inputs_given
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from pydantic import BaseModel
 
 
@@ -54,6 +55,20 @@ def refuse_existing(paths: Sequence[Path], force: bool, plan: BaseModel | None =
             raise UsageError(f"{path}: is a folder, give the name of a file")
         if path.exists() and not force:
             raise OutputExistsError(f"{path}: exists already; --force replaces it")
+
+
+def refuse_other_files(path: Path, suffix: str, what: str = "the figure") -> None:
+    """Refuse the name of an output that does not end as files of its kind do."""
+    if path.suffix.lower() != suffix:
+        raise UsageError(f"{what} must be a {suffix} file, got '{path}'")
+
+
+def write_figure(path: Path, figure: Figure, force: bool, *, dpi: float = 120) -> Path:
+    """Write a figure as PNG."""
+    from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.render.png import figure_png
+
+    return write_atomically(path, figure_png(figure, dpi=dpi), force=force)
 
 
 def refuse_unwritable_files(paths: Iterable[Path], force: bool) -> None:

@@ -4,23 +4,15 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from phasemark import UsageError
-from phasemark.data.commands.inputs import (
-    background_of,
-    note_too_far,
-    read_class_or_mesh,
-    read_sensor,
-    refuse_unless_one,
-)
-from phasemark.data.commands.options import Floor, Force, MeshReading, Pitch, Roll, SensorName, Wall, a_class
-from phasemark.data.commands.outputs import refuse_existing
+from phasemark.data.commands.inputs import ClassOrMesh, background_of, note_too_far, read_sensor
+from phasemark.data.commands.options import Floor, Force, Out, SensorName, View, Wall
+from phasemark.data.commands.outputs import refuse_existing, refuse_other_files
 
 if TYPE_CHECKING:
     from phasemark.render import PhasorImages
@@ -29,56 +21,38 @@ if TYPE_CHECKING:
 
 def render_frame(
     *,
-    out: Annotated[Path, typer.Option("-o", "--out", help="The figure, .png; the data go beside it as .npz.")],
-    distance: Annotated[
-        float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")
-    ] = 1.0,
-    delta: Annotated[
-        float, typer.Option("--delta", metavar="DEG", help="Side δ from which the landmark is seen.")
-    ] = 0.0,
-    bearing: Annotated[
-        float, typer.Option("--bearing", metavar="DEG", help="Azimuth of the landmark in the camera frame.")
-    ] = 0.0,
-    height: Annotated[
-        float, typer.Option("--height", metavar="M", help="Height of the landmark's origin above the lens.")
-    ] = 0.0,
-    pitch: Pitch = 0.0,
-    roll: Roll = 0.0,
-    class_name: Annotated[
-        str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=a_class)
-    ] = None,
-    mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
-    mesh_reading: MeshReading,
+    out: Out,
+    view: View,
+    landmark: ClassOrMesh,
     sensor: SensorName = "pmd-16x16",
     wall: Wall = None,
     floor: Floor = None,
-    variant: Annotated[
-        Literal["exact", "hard"],
-        typer.Option(
-            "--variant",
-            help="exact: the exact integral; hard: the centre ray of each pixel alone.",
-        ),
-    ] = "exact",
+    variant: Literal["exact", "hard"] = "exact",
     force: Force = False,
 ) -> None:
     """Render one noise-free frame: a figure, the phasors, and a sketch in the terminal.
 
     Of a direct sensor with a [histogram] table the figure and the data have the expected counts of every zone's bins.
+
+    Parameters
+    ----------
+    out
+        The figure, .png; the data go beside it as .npz.
+    variant
+        exact: the exact integral; hard: the centre ray of each pixel alone.
     """
-    from phasemark.render import Renderer, Views
+    from phasemark.render import Renderer
     from phasemark.render.figures import landmark_limits_m, terminal_figure
 
-    refuse_unless_one(class_name, mesh_file, mesh_reading, "render")
-    if out.suffix.lower() != ".png":
-        raise UsageError(f"the figure must be a .png file, got '{out}'")
+    landmark.check("render")
+    refuse_other_files(out, ".png")
     data = out.with_suffix(".npz")
     refuse_existing([out, data], force)
-    _, mesh = read_class_or_mesh(class_name, mesh_file, mesh_reading)
+    _, mesh = landmark.read()
     camera = read_sensor(sensor)
-    note_too_far(camera, {"--distance": distance, "--wall": wall})
+    note_too_far(camera, {"--distance": view.distance, "--wall": wall})
     renderer = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8))
-    angles = {name: math.radians(value) for name, value in (("pitch_rad", pitch), ("roll_rad", roll))}
-    views = Views.broadcast(distance, math.radians(delta), math.radians(bearing), height, **angles)
+    views = view.views(view.distance, view.delta)
     renderer.check_in_view(views)
     background = background_of(wall, floor)
     image = renderer.render_views(views, background=background, variant=variant)
@@ -99,11 +73,12 @@ def render_frame(
 
 def _write_image(image: PhasorImages, histograms: HistogramImages | None, out: Path, data: Path, force: bool) -> None:
     """Write the figure of an image, or of its histograms where there are any, and the arrays."""
-    import io as bytes_io
+    import io
 
     import numpy as np
 
     from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.render.png import figure_png
 
     arrays = {
         "phasor": image.phasor[0],
@@ -117,8 +92,8 @@ def _write_image(image: PhasorImages, histograms: HistogramImages | None, out: P
         arrays |= {"frequency": np.array(image.sensor.frequencies_hz), "frequency_phasor": image.phasors[0]}
     if histograms is not None:
         arrays |= {"expected_counts": histograms.expected[0], "signal_counts": histograms.signal[0]}
-    buffer, figure = bytes_io.BytesIO(), bytes_io.BytesIO()
+    buffer = io.BytesIO()
     np.savez(buffer, **arrays)
-    (image if histograms is None else histograms).plot().savefig(figure, format="png", dpi=120)
+    figure = figure_png((image if histograms is None else histograms).plot(), dpi=120)
     write_atomically(data, buffer.getvalue(), force=force)
-    write_atomically(out, figure.getvalue(), force=force)
+    write_atomically(out, figure, force=force)

@@ -9,58 +9,54 @@ from typing import Annotated
 
 import typer
 
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import echo_json
-from phasemark.data.commands.inputs import (
-    background_of,
-    class_surface,
-    note_too_far,
-    read_class_or_mesh,
-    read_sensor,
-    refuse_unless_one,
-)
-from phasemark.data.commands.options import Floor, Json, MeshReading, SensorName, Wall, a_class
+from phasemark.data.commands.inputs import ClassOrMesh, background_of, class_surface, note_too_far, read_sensor
+from phasemark.data.commands.options import Count, Degrees, Floor, Json, Metres, SensorName, Wall
 
 
 def accuracy_line(
-    distance: Annotated[float, typer.Option("--distance", metavar="M", help="Distance D to the landmark's axis.")],
     *,
-    delta: Annotated[
-        float | None,
-        typer.Option("--delta", metavar="DEG", help="Side δ from which the landmark is seen; all sides unless stated."),
-    ] = None,
-    class_name: Annotated[
-        str | None, typer.Option("--class", help="A class of the catalogue.", autocompletion=a_class)
-    ] = None,
-    mesh_file: Annotated[str | None, typer.Option("--mesh", metavar="NAME=FILE", help="A mesh file.")] = None,
-    mesh_reading: MeshReading,
+    distance: Metres,
+    delta: Degrees | None = None,
+    landmark: ClassOrMesh,
     sensor: SensorName = "pmd-16x16",
     wall: Wall = None,
     floor: Floor = None,
-    n_frames: Annotated[int, typer.Option("--frames", min=1, help="Frames averaged for one measurement.")] = 50,
+    n_frames: Annotated[Count, Shown("--frames")] = 50,
     as_json: Json = False,
 ) -> None:
     """Print in one line how accurate a measurement can be, from the Cramér–Rao bound.
 
     1 σ of distance, angle and position with the bearing free, what limits it, and how often another class of the
     catalogue explains a frame better.
+
+    Parameters
+    ----------
+    distance
+        Distance D to the landmark's axis.
+    delta
+        Side δ from which the landmark is seen; all sides unless stated.
+    n_frames
+        Frames averaged for one measurement.
     """
     from phasemark.landmarks import catalog
     from phasemark.matcher.accuracy.expected_accuracy import accuracy_card, sides_of
     from phasemark.render import Renderer, Views
 
-    refuse_unless_one(class_name, mesh_file, mesh_reading, "judge")
-    name, mesh = read_class_or_mesh(class_name, mesh_file, mesh_reading)
+    landmark.check("judge")
+    name, mesh = landmark.read()
     camera = read_sensor(sensor)
     note_too_far(camera, {"--distance": distance, "--wall": wall})
     renderer = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8))
     views = Views.broadcast(distance, math.radians(delta or 0.0))
     renderer.check_in_view(views)
     if delta is None:
-        views = sides_of(distance, _period_rad(name if class_name else None))
+        views = sides_of(distance, _period_rad(landmark.class_name))
     others = {
         other: Renderer(class_surface(other), camera, albedo=spec.albedo)
         for other, spec in catalog().items()
-        if class_name is None or other != name
+        if other != landmark.class_name
     }
     card = accuracy_card(renderer, views, others=others, n_frames=n_frames, background=background_of(wall, floor))
     if as_json:
