@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import echo_facts, echo_json, echo_table, readable
 from phasemark.data.commands.inputs import class_mesh, read_landmark
-from phasemark.data.commands.options import Force, Json, MeshReading, a_class
+from phasemark.data.commands.options import ClassName, Force, Json, MeshReading, Out, a_class
 from phasemark.data.commands.outputs import refuse_existing, refuse_input_files
 
 if TYPE_CHECKING:
@@ -42,16 +43,21 @@ def landmark_list(*, as_json: Json = False) -> None:
 
 
 def landmark_show(
+    name_or_file: Annotated[str, Shown(autocompletion=a_class)],
     *,
-    name_or_file: Annotated[
-        str,
-        typer.Argument(metavar="NAME|FILE", help="A class, or an STL, PLY, OBJ or OFF file.", autocompletion=a_class),
-    ],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder that NAME.png and NAME.html go to.")] = None,
+    out: Out | None = None,
     mesh_reading: MeshReading,
     force: Force = False,
 ) -> None:
-    """Draw a landmark: a shaded figure, and a page to turn it in 3D."""
+    """Draw a landmark: a shaded figure, and a page to turn it in 3D.
+
+    Parameters
+    ----------
+    name_or_file
+        A class, or an STL, PLY, OBJ or OFF file.
+    out
+        Folder that NAME.png and NAME.html go to.
+    """
     from phasemark.data.files.atomic_write import write_atomically
     from phasemark.data.files.folder_marker import made_folder
     from phasemark.landmarks import mesh_figure
@@ -68,13 +74,14 @@ def landmark_show(
     typer.echo(page)
 
 
-def landmark_export(
-    *,
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A class of the catalogue.", autocompletion=a_class)],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The file; .stl, .ply, .obj or .off.")],
-    force: Force = False,
-) -> None:
-    """Write a landmark of the catalogue as a mesh, in metres."""
+def landmark_export(name: ClassName, *, out: Out, force: Force = False) -> None:
+    """Write a landmark of the catalogue as a mesh, in metres.
+
+    Parameters
+    ----------
+    out
+        The file; .stl, .ply, .obj or .off.
+    """
     from phasemark.data.files.atomic_write import write_atomically
     from phasemark.landmarks import export_mesh
 
@@ -83,13 +90,14 @@ def landmark_export(
     typer.echo(write_atomically(out, export_mesh(mesh, out.suffix.removeprefix(".")), force=force))
 
 
-def landmark_check(
-    *,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="An STL, PLY, OBJ or OFF file.")],
-    mesh_reading: MeshReading,
-    as_json: Json = False,
-) -> None:
-    """Check a mesh file and say what it holds."""
+def landmark_check(file: Path, *, mesh_reading: MeshReading, as_json: Json = False) -> None:
+    """Check a mesh file and say what it holds.
+
+    Parameters
+    ----------
+    file
+        An STL, PLY, OBJ or OFF file.
+    """
     from phasemark.landmarks import check_mesh
     from phasemark.landmarks.symmetry import MAX_SYMMETRY
 
