@@ -13,17 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from phasemark import UsageError
-from phasemark.data.commands.command import Without
+from phasemark.data.commands.command import Shown, Without
 from phasemark.data.commands.console import echo_json, echo_table, readable, tell
 from phasemark.data.commands.inputs import note_too_far, read_sensor, read_sensor_sources
-from phasemark.data.commands.options import (
-    Force,
-    FrameReading,
-    Json,
-    SensorName,
-    a_preset,
-)
-from phasemark.data.commands.outputs import refuse_existing
+from phasemark.data.commands.options import Force, FrameReading, Json, Metres, Out, SensorName
+from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure
 from phasemark.inputs.numbers import in_words
 from phasemark.inputs.toml_file import toml_value
 
@@ -61,8 +55,7 @@ def sensor_list(*, as_json: Json = False) -> None:
 
 
 Frequency = Annotated[
-    float | None,
-    typer.Option("--frequency", metavar="HZ", help="Which of the sensor's modulation frequencies, if it has several."),
+    float | None, Shown(metavar="HZ", help="Which of the sensor's modulation frequencies, if it has several.")
 ]
 
 
@@ -82,19 +75,16 @@ def _in_mhz(sensor: Sensor) -> str:
 
 
 def sensor_show(
-    *,
-    name_or_file: Annotated[
-        str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=a_preset)
-    ],
-    picture: Annotated[
-        Path | None, typer.Option("--picture", help="Also write a picture of the pixel grid on the view, .png.")
-    ] = None,
-    as_json: Json = False,
-    force: Force = False,
+    name_or_file: SensorName, *, picture: Path | None = None, as_json: Json = False, force: Force = False
 ) -> None:
     """Print a sensor in groups, and of each number whether it is measured, published or assumed.
 
     The text is a sensor file again. Fields at their defaults stand in a line of comment; --json prints every field.
+
+    Parameters
+    ----------
+    picture
+        Also write a picture of the pixel grid on the view, .png.
     """
     from phasemark.render.sensor.sensor_file import source_lines
 
@@ -167,40 +157,36 @@ def _echo_group(title: str, fields: Mapping[str, object], model: type[BaseModel]
 
 def _write_picture(sensor: Sensor, picture: Path, force: bool) -> None:
     """Write the picture of a sensor's pixel grid."""
-    from io import BytesIO
-
-    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.render.figures import pixel_grid_figure
 
     if picture.suffix != ".png":
         raise UsageError(f"--picture must end in .png, got '{picture}'")
     refuse_existing([picture], force)
-    drawn = BytesIO()
-    pixel_grid_figure(sensor).savefig(drawn, format="png", dpi=120)
-    write_atomically(picture, drawn.getvalue(), force=force)
+    write_figure(picture, pixel_grid_figure(sensor), force)
 
 
 def sensor_import(
+    camera_info: Path,
     *,
-    camera_info: Annotated[Path, typer.Argument(metavar="CAMERA_INFO", help="A camera_info of ROS 1 or ROS 2, .yaml.")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
-    like: Annotated[
-        str | None,
-        typer.Option(
-            "--like",
-            metavar="NAME|FILE",
-            help="The preset or sensor file of all other fields; without it those of pmd-16x16 are assumed.",
-            autocompletion=a_preset,
-        ),
-    ] = None,
-    modulation: Annotated[
-        float | None,
-        typer.Option("--modulation", metavar="HZ", help="Modulation frequency; by default that of --like."),
-    ] = None,
+    out: Out,
+    like: SensorName | None = None,
+    modulation: Annotated[float | None, Shown(metavar="HZ")] = None,
     as_json: Json = False,
     force: Force = False,
 ) -> None:
-    """Make a sensor file from the intrinsics that ROS or OpenCV calibrated."""
+    """Make a sensor file from the intrinsics that ROS or OpenCV calibrated.
+
+    Parameters
+    ----------
+    camera_info
+        A camera_info of ROS 1 or ROS 2, .yaml.
+    out
+        The sensor file to write, .toml.
+    like
+        The preset or sensor file of all other fields; without it those of pmd-16x16 are assumed.
+    modulation
+        Modulation frequency; by default that of --like.
+    """
     from phasemark.data.files.atomic_write import write_atomically
     from phasemark.render.sensor.camera_info import read_camera_info
     from phasemark.render.sensor.lens_fields import DERIVED
@@ -252,32 +238,14 @@ def _with_lens_of(found: CameraInfo, base: Sensor, modulation_hz: float | None) 
 
 
 def sensor_fit(
+    frames: list[Path],
     *,
-    frames: Annotated[
-        list[Path], typer.Argument(metavar="FRAMES...", help="Frames of a flat board: CSV, NPY, NPZ or HDF5.")
-    ],
-    distance: Annotated[
-        list[float],
-        typer.Option("--distance", metavar="M", help="Distance of the board; once for each FRAMES, in order."),
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
-    albedo: Annotated[
-        list[float] | None,
-        typer.Option("--albedo", help="Albedo of the board, one for all or one for each; 0.8 is assumed."),
-    ] = None,
-    distance_std: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--distance-std",
-            metavar="M",
-            help="Standard deviation of the distances, one for all or one for each; 0.001 is assumed.",
-        ),
-    ] = None,
+    distance: list[Metres],
+    out: Out,
+    albedo: list[float] | None = None,
+    distance_std: list[Metres] | None = None,
     sensor: SensorName = "pmd-16x16",
-    amplitude_unit: Annotated[
-        Literal["electrons", "arbitrary"],
-        typer.Option("--amplitude-unit", help="Unit of amplitude and intensity: electrons or arbitrary."),
-    ] = "electrons",
+    amplitude_unit: Literal["electrons", "arbitrary"] = "electrons",
     reading: Annotated[FrameReading, Without("invalid_means")],
     frequency: Frequency = None,
     as_json: Json = False,
@@ -287,12 +255,26 @@ def sensor_fit(
 
     Give the board's distance for each file, in order: FRAMES FRAMES --distance 1.0 --distance 2.0. Geometry and
     whatever the frames do not tell come from --sensor; the file says of each number whether it is measured or assumed.
+
+    Parameters
+    ----------
+    frames
+        Frames of a flat board: CSV, NPY, NPZ or HDF5.
+    distance
+        Distance of the board; once for each FRAMES, in order.
+    out
+        The sensor file to write, .toml.
+    albedo
+        Albedo of the board, one for all or one for each; 0.8 is assumed.
+    distance_std
+        Standard deviation of the distances, one for all or one for each; 0.001 is assumed.
+    amplitude_unit
+        Unit of amplitude and intensity: electrons or arbitrary.
     """
     from phasemark.data.files.atomic_write import write_atomically
     from phasemark.render.bench.fit.fit_sensor import fit_sensor
 
-    if out.suffix.lower() != ".toml":
-        raise UsageError(f"the sensor must be a .toml file, got '{out}'")
+    refuse_other_files(out, ".toml", "the sensor")
     refuse_existing([out], force)
     base = read_sensor(sensor)
     which = which_frequency(base, frequency)
