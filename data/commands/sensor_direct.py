@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from phasemark import UsageError
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable, tell
 from phasemark.data.commands.inputs import read_sensor
-from phasemark.data.commands.options import Force, Json, SensorName
-from phasemark.data.commands.outputs import refuse_existing
+from phasemark.data.commands.options import Force, Json, Metres, Out, SensorName
+from phasemark.data.commands.outputs import refuse_existing, refuse_other_files
 
 if TYPE_CHECKING:
     from phasemark.render import Sensor
@@ -21,20 +22,11 @@ if TYPE_CHECKING:
 
 
 def sensor_fit_direct(
+    plane: Annotated[Path, Shown(metavar="LOG")],
     *,
-    plane: Annotated[
-        Path, typer.Argument(metavar="LOG", help="Histograms of a plane with its distances: NPZ or JSON lines.")
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
-    known: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--object", metavar="LOG,MESH", help="Histograms of a known object with poses, and its mesh in metres."
-        ),
-    ] = None,
-    nearest: Annotated[
-        float, typer.Option("--nearest", metavar="M", help="Distances of the plane below this are left out.")
-    ] = 0.06,
+    out: Out,
+    known: Annotated[list[str] | None, Shown("--object", metavar="LOG,MESH")] = None,
+    nearest: Metres = 0.06,
     sensor: SensorName = "tmf8820-3x3",
     as_json: Json = False,
     force: Force = False,
@@ -44,14 +36,24 @@ def sensor_fit_direct(
     The plane tells bin widths, delays, response, pile-up and the crosstalk of a cover glass; objects tell where each
     zone looks, in which order zones are logged, how large they are and how much light strays. Each log holds
     `histogram`, a plane's `distance_m`, an object's `sensor2world`; an object's mesh holds the table that it stands on.
+
+    Parameters
+    ----------
+    plane
+        Histograms of a plane with its distances: NPZ or JSON lines.
+    out
+        The sensor file to write, .toml.
+    known
+        Histograms of a known object with poses, and its mesh in metres.
+    nearest
+        Distances of the plane below this are left out.
     """
     from phasemark.data.files.atomic_write import write_atomically
     from phasemark.data.files.same_file import refuse_inputs
     from phasemark.render.direct import fit_direct_sensor
     from phasemark.render.sensor.sensor_file import sensor_toml
 
-    if out.suffix.lower() != ".toml":
-        raise UsageError(f"the sensor must be a .toml file, got '{out}'")
+    refuse_other_files(out, ".toml", "the sensor")
     refuse_inputs([out], [Path(part) for text in known or [] for part in text.split(",")])
     refuse_existing([out], force)
     base, recording = _plane(plane, sensor, nearest)
