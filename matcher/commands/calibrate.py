@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,20 +13,25 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from phasemark import InputFileError, UsageError
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
 from phasemark.data.commands.flag_wording import in_flags
 from phasemark.data.commands.inputs import background_of, class_mesh, note_too_far, open_any_bank, read_sensor
 from phasemark.data.commands.options import (
+    ClassName,
+    Degrees,
     Floor,
     Force,
     FrameReading,
     Json,
+    Metres,
+    Out,
+    SensorName,
     Wall,
     Workers,
     a_class,
-    a_preset,
 )
-from phasemark.data.commands.outputs import refuse_existing
+from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -38,91 +42,35 @@ if TYPE_CHECKING:
     from phasemark.matcher.calibration.result import Calibration
     from phasemark.render import Frames, Sensor
 
+Names = Annotated[str, Shown(metavar="NAMES")]
+
 
 def calibrate_camera(
+    bank_or_class: Annotated[str, Shown(autocompletion=a_class)],
+    frames: list[Path],
     *,
-    landmark: Annotated[
-        str, typer.Argument(metavar="BANK|CLASS", help="A bank, or a class of the catalogue.", autocompletion=a_class)
-    ],
-    frames: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FRAMES...", help="Measured frames: a file for each pose, or one of them all, in order."
-        ),
-    ],
-    poses: Annotated[
-        Path,
-        typer.Option(
-            "--poses", metavar="CSV", help="Columns distance_m,delta_deg[,bearing_deg] or x_m,y_m,heading_deg [,t_ms]."
-        ),
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The sensor file to write, .toml.")],
-    class_name: Annotated[
-        str | None, typer.Option("--class", help="Which class of a bank that has several.", autocompletion=a_class)
-    ] = None,
-    sensor: Annotated[
-        str | None,
-        typer.Option(
-            "--sensor",
-            metavar="NAME|FILE",
-            help="The assumed camera; a bank has its own.",
-            autocompletion=a_preset,
-        ),
-    ] = None,
-    free: Annotated[
-        str | None, typer.Option("--free", metavar="NAMES", help="Estimate these alone, e.g. pitch,roll,height.")
-    ] = None,
-    fix: Annotated[
-        str | None, typer.Option("--fix", metavar="NAMES", help="Leave these as they are, e.g. fov.")
-    ] = None,
-    height: Annotated[
-        float | None,
-        typer.Option("--height", metavar="M", help="Assumed height of the landmark's origin above the lens."),
-    ] = None,
-    bearing: Annotated[
-        float | None,
-        typer.Option("--bearing", metavar="DEG", help="Initial guess for the bearing offset."),
-    ] = None,
-    albedo: Annotated[float | None, typer.Option("--albedo", help="Initial guess for the landmark's albedo.")] = None,
-    moving: Annotated[
-        bool, typer.Option("--moving", help="A moving camera: each frame has a pose of its own, by time stamps.")
-    ] = False,
-    delay_ms: Annotated[
-        float | None,
-        typer.Option("--delay-ms", metavar="MS", help="Fixed delay: added to the stamp of a frame to get its time."),
-    ] = None,
-    zones: Annotated[
-        bool | None,
-        typer.Option("--zones/--no-zones", help="Offsets of zones and noise law of a direct sensor; with --moving."),
-    ] = None,
-    position_std: Annotated[
-        float | None,
-        typer.Option("--position-std", metavar="M", help="Standard deviation of the coordinates of the lens."),
-    ] = None,
-    heading_std: Annotated[
-        float | None, typer.Option("--heading-std", metavar="DEG", help="Standard deviation of the camera's headings.")
-    ] = None,
-    delta_std: Annotated[
-        float | None,
-        typer.Option(
-            "--delta-std", metavar="DEG", help="Standard deviation of the side δ that the landmark was turned to."
-        ),
-    ] = None,
-    landmark_xy: Annotated[
-        tuple[float, float], typer.Option("--landmark-xy", metavar="X Y", help="Place of the landmark, for x_m,y_m.")
-    ] = (0.0, 0.0),
-    landmark_yaw: Annotated[float, typer.Option("--landmark-yaw", metavar="DEG", help="Heading of its x' axis.")] = 0.0,
-    on: Annotated[
-        Literal["auto", "ranges", "phasors"],
-        typer.Option("--on", help="What is explained: ranges, or phasors, which use amplitudes too; auto chooses."),
-    ] = "auto",
+    poses: Annotated[Path, Shown(metavar="CSV")],
+    out: Out,
+    class_name: ClassName | None = None,
+    sensor: SensorName | None = None,
+    free: Names | None = None,
+    fix: Names | None = None,
+    height: Metres | None = None,
+    bearing: Degrees | None = None,
+    albedo: float | None = None,
+    moving: bool = False,
+    delay_ms: Annotated[float | None, Shown(metavar="MS")] = None,
+    zones: Annotated[bool | None, Shown("--zones/--no-zones")] = None,
+    position_std: Metres | None = None,
+    heading_std: Degrees | None = None,
+    delta_std: Degrees | None = None,
+    landmark_xy: Annotated[tuple[float, float], Shown(metavar="X Y")] = (0.0, 0.0),
+    landmark_yaw: Degrees = 0.0,
+    on: Literal["auto", "ranges", "phasors"] = "auto",
     wall: Wall = None,
     floor: Floor = None,
     reading: FrameReading,
-    plot: Annotated[
-        Path | None,
-        typer.Option("--plot", help="The figure of the residuals, .png; beside the sensor file otherwise."),
-    ] = None,
+    plot: Path | None = None,
     workers: Workers = None,
     as_json: Json = False,
     force: Force = False,
@@ -134,6 +82,51 @@ def calibrate_camera(
     range_offset, albedo and delay. A sensor with a lens has its terms in place of half angles, estimated where --free
     names them: fx, fy, cx, cy, k1, k2 ... (all: lens). A result that cannot be trusted is not written without --force
     (exit code 3).
+
+    Parameters
+    ----------
+    bank_or_class
+        A bank, or a class of the catalogue.
+    frames
+        Measured frames: a file for each pose, or one of them all, in order.
+    poses
+        Columns distance_m,delta_deg[,bearing_deg] or x_m,y_m,heading_deg [,t_ms].
+    out
+        The sensor file to write, .toml.
+    class_name
+        Which class of a bank that has several.
+    sensor
+        The assumed camera; a bank has its own.
+    free
+        Estimate these alone, e.g. pitch,roll,height.
+    fix
+        Leave these as they are, e.g. fov.
+    height
+        Assumed height of the landmark's origin above the lens.
+    bearing
+        Initial guess for the bearing offset.
+    albedo
+        Initial guess for the landmark's albedo.
+    moving
+        A moving camera: each frame has a pose of its own, by time stamps.
+    delay_ms
+        Fixed delay: added to the stamp of a frame to get its time.
+    zones
+        Offsets of zones and noise law of a direct sensor; with --moving.
+    position_std
+        Standard deviation of the coordinates of the lens.
+    heading_std
+        Standard deviation of the camera's headings.
+    delta_std
+        Standard deviation of the side δ that the landmark was turned to.
+    landmark_xy
+        Place of the landmark, for x_m,y_m.
+    landmark_yaw
+        Heading of its x' axis.
+    on
+        What is explained: ranges, or phasors, which use amplitudes too; auto chooses.
+    plot
+        The figure of the residuals, .png; beside the sensor file otherwise.
     """
     from phasemark.data.shards.executor import processors
     from phasemark.matcher import calibrate
@@ -142,7 +135,7 @@ def calibrate_camera(
     figure = _figure_beside(out, plot)
     refuse_existing([out, figure], force)
     background = background_of(wall, floor)
-    mesh, base, base_name = _calibration_target(landmark, class_name, sensor)
+    mesh, base, base_name = _calibration_target(bank_or_class, class_name, sensor)
     known = read_poses(poses, landmark_xy_m=landmark_xy, landmark_yaw_rad=math.radians(landmark_yaw))
     note_too_far(base, {f"{poses}: the landmark": max(known.distance_m.tolist(), default=None), "--wall": wall})
     filtered = _filtered([reading.read(path, base) for path in frames], known, on, moving)
@@ -177,11 +170,9 @@ def calibrate_camera(
 
 def _figure_beside(out: Path, plot: Path | None) -> Path:
     """Return where the figure of the residuals goes; refuse names of a wrong kind."""
-    if out.suffix.lower() != ".toml":
-        raise UsageError(f"the sensor must be a .toml file, got '{out}'")
+    refuse_other_files(out, ".toml", "the sensor")
     figure = plot or out.with_suffix(".png")
-    if figure.suffix.lower() != ".png":
-        raise UsageError(f"the figure must be a .png file, got '{figure}'")
+    refuse_other_files(figure, ".png")
     return figure
 
 
@@ -251,9 +242,7 @@ def _write_calibration(found: Calibration, out: Path, figure: Path, base_name: s
             f"nothing was written, for the calibration cannot be trusted: {'; '.join(found.doubts)}. Likely cause:"
             f" {found.cause} (--force writes it all the same)"
         )
-    buffer = io.BytesIO()
-    residual_figure(found).savefig(buffer, format="png", dpi=100)
-    write_atomically(figure, buffer.getvalue(), force=force)
+    write_figure(figure, residual_figure(found), force, dpi=100)
     write_atomically(out, found.to_toml(base_name=readable(base_name)).encode(), force=force)
 
 
