@@ -4,15 +4,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from phasemark import PhasemarkError
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo_json, readable
 from phasemark.data.commands.inputs import class_surface, read_sensor
-from phasemark.data.commands.options import Force, Json, Seed, a_preset
+from phasemark.data.commands.options import Force, Json, Out, Seed, SensorName
 from phasemark.data.commands.outputs import output_folder
 from phasemark.data.commands.sensor import Frequency, which_frequency
 
@@ -21,20 +21,24 @@ if TYPE_CHECKING:
 
 
 def sensor_characterise(
+    name_or_file: SensorName,
     *,
-    name_or_file: Annotated[
-        str, typer.Argument(metavar="NAME|FILE", help="A preset, or a sensor file (.toml).", autocompletion=a_preset)
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, its pictures and numbers.")],
-    n_frames: Annotated[
-        int | None, typer.Option("--frames", min=2, help="Frames at each point; by default 51200 readings a point.")
-    ] = None,
+    out: Out,
+    n_frames: Annotated[int | None, Shown("--frames", min=2)] = None,
     seed: Seed = 2005,
     frequency: Frequency = None,
     as_json: Json = False,
     force: Force = False,
 ) -> None:
-    """Measure a sensor before flat fields, as EMVA 1288 would, and compare it with what its numbers predict."""
+    """Measure a sensor before flat fields, as EMVA 1288 would, and compare it with what its numbers predict.
+
+    Parameters
+    ----------
+    out
+        Folder for the report, its pictures and numbers.
+    n_frames
+        Frames at each point; by default 51200 readings a point.
+    """
     from phasemark.data.pages.characterisation import NAMES, summary_sentences, write_characterisation
     from phasemark.data.seeds import stream
     from phasemark.render import characterise
