@@ -5,26 +5,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from phasemark.data.commands.console import LongWork, echo_json, echo_table
-from phasemark.data.commands.options import Force, Json, Seed, Workers
+from phasemark.data.commands.options import Force, Json, Out, Seed, Workers
 from phasemark.data.commands.outputs import output_folder, refuse_existing
 
 
 def demo_report(
     *,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the report, the tables and the bank.")] = Path(
-        "out/demo"
-    ),
+    out: Out = Path("out/demo"),
     seed: Seed = 2005,
     workers: Workers = None,
     as_json: Json = False,
     force: Force = False,
 ) -> None:
-    """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°."""
+    """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°.
+
+    Parameters
+    ----------
+    out
+        Folder for the report, the tables and the bank.
+    """
     from phasemark.data.shards.run import outputs_of
     from phasemark.matcher.demo.report import DEMO_FILES, HALVES, answer, on_grid, summary_rows, write_demo
     from phasemark.matcher.demo.run import run_demo
