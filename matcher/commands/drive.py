@@ -6,33 +6,37 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from phasemark.data.commands.console import LongWork, echo_json, echo_table
 from phasemark.data.commands.inputs import note_plan_too_far
-from phasemark.data.commands.options import Force, Json, Workers
+from phasemark.data.commands.options import Force, Json, Out, Seed, Workers
 from phasemark.data.commands.outputs import output_folder
 
 
 def drive_robot(
+    plan_file: Path | None = None,
     *,
-    plan_file: Annotated[
-        Path | None, typer.Argument(metavar="[PLAN]", help="A plan (.toml); without it a tour of 20 m.")
-    ] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for tables, summary, figure and animation.")] = Path(
-        "out/drive"
-    ),
-    seed: Annotated[int, typer.Option("--seed", min=0, max=2**64 - 1, help="Root of all random numbers.")] = 2005,
-    example: Annotated[
-        bool, typer.Option("--example", help="Print the plan of that tour, and do nothing else.")
-    ] = False,
+    out: Out = Path("out/drive"),
+    seed: Seed = 2005,
+    example: bool = False,
     workers: Workers = None,
     as_json: Json = False,
     force: Force = False,
 ) -> None:
-    """Drive a robot from landmark to landmark, its odometry corrected on the way."""
+    """Drive a robot from landmark to landmark, its odometry corrected on the way.
+
+    Parameters
+    ----------
+    plan_file
+        A plan (.toml); without it a tour of 20 m.
+    out
+        Folder for tables, summary, figure and animation.
+    example
+        Print the plan of that tour, and do nothing else.
+    """
     from phasemark.matcher.drive import (
         OUTPUTS,
         default_drive,
