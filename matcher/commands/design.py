@@ -11,33 +11,38 @@ from typing import Annotated, Any
 
 import typer
 
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo_json, echo_table
-from phasemark.data.commands.options import Force, Json, Workers
+from phasemark.data.commands.options import Force, Index, Json, Out, Seed, Workers
 from phasemark.data.commands.outputs import output_folder
 
 
 def landmark_design(
+    plan_file: Path | None = None,
     *,
-    plan_file: Annotated[
-        Path | None,
-        typer.Argument(metavar="[PLAN]", help="A plan (.toml); without it four landmarks for the PMD camera."),
-    ] = None,
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder for landmarks, tables, pictures and drawings.")
-    ] = Path("out/design"),
-    confirm_frames: Annotated[
-        int,
-        typer.Option("--confirm", metavar="N", min=0, help="Simulated frame sets to match from every side; 0: none."),
-    ] = 100,
-    seed: Annotated[
-        int | None, typer.Option("--seed", min=0, max=2**64 - 1, help="Replaces the plan's root of all random numbers.")
-    ] = None,
-    example: Annotated[bool, typer.Option("--example", help="Print the default plan, and do nothing else.")] = False,
+    out: Out = Path("out/design"),
+    confirm: Annotated[Index, Shown(metavar="N")] = 100,
+    seed: Seed | None = None,
+    example: bool = False,
     workers: Workers = None,
     as_json: Json = False,
     force: Force = False,
 ) -> None:
-    """Design a set of landmarks for a camera and a working range, and confirm what it gains by simulated frames."""
+    """Design a set of landmarks for a camera and a working range, and confirm what it gains by simulated frames.
+
+    Parameters
+    ----------
+    plan_file
+        A plan (.toml); without it four landmarks for the PMD camera.
+    out
+        Folder for landmarks, tables, pictures and drawings.
+    confirm
+        Simulated frame sets to match from every side; 0: none.
+    seed
+        Replaces the plan's root of all random numbers.
+    example
+        Print the default plan, and do nothing else.
+    """
     from phasemark.matcher.design import (
         confirm_design,
         default_design,
@@ -59,9 +64,9 @@ def landmark_design(
         with LongWork("searching") as progress:
             design = run_design(plan, workers=workers, progress=progress)
         confirmed = None
-        if confirm_frames:
+        if confirm:
             with LongWork("matching simulated frames") as progress:
-                confirmed = confirm_design(design, confirm_frames, workers=workers, progress=progress)
+                confirmed = confirm_design(design, confirm, workers=workers, progress=progress)
         with LongWork("writing the design"):
             files = write_design(design, confirmed, out, force=force)
     facts = summary(design, confirmed)
