@@ -9,46 +9,40 @@ from typing import Annotated, Literal
 
 import typer
 
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import echo_json
 from phasemark.data.commands.inputs import note_plan_too_far
 from phasemark.data.commands.options import Json
 
-PlanKind = Literal["bank", "frames", "sweep", "drive", "design"]
+PlanKind = Annotated[
+    Literal["bank", "frames", "sweep", "drive", "design"], Shown(help="bank, frames, sweep, drive or design.")
+]
 
 
-def plan_example(
-    *,
-    kind: Annotated[PlanKind, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.")],
-) -> None:
+def plan_example(kind: PlanKind) -> None:
     """Print a plan with comments; it can be used as it is."""
     from phasemark.matcher.plan_kinds import plan_example
 
     typer.echo(plan_example(kind), nl=False)
 
 
-def plan_schema(
-    *,
-    kind: Annotated[PlanKind, typer.Argument(metavar="KIND", help="bank, frames, sweep, drive or design.")],
-) -> None:
+def plan_schema(kind: PlanKind) -> None:
     """Print the JSON Schema of a kind of plan, for editors and other programs."""
     from phasemark.matcher.plan_kinds import plan_schema
 
     echo_json(plan_schema(kind))
 
 
-def plan_check(
-    *,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A plan (.toml).")],
-    kind: Annotated[
-        PlanKind | None,
-        typer.Option(
-            "--kind",
-            help="bank, frames, sweep, drive or design, if the plan leaves it open.",
-        ),
-    ] = None,
-    as_json: Json = False,
-) -> None:
-    """Check a plan and say what it is; with --json print it with every default made explicit."""
+def plan_check(file: Path, *, kind: PlanKind | None = None, as_json: Json = False) -> None:
+    """Check a plan and say what it is; with --json print it with every default made explicit.
+
+    Parameters
+    ----------
+    file
+        A plan (.toml).
+    kind
+        bank, frames, sweep, drive or design, if the plan leaves it open.
+    """
     from phasemark.data.plans.bank_plan import ScenePlan
     from phasemark.matcher.drive import DrivePlan
     from phasemark.matcher.plan_kinds import check_plan
