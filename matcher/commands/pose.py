@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from phasemark import UsageError
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import Table, echo_json
-from phasemark.data.commands.options import Json
+from phasemark.data.commands.options import Count, Json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,27 +23,31 @@ if TYPE_CHECKING:
 
 
 def pose_report_command(
+    measured: Annotated[Path, Shown(metavar="ESTIMATES")],
+    truth: Path,
     *,
-    measured: Annotated[Path, typer.Argument(metavar="ESTIMATES", help="What match --estimates wrote, CSV.")],
-    truth: Annotated[
-        Path,
-        typer.Argument(
-            metavar="TRUTH", help="True poses by position or by time, or a recording with truth_ columns, CSV."
-        ),
-    ],
-    symmetry: Annotated[
-        int, typer.Option("--symmetry", min=1, help="Number of turns about its axis that leave the landmark as it is.")
-    ] = 1,
-    delay_s: Annotated[
-        float, typer.Option("--delay", help="Seconds added to the stamps of the estimates, for poses by time.")
-    ] = 0.0,
-    refused: Annotated[bool, typer.Option("--refused", help="Count answers that were not accepted, too.")] = False,
+    symmetry: Count = 1,
+    delay_s: Annotated[float, Shown("--delay")] = 0.0,
+    refused: bool = False,
     as_json: Json = False,
 ) -> None:
     """Report the errors of measured poses in the terms of ASTM E2919.
 
     Absolute errors of position and orientation, and those of the motion from one pose to the next: mean, r.m.s.,
     percentiles and maximum, each with its 95 % interval.
+
+    Parameters
+    ----------
+    measured
+        What match --estimates wrote, CSV.
+    truth
+        True poses by position or by time, or a recording with truth_ columns, CSV.
+    symmetry
+        Number of turns about its axis that leave the landmark as it is.
+    delay_s
+        Seconds added to the stamps of the estimates, for poses by time.
+    refused
+        Count answers that were not accepted, too.
     """
     import numpy as np
 
