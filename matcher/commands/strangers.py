@@ -7,18 +7,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
-
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo_json, echo_table
 from phasemark.data.commands.inputs import open_any_bank
-from phasemark.data.commands.options import Json, Seed, Workers
+from phasemark.data.commands.options import Count, Json, Seed, Workers
 
 
 def bank_strangers(
+    bank: Path,
     *,
-    bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank.")],
-    population: Annotated[int, typer.Option("--population", min=1, help="Frames of each part.")] = 20,
-    n_frames: Annotated[int, typer.Option("--frames", min=1, help="Exposures averaged in each frame.")] = 50,
+    population: Count = 20,
+    n_frames: Annotated[Count, Shown("--frames")] = 50,
     seed: Seed = 0,
     workers: Workers = None,
     as_json: Json = False,
@@ -27,6 +26,15 @@ def bank_strangers(
 
     What is accepted here in every second frame, the sensor cannot distinguish from the landmark: that part must not
     stand where the robot looks for it.
+
+    Parameters
+    ----------
+    bank
+        A bank.
+    population
+        Frames of each part.
+    n_frames
+        Exposures averaged in each frame.
     """
     from phasemark.matcher import Matcher
     from phasemark.matcher.accuracy.strangers import stranger_rates
