@@ -5,26 +5,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from phasemark.data.commands.console import LongWork, echo_facts, echo_json
+from phasemark.data.commands.console import LongWork, echo_facts
 from phasemark.data.commands.inputs import open_any_bank
-from phasemark.data.commands.options import Json, Sample, Seed
+from phasemark.data.commands.options import Count, Json, Sample, Seed
 
 
 def bank_verify(
-    *,
-    bank: Annotated[Path, typer.Argument(metavar="BANK", help="A bank, its checksum beside it.")],
-    population: Annotated[
-        int | None, typer.Option("--population", min=1, help="Number of random views to match against the bank.")
-    ] = None,
-    sample: Sample = 16,
-    seed: Seed = 0,
-    as_json: Json = False,
+    bank: Path, *, population: Count | None = None, sample: Sample = 16, seed: Seed = 0, as_json: Json = False
 ) -> None:
-    """Check a bank: checksum, schema, values, random images rendered again; and what its grid's spacing costs."""
+    """Check a bank: checksum, schema, values, random images rendered again; and what its grid's spacing costs.
+
+    Parameters
+    ----------
+    bank
+        A bank, its checksum beside it.
+    population
+        Number of random views to match against the bank.
+    """
     from phasemark.data.verify import verify_bank
 
     with LongWork("verifying"):
@@ -35,4 +33,4 @@ def bank_verify(
         with open_any_bank(bank) as opened, LongWork("matching random views"):
             loss = grid_loss(opened, population, seed=seed).as_dict()
         report |= {key: float(f"{value:.3g}") if isinstance(value, float) else value for key, value in loss.items()}
-    echo_json(report) if as_json else echo_facts(report)
+    echo_facts(report, as_json=as_json)
