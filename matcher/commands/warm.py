@@ -8,8 +8,7 @@ import time
 from enum import StrEnum
 from typing import Annotated
 
-import typer
-
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, duration, echo_table
 
 
@@ -22,20 +21,16 @@ class Work(StrEnum):
 
 
 def warm_kernels(
-    *,
-    works: Annotated[
-        list[Work] | None,
-        typer.Option(
-            "--for",
-            metavar="WORK",
-            help="What to compile for: render, match or histograms; may be repeated. Without it, for all.",
-            show_default=False,
-        ),
-    ] = None,
+    *, works: Annotated[list[Work] | None, Shown("--for", metavar="WORK", show_default=False)] = None
 ) -> None:
     """Compile what the first image and the first match would wait for, and keep it.
 
     Compiled code is kept beside the package or in the user's cache folder, until phasemark changes.
+
+    Parameters
+    ----------
+    works
+        What to compile for: render, match or histograms; may be repeated. Without it, for all.
     """
     from phasemark.matcher.warm import warm
 
