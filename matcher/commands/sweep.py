@@ -10,50 +10,57 @@ from typing import Annotated, Any
 
 import typer
 
+from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo_json, echo_table
 from phasemark.data.commands.inputs import note_plan_too_far
-from phasemark.data.commands.options import Force, Json, Workers, one_of
+from phasemark.data.commands.options import Force, Index, Json, Out, Workers, one_of
 from phasemark.data.commands.outputs import refuse_existing, refuse_input_files
+
+Folder = Annotated[Path, Shown(metavar="DIR", help="A sweep's folder.")]
 
 
 def sweep_run(
+    plan_or_name: Annotated[str, Shown(autocompletion=one_of("paper", "distance-angle-noise", "robustness"))],
     *,
-    plan: Annotated[
-        str,
-        typer.Argument(
-            metavar="PLAN|NAME",
-            help="A plan (.toml), or paper, distance-angle-noise or robustness.",
-            autocompletion=one_of("paper", "distance-angle-noise", "robustness"),
-        ),
-    ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for trials, tables and the report.")],
-    trials: Annotated[
-        int | None, typer.Option("--trials", help="Trials of each condition, in place of the plan's.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Root of all random numbers.")] = None,
-    matcher: Annotated[
-        str | None,
-        typer.Option("--matcher", metavar="MODULE:NAME", help="Your own matcher, beside the plan's methods."),
-    ] = None,
-    trust_plan: Annotated[
-        bool, typer.Option("--trust-plan", help="Run the programs (MODULE:NAME) that the plan itself names.")
-    ] = False,
+    out: Out,
+    trials: int | None = None,
+    seed: Annotated[int | None, Shown(help="Root of all random numbers.")] = None,
+    matcher: Annotated[str | None, Shown(metavar="MODULE:NAME")] = None,
+    trust_plan: bool = False,
     workers: Workers = None,
-    scheduler: Annotated[
-        str, typer.Option("--scheduler", help="threads, local:N (processes), or a Dask scheduler's address.")
-    ] = "threads",
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a sweep that was interrupted.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Start over where the folder holds a sweep.")] = False,
+    scheduler: str = "threads",
+    resume: bool = False,
+    force: bool = False,
 ) -> None:
-    """Run a sweep and write its tables and report."""
+    """Run a sweep and write its tables and report.
+
+    Parameters
+    ----------
+    plan_or_name
+        A plan (.toml), or paper, distance-angle-noise or robustness.
+    out
+        Folder for trials, tables and the report.
+    trials
+        Trials of each condition, in place of the plan's.
+    matcher
+        Your own matcher, beside the plan's methods.
+    trust_plan
+        Run the programs (MODULE:NAME) that the plan itself names.
+    scheduler
+        threads, local:N (processes), or a Dask scheduler's address.
+    resume
+        Go on with a sweep that was interrupted.
+    force
+        Start over where the folder holds a sweep.
+    """
     from phasemark.matcher.sweep.plan import Method, SweepPlan, read_sweep_plan, refuse_programs
     from phasemark.matcher.sweep.report import write_report
     from phasemark.matcher.sweep.run import run_sweep, sweep_outputs
 
-    loaded = read_sweep_plan(plan)
+    loaded = read_sweep_plan(plan_or_name)
     changes: dict[str, Any] = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     if not trust_plan:
-        refuse_programs(loaded, () if matcher is None else (matcher,), plan)
+        refuse_programs(loaded, () if matcher is None else (matcher,), plan_or_name)
     if matcher is not None and matcher not in [method.method for method in loaded.methods]:
         changes["methods"] = (*loaded.methods, Method(name=matcher, method=matcher))
     changed = SweepPlan(**{**loaded.model_dump(), **changes})
@@ -68,11 +75,7 @@ def sweep_run(
     typer.echo(report)
 
 
-def sweep_report(
-    *,
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A sweep's folder.")],
-    as_json: Json = False,
-) -> None:
+def sweep_report(folder: Folder, *, as_json: Json = False) -> None:
     """Write a sweep's tables, figures and report again."""
     from phasemark.matcher.sweep.report import summary, write_report
     from phasemark.matcher.sweep.run import read_sweep
@@ -89,17 +92,18 @@ def sweep_report(
     typer.echo(report)
 
 
-def sweep_frames_again(
-    *,
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A sweep's folder.")],
-    condition: Annotated[
-        int, typer.Argument(metavar="CONDITION", help="Number of the condition in trials.csv.", min=0)
-    ],
-    trial: Annotated[int, typer.Argument(metavar="TRIAL", help="Number of the trial in trials.csv.", min=0)],
-    out: Annotated[Path, typer.Option("-o", "--out", help="The noisy frames as .npz, to be matched again.")],
-    force: Force = False,
-) -> None:
-    """Take the frames of one trial of a sweep again, bit for bit."""
+def sweep_frames_again(folder: Folder, condition: Index, trial: Index, *, out: Out, force: Force = False) -> None:
+    """Take the frames of one trial of a sweep again, bit for bit.
+
+    Parameters
+    ----------
+    condition
+        Number of the condition in trials.csv.
+    trial
+        Number of the trial in trials.csv.
+    out
+        The noisy frames as .npz, to be matched again.
+    """
     from phasemark.data.files.folder_marker import read_marker
     from phasemark.data.files.same_file import refuse_inputs
     from phasemark.data.measured.reading import write_measured
@@ -111,13 +115,23 @@ def sweep_frames_again(
 
 
 def sweep_compare(
+    first: Annotated[Path, Shown(metavar="DIR1")],
+    second: Annotated[Path, Shown(metavar="DIR2")],
     *,
-    first: Annotated[Path, typer.Argument(metavar="DIR1", help="A sweep's folder.")],
-    second: Annotated[Path, typer.Argument(metavar="DIR2", help="Folder of the other sweep.")],
-    everything: Annotated[bool, typer.Option("--all", help="Show differences that may be chance, too.")] = False,
+    all_: bool = False,
     as_json: Json = False,
 ) -> None:
-    """Compare two sweeps cell by cell; significant differences are marked, corrected for their number."""
+    """Compare two sweeps cell by cell; significant differences are marked, corrected for their number.
+
+    Parameters
+    ----------
+    first
+        A sweep's folder.
+    second
+        Folder of the other sweep.
+    all_
+        Show differences that may be chance, too.
+    """
     from phasemark.matcher.sweep.compare import compare_cells
     from phasemark.matcher.sweep.run import read_sweep
 
@@ -125,7 +139,7 @@ def sweep_compare(
     if as_json:
         echo_json([one.as_dict() for one in found])
         return
-    shown = [one for one in found if one.significant or everything]
+    shown = [one for one in found if one.significant or all_]
     echo_table(
         ("class", "D (m)", "δ (°)", "noise", "frames", "method", "quantity", str(first), str(second), "p", ""),
         (
