@@ -23,7 +23,6 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
 from typer.core import TyperCommand
-from typer.models import ParameterInfo
 
 _DESCRIPTION = re.compile(r"^(\w+)\n((?: +.+\n?)+)", re.MULTILINE)
 """A parameter in a docstring, and its description."""
@@ -138,19 +137,27 @@ def _settings(kind: Any) -> dict[str, Any]:
 
 def _parameter(name: str, kind: Any, default: Any, described: Mapping[str, str], make: Any = typer.Option) -> Parameter:
     """Return a parameter as typer reads it; `make` is typer.Option or typer.Argument."""
-    if any(isinstance(one, ParameterInfo) for one in get_args(kind)):
-        return Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=default)
-    word = _SUFFIX.sub("", name)
     if make is typer.Argument:
-        metavar = word.upper().replace("_OR_", "|") + ("..." if get_origin(kind) is list else "")
+        metavar = _SUFFIX.sub("", name).upper().replace("_OR_", "|") + ("..." if get_origin(kind) is list else "")
         settings: dict[str, Any] = {"metavar": f"[{metavar}]" if default is None else metavar, "param_decls": ()}
     else:
-        settings = {"param_decls": ("--" + word.replace("_", "-"),)}
+        settings = {"param_decls": (_flag(name),)}
     settings |= _settings(kind)
     if name in described:
         settings["help"] = described[name]
     shown = make(... if default is Parameter.empty else default, *settings.pop("param_decls"), **settings)
     return Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=shown)
+
+
+def _flag(name: str) -> str:
+    """Return the flag that the name of a parameter makes."""
+    return "--" + _SUFFIX.sub("", name).replace("_", "-")
+
+
+def stated_flags(group: Any, *names: str) -> list[str]:
+    """Return the flags of those fields of a group, or of the named ones, that are not at their defaults."""
+    defaults = {field.name: field.default for field in fields(group)}
+    return [_flag(name) for name in names or defaults if getattr(group, name) != defaults[name]]
 
 
 def _group_of(kind: Any) -> tuple[Any, tuple[str, ...]]:

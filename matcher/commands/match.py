@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from phasemark import InputFileError, UsageError
+from phasemark.data.commands.command import Shown, stated_flags
 from phasemark.data.commands.console import LongWork, Table, echo_facts, echo_json, one_line, tell
 from phasemark.data.commands.inputs import note_too_far, open_any_bank
-from phasemark.data.commands.options import (
-    FrameReading,
-)
-from phasemark.data.commands.outputs import refuse_unwritable_files
+from phasemark.data.commands.options import FrameReading
+from phasemark.data.commands.outputs import refuse_unwritable_files, write_figure
 from phasemark.matcher.commands.diagnosis_flags import Given, diagnosis_text
 from phasemark.matcher.commands.match_options import Landmark, Place, Results, Search
 from phasemark.matcher.commands.match_table import Columns, bank_ends, match_rows, summary
@@ -41,26 +40,15 @@ NEAREST_AT_ONCE, REFINED_AT_ONCE = 256, 64
 
 
 def match_frames(
+    bank: Annotated[Path, Shown(metavar="BANK|MESH|CLASS")],
+    frames: Path,
     *,
-    bank: Annotated[
-        Path,
-        typer.Argument(metavar="BANK|MESH|CLASS", help="A bank; or a landmark, of which a bank is built and kept."),
-    ],
-    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Measured frames: CSV, NPY, NPZ or HDF5.")],
     reading: FrameReading,
     landmark: Landmark,
     search: Search,
     place: Place,
-    moving: Annotated[
-        bool, typer.Option("--moving", help="The camera moves: match every frame by itself instead of their mean.")
-    ] = False,
-    learn: Annotated[
-        bool,
-        typer.Option(
-            "--learn-orientation",
-            help="With refine: learn from up to 10 frames how the image is mirrored and turned, then match.",
-        ),
-    ] = False,
+    moving: bool = False,
+    learn_orientation: bool = False,
     results: Results,
 ) -> None:
     """Match measured frames against a bank, and place the robot.
@@ -70,6 +58,17 @@ def match_frames(
     t_s, mm_0 ... (or range_0 ..., z_0 ...), status_0 ...; for a VL53L5CX or VL53L8CX give --valid-status 5.
     With --on histograms or --on targets FRAMES is a log of a direct sensor (histograms in NPZ or lines of JSON, targets
     in CSV with columns mm_ZONE_TARGET) or a frame set with histograms, whose views are positions.
+
+    Parameters
+    ----------
+    bank
+        A bank; or a landmark, of which a bank is built and kept.
+    frames
+        Measured frames: CSV, NPY, NPZ or HDF5.
+    moving
+        The camera moves: match every frame by itself instead of their mean.
+    learn_orientation
+        With refine: learn from up to 10 frames how the image is mirrored and turned, then match.
     """
     from phasemark.data.files.atomic_write import write_atomically
 
@@ -78,7 +77,7 @@ def match_frames(
     landmarks = place.landmarks()
     results.check()
     search.check()
-    if learn:
+    if learn_orientation:
         _refuse_to_learn(reading, search)
     if search.is_direct:
         _match_directly(bank, frames, reading, search, place, landmarks, moving, results)
@@ -88,7 +87,7 @@ def match_frames(
         note_too_far(opened.camera, {"--wall": search.wall})
         search = search.for_bank(opened)
         matcher = search.matcher(opened)
-        if learn:
+        if learn_orientation:
             reading = replace(reading, **_learnt(matcher, measured, frames))
             measured = reading.read(frames, opened.camera)
         positions = measured.each_a_position() if moving else measured
@@ -150,18 +149,11 @@ def _match_directly(
 
 def _refuse_turned(reading: FrameReading) -> None:
     """Refuse what is said of images of ranges."""
-    stated = {
-        "--unit": reading.unit is not None, "--quantity": reading.quantity is not None,
-        "--invalid-means": reading.invalid_means != "missing", "--flip-h": reading.flip_h,
-        "--flip-v": reading.flip_v, "--rotate": reading.rotate != 0,
-        "--board": reading.board is not None,
-    }  # fmt: skip
-    for option, is_stated in stated.items():
-        if is_stated:
-            raise UsageError(
-                f"{option} goes with images of ranges: zones of a direct sensor's log are turned by 'zone_order' in its"
-                " [histogram] table, and its units are fixed"
-            )
+    for option in stated_flags(replace(reading, valid_status=None)):
+        raise UsageError(
+            f"{option} goes with images of ranges: zones of a direct sensor's log are turned by 'zone_order' in its"
+            " [histogram] table, and its units are fixed"
+        )
 
 
 def _refuse_to_learn(reading: FrameReading, search: Search) -> None:
@@ -366,12 +358,7 @@ def _save_match_figure(
     path: Path, filtered: FilteredFrames, match: Match, bank: Bank, search: Search, force: bool
 ) -> None:
     """Draw one position."""
-    import io as bytes_io
-
-    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.matcher.figures import match_figure
 
-    buffer = bytes_io.BytesIO()
     figure = match_figure(filtered, match, bank, search.background, reported=search.on == "reported")
-    figure.savefig(buffer, format="png", dpi=120)
-    write_atomically(path, buffer.getvalue(), force=force)
+    write_figure(path, figure, force)

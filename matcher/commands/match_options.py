@@ -9,24 +9,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
-
 from phasemark import UsageError
+from phasemark.data.commands.command import Shown, stated_flags
 from phasemark.data.commands.console import LongWork, tell
 from phasemark.data.commands.inputs import background_of, open_any_bank, read_landmark, read_sensor, sensor_of_board
 from phasemark.data.commands.options import (
+    Degrees,
     Floor,
     Force,
     FrameReading,
     Json,
     MeshReading,
     MeshUnitWord,
+    Metres,
     Origin,
+    SensorName,
     Up,
     Wall,
-    a_preset,
     one_of,
 )
+from phasemark.data.commands.outputs import refuse_other_files
 from phasemark.matcher.commands.match_table import pose_facts
 
 if TYPE_CHECKING:
@@ -38,106 +40,74 @@ if TYPE_CHECKING:
     from phasemark.render import Background, Frames
 
 _DRAWN_ALL = 4
-"""Most positions that are drawn unless the user says which; a figure takes two seconds."""
+"""Most positions that are drawn unless the user says which, also in the help; a figure takes two seconds."""
+
+_REFINED = (
+    "free", "on", "pixels", "robust", "auto_background", "unknown_background", "no_background", "fix", "bearing_std",
+)  # fmt: skip
+"""Options of :class:`Search` that the nearest image does not have."""
 
 _FREE = {"bearing": "bearing_rad", "height": "height_m", "pitch": "pitch_rad", "roll": "roll_rad"}
 
 
 @dataclass(frozen=True)
 class Search:
-    """Options for averaging and matching frames."""
+    """Options for averaging and matching frames.
 
-    filter_name: Annotated[
-        Literal["kalman", "phasor-mean"],
-        typer.Option("--filter", help="How frames are averaged: kalman or phasor-mean."),
-    ] = "kalman"
-    method: Annotated[
-        Literal["nearest", "refine"] | None,
-        typer.Option(
-            "--method",
-            help="refine: maximum likelihood, with covariance. nearest: the paper's minimum-distance classifier. Unless"
-            " stated: refine, or nearest where the bank knows no mixed pixels.",
-        ),
-    ] = None
-    free: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--free",
-            help="With refine: estimate bearing, height, pitch or roll too; repeatable. Bearing and height are taken as"
-            " unknown, pitch and roll as near 0.",
-            autocompletion=one_of(*_FREE),
-        ),
-    ] = None
-    pitch_std: Annotated[
-        float | None,
-        typer.Option(
-            "--pitch-std", metavar="DEG", help="With --free pitch: standard deviation of the pitch; 3 unless stated."
-        ),
-    ] = None
-    roll_std: Annotated[
-        float | None,
-        typer.Option(
-            "--roll-std", metavar="DEG", help="With --free roll: standard deviation of the roll; 3 unless stated."
-        ),
-    ] = None
-    height_std: Annotated[
-        float | None,
-        typer.Option(
-            "--height-std",
-            metavar="M",
-            help="With --free height: standard deviation of the height; unknown unless stated.",
-        ),
-    ] = None
-    fix: Annotated[
-        Literal["bearing"] | None,
-        typer.Option("--fix", help="With refine: keep at 0, not estimated; only: bearing.", metavar="NAME"),
-    ] = None
-    bearing_std: Annotated[
-        float | None,
-        typer.Option(
-            "--bearing-std",
-            metavar="DEG",
-            help="With refine: standard deviation of the bearing; 1.5, with --on reported 3, unless --free or --fix is"
-            " given.",
-        ),
-    ] = None
-    on: Annotated[
-        Literal["ranges", "reported", "phasors", "histograms", "targets"] | None,
-        typer.Option(
-            "--on",
-            help="With refine: ranges, or phasors with the albedo free; of a direct sensor also reported (ranges as its"
-            " chip makes them), histograms or targets. Unless stated: reported where the sensor has a [histogram]"
-            " table, or ranges, also with --unknown-background and --no-background.",
-        ),
-    ] = None
-    pixels: Annotated[
-        Literal["all", "lower"],
-        typer.Option("--pixels", help="With refine: pixels that are compared, all or the lower half of the rows."),
-    ] = "all"
-    robust: Annotated[bool, typer.Option("--robust", help="With refine: give residuals beyond 3 σ less weight.")] = (
-        False
-    )
-    false_alarm: Annotated[
-        float, typer.Option("--false-alarm", help="Share of good frames that the test of the fit may refuse.")
-    ] = 0.01
-    auto_background: Annotated[
-        bool,
-        typer.Option(
-            "--auto-background", help="With refine: estimate wall and floor from each frame; from histograms a wall."
-        ),
-    ] = False
-    unknown_background: Annotated[
-        bool,
-        typer.Option("--unknown-background", help="With refine: other things may stand before, beside and behind it."),
-    ] = False
-    no_background: Annotated[
-        bool,
-        typer.Option(
-            "--no-background",
-            help="With refine: nothing returns beside it. Unless the background is stated, nothing, wall and floor, and"
-            " unknown things are tried in turn, up to what explains the frame.",
-        ),
-    ] = False
+    Parameters
+    ----------
+    filter_name
+        How frames are averaged: kalman or phasor-mean.
+    method
+        refine: maximum likelihood, with covariance. nearest: the paper's minimum-distance classifier. Unless stated:
+        refine, or nearest where the bank knows no mixed pixels.
+    free
+        With refine: estimate bearing, height, pitch or roll too; repeatable. Bearing and height are taken as unknown,
+        pitch and roll as near 0.
+    pitch_std
+        With --free pitch: standard deviation of the pitch; 3 unless stated.
+    roll_std
+        With --free roll: standard deviation of the roll; 3 unless stated.
+    height_std
+        With --free height: standard deviation of the height; unknown unless stated.
+    fix
+        With refine: keep at 0, not estimated; only: bearing.
+    bearing_std
+        With refine: standard deviation of the bearing; 1.5, with --on reported 3, unless --free or --fix is given.
+    on
+        With refine: ranges, or phasors with the albedo free; of a direct sensor also reported (ranges as its chip makes
+        them), histograms or targets. Unless stated: reported where the sensor has a [histogram] table, or ranges, also
+        with --unknown-background and --no-background.
+    pixels
+        With refine: pixels that are compared, all or the lower half of the rows.
+    robust
+        With refine: give residuals beyond 3 σ less weight.
+    false_alarm
+        Share of good frames that the test of the fit may refuse.
+    auto_background
+        With refine: estimate wall and floor from each frame; from histograms a wall.
+    unknown_background
+        With refine: other things may stand before, beside and behind it.
+    no_background
+        With refine: nothing returns beside it. Unless the background is stated, nothing, wall and floor, and unknown
+        things are tried in turn, up to what explains the frame.
+    """
+
+    filter_name: Literal["kalman", "phasor-mean"] = "kalman"
+    method: Literal["nearest", "refine"] | None = None
+    free: Annotated[list[str] | None, Shown(autocompletion=one_of(*_FREE))] = None
+    pitch_std: Degrees | None = None
+    roll_std: Degrees | None = None
+    height_std: Metres | None = None
+    fix: Annotated[Literal["bearing"] | None, Shown(metavar="NAME")] = None
+    bearing_std: Degrees | None = None
+    on: Literal["ranges", "reported", "phasors", "histograms", "targets"] | None = None
+    pixels: Literal["all", "lower"] = "all"
+    robust: bool = False
+    false_alarm: float = 0.01
+    auto_background: bool = False
+    unknown_background: bool = False
+    no_background: bool = False
     wall: Wall = None
     floor: Floor = None
 
@@ -209,26 +179,15 @@ class Search:
                 raise UsageError(f"--{name}-std goes with --free {name}: what is not free is 0")
         if self.is_direct:
             self._check_direct()
-        refined = (
-            ("--free", bool(self.free)), ("--on", self.on not in (None, "ranges")), ("--pixels", self.pixels != "all"),
-            ("--robust", self.robust), ("--auto-background", self.auto_background),
-            ("--unknown-background", self.unknown_background), ("--no-background", self.no_background),
-            ("--fix", self.fix is not None),
-            ("--bearing-std", self.bearing_std is not None),
-        )  # fmt: skip
-        for option, used in refined:
-            if used and self.method == "nearest":
-                raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
+        if self.method == "nearest":
+            for option in stated_flags(self, *_REFINED):
+                if option != "--on" or self.on != "ranges":
+                    raise UsageError(f"{option} goes with --method refine: the nearest image has nothing of the kind")
 
     def _check_direct(self) -> None:
         """Refuse options that belong to images of ranges."""
-        foreign = (
-            ("--pixels", self.pixels != "all"), ("--robust", self.robust),
-            ("--unknown-background", self.unknown_background), ("--filter", self.filter_name != "kalman"),
-        )  # fmt: skip
-        for option, used in foreign:
-            if used:
-                raise UsageError(f"{option} goes with images of ranges: leave it out with --on {self.on}")
+        for option in stated_flags(self, "pixels", "robust", "unknown_background", "filter_name"):
+            raise UsageError(f"{option} goes with images of ranges: leave it out with --on {self.on}")
         if self.auto_background and self.on == "targets":
             raise UsageError("--auto-background takes histograms: with --on targets give --wall and --floor")
 
@@ -273,39 +232,28 @@ class Search:
 
 @dataclass(frozen=True)
 class Landmark:
-    """Options for a mesh or a class in place of a bank."""
+    """Options for a mesh or a class in place of a bank.
 
-    sensor: Annotated[
-        str | None,
-        typer.Option(
-            "--sensor",
-            metavar="NAME|FILE",
-            help="Without a bank: a preset or sensor file; unless stated, that of the board that printed the frames.",
-            autocompletion=a_preset,
-        ),
-    ] = None
-    part_unit: Annotated[
-        MeshUnitWord | None,
-        typer.Option(
-            "--part-unit", metavar="UNIT", help="Unit of a mesh: m, cm, mm or inch; that of --unit unless stated."
-        ),
-    ] = None
+    Parameters
+    ----------
+    sensor
+        Without a bank: a preset or sensor file; unless stated, that of the board that printed the frames.
+    part_unit
+        Unit of a mesh: m, cm, mm or inch; that of --unit unless stated.
+    no_cache
+        Without a bank: build one again, and do not keep it.
+    """
+
+    sensor: SensorName | None = None
+    part_unit: Annotated[MeshUnitWord | None, Shown(metavar="UNIT")] = None
     up: Up = "z"
     origin: Origin = "file"
-    no_cache: Annotated[
-        bool, typer.Option("--no-cache", help="Without a bank: build one again, and do not keep it.")
-    ] = False
+    no_cache: bool = False
 
     def check(self, bank: Path) -> None:
         """Refuse options that belong to a mesh or a class beside a bank."""
-        if self.is_for(bank):
-            return
-        stated = {
-            "--sensor": self.sensor is not None, "--part-unit": self.part_unit is not None, "--up": self.up != "z",
-            "--origin": self.origin != "file", "--no-cache": self.no_cache,
-        }  # fmt: skip
-        for option, is_stated in stated.items():
-            if is_stated:
+        if not self.is_for(bank):
+            for option in stated_flags(self):
                 raise UsageError(f"{option} goes with a mesh or a class in place of a bank: {bank} has its own")
 
     @staticmethod
@@ -350,32 +298,30 @@ class Landmark:
 
 @dataclass(frozen=True)
 class Place:
-    """Poses of the landmarks, and the expected pose of the robot."""
+    """Poses of the landmarks, and the expected pose of the robot.
 
-    landmark_xy: Annotated[
-        tuple[float, float] | None,
-        typer.Option("--landmark-xy", metavar="X Y", help="Place of the landmark, metres."),
-    ] = None
-    landmark_yaw: Annotated[float, typer.Option("--landmark-yaw", metavar="DEG", help="Heading of its x' axis.")] = 0.0
-    pan: Annotated[float, typer.Option("--pan", metavar="DEG", help="Pan angle of the camera on the robot.")] = 0.0
-    prior: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(
-            "--prior", metavar="X Y DEG", help="Expected pose of the robot; the nearest solution comes first."
-        ),
-    ] = None
-    prior_std: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            "--prior-std",
-            metavar="M DEG",
-            help="Standard deviations of the expected pose: of x and y, and of the heading.",
-        ),
-    ] = None
-    map_file: Annotated[
-        Path | None,
-        typer.Option("--map", metavar="MAP", help="Map of the landmarks (.toml), instead of --landmark-xy."),
-    ] = None
+    Parameters
+    ----------
+    landmark_xy
+        Place of the landmark, metres.
+    landmark_yaw
+        Heading of its x' axis.
+    pan
+        Pan angle of the camera on the robot.
+    prior
+        Expected pose of the robot; the nearest solution comes first.
+    prior_std
+        Standard deviations of the expected pose: of x and y, and of the heading.
+    map_file
+        Map of the landmarks (.toml), instead of --landmark-xy.
+    """
+
+    landmark_xy: Annotated[tuple[float, float] | None, Shown(metavar="X Y")] = None
+    landmark_yaw: Degrees = 0.0
+    pan: Degrees = 0.0
+    prior: Annotated[tuple[float, float, float] | None, Shown(metavar="X Y DEG")] = None
+    prior_std: Annotated[tuple[float, float] | None, Shown(metavar="M DEG")] = None
+    map_file: Annotated[Path | None, Shown(metavar="MAP")] = None
 
     def check(self) -> None:
         """Refuse options that contradict each other, or lack what they belong to."""
@@ -417,43 +363,38 @@ def _one_landmark(xy: tuple[float, float], yaw_deg: float) -> LandmarkMap:
 
 @dataclass(frozen=True)
 class Results:
-    """Options for printed and written output."""
+    """Options for printed and written output.
 
-    estimates: Annotated[
-        Path | None,
-        typer.Option("--estimates", metavar="FILE", help="Write a line for each position into this .csv."),
-    ] = None
-    plot: Annotated[
-        Path | None,
-        typer.Option(
-            "--plot", help="Draw measured, model and residual into this .png; of several positions, number K into -K."
-        ),
-    ] = None
-    plot_index: Annotated[
-        str | None,
-        typer.Option(
-            "--plot-index",
-            metavar="LIST",
-            help=f"Positions to draw, such as 0,17,200:210. By default all, or the first of more than {_DRAWN_ALL}.",
-        ),
-    ] = None
-    no_diagnosis: Annotated[
-        bool, typer.Option("--no-diagnosis", help="Do not look for the setting that makes a refused frame fit.")
-    ] = False
+    Parameters
+    ----------
+    estimates
+        Write a line for each position into this .csv.
+    plot
+        Draw measured, model and residual into this .png; of several positions, number K into -K.
+    plot_index
+        Positions to draw, such as 0,17,200:210. By default all, or the first of more than 4.
+    no_diagnosis
+        Do not look for the setting that makes a refused frame fit.
+    as_jsonl
+        Print each match as a line of JSON as soon as it is known.
+    """
+
+    estimates: Annotated[Path | None, Shown(metavar="FILE")] = None
+    plot: Path | None = None
+    plot_index: Annotated[str | None, Shown(metavar="LIST")] = None
+    no_diagnosis: bool = False
     as_json: Json = False
-    as_jsonl: Annotated[
-        bool, typer.Option("--jsonl", help="Print each match as a line of JSON as soon as it is known.")
-    ] = False
+    as_jsonl: Annotated[bool, Shown("--jsonl")] = False
     force: Force = False
 
     def check(self) -> None:
         """Refuse names of a wrong kind, and options that contradict each other."""
-        if self.plot is not None and self.plot.suffix.lower() != ".png":
-            raise UsageError(f"the figure must be a .png file, got '{self.plot}'")
+        if self.plot is not None:
+            refuse_other_files(self.plot, ".png")
         if self.plot is None and self.plot_index is not None:
             raise UsageError("--plot-index needs --plot, the file to draw into")
-        if self.estimates is not None and self.estimates.suffix.lower() != ".csv":
-            raise UsageError(f"the estimates must be a .csv file, got '{self.estimates}'")
+        if self.estimates is not None:
+            refuse_other_files(self.estimates, ".csv", "the estimates")
         if self.as_json and self.as_jsonl:
             raise UsageError("--json and --jsonl are two forms of the same output: give one of them")
 
