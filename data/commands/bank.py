@@ -139,11 +139,7 @@ def _completed(plan: BankPlan, layout_stated: bool) -> BankPlan:
     return plan
 
 
-def bank_info(
-    bank: Path,
-    *,
-    as_json: Json = False,
-) -> None:
+def bank_info(bank: Path, *, as_json: Json = False) -> None:
     """Print the content of a bank.
 
     Parameters
@@ -155,13 +151,7 @@ def bank_info(
         echo_facts(opened.info(), as_json=as_json)
 
 
-def bank_merge(
-    shards: Shards,
-    *,
-    out: Out,
-    resume: Resume = False,
-    force: Force = False,
-) -> None:
+def bank_merge(shards: Shards, *, out: Out, resume: Resume = False, force: Force = False) -> None:
     """Put the parts of a bank together.
 
     Parameters

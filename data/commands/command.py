@@ -40,6 +40,14 @@ inputs_given: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
 class _Command(TyperCommand):
     """A command that notes which files it was given to read, so that none of them becomes its output."""
 
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        from rich.markup import escape
+
+        shown: list[Any] = [self, *self.params]
+        for one in shown:
+            one.help = escape(one.help or "")  # or words in square brackets would be taken for styles
+        super().format_help(ctx, formatter)
+
     def invoke(self, ctx: Any) -> Any:
         from phasemark.data.files.same_file import named_files
 
