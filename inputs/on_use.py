@@ -8,14 +8,11 @@ from __future__ import annotations
 import ast
 import importlib
 import sys
-import warnings
 from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 
-from phasemark.inputs.moved_names import MOVED
-
-__all__ = ["imported_on_use", "moved_name"]
+__all__ = ["imported_on_use"]
 
 
 def imported_on_use(package: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
@@ -31,8 +28,8 @@ def imported_on_use(package: str) -> tuple[Callable[[str], object], Callable[[],
     Returns
     -------
     tuple of callable
-        The first imports a name where it is asked for; it finds names that moved, with a `DeprecationWarning`, and
-        raises `AttributeError` if the package has none of that name. The second lists the names.
+        The first imports a name where it is asked for, and raises `AttributeError` if the package has none of that
+        name. The second lists the names.
     """
 
     @cache
@@ -41,7 +38,7 @@ def imported_on_use(package: str) -> tuple[Callable[[str], object], Callable[[],
 
     def attribute(name: str) -> object:
         if name.startswith("__") or name not in homes():
-            return moved_name(package, name)
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
         value = getattr(importlib.import_module(homes()[name]), name)
         setattr(sys.modules[package], name, value)
         return value
@@ -50,25 +47,6 @@ def imported_on_use(package: str) -> tuple[Callable[[str], object], Callable[[],
         return sorted({*vars(sys.modules[package]), *homes()})
 
     return attribute, names
-
-
-def moved_name(package: str, name: str) -> object:
-    """Return a name that moved out of a package, with a warning that says where it is now.
-
-    Parameters
-    ----------
-    package, name : str
-
-    Raises
-    ------
-    AttributeError
-        The package never had that name.
-    """
-    for place, names in MOVED.get(package, {}).items():
-        if name in names:
-            warnings.warn(f"{package}.{name} moved: import it from {place}", DeprecationWarning, stacklevel=3)
-            return getattr(importlib.import_module(place), name)
-    raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
 
 def _homes(package: str) -> dict[str, str]:

@@ -18,7 +18,6 @@ from types import FunctionType, ModuleType
 import pytest
 
 import phasemark
-from phasemark.inputs.moved_names import MOVED
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("inputs", "data", "landmarks", "matcher", "render")
@@ -144,17 +143,6 @@ print("numpy" in sys.modules)
     command = [sys.executable, "-c", program.format(first)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout.split()) == (0, ["False", "True", "True"]), done.stderr
-
-
-@pytest.mark.parametrize(
-    ("room", "place", "name"),
-    [(room, place, name) for room, places in MOVED.items() for place, names in places.items() for name in names],
-)
-def test_a_name_that_moved_is_found_with_a_warning(room: str, place: str, name: str) -> None:
-    assert name not in importlib.import_module(room).__all__
-    with pytest.warns(DeprecationWarning, match=rf"{room}\.{name} moved: import it from {place}$"):
-        found = getattr(importlib.import_module(room), name)
-    assert found is getattr(importlib.import_module(place), name)
 
 
 def test_the_rooms_export_what_a_newcomer_needs_and_no_more() -> None:
