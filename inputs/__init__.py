@@ -3,7 +3,7 @@
 from phasemark.inputs.checksum import checksum_line, checksum_path, read_checksum, sha256_of, verify_checksum
 from phasemark.inputs.reading import MOST_TOML_BYTES, opened, pipes_read_once, read_text, read_whole
 from phasemark.inputs.truth_values import refuse_truth_values
-from phasemark.inputs.vouching import is_vouched_for, unverified, verifying, vouching_begun
+from phasemark.inputs.vouching import is_vouched_for, unverified, verifying
 
 __all__ = [
     "MOST_TOML_BYTES",
@@ -20,5 +20,4 @@ __all__ = [
     "unverified",
     "verify_checksum",
     "verifying",
-    "vouching_begun",
 ]

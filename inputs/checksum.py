@@ -95,7 +95,7 @@ def read_checksum(path: str | os.PathLike[str]) -> str:
 
 
 def verify_checksum(path: str | os.PathLike[str]) -> str:
-    """Compare a file with its ``FILE.sha256``; every byte is read, whatever is remembered of the file.
+    """Compare a file with its ``FILE.sha256``.
 
     Parameters
     ----------

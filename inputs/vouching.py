@@ -5,15 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import BinaryIO
 
 from phasemark import InputFileError
-from phasemark.inputs.ahead import computed_ahead, digest_computed_ahead
 from phasemark.inputs.checksum import checksum_path, contradiction, read_checksum, sha256_of, with_checksum
-from phasemark.inputs.remembered import is_worth_remembering, remember_digest, remembered_digest
 
 _ATTEMPTS = 3
 """How often file and checksum are compared while somebody replaces both."""
@@ -39,36 +37,6 @@ def unverified() -> Iterator[None]:
         yield
     finally:
         _verifying.reset(token)
-
-
-@contextmanager
-def vouching_begun(path: Path) -> Iterator[None]:
-    """Compute the digest of a large file in a thread while the block imports what opens it.
-
-    :func:`is_vouched_for` waits for the digest. Nothing is read ahead of a file that is not going to be compared.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Yields
-    ------
-    None
-    """
-    with computed_ahead(path) if _takes_long(path) else nullcontext():
-        yield
-
-
-def _takes_long(path: Path) -> bool:
-    """Return whether a file is going to be compared, and is large and not remembered."""
-    try:
-        if not verifying() or not os.path.lexists(checksum_path(with_checksum(path))):
-            return False
-        status = path.stat()
-    except (OSError, ValueError):  # opening it raises the error that explains why
-        return False
-    return is_worth_remembering(status) and remembered_digest(status) is None
 
 
 def is_vouched_for(path: Path, content: bytes | BinaryIO | None = None) -> bool:
@@ -116,14 +84,8 @@ def _digest(path: Path, content: bytes | BinaryIO | None) -> str:
         if content is None:
             with path.open("rb") as file:
                 return _digest(path, file)
-        before = os.fstat(content.fileno())
-        digest = remembered_digest(before)
-        if digest is None:
-            digest = digest_computed_ahead(before)
-            if digest is None:
-                content.seek(0)
-                digest = sha256_of(content)
-            remember_digest(before, os.fstat(content.fileno()), digest)
+        content.seek(0)
+        digest = sha256_of(content)
         content.seek(0)
     except OSError as error:
         raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None

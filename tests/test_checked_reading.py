@@ -8,7 +8,6 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 import zipfile
 import zlib
 from pathlib import Path
@@ -25,16 +24,7 @@ from phasemark.data.export import export_frames
 from phasemark.data.files import write_checksum
 from phasemark.data.files.narrow import narrowed
 from phasemark.data.verify import verify_frames
-from phasemark.inputs import (
-    ahead,
-    checksum_path,
-    is_vouched_for,
-    read_whole,
-    remembered,
-    sha256_of,
-    unverified,
-    vouching_begun,
-)
+from phasemark.inputs import checksum_path, is_vouched_for, read_whole, unverified
 from phasemark.landmarks import read_mesh
 from phasemark.render import Sensor, preset
 
@@ -135,55 +125,20 @@ def test_other_files_are_compared_with_a_checksum_they_have(tmp_path):
             read(tmp_path / name)
 
 
-def test_a_digest_is_remembered_until_the_file_changes(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(remembered, "_SMALLEST_BYTES", 1)
-    monkeypatch.setattr(remembered, "_SETTLED_NS", 0)
-    path = tmp_path / "large"
+def test_a_changed_byte_is_found_whatever_the_size_and_time_of_the_file(tmp_path):
+    path = tmp_path / "file"
     path.write_bytes(b"one")
     write_checksum(path)
-    read = []
-    monkeypatch.setattr("phasemark.inputs.vouching.sha256_of", lambda file: read.append(1) or sha256_of(file))
     assert is_vouched_for(path)
-    assert is_vouched_for(path)
-    assert len(read) == 1
     times = path.stat()
     path.write_bytes(b"two")
-    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # size and time of content are as before
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
     with pytest.raises(InputFileError, match="damaged"):
         is_vouched_for(path)
-    remembered.cache_file().write_text("[" * 10_000)  # a damaged memory is none
-    with pytest.raises(InputFileError, match="damaged"):
-        is_vouched_for(path)
-
-
-@pytest.fixture
-def all_large(tmp_path, monkeypatch):
-    """Have every file count as a large one, none of them remembered."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(remembered, "_SMALLEST_BYTES", 1)
-
-
-@pytest.fixture
-def computed(monkeypatch):
-    """Return a list that grows with each digest: "ahead" in a thread, "then" when the file is opened."""
-    computed = []
-    run = ahead._Reader.run
-    monkeypatch.setattr(ahead._Reader, "run", lambda reader: computed.append("ahead") or run(reader))
-    monkeypatch.setattr("phasemark.inputs.vouching.sha256_of", lambda file: computed.append("then") or sha256_of(file))
-    return computed
-
-
-@pytest.mark.parametrize("command", ["bank info", "frames info", "frames export", "frames show"])
-def test_the_digest_of_a_large_file_is_computed_while_libraries_are_imported(folder, all_large, computed, command):
-    assert main(READ[command]) == 0
-    assert computed == ["ahead"]
 
 
 @pytest.mark.parametrize("command", ["bank info", "frames info", "frames export", "frames show", "match"])
-def test_a_large_file_that_its_checksum_contradicts_is_refused_before_hdf5_opens_it(
-    folder, all_large, capsys, monkeypatch, command
-):
+def test_a_file_that_its_checksum_contradicts_is_refused_before_hdf5_opens_it(folder, capsys, monkeypatch, command):
     def opened(*given, **options):
         raise AssertionError("opened before it was compared")
 
@@ -191,61 +146,10 @@ def test_a_large_file_that_its_checksum_contradicts_is_refused_before_hdf5_opens
     flip_last_value(victim)
     monkeypatch.setattr("phasemark.data.files.hdf5_reading.refusal", opened)
     monkeypatch.setattr(h5py, "File", opened)
-    delayed = ahead._Reader.run
-    monkeypatch.setattr(ahead._Reader, "run", lambda reader: time.sleep(0.5) or delayed(reader))
     assert main(READ[command]) == 3
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith(f"error: {victim.name}: damaged: its SHA-256 is ")
-
-
-def test_a_digest_computed_ahead_serves_its_own_file_once_and_as_long_as_it_is_the_same(tmp_path, all_large, computed):
-    for name in ("one", "two"):
-        (tmp_path / name).write_bytes(name.encode())
-        write_checksum(tmp_path / name)
-    with vouching_begun(tmp_path / "one"):
-        assert is_vouched_for(tmp_path / "two")
-        assert is_vouched_for(tmp_path / "one")
-    assert computed == ["ahead", "then", "then"]
-    with vouching_begun(tmp_path / "one"):
-        (tmp_path / "one").write_bytes(b"changed")
-        with pytest.raises(InputFileError, match="damaged"):
-            is_vouched_for(tmp_path / "one")
-    with pytest.raises(InputFileError, match="damaged"):
-        is_vouched_for(tmp_path / "one")
-
-
-def test_nothing_is_computed_ahead_that_is_not_compared(tmp_path, all_large, computed):
-    path = tmp_path / "large"
-    path.write_bytes(b"content")
-    with vouching_begun(path):  # no checksum
-        assert not is_vouched_for(path)
-    write_checksum(path)
-    with unverified(), vouching_begun(path):
-        assert not is_vouched_for(path)
-    with vouching_begun(tmp_path / "absent"):
-        pass
-    assert computed == []
-
-
-def test_a_reader_that_is_no_longer_needed_ends(tmp_path, all_large, monkeypatch):
-    monkeypatch.setattr(ahead, "_BLOCK_BYTES", 1)
-    path = tmp_path / "large"
-    path.write_bytes(bytes(1 << 24))
-    write_checksum(path)
-    with pytest.raises(UsageError), vouching_begun(path):
-        raise UsageError("something else is wrong")
-    assert not any(isinstance(thread, ahead._Reader) for thread in threading.enumerate())
-
-
-def test_a_file_that_was_just_written_is_not_remembered(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(remembered, "_SMALLEST_BYTES", 1)
-    path = tmp_path / "new"
-    path.write_bytes(b"one")
-    write_checksum(path)
-    assert is_vouched_for(path)
-    assert not remembered.cache_file().exists()
 
 
 def test_a_pipe_delivers_every_frame(folder, capsys):

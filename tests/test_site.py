@@ -278,7 +278,7 @@ def test_lists_and_tables_are_written_as_the_sites_builder_reads_them(text, expe
     [
         ("as :func:`read_frames` reads", "as `read_frames` reads"),
         ("of :class:`~phasemark.render.Sensor`", "of `Sensor`"),
-        ("in `~/.cache/phasemark/digests.json`", "in `~/.cache/phasemark/digests.json`"),
+        ("in `~/.cache/phasemark/banks`", "in `~/.cache/phasemark/banks`"),
     ],
 )
 def test_marks_of_sphinx_are_not_shown(text, shown):

@@ -13,7 +13,6 @@ from phasemark.data.bank.bank_file import Bank, open_bank
 from phasemark.data.bank.build_bank import BankJob, build_bank
 from phasemark.data.plans.bank_plan import BankPlan
 from phasemark.data.progress import Progress
-from phasemark.inputs.remembered import cache_folder
 
 __all__ = ["cached_bank"]
 
@@ -41,7 +40,7 @@ def cached_bank(plan: BankPlan, *, keep: bool = True, progress: Progress | None 
     UsageError, InputFileError
         As :func:`~phasemark.data.build_bank`.
     """
-    folder = cache_folder()
+    folder = _cache_folder()
     if not keep or folder is None:
         return build_bank(plan, progress=progress)
     path = folder / "banks" / f"{_key(plan)}.h5"
@@ -57,6 +56,12 @@ def cached_bank(plan: BankPlan, *, keep: bool = True, progress: Progress | None 
         return build_bank(plan, progress=progress)
     _prune(path)
     return bank
+
+
+def _cache_folder() -> Path | None:
+    """Return the folder of this program in the user's cache folder; None if there is no cache folder."""
+    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(folder) / "phasemark" if os.path.isabs(folder) else None
 
 
 def _key(plan: BankPlan) -> str:
