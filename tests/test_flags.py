@@ -78,7 +78,7 @@ def test_every_parameter_that_becomes_a_flag_is_named_by_a_message_and_is_an_opt
         ("is unit=… right? All would fit with unit=mm (dividing by 1000)",
          "is --unit right? All would fit with --unit mm (dividing by 1000)"),
         ("say in which unit it is (unit=…); its extents", "say in which unit it is (--unit); its extents"),
-        ("scheduler=local:N needs a number", "--scheduler local:N needs a number"),
+        ("scheduler=… must be threads", "--scheduler must be threads"),
         ("part=… must be I/N", "--shard must be I/N"),
         ("part=3/8 would be empty", "--shard 3/8 would be empty"),
         ("give fixed=pitch or fixed=roll", "give --fix pitch or --fix roll"),

@@ -148,10 +148,10 @@ def test_quantities_are_independent_of_one_another():
 
 @pytest.mark.parametrize(
     "options",
-    [{"workers": 1}, {"workers": 3, "shard_items": 7}, {"workers": 8, "shard_items": 1}, {"scheduler": "local:2"}],
+    [{"workers": 1}, {"workers": 3, "shard_items": 7}, {"workers": 8, "shard_items": 1}],
     ids=str,
 )
-def test_workers_shards_and_processes_do_not_change_the_bytes(frames_file, tmp_path, options):
+def test_workers_and_shards_do_not_change_the_bytes(frames_file, tmp_path, options):
     build_frames(PLAN, tmp_path / "again.h5", **options).close()
     assert sha256(tmp_path / "again.h5") == sha256(frames_file)
 

@@ -93,7 +93,7 @@ def build_bank(
     shard_items : int, optional
         Images rendered at a time; the result does not depend on it.
     scheduler : str
-        ``threads``, ``local:N`` for N worker processes, or the address of a Dask scheduler.
+        ``threads``, or the address of a Dask scheduler.
     progress : callable (done, total), optional
         Called from this thread with the number of images rendered so far and in all.
 

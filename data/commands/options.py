@@ -173,7 +173,7 @@ class Building:
     shard_size
         Images or views per shard; the result does not depend on it.
     scheduler
-        threads, local:N processes, or a Dask scheduler's address.
+        threads, or a Dask scheduler's address.
     """
 
     workers: Workers = None

@@ -1,1 +1,1 @@
-"""Work in parts: shards of a file, the processes that make them, and how a run goes on."""
+"""Work in parts: shards of a file, the threads or the cluster that make them, and how a run goes on."""

@@ -160,7 +160,7 @@ def build(
     shard_items : int, optional
         Items of a shard; None: about 4 MiB. A resumed run keeps the size it was begun with.
     maker : Maker, optional
-        Makes the shards elsewhere, in processes or on a cluster.
+        Makes the shards elsewhere, on a cluster.
     progress : callable (done, total), optional
         Called from this thread with the number of items finished so far and in all.
 

@@ -75,7 +75,7 @@ def produce(
     finished : callable
         Returns the identity of a finished file, see :meth:`phasemark.data.shards.build.Job.identity`.
     scheduler : str
-        ``threads``, ``local:N`` for N worker processes, or the address of a Dask scheduler.
+        ``threads``, or the address of a Dask scheduler.
     force, resume, workers, shard_items, progress
         As for :func:`phasemark.data.shards.build.build`, which says what is raised.
     """

@@ -47,7 +47,7 @@ def sweep_run(
     trust_plan
         Run the programs (MODULE:NAME) that the plan itself names.
     scheduler
-        threads, local:N (processes), or a Dask scheduler's address.
+        threads, or a Dask scheduler's address.
     resume
         Go on with a sweep that was interrupted.
     force

@@ -60,7 +60,7 @@ def run_sweep(
     workers : int, optional
         Threads; None: one for each processor.
     scheduler : str
-        ``threads``, ``local:N`` for N processes, or the address of a Dask scheduler.
+        ``threads``, or the address of a Dask scheduler.
     resume : bool
         Whether to go on with what the folder holds, if it is of the same plan.
     force : bool
