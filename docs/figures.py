@@ -56,7 +56,6 @@ LEFT_BY = {
     "phasemark landmark design --out out/design": {
         "design-bound.png": "design/bound.png",
         "design-pareto.png": "design/pareto.png",
-        "design-mark-2.svg": "design/mark-2.svg",
     },
 }
 """Pictures that are those of a run, by its command."""
@@ -72,7 +71,6 @@ SOURCES = {
     "cost.png": ("docs/figures.py",),
     "demo.png": ("docs/figures.py", "landmarks/catalog.py", "landmarks/figures.py", "render/figures.py"),
     "design-bound.png": ("matcher/design/plan.toml", "matcher/design/figures.py"),
-    "design-mark-2.svg": ("matcher/design/plan.toml", "matcher/design/drawing.py"),
     "design-pareto.png": ("matcher/design/plan.toml", "matcher/design/figures.py"),
     "direct_error.png": ("examples/direct_sensor.py",),
     "direct_histograms.png": ("examples/direct_sensor.py",),

@@ -5,7 +5,6 @@ import io
 import json
 import math
 import tomllib
-import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from itertools import combinations
 
@@ -31,7 +30,6 @@ from phasemark.matcher.design import (
     choose_far_apart,
     confirm_design,
     default_design,
-    drawing_svg,
     example_design,
     landmarks_toml,
     mesh_stl,
@@ -44,7 +42,6 @@ from phasemark.matcher.design import (
     turn_distance,
     write_design,
 )
-from phasemark.matcher.design.drawing import scale_words
 from phasemark.matcher.design.position_bound import box_alone
 from phasemark.matcher.design.search import Search
 from phasemark.matcher.design.separation import upper_appearance
@@ -450,50 +447,7 @@ def test_the_interval_of_a_ratio_covers_the_truth():
     assert isinstance(quotient, Interval)
 
 
-# drawings, meshes and files
-
-
-@pytest.mark.parametrize("spec", catalog().values(), ids=catalog())
-def test_a_drawing_is_to_scale(spec):
-    root = ElementTree.fromstring(drawing_svg(spec))
-    assert root.get("width") == "297mm"
-    assert root.get("viewBox") == "0 0 297 210"
-    texts = [element.text for element in root.iter("{http://www.w3.org/2000/svg}text")]
-    words = next(text for text in texts if text.startswith("scale "))
-    scale = next(s for s in (0.5, 0.4, 0.25, 0.2, 0.1) if words.startswith(f"scale {scale_words(s)},"))
-
-    def extent(name):
-        path = next(e for e in root.iter() if e.get("id") == name).get("d")
-        numbers = np.array(path.replace("M", " ").replace("L", " ").replace("Z", "").split(), float).reshape(-1, 2)
-        return np.ptp(numbers, axis=0) / scale
-
-    box = spec.box
-    # coordinates have three decimals of a millimetre of paper
-    for name, size in (
-        ("front-box", (box.width_m, box.height_m)),
-        ("side-box", (box.length_m, box.height_m)),
-        ("top-box", (box.width_m, box.length_m)),
-        ("front-upper", build_mesh(spec, part="upper").extents[[0, 2]]),
-    ):
-        # tessellation puts the corners of a cylinder a few micrometres outside its radius
-        np.testing.assert_allclose(extent(name), 1000 * np.array(size), atol=0.05)
-    for value in (box.length_m, box.width_m, box.height_m):
-        assert f"{1000 * value:.4g}" in texts
-
-
-def test_everything_of_a_drawing_is_on_the_page():
-    for side, height in ((0.05, 0.02), (0.22, 0.15), (1.5, 0.2), (0.1, 3.0)):
-        spec = LandmarkSpec(
-            name="x",
-            box=Box(length_m=side, width_m=side, height_m=height),
-            upper=Cylinder(radius_m=side / 2, height_m=height),
-        )
-        root = ElementTree.fromstring(drawing_svg(spec))
-        for element in root.iter("{http://www.w3.org/2000/svg}path"):
-            path = element.get("d").replace("M", " ").replace("L", " ").replace("Z", "").split()
-            numbers = np.array(path, float).reshape(-1, 2)
-            assert (numbers > 4).all()
-            assert (numbers < np.array([293, 206])).all()
+# meshes and files
 
 
 def test_a_mesh_file_is_in_millimetres(tmp_path):
@@ -545,7 +499,7 @@ def test_the_command_writes_and_refuses_to_overwrite(tmp_path, capsys):
     assert main(arguments) == 0
     said = capsys.readouterr().out
     assert "times lower than the catalogue's" in said
-    assert str(out / "mark-1.svg") in said
+    assert str(out / "mark-1.stl") in said
     assert main(arguments) == 4
     assert "exists already" in capsys.readouterr().err
     assert main(["bank", "build", str(out / "landmarks.toml"), "--dry-run", "-o", str(out / "bank.h5")]) == 0

@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING
 
 from phasemark.matcher.design.confirm import Confirmation, Trial, confirm, confirm_design
-from phasemark.matcher.design.drawing import drawing_svg
 from phasemark.matcher.design.output import (
     landmarks_toml,
     mesh_stl,
@@ -50,7 +49,6 @@ __all__ = [
     "confirm",
     "confirm_design",
     "default_design",
-    "drawing_svg",
     "example_design",
     "landmarks_toml",
     "mesh_stl",

@@ -1,4 +1,4 @@
-"""Files of a design: landmarks for other commands, tables, pictures, meshes and drawings."""
+"""Files of a design: landmarks for other commands, tables, pictures and meshes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from phasemark.inputs.toml_file import toml_value
 from phasemark.landmarks import LandmarkSpec, build_mesh, export_mesh
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability
 from phasemark.matcher.design.confirm import Confirmation
-from phasemark.matcher.design.drawing import drawing_svg
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.position_bound import RangeBound
 from phasemark.matcher.design.search import Design, Scored
@@ -32,7 +31,7 @@ _MESH_TOLERANCE_M = 1e-5
 
 def output_names(plan: DesignPlan) -> list[str]:
     """Return the files that :func:`write_design` writes."""
-    marks = [f"mark-{k + 1}.{suffix}" for k in range(plan.n_classes) for suffix in ("stl", "svg")]
+    marks = [f"mark-{k + 1}.stl" for k in range(plan.n_classes)]
     return ["landmarks.toml", "pareto.csv", "design.json", "pareto.png", "bound.png", *marks]
 
 
@@ -257,8 +256,6 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
     """
     from phasemark.matcher.design.figures import bound_figure, pareto_figure  # matplotlib is slow to import
 
-    near, far = design.plan.distance_m
-    notes = [f"for {Path(design.plan.sensor).stem}, {near:g} … {far:g} m"]
     table = [{key: _plain(value) for key, value in row.items()} for row in pareto_rows(design)]
     facts = {**summary(design, confirmed), "pareto": table}
     text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
@@ -268,9 +265,8 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
         text.encode(),
         figure_png(pareto_figure(design)),
         figure_png(bound_figure(design, confirmed)),
+        *map(mesh_stl, design.result.specs),
     ]
-    for spec in design.result.specs:
-        contents += [mesh_stl(spec), drawing_svg(spec, notes).encode()]
     names = output_names(design.plan)
     return [
         write_atomically(folder / name, content, force=force) for name, content in zip(names, contents, strict=True)
