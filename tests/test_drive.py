@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
-from PIL.GifImagePlugin import GifImageFile
 from scipy import stats
 
 from phasemark import UsageError
@@ -23,7 +21,6 @@ from phasemark.matcher.drive import (
     PoseFilter,
     RobotEquipment,
     default_drive,
-    drive_animation,
     example_drive,
     path_csv,
     pose_error,
@@ -359,15 +356,6 @@ def test_tables_and_summary_hold_the_drive(drives):
     facts = json.loads(json.dumps(drive.as_dict(), allow_nan=False))
     assert facts["corrections"] == len(drive.corrections)
     assert DrivePlan(**facts["plan"]) == drive.plan
-
-
-def test_the_animation_moves(drives):
-    with Image.open(io.BytesIO(drive_animation(drives[0]))) as gif:
-        assert isinstance(gif, GifImageFile)
-        first = np.asarray(gif.convert("RGB"))
-        assert gif.n_frames > 50
-        gif.seek(gif.n_frames - 1)
-        assert not np.array_equal(first, np.asarray(gif.convert("RGB")))
 
 
 def short_plan(folder):

@@ -35,7 +35,7 @@ def landmark_design(
     plan_file
         A plan (.toml); without it four landmarks for the PMD camera.
     out
-        Folder for landmarks, tables, pictures and drawings.
+        Folder for landmarks, tables, pictures and meshes.
     confirm
         Simulated frame sets to match from every side; 0: none.
     seed

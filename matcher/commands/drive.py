@@ -33,7 +33,7 @@ def drive_robot(
     plan_file
         A plan (.toml); without it a tour of 20 m.
     out
-        Folder for tables, summary, figure and animation.
+        Folder for tables, summary and figure.
     example
         Print the plan of that tour, and do nothing else.
     """

@@ -17,7 +17,7 @@ from phasemark.matcher.drive.pose_filter import PoseFilter
 from phasemark.matcher.drive.simulate import Drive, RobotEquipment, Stop, pose_error, run_drive
 
 if TYPE_CHECKING:
-    from phasemark.matcher.drive.figures import drive_animation, drive_figure
+    from phasemark.matcher.drive.figures import drive_figure
 
 __all__ = [
     "OUTPUTS",
@@ -31,7 +31,6 @@ __all__ = [
     "Stop",
     "StopPlan",
     "default_drive",
-    "drive_animation",
     "drive_figure",
     "example_drive",
     "path_csv",
@@ -45,7 +44,7 @@ __all__ = [
 
 def __getattr__(name: str) -> object:
     """Import pictures when they are asked for: matplotlib takes half a second to load."""
-    if name in ("drive_animation", "drive_figure"):
+    if name == "drive_figure":
         from phasemark.matcher.drive import figures
 
         return getattr(figures, name)

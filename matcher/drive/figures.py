@@ -1,31 +1,23 @@
-"""The drive seen from above: three paths, ellipses, landmarks; as a figure, and as an animation."""
+"""The drive seen from above: three paths, ellipses, landmarks; and errors over the way."""
 
 from __future__ import annotations
 
-import io
 import math
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse, Polygon
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import stats
 
 from phasemark.landmarks import catalog
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
-from phasemark.render.figures import draw_range
 
 _TRUE, _DEAD, _CORRECTED, _MARK = "#1a1a1a", "#c8553d", "#2a6fbb", "#5b8c5a"
 _ENLARGED = 10.0
 """Ellipses of centimetres would be lost in a room of metres."""
 _LEVEL = 0.95
-_MOVING_FRAMES, _MOVING_MS, _STANDING_MS = 100, 80, 1500
-_COLOURS = 64
-_COLOURS_SAY = "range: white near, blue between, black far"
 
 
 def drive_figure(drive: Drive) -> Figure:
@@ -61,68 +53,6 @@ def drive_figure(drive: Drive) -> Figure:
     _draw_errors(figure.add_subplot(grid[0, 1]), drive, position=True)
     _draw_errors(figure.add_subplot(grid[1, 1]), drive, position=False)
     return figure
-
-
-def drive_animation(drive: Drive) -> bytes:
-    """Return the drive as an animated GIF: the paths grow, and at each stop the camera's frame is shown.
-
-    Parameters
-    ----------
-    drive : Drive
-        The drive.
-    """
-    figure = Figure(figsize=(9.0, 4.8), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    room, frame = figure.subplots(1, 2, width_ratios=(2.2, 1))
-    _draw_room(room, drive)
-    lines = [
-        room.plot([], [], color=color, lw=width, ls=style, label=label)[0]
-        for color, width, style, label in (
-            (_TRUE, 2.4, "-", "true"),
-            (_DEAD, 1.3, "-", "dead reckoning"),
-            (_CORRECTED, 1.2, "--", "corrected"),
-        )
-    ]
-    robot = Polygon(_outline(drive.true[0]), closed=True, fc=_TRUE, ec="none", zorder=5)
-    room.add_patch(robot)
-    room.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, fontsize=7, frameon=False)
-    _no_frame(frame)
-    canvas.draw()
-    figure.set_layout_engine("none")  # nothing moves any more
-    moving: list[Artist] = [*lines, robot]
-    for artist in moving:
-        artist.set_animated(True)  # drawn over the still parts, which are redrawn at stops alone
-    still = None
-    images, durations = [], []
-    for index, stop in _moments(drive):
-        if stop is not None:
-            _draw_stop(room, stop)
-            _draw_frame(frame, stop)
-        if stop is not None or still is None:
-            canvas.draw()
-            still = canvas.copy_from_bbox(figure.bbox)
-        canvas.restore_region(still)
-        for line, path in zip(lines, (drive.true, drive.dead_reckoned, drive.corrected), strict=True):
-            line.set_data(*path[: index + 1, :2].T)
-        robot.set_xy(_outline(drive.true[index]))
-        for artist in moving:
-            room.draw_artist(artist)
-        images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
-        durations.append(_MOVING_MS if stop is None else _STANDING_MS)
-    palette = images[-1].quantize(_COLOURS)  # the last image has every colour, the first ones hardly any red
-    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    buffer = io.BytesIO()
-    images[0].save(buffer, "GIF", save_all=True, append_images=images[1:], duration=durations, loop=0)
-    return buffer.getvalue()
-
-
-def _moments(drive: Drive) -> list[tuple[int, Stop | None]]:
-    """Return which rows of the drive are shown, in order; a stop with its own row."""
-    step = max(1, len(drive.way_m) // _MOVING_FRAMES)
-    moments: dict[int, Stop | None] = dict.fromkeys([*range(0, len(drive.way_m), step), len(drive.way_m) - 1])
-    for stop in drive.stops:
-        moments[int(np.searchsorted(drive.time_s, stop.time_s - 1e-6))] = stop
-    return sorted(moments.items())
 
 
 def _draw_room(axes: Axes, drive: Drive) -> None:
@@ -175,22 +105,6 @@ def _ellipse(pose: NDArray[np.float64], covariance: NDArray[np.float64], width: 
     return Ellipse(centre, float(axes[1]), float(axes[0]), angle=angle, fc="none", ec=_CORRECTED, lw=width, zorder=3)
 
 
-def _draw_frame(axes: Axes, stop: Stop) -> None:
-    axes.clear()
-    seen = stop.range_m[np.isfinite(stop.range_m)]
-    draw_range(axes, stop.range_m, near_m=0.5, far_m=float(seen.max(initial=1.0)), colour_bar=False)
-    found = stop.match.class_name or "nothing"
-    verdict = "used" if stop.used else "refused"
-    text = f"{found} at {stop.match.distance_m:.2f} m" if stop.match.class_name else found
-    axes.set(xticks=[], yticks=[], xlabel=_COLOURS_SAY, ylabel="")
-    axes.set_title(f"{stop.landmark.name}: {text}\n{verdict}", fontsize=9)
-
-
-def _no_frame(axes: Axes) -> None:
-    axes.set(xticks=[], yticks=[], aspect="equal", xlim=(0, 16), ylim=(16, 0), xlabel=_COLOURS_SAY)
-    axes.set_title("what the camera sees at a stop\n", fontsize=9)
-
-
 def _draw_errors(axes: Axes, drive: Drive, *, position: bool) -> None:
     """Draw the errors of dead reckoning and filter over the way, and what the filter thinks of its own."""
     for pose, color, label in (
@@ -215,12 +129,6 @@ def _draw_errors(axes: Axes, drive: Drive, *, position: bool) -> None:
         axes.legend(fontsize=7, loc="upper left")
     else:
         axes.set_xlabel("way (m); a green line is a correction")
-
-
-def _outline(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return an arrowhead for the robot, (4, 2)."""
-    shape = np.array([[0.28, 0.0], [-0.18, 0.16], [-0.10, 0.0], [-0.18, -0.16]])
-    return np.asarray(shape @ _rotation(float(pose[2])).T + pose[:2])
 
 
 def _rotation(angle_rad: float) -> NDArray[np.float64]:

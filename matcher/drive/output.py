@@ -1,4 +1,4 @@
-"""Files of a drive: tables of the path and of the stops, a summary, a figure and an animation."""
+"""Files of a drive: tables of the path and of the stops, a summary and a figure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from phasemark.data.files.atomic_write import write_atomically
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
 
-OUTPUTS = ("path.csv", "stops.csv", "summary.json", "drive.png", "drive.gif")
+OUTPUTS = ("path.csv", "stops.csv", "summary.json", "drive.png")
 """Files that :func:`write_drive` writes."""
 
 _POSES = ("true", "dead", "corrected")
@@ -89,18 +89,12 @@ def write_drive(drive: Drive, folder: Path, *, force: bool = False) -> list[Path
     OutputExistsError, StorageError
         A file cannot be written.
     """
-    from phasemark.matcher.drive.figures import drive_animation, drive_figure  # matplotlib is slow to import
+    from phasemark.matcher.drive.figures import drive_figure  # matplotlib is slow to import
 
     figure = io.BytesIO()
     drive_figure(drive).savefig(figure, format="png", dpi=130)
     text = json.dumps(drive.as_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    contents = (
-        path_csv(drive).encode(),
-        stops_csv(drive).encode(),
-        text.encode(),
-        figure.getvalue(),
-        drive_animation(drive),
-    )
+    contents = (path_csv(drive).encode(), stops_csv(drive).encode(), text.encode(), figure.getvalue())
     return [
         write_atomically(folder / name, content, force=force) for name, content in zip(OUTPUTS, contents, strict=True)
     ]

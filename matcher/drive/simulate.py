@@ -66,8 +66,6 @@ class Stop:
         The true pose, and the filter's before and after the correction.
     covariance_before, covariance_after : (3, 3) float64
         Covariance of the pose before and after the correction.
-    range_m : (rows, cols) float64
-        The filtered frame.
     """
 
     time_s: float
@@ -86,7 +84,6 @@ class Stop:
     after: NDArray[np.float64]
     covariance_before: NDArray[np.float64]
     covariance_after: NDArray[np.float64]
-    range_m: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -429,7 +426,6 @@ class _Driver:
                 after=self.filter.pose.copy(),
                 covariance_before=covariance_before,
                 covariance_after=self.filter.pose_covariance.copy(),
-                range_m=filtered.range_m[0],
             )
         )
         self.not_before_m[landmark.name] = self.way_m + (plan.stop.retry_m if used is None else plan.stop.again_m)
