@@ -416,7 +416,6 @@ MISTAKES = [
     _case(3, "landmark", "check", "frames.csv", "--unit", "m", contains="csv"),
     _case(2, "landmark", "show", "cone", "-o", "box.stl", contains="is not a folder"),
     _case(2, "landmark", "export", "box.stl", "-o", "x.stl", contains="catalogue"),
-    _case(4, "demo", "-o", ".", contains="bank.h5"),
     _case(2, "demo", "-o", "new", "--seed", -1, contains="--seed"),
     _case(2, "demo", "-o", "new", "--seed", 2**64, contains="--seed"),
     _case(2, "demo", "-o", "new", "--workers", 0, contains="--workers"),

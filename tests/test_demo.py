@@ -1,92 +1,97 @@
-"""The paper's experiment at a small size: the same whatever the workers, and a report that stands alone."""
+"""The paper's experiment at a small size: the command, its page, and how accurate both methods are."""
 
-import csv
+import contextlib
 import html
 import io
 import math
 import re
 from html.parser import HTMLParser
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, look
 
-from phasemark import OutputExistsError, UsageError
+from phasemark import UsageError
+from phasemark.cli import main
 from phasemark.data.seeds import stream
-from phasemark.matcher.demo.report import answer, summary_rows, write_demo
-from phasemark.matcher.demo.run import LANDMARK_XY_M, LIKELIHOOD, NEAREST, cells_csv, run_demo, trials_csv
+from phasemark.matcher import Match, robot_poses
+from phasemark.matcher.sweep.answer import answer
+from phasemark.matcher.sweep.figures.errors import maps
+from phasemark.matcher.sweep.plan import SweepPlan, read_sweep_plan
+from phasemark.matcher.sweep.report import view_rows
+from phasemark.matcher.sweep.run import read_sweep, run_sweep
 
-SMALL: dict[str, Any] = {
-    "classes": ("cone", "post"),
-    "distances_m": (1.0,),
-    "deltas_deg": (0.0, 45.0),
-    "repetitions": 3,
-    "n_frames": 20,
-    "bank_distance_m": "0.96:1.04:0.01",
-    "bank_delta_deg": "0:180:1",
-}
+DEMO = read_sweep_plan("demo")
+LIKELIHOOD, NEAREST = 0, 1
 
 
-@pytest.fixture(scope="module")
-def result():
-    return run_demo(workers=1, **SMALL)
+def small(**changes: Any) -> SweepPlan:
+    axes = {"distance_m": (1.0,), "delta_deg": (0.0, 45.0), "wall_m": DEMO.axes["wall_m"], "n_frames": (20,)}
+    given = {"classes": ("cone", "post"), "axes": axes, "trials": 3, "bank_distance_m": (0.96, 1.04)}
+    return SweepPlan(**{**DEMO.model_dump(), **given, **changes})
 
 
 @pytest.fixture(scope="module")
-def written(result, tmp_path_factory):
-    return write_demo(result, tmp_path_factory.mktemp("demo"))
+def made(tmp_path_factory):
+    """What the command printed, and its folder."""
+    folder, printed = tmp_path_factory.mktemp("demo") / "out", io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        patch.setattr("phasemark.matcher.sweep.plan.read_sweep_plan", lambda name: small(name=name))
+        assert main(["demo", "--out", str(folder), "--seed", "7", "--workers", "1"]) == 0
+    return SimpleNamespace(folder=folder, printed=printed.getvalue(), trials=read_sweep(folder)[1])
 
 
-def test_cells_on_the_grid_are_found_exactly(result):
-    for cell in result.select(shifted=False):
-        assert cell.class_right.all()
-        assert np.abs(cell.distance_error_m).max() < 1e-9
-        assert np.abs(cell.delta_error_rad).max() < 1e-9
+@pytest.fixture(scope="module")
+def page(made):
+    return (made.folder / "report.html").read_text(encoding="utf-8")
 
 
-def test_shifted_cells_lie_between_grid_points_and_are_missed_by_at_least_their_shift(result):
-    shifted = result.select(shifted=True)
-    assert len(shifted) == len(result.select(shifted=False)) == 4
-    for cell in shifted:
-        assert cell.class_right.all()
-        assert np.abs(cell.distance_error_m).min() >= 0.0037 - 1e-9
+def test_the_demo_is_the_paper_s_experiment_before_a_wall():
+    assert DEMO.class_names == ("cylinder", "cone", "sphere", "post")
+    assert DEMO.axes == {"distance_m": (0.8, 1.0, 1.2), "delta_deg": (0.0, 45.0, 90.0), "wall_m": (3.0,)}
+    assert {(one.n_frames, one.wall_m) for one in DEMO.conditions()} == {(50, 3.0)}
+    assert [(method.method, method.knows, method.free) for method in DEMO.methods] == [
+        ("refine", "wall", ()), ("nearest", "wall", ()),
+    ]  # fmt: skip
 
 
-def test_the_result_does_not_depend_on_the_number_of_workers(result):
-    other = run_demo(workers=3, **SMALL)
-    assert trials_csv(other.cells) == trials_csv(result.cells)
-    assert cells_csv(other.cells) == cells_csv(result.cells)
+def test_views_on_the_grid_are_found_exactly_by_the_nearest_image(tmp_path):
+    trials = run_sweep(small(spread=(0.0, 0.0), methods=DEMO.methods[NEAREST:]), tmp_path)
+    assert len(trials) == 12
+    assert (trials.found[:, 0] == trials.true_class).all()
+    assert np.abs(trials.error[:, 0]).max() < 1e-9
+    assert trials.position_error_of(slice(None)).max() < 1e-9
 
 
-def test_another_seed_gives_other_frames(result):
-    other = run_demo(workers=2, seed=1, **SMALL)
-    assert trials_csv(other.cells) != trials_csv(result.cells)
+def test_between_grid_points_the_nearest_image_answers_with_a_grid_point(made):
+    assert (made.trials.found == made.trials.true_class[:, None]).all()
+    steps = made.trials.estimate[:, NEAREST, :2] / (0.01, math.radians(1))
+    np.testing.assert_allclose(steps, np.round(steps), rtol=0, atol=1e-9)
+    assert np.abs(made.trials.error[:, NEAREST, 0]).max() > 1e-3
 
 
-def test_the_table_of_cells_follows_from_the_table_of_trials(result):
-    trials = list(csv.DictReader(io.StringIO(trials_csv(result.cells))))
-    for row in csv.DictReader(io.StringIO(cells_csv(result.cells))):
-        same = ("class", "shifted", "method", "distance_m", "delta_deg")
-        own = [t for t in trials if all(t[key] == row[key] for key in same)]
-        assert len(own) == int(row["trials"]) == 3
-        errors = [1e3 * abs(float(t["found_distance_m"]) - float(t["distance_m"])) for t in own]
-        # both tables are rounded, to 1e-6 m and 1e-4 mm
-        assert float(row["median_abs_distance_error_mm"]) == pytest.approx(sorted(errors)[1], abs=2e-3)
-        assert int(row["class_right"]) == sum(t["found_class"] == t["class"] for t in own)
+def test_maximum_likelihood_is_as_accurate_as_its_covariance_between_grid_points(made):
+    """24 errors of two parameters over their standard deviations: mean square 1, ± 3.3 √(2 / 24)."""
+    variance = np.einsum("npp->np", made.trials.covariance[:, LIKELIHOOD])[:, :2]
+    assert abs((made.trials.error[:, LIKELIHOOD, :2] ** 2 / variance).mean() - 1) < 3.3 * math.sqrt(2 / 24)
 
 
-def test_the_position_error_is_the_distance_of_the_nearest_symmetric_pose(result):
-    for cell in result.cells:
-        d, delta = cell.cell.distance_m, cell.cell.delta_rad
-        truth = np.array(LANDMARK_XY_M) - d * np.array([math.cos(delta), math.sin(delta)])
-        for match, error in zip(cell.matches, cell.position_error_m, strict=True):
-            found = [
-                np.array(LANDMARK_XY_M)
-                - match.distance_m * np.array([math.cos(match.delta_rad + turn), math.sin(match.delta_rad + turn)])
-                for turn in (0, math.pi)
-            ]
-            assert error == pytest.approx(min(np.hypot(*(place - truth)) for place in found), abs=1e-9)
+def test_the_position_error_is_the_distance_of_the_nearest_symmetric_pose(made):
+    landmark = (2.0, 1.0)
+    for k, errors in enumerate(made.trials.position_error_of(slice(None))):
+        true, *found = (
+            robot_poses(Match("cone", True, distance_m=view[0], delta_rad=view[1], symmetry=2), landmark)
+            for view in (made.trials.truth[k], *made.trials.estimate[k])
+        )
+        for poses, error in zip(found, errors, strict=True):
+            assert error == pytest.approx(
+                min(math.hypot(pose.x_m - true[0].x_m, pose.y_m - true[0].y_m) for pose in poses), abs=1e-9
+            )
+    cell = made.trials.cells()[LIKELIHOOD]
+    assert cell.position.value == pytest.approx(
+        math.sqrt((made.trials.position_error_of(made.trials.rows_of(0))[:, LIKELIHOOD] ** 2).mean())
+    )
 
 
 class _Sources(HTMLParser):
@@ -103,93 +108,57 @@ class _Sources(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_report_loads_nothing_and_its_tags_are_balanced(written):
-    page = _Sources()
-    page.feed(written.read_text(encoding="utf-8"))
-    assert page.open == []
-    pictures = [source for source in page.sources if source.startswith("data:image/png;base64,")]
-    assert len(pictures) == 10  # two a class, four matches, classes and errors
-    text = written.read_text(encoding="utf-8")
-    for link in set(page.sources) - set(pictures):
-        assert f'id="{link[1:]}"' in text if link.startswith("#") else (written.parent / link).is_file()
+def test_the_report_loads_nothing_and_its_tags_are_balanced(made, page):
+    read = _Sources()
+    read.feed(page)
+    assert read.open == []
+    pictures = [source for source in read.sources if source.startswith("data:image/png;base64,")]
+    figures = list((made.folder / "figures").glob("*.png"))
+    assert len(pictures) == len(figures) + 2 * 2 + 2 * 5  # two a class; of each method one typical and four worst
+    for link in set(read.sources) - set(pictures):
+        assert f'id="{link[1:]}"' in page if link.startswith("#") else (made.folder / link).is_file()
 
 
-def test_the_report_states_the_seed_the_versions_and_each_class(written, result):
-    text = written.read_text(encoding="utf-8")
-    assert f"phasemark demo --seed {result.seed}" in text
-    assert "numpy" in text
-    for name in result.bank.classes:
-        assert f"<h3>{name}</h3>" in text
+def test_the_report_states_the_seed_the_versions_and_each_class(page):
+    assert "<dt>seed</dt><dd>7</dd>" in page
+    assert "numpy" in page
+    for name in ("cone", "post"):
+        assert f"<h3>{name}</h3>" in page
 
 
-def test_maximum_likelihood_is_as_accurate_as_its_covariance_between_grid_points(result):
-    """24 errors of two parameters over their standard deviations: mean square 1, ± 3.3 √(2 / 24)."""
-    own = result.select(shifted=True, method=LIKELIHOOD)
-    assert all(cell.class_right.all() for cell in own)
-    squares = [
-        (error**2 / [match.covariance[k, k] for match in cell.matches]).mean()
-        for cell in own
-        for k, error in enumerate((cell.distance_error_m, cell.delta_error_rad))
-    ]
-    assert abs(np.mean(squares) - 1) < 3.3 * math.sqrt(2 / 24)
+def test_the_page_leads_with_maximum_likelihood_and_the_command_with_the_same_sentence(made, page):
+    text = html.unescape(re.sub("<[^>]*>", "", page.split("<main>")[1]))
+    error = made.trials.error[:, LIKELIHOOD]
+    first = (
+        f"At 1 m, before a wall at 3 m, you get {1e3 * math.sqrt(np.mean(error[:, 0] ** 2)):.2g} mm and"
+        f" {math.degrees(math.sqrt(np.mean(error[:, 1] ** 2))):.2g}° (1 σ) with maximum likelihood; class right 100 %"
+        " of 12 trials."
+    )
+    assert answer(made.trials.cells()) == first
+    assert made.printed.startswith(first)
+    assert text.index(first) < text.index("What the camera sees")
+    assert f"phasemark sweep run {made.folder}/plan.json" in text.split("Make this page again")[-1]
+    assert made.printed.rstrip().endswith(str(made.folder / "report.html"))
 
 
-def test_the_page_leads_with_maximum_likelihood_between_grid_points(written, result):
-    text = html.unescape(re.sub("<[^>]*>", "", written.read_text(encoding="utf-8").split("<main>")[1]))
-    assert answer(result) in text
-    assert text.index(answer(result)) < text.index("Errors between grid points")
-    headings = [text.index(title) for title in ("Maximum likelihood, between grid", "Nearest image, between grid")]
-    assert headings == sorted(headings)
-    assert "it found the true grid point in 12 of 12 trials" in text
-    assert text.count("0.00") < 10  # no rows of errors that cannot be anything else
-    for name in ("distance_m", "delta_deg", "median_abs"):
-        assert name not in text
-    assert text.rstrip().split("Make this page again")[-1].split()[:2] == ["phasemark", "demo"]
+def test_the_printed_table_has_a_row_for_each_view(made):
+    for m in (LIKELIHOOD, NEAREST):
+        rows = view_rows(made.trials, m)
+        assert [row[:3] for row in rows] == [("1", "0", "6/6"), ("1", "45", "6/6")]
+        assert all(row[3] in made.printed for row in rows)
+        worst = 1e3 * np.abs(made.trials.error[:, m, 0]).max()
+        assert max(float(row[4]) for row in rows) == pytest.approx(worst, abs=0.05)
 
 
-def test_the_answer_is_the_root_mean_square_error_of_its_cells(result):
-    own = result.select(shifted=True, method=LIKELIHOOD)
-    error = np.concatenate([cell.distance_error_m for cell in own])
-    assert f"you get {1e3 * math.sqrt(np.mean(error**2)):.2g} mm" in answer(result)
+def test_no_map_of_the_errors_is_empty(made):
+    drawn = [axes.images[0].get_array() for axes in maps(made.trials.cells(), "rmse").axes if axes.images]
+    assert len(drawn) == 4
+    assert all((table > 0).all() for table in drawn)
 
 
-def test_no_panel_of_the_report_is_empty(written):
-    """Every panel of the errors has a point for each angle and distance, and errors that are not 0."""
-    rows = list(csv.DictReader(io.StringIO((written.parent / "errors.csv").read_text(encoding="utf-8"))))
-    assert {row["panel"] for row in rows} == {LIKELIHOOD, NEAREST}
-    assert len(rows) == 2 * 3 * 2
-    assert all(float(row["high"]) > 0 for row in rows)
-    classes = list(csv.DictReader(io.StringIO((written.parent / "classes.csv").read_text(encoding="utf-8"))))
-    assert sum(float(row["value"]) for row in classes) == 2 * 2 * 2 * 3
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
-@pytest.mark.parametrize("width_px", [390, 1280])
-def test_a_browser_shows_the_whole_report_on_a_phone_and_on_a_desktop(written, tmp_path, width_px):
-    seen = look(written, width_px, tmp_path)
-    assert seen["width"] <= width_px
-    assert seen["cut"] == []
-    assert seen["console"] == []
-    assert all(seen["images"])
-
-
-def test_reports_are_not_overwritten_unasked(written, result):
-    with pytest.raises(OutputExistsError):
-        write_demo(result, written.parent)
-    assert write_demo(result, written.parent, force=True) == written
-
-
-def test_the_printed_summary_has_a_row_for_each_view(result):
-    assert [row[:3] for row in summary_rows(result.select(shifted=False))] == [
-        ("100.00", "0.00", "6/6"),
-        ("100.00", "45.00", "6/6"),
-    ]
-
-
-@pytest.mark.parametrize("wrong", [{"repetitions": 0}, {"n_frames": 0}, {"classes": ("pyramid",)}])
-def test_wrong_arguments_are_refused(wrong):
-    with pytest.raises(UsageError):
-        run_demo(**{**SMALL, **wrong})
+def test_a_demo_is_not_overwritten_unasked(made, capsys):
+    assert main(["demo", "--out", str(made.folder)]) == 4
+    assert "plan.json: exists already; --force replaces it" in capsys.readouterr().err
 
 
 def test_a_stream_depends_on_seed_purpose_and_index_alone():

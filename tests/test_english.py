@@ -47,7 +47,7 @@ NAMES = ("classes told apart, d", "sides told apart, d")
 NO_VERBS = QUESTIONS | {"The", "A", "An", "It", "If", "One", "Names", "Sides", "That", "This", "These", "There"}
 
 
-MENDED = ("calibration", "commands", "demo", "design", "drive", "sweep")
+MENDED = ("calibration", "commands", "design", "drive", "sweep")
 """Packages of the matcher whose functions name their result."""
 
 

@@ -64,7 +64,7 @@ method = "own_matchers:nearest_to_mean"
 
 @pytest.fixture(scope="module", autouse=True)
 def one_example_of_each_method():
-    """Pictures take half a second each, and every report of these tests would draw six."""
+    """Pictures take half a second each, and every report of these tests would draw nine."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("phasemark.matcher.sweep.report._MOST_EXAMPLES", 3)
         yield
@@ -84,7 +84,7 @@ def test_the_report_is_one_page_that_loads_nothing(folder):
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert len(page.encode()) < 3_000_000
     assert re.findall(r'src="(?!data:)', page) == []
-    assert page.count("figures/worst-") == 2 * 3  # each link names its file
+    assert page.count("figures/example-") == 2 * 6  # each link names its file
     for link in re.findall(r'href="([^"]*)"', page):
         assert f'id="{link[1:]}"' in page if link.startswith("#") else (folder / link).is_file()
     assert "<script" not in page
@@ -94,9 +94,11 @@ def test_the_report_is_one_page_that_loads_nothing(folder):
         ["rmse-distance-m", "rmse-delta-deg", "map-ratio", "map-rmse", "bias-arrows",
          "observability", "position-in-cell", "models", "confusion", "confusion-bound", "risk", "roc"]
     )  # fmt: skip
-    # one image a figure, and an example of each method
-    assert page.count("<img") == len(figures) + 3
-    assert page.count("phasemark sweep frames") == page.count("<img") - len(figures)
+    # one image a figure, two of each object, and of each method a typical trial and a bad one
+    assert page.count("<img") == len(figures) + 2 * 3 + 2 * 3
+    assert page.count("phasemark sweep frames") == 2 * 3
+    for name in ("cone", "cylinder", "bare-box"):
+        assert f"<h3>{name}</h3>" in page
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")

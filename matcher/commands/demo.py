@@ -10,7 +10,7 @@ import typer
 
 from phasemark.data.commands.console import LongWork, echo_json, echo_table
 from phasemark.data.commands.options import Force, Json, Out, Seed, Workers
-from phasemark.data.commands.outputs import output_folder, refuse_existing
+from phasemark.data.commands.outputs import refuse_existing
 
 
 def demo_report(
@@ -26,30 +26,25 @@ def demo_report(
     Parameters
     ----------
     out
-        Folder for the report, the tables and the bank.
+        Folder for trials, tables and the report.
     """
-    from phasemark.data.shards.run import outputs_of
-    from phasemark.matcher.demo.report import DEMO_FILES, HALVES, answer, on_grid, summary_rows, write_demo
-    from phasemark.matcher.demo.run import run_demo
+    from phasemark.matcher.sweep.answer import answer
+    from phasemark.matcher.sweep.plan import read_sweep_plan
+    from phasemark.matcher.sweep.report import VIEW_HEADER, view_rows, write_report
+    from phasemark.matcher.sweep.run import run_sweep
 
-    bank = out / "bank.h5"
-    refuse_existing([bank], force)
-    with output_folder(out, "demo", DEMO_FILES, force, also=[path.name for path in outputs_of(bank)]):
-        with LongWork("matching") as progress:
-            result = run_demo(bank, seed=seed, workers=workers, force=force, progress=progress)
-        with LongWork("writing the report"):
-            report = write_demo(result, out, force=force)
+    refuse_existing([out / "plan.json"], force)
+    plan = read_sweep_plan("demo").model_copy(update={"seed": seed})
+    with LongWork("matching") as progress:
+        trials = run_sweep(plan, out, workers=workers, force=force, progress=progress)
+    with LongWork("writing the report"):
+        report = write_report(out)
+    cells = trials.cells()
     if as_json:
-        echo_json({"report": str(report), **result.as_dict()})
+        echo_json({"report": str(report), "cells": [cell.as_dict() for cell in cells]})
         return
-    header = ("D (cm)", "δ (°)", "class right", "|ΔD| mm", "worst", "|Δδ| °", "worst", "position mm", "worst")
-    typer.echo(answer(result))
-    typer.echo("")
-    for shifted, method, title in HALVES:
-        if not shifted:
-            typer.echo(f"{title}: {on_grid(result)}")
-            continue
-        typer.echo(f"{title}: medians and worst over the classes")
-        echo_table(header, summary_rows(result.select(shifted=shifted, method=method)))
-        typer.echo("")
-    typer.echo(report)
+    typer.echo(answer(cells))
+    for m, method in enumerate(trials.methods):
+        typer.echo(f"\n{method}: medians and worst over the classes")
+        echo_table(VIEW_HEADER, view_rows(trials, m))
+    typer.echo(f"\n{report}")

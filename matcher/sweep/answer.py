@@ -23,6 +23,7 @@ SAID = {
 }  # fmt: skip
 """A condition in words, by the name of its axis."""
 _POOLED = ("class_name", "distance_m", "delta_deg")
+_SAID_FIRST = (*_POOLED, "wall_m")
 
 
 def answer_cells(cells: Sequence[Cell]) -> list[Cell]:
@@ -69,15 +70,16 @@ def answer(cells: Sequence[Cell]) -> str:
     if not own:
         return "No method found distance and angle in the middle of the design."
     condition = own[0].condition
-    axes = [name for name in condition_axes([one.condition for one in cells]) if name not in _POOLED]
+    axes = [name for name in condition_axes([one.condition for one in cells]) if name not in _SAID_FIRST]
     where = ", ".join(SAID[name].format(getattr(condition, name)) for name in axes)
+    wall = f", before a wall at {condition.wall_m:g} m," if condition.wall_m else ""
     trials = sum(one.n for one in own)
     right = sum(round(one.class_right.value * one.n) for one in own)
     left_out = f", {outliers_in_words(own)} left out," if outlier_share(own) else ""
     rms = {name: _rms([one.rmse[name].value for one in own if _found(one)]) for name in ("distance_m", "delta_rad")}
     return (
-        f"At {condition.distance_m:g} m{f' ({where})' if where else ''} you get {1e3 * rms['distance_m']:.2g} mm and"
-        f" {math.degrees(rms['delta_rad']):.2g}° (1 σ){left_out} with {own[0].method}; class"
+        f"At {condition.distance_m:g} m{f' ({where})' if where else ''}{wall} you get {1e3 * rms['distance_m']:.2g} mm"
+        f" and {math.degrees(rms['delta_rad']):.2g}° (1 σ){left_out} with {own[0].method}; class"
         f" right {100 * right / trials:.4g} % of {trials} trials."
     )
 

@@ -1,9 +1,10 @@
-"""Single trials of a sweep, taken again from its plan: their frames, and pictures of the worst of them."""
+"""Single trials of a sweep, taken again from its plan: their frames, and pictures of some."""
 
 from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,7 +31,8 @@ class Example:
 
     Parameters
     ----------
-    method : str
+    method, rank : str
+        Name of the method, and "typical" or "among the worst".
     condition, trial : int
     text : str
         What was shown, what was found, and how far it is from the truth.
@@ -39,6 +41,7 @@ class Example:
     """
 
     method: str
+    rank: str
     condition: int
     trial: int
     text: str
@@ -78,26 +81,22 @@ def sweep_frames(folder: str | os.PathLike[str], condition: int, trial: int) -> 
     return job.raw_frames(condition, job.image(condition, job.views(condition, trial, trial + 1)), trial)
 
 
-def worst_examples(plan: SweepPlan, trials: SweepTrials, n: int) -> list[Example]:
-    """Return pictures of the n worst trials of each method, one of a condition: the largest error over its bound."""
-    job = job_of_plan(plan)
+def example_trials(job: SweepJob, trials: SweepTrials, n: int) -> Iterator[Example]:
+    """Yield pictures of trials of each method: of median error over its bound, and the n worst, one of a condition."""
     error = trials.error
-    examples = []
-    for m, method in enumerate(plan.methods):
+    for m in range(len(trials.methods)):
         with np.errstate(invalid="ignore"):
             std = np.sqrt(np.einsum("npp->np", trials.bound[:, m]))[:, :2]
             scaled = np.abs(error[:, m, :2]) / np.where(std > _SIGMA, std, _SIGMA)
         badness = np.where(np.isfinite(scaled).all(axis=1), scaled.max(axis=1), np.inf)
-        badness[trials.true_class < 0] = -1.0
-        seen: set[int] = set()
-        for k in np.argsort(-badness, kind="stable"):
-            number = int(trials.condition[k])
-            if len(seen) == n or badness[k] < 0:
-                break
-            if number not in seen:
-                seen.add(number)
-                examples.append(_example(job, trials, m, int(k), method.name))
-    return examples
+        ranked = [int(k) for k in np.argsort(-badness, kind="stable") if trials.true_class[k] >= 0]
+        if ranked:
+            yield _example(job, trials, m, ranked[len(ranked) // 2], "typical")
+        worst: dict[int, int] = {}
+        for k in ranked:
+            worst.setdefault(int(trials.condition[k]), k)
+        for k in list(worst.values())[:n]:
+            yield _example(job, trials, m, k, "among the worst")
 
 
 def job_of_plan(plan: SweepPlan) -> SweepJob:
@@ -105,10 +104,10 @@ def job_of_plan(plan: SweepPlan) -> SweepJob:
     return SweepJob(plan, Round(0, tuple(range(len(plan.conditions()))), 0, plan.trials))
 
 
-def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, method: str) -> Example:
+def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, rank: str) -> Example:
     from phasemark.matcher.figures import match_figure  # matplotlib is slow to import
 
-    number, trial = int(trials.condition[k]), int(trials.trial[k])
+    number, trial, method = int(trials.condition[k]), int(trials.trial[k]), trials.methods[m]
     condition = trials.conditions[number]
     image = job.image(number, job.views(number, trial, trial + 1))
     frames = job.frames(number, job.plan.methods[m], image, trial)
@@ -131,4 +130,5 @@ def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, method: str) ->
         errors = f"{1e3 * error[0]:+.2f} mm and {math.degrees(error[1]):+.2f}°".replace("-", "−")
         text += f"{name}, error {errors}"
         text += f", p = {trials.p_value[k, m]:.2g}" if math.isfinite(trials.p_value[k, m]) else ""
-    return Example(method, number, trial, text, match_figure(frames, match, job.bank(m), background, title=False))
+    figure = match_figure(frames, match, job.bank(m), background, title=False)
+    return Example(method, rank, number, trial, text, figure)

@@ -25,7 +25,7 @@ from phasemark.landmarks import LandmarkSpec
 from phasemark.matcher.likelihood.images import LEVEL_VIEW, VIEW
 
 _MOST_CELLS = 100_000
-SHIPPED_SWEEPS = ("paper", "distance-angle-noise", "robustness")
+SHIPPED_SWEEPS = ("paper", "distance-angle-noise", "robustness", "demo")
 """Names of the plans that come with the program."""
 
 

@@ -6,23 +6,26 @@ import io
 import math
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 
 from phasemark.data.files.atomic_write import storage_errors, write_atomically
 from phasemark.data.files.folder_marker import OwnedFiles
 from phasemark.data.files.provenance import versions
 from phasemark.data.pages.figure_data import figure_csv
-from phasemark.data.pages.page import embedded_png, figure_png, page_template
+from phasemark.data.pages.page import embedded_png, figure_png, page_template, short_number
+from phasemark.landmarks import mesh_figure
 from phasemark.matcher.statistics import Interval
 from phasemark.matcher.sweep.answer import SAID, answer, answer_cells, card_of
-from phasemark.matcher.sweep.examples import job_of_plan, worst_examples
+from phasemark.matcher.sweep.examples import example_trials, job_of_plan
 from phasemark.matcher.sweep.figures.sheet import sweep_figures
 from phasemark.matcher.sweep.figures.style import COLUMN_NAME
+from phasemark.matcher.sweep.job import SweepJob
 from phasemark.matcher.sweep.plan import SweepPlan
 from phasemark.matcher.sweep.result_tables import (
     Cell,
@@ -32,13 +35,16 @@ from phasemark.matcher.sweep.result_tables import (
     outliers_in_words,
 )
 from phasemark.matcher.sweep.run import read_plan_of, read_sweep, sweep_folder, write_cells
+from phasemark.render.figures import RANGE_COLOURS, draw_range, landmark_limits_m
 from phasemark.render.integral.rounding import with_interval
 
 _MOST_ROWS = 80
 _READABLE_IN = 6.5
 """Wider figures keep their size on a phone, to be moved about."""
 _MOST_EXAMPLES = 8
-_AGAIN = "Make this page again"
+_SEEN, _EXAMPLES, _AGAIN = "What the camera sees", "Typical and worst trials", "Make this page again"
+VIEW_HEADER = ("D (m)", "δ (°)", "class right", "|ΔD| mm", "worst", "|Δδ| °", "worst", "position mm", "worst")
+"""Columns of :func:`view_rows`."""
 _ALWAYS_SAID = ("class_name", "distance_m", "delta_deg", "noise_factor", "n_frames")
 _PARAMETERS = (("distance_m", "distance", " mm", 1e3), ("delta_rad", "angle", "°", 180 / math.pi))
 
@@ -97,17 +103,19 @@ def _write_report(ours: OwnedFiles) -> Path:
                 "data": f"figures/{figure.name}.csv",
             }
         )
-    card = card_of(job_of_plan(plan), landmarks)
-    examples = _examples(plan, trials, ours)
+    job = job_of_plan(plan)
+    card = card_of(job, landmarks)
     axes = condition_axes([cell.condition for cell in cells])
     page = page_template("phasemark.matcher.sweep", "page.html.j2").render(
         plan=plan,
         answer=answer(landmarks),
         card=None if card is None else f"{_first_class(landmarks)} {card.line()}",
         summary=summary(trials, cells),
-        contents=[*(one["title"] for one in shown), "Cells", "Worst trials", "How it was made", _AGAIN],
+        contents=[_SEEN, *(one["title"] for one in shown), "Cells", _EXAMPLES, "How it was made", _AGAIN],
+        gallery=_gallery(job),
+        range_colours=RANGE_COLOURS,
         figures=shown,
-        examples=examples,
+        examples=_examples(job, trials, ours),
         header=(
             *(COLUMN_NAME[name] for name in axes), "method", "trials", "share of outliers", "RMSE of D (mm)",
             "bound on D (mm)", "RMSE / bound, D", "RMSE of δ (°)", "bound on δ (°)", "RMSE / bound, δ",
@@ -144,6 +152,21 @@ def summary(trials: SweepTrials, cells: Sequence[Cell]) -> list[str]:
         sentences.append(f"The worst cells are, {'; '.join(worst)}.")
     classes = "; ".join(_classes(trials, m) for m in range(len(trials.methods)))
     return [*sentences, f"{classes[:1].upper()}{classes[1:]}."]
+
+
+def view_rows(trials: SweepTrials, m: int) -> list[tuple[str, ...]]:
+    """Return classes right, medians and worst errors of method m over all classes, one row for each D and δ."""
+    error, position = trials.error[:, m], trials.position_error_of(slice(None))[:, m]
+    errors = np.abs([1e3 * error[:, 0], np.degrees(error[:, 1]), 1e3 * position])
+    right = trials.found[:, m] == trials.true_class
+    view = np.array([(one.distance_m, one.delta_deg) for one in trials.conditions])[trials.condition]
+    rows = []
+    for distance, delta in dict.fromkeys(map(tuple, view.tolist())):
+        own = (view == (distance, delta)).all(axis=1) & (trials.true_class >= 0)
+        numbers = np.stack([np.nanmedian(errors[:, own], axis=1), np.nanmax(errors[:, own], axis=1)], axis=1)
+        share = f"{right[own].sum()}/{own.sum()}"
+        rows.append((f"{distance:g}", f"{delta:g}", share, *map(short_number, numbers.ravel().tolist())))
+    return rows
 
 
 def _accuracy(cells: Sequence[Cell]) -> str:
@@ -232,17 +255,36 @@ def _commands(plan: SweepPlan, folder: Path) -> list[str]:
     return [run, f"phasemark sweep report {where}"]
 
 
-def _examples(plan: SweepPlan, trials: SweepTrials, ours: OwnedFiles) -> list[dict[str, Any]]:
+def _gallery(job: SweepJob) -> Iterator[dict[str, Any]]:
+    """Yield pictures of each object in the first of those conditions whose angle is nearest to 45°."""
+    for name, shown in job.objects.items():
+        own = [k for k, one in enumerate(job.all_conditions) if one.class_name == name]
+        number = min(own, key=lambda k: abs(job.all_conditions[k].delta_deg - 45))
+        views = job.views(number, 0, 1)
+        image = job.image(number, views)
+        range_m = job.frames(number, job.plan.methods[0], image, 0).range_m[0]
+        near, far = landmark_limits_m(range_m, image.coverage[0])
+        figure = Figure(figsize=(3.9, 3.3), layout="constrained")
+        draw_range(figure.add_subplot(title=name), range_m, near_m=near, far_m=far)
+        yield {
+            "name": name,
+            "view": f"D = {views.distance_m[0]:.3f} m, δ = {math.degrees(views.delta_rad[0]):.1f}°",
+            "mesh": embedded_png(mesh_figure(shown.mesh), f"The {name}"),
+            "frame": embedded_png(figure_png(figure), f"Filtered range image of the {name}"),
+        }
+
+
+def _examples(job: SweepJob, trials: SweepTrials, ours: OwnedFiles) -> list[dict[str, Any]]:
     where = shlex.quote(str(ours.folder))
-    of_each = max(1, _MOST_EXAMPLES // len(plan.methods))
+    of_each = max(1, _MOST_EXAMPLES // len(trials.methods))
     shown: list[dict[str, Any]] = []
-    for example in worst_examples(plan, trials, of_each):
-        name = f"figures/worst-{len(shown) + 1}.csv"
+    for example in example_trials(job, trials, of_each):
+        name = f"figures/example-{len(shown) + 1}.csv"
         ours.claim(name)
         write_atomically(ours.folder / name, figure_csv(example.figure), force=True)
         shown.append(
             {
-                "title": f"{example.method}: condition {example.condition}, trial {example.trial}",
+                "title": f"{example.method}, {example.rank}: condition {example.condition}, trial {example.trial}",
                 "text": example.text,
                 "image": embedded_png(figure_png(example.figure), example.text),
                 "data": name,
@@ -253,12 +295,15 @@ def _examples(plan: SweepPlan, trials: SweepTrials, ours: OwnedFiles) -> list[di
 
 
 def _facts(plan: SweepPlan, trials: SweepTrials) -> dict[str, Any]:
+    seconds = trials.seconds.sum(axis=0)
+    times = [f"{name} {short_number(value)} s" for name, value in zip(trials.methods, seconds.tolist(), strict=True)]
     return {
         "design": f"{plan.design}, {len(trials.conditions)} conditions, {len(trials)} trials of each method",
         "truths": f"uniform within {plan.spread[0]:g} m × {plan.spread[1]:g}° about a condition, off the banks' grids",
         "outliers": f"beyond {plan.outlier[0]:g} m or {plan.outlier[1]:g}°",
         "bound": "Cramér–Rao of the true world at each trial's view, for each method's own pixels and parameters",
         "sensor": plan.sensor,
+        "time": f"{', '.join(times)}: matching, added up over the threads",
         "seed": str(plan.seed),
         "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
     }

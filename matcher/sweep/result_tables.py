@@ -20,6 +20,7 @@ from phasemark.matcher.statistics import (
     Interval,
     binomial_interval,
     error_statistics,
+    rms_interval,
     wrapped_errors,
 )
 from phasemark.matcher.sweep.plan import Condition
@@ -137,6 +138,12 @@ class SweepTrials:
         period = np.array([delta_period_rad(n) for n in self.symmetry])[true_class][:, None]
         return wrapped_errors(error, self.numbers, period)
 
+    def position_error_of(self, rows: slice) -> NDArray[np.float64]:
+        """Return the distance of the lens from its true place, the landmark's symmetry allowed for; (n, m), metres."""
+        found, true = self.estimate[rows, :, 0], self.truth[rows, None, 0]
+        across = 2 * np.sin(self.error_of(rows)[:, :, 1] / 2)
+        return _root((found - true) ** 2 + found * true * across**2)
+
     def rows_of(self, condition: int) -> slice:
         """Return where the trials of a condition lie."""
         return slice(*np.searchsorted(self.condition, [condition, condition + 1]))
@@ -157,6 +164,7 @@ class SweepTrials:
         own: dict[str, NDArray[Any]] = {
             **{name: self.estimate[rows, :, i] for i, name in enumerate(names_of_view)},
             **{f"error_{name}": error[:, :, i] for i, name in enumerate(names_of_view)},
+            "error_position_m": self.position_error_of(rows),
             **{f"bound_{name}": _root(self.bound[rows, :, i, i]) for i, name in enumerate(names_of_view)},
             **{
                 f"cov_{_SHORT[i]}_{_SHORT[j]}": self.covariance[rows, :, i, j]
@@ -229,6 +237,7 @@ class SweepTrials:
             },
             bias=dict(kept.bias),
             rmse=dict(kept.rmse),
+            position=rms_interval(self.position_error_of(rows)[inner, m]),
             rmse_with_outliers=dict(error_statistics(error[answered], self.free[m]).rmse),
             bound={
                 name: float(np.sqrt(np.mean(std[bounded, k] ** 2))) if bounded.any() else math.nan
@@ -279,6 +288,8 @@ class Cell:
         Of the answered trials that are no outliers.
     rmse_with_outliers : dict of str to Interval
         RMSE of each parameter, outliers included.
+    position : Interval
+        Root mean square distance of the lens from its true place, of the same trials.
     bound : dict of str to float
         Cramér–Rao bound on the standard deviation, root mean square over the true views.
     ratio : dict of str to Interval
@@ -312,6 +323,7 @@ class Cell:
     bias: dict[str, Interval]
     rmse: dict[str, Interval]
     rmse_with_outliers: dict[str, Interval]
+    position: Interval
     bound: dict[str, float]
     ratio: dict[str, Interval]
     nees: Interval
@@ -335,6 +347,7 @@ class Cell:
                 out |= _flat(f"{kind}_{name}", getattr(self, kind).get(name, _UNKNOWN))
             out[f"bound_{name}"] = self.bound.get(name, math.nan)
             out[f"weak_{name}"] = self.weak_direction.get(name, math.nan)
+        out |= _flat("rmse_position_m", self.position)
         for level, share in self.coverage.items():
             out |= _flat(f"coverage_{round(100 * level)}", share)
         out |= {f"found_{name}": count for name, count in self.found.items()}

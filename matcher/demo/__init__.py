@@ -1,1 +1,0 @@
-"""The paper's experiment as one command."""
