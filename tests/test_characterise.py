@@ -246,10 +246,8 @@ def test_the_report_is_one_small_page_that_loads_nothing(folder):
 
 
 def test_every_figure_is_a_picture_too(folder):
-    numbers = {path.stem for path in folder.glob("*.csv")} - {"points"}
     names = {"photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold"}
-    assert {path.stem for path in folder.glob("*.png")} == names == numbers
-    assert all(path.read_text(encoding="utf-8").count("\n") > 5 for path in folder.glob("*.csv"))
+    assert {path.stem for path in folder.glob("*.png")} == names
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in folder.glob("*.png"))
 
 

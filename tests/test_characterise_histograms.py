@@ -116,7 +116,6 @@ def test_the_command_writes_the_three_figures(tmp_path: Path, capsys: pytest.Cap
     assert main(["sensor", "characterise", "vl53l5cx-4x4", "--frames", "30", "-o", str(folder)]) == 0
     for name in ("histogram", "merging", "ambient"):
         assert (folder / f"{name}.png").stat().st_size > 10_000
-        assert (folder / f"{name}.csv").read_text(encoding="utf-8").count("\n") > 2
     assert "Where two targets merge" not in capsys.readouterr().err
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "merging" in page.lower()

@@ -9,7 +9,6 @@ from pathlib import Path
 from phasemark.data.files.atomic_write import write_atomically
 from phasemark.data.files.json_text import json_text
 from phasemark.data.files.provenance import versions
-from phasemark.data.pages.figure_data import figure_csv
 from phasemark.data.pages.page import embedded_png, figure_png, page_template
 from phasemark.render.bench.data_sheet.bench import ALBEDOS
 from phasemark.render.bench.data_sheet.results import Z95, Characterisation, SheetQuantity
@@ -21,8 +20,7 @@ FIGURES = (
     "photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold", "histogram", "merging",
     "ambient",
 )  # fmt: skip
-_OF_FIGURES = tuple(f"{name}.{kind}" for name in FIGURES for kind in ("png", "csv"))
-NAMES = (REPORT, "characterisation.json", "points.csv", *_OF_FIGURES)
+NAMES = (REPORT, "characterisation.json", "points.csv", *(f"{name}.png" for name in FIGURES))
 """What :func:`write_characterisation` may write; a sensor that lacks a figure lacks its picture."""
 
 _CAPTIONS = {
@@ -54,7 +52,7 @@ _DIRECT_CAPTIONS = {
 def write_characterisation(
     found: Characterisation, name: str, folder: Path, *, seed: int, bound: str | None = None, force: bool = False
 ) -> list[Path]:
-    """Write ``report.html``, ``characterisation.json``, ``points.csv``, and a PNG and a CSV for each figure.
+    """Write ``report.html``, ``characterisation.json``, ``points.csv``, and a PNG for each figure.
 
     The files hold no time: the same sensor and seed make the same bytes.
 
@@ -85,15 +83,13 @@ def write_characterisation(
     """
     from phasemark.render.bench.figures import characterisation_figures
 
-    figures = characterisation_figures(found)
-    pictures = {title: figure_png(figure) for title, figure in figures.items()}
+    pictures = {title: figure_png(figure) for title, figure in characterisation_figures(found).items()}
     facts = {"name": name, "seed": seed, "versions": versions(), **found.as_dict()}
     files = {
         REPORT: _report(found, name, seed, pictures, bound).encode(),
         "characterisation.json": (json_text(facts, indent=1, allow_nan=False) + "\n").encode(),
         "points.csv": _points_csv(found).encode(),
         **{f"{title}.png": png for title, png in pictures.items()},
-        **{f"{title}.csv": figure_csv(figure) for title, figure in figures.items()},
     }
     return [write_atomically(folder / file, content, force=force) for file, content in files.items()]
 
@@ -181,7 +177,6 @@ def _report(found: Characterisation, name: str, seed: int, pictures: dict[str, b
             {
                 "title": title.replace("_", " ").capitalize(),
                 "caption": captions[title],
-                "data": f"{title}.csv",
                 "picture": embedded_png(png, captions[title]),
                 "tests": [one for one in found.of_figure(title) if one.degrees_of_freedom],
             }

@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from phasemark.data.files.atomic_write import storage_errors, write_atomically
 from phasemark.data.files.folder_marker import OwnedFiles
 from phasemark.data.files.provenance import versions
-from phasemark.data.pages.figure_data import figure_csv
 from phasemark.data.pages.page import embedded_png, figure_png, page_template, short_number
 from phasemark.landmarks import mesh_figure
 from phasemark.matcher.statistics import Interval
@@ -85,13 +84,12 @@ def _write_report(ours: OwnedFiles) -> Path:
         (folder / "figures").mkdir(exist_ok=True)
     shown = []
     figures = list(sweep_figures(plan, trials, cells))
-    ours.claim(*(f"figures/{figure.name}.{kind}" for figure in figures for kind in ("png", "svg", "csv")))
+    ours.claim(*(f"figures/{figure.name}.{kind}" for figure in figures for kind in ("png", "svg")))
     for figure in figures:
         png, svg = figure_png(figure.figure), io.BytesIO()
         with matplotlib.rc_context({"svg.hashsalt": "phasemark"}):  # or the names inside would differ each time
             figure.figure.savefig(svg, format="svg", metadata={"Date": None})
-        files = {"png": png, "svg": svg.getvalue(), "csv": figure_csv(figure.figure)}
-        for kind, content in files.items():
+        for kind, content in (("png", png), ("svg", svg.getvalue())):
             write_atomically(folder / "figures" / f"{figure.name}.{kind}", content, force=True)
         wide = figure.figure.get_figwidth() > _READABLE_IN
         shown.append(
@@ -100,7 +98,6 @@ def _write_report(ours: OwnedFiles) -> Path:
                 "text": figure.text,
                 "image": embedded_png(png, figure.title),
                 "wide": wide,
-                "data": f"figures/{figure.name}.csv",
             }
         )
     job = job_of_plan(plan)
@@ -115,7 +112,7 @@ def _write_report(ours: OwnedFiles) -> Path:
         gallery=_gallery(job),
         range_colours=RANGE_COLOURS,
         figures=shown,
-        examples=_examples(job, trials, ours),
+        examples=_examples(job, trials, folder),
         header=(
             *(COLUMN_NAME[name] for name in axes), "method", "trials", "share of outliers", "RMSE of D (mm)",
             "bound on D (mm)", "RMSE / bound, D", "RMSE of δ (°)", "bound on δ (°)", "RMSE / bound, δ",
@@ -274,24 +271,15 @@ def _gallery(job: SweepJob) -> Iterator[dict[str, Any]]:
         }
 
 
-def _examples(job: SweepJob, trials: SweepTrials, ours: OwnedFiles) -> list[dict[str, Any]]:
-    where = shlex.quote(str(ours.folder))
+def _examples(job: SweepJob, trials: SweepTrials, folder: Path) -> Iterator[dict[str, Any]]:
     of_each = max(1, _MOST_EXAMPLES // len(trials.methods))
-    shown: list[dict[str, Any]] = []
-    for example in example_trials(job, trials, of_each):
-        name = f"figures/example-{len(shown) + 1}.csv"
-        ours.claim(name)
-        write_atomically(ours.folder / name, figure_csv(example.figure), force=True)
-        shown.append(
-            {
-                "title": f"{example.method}, {example.rank}: condition {example.condition}, trial {example.trial}",
-                "text": example.text,
-                "image": embedded_png(figure_png(example.figure), example.text),
-                "data": name,
-                "command": f"phasemark sweep frames {where} {example.condition} {example.trial} -o frames.npz",
-            }
-        )
-    return shown
+    for one in example_trials(job, trials, of_each):
+        yield {
+            "title": f"{one.method}, {one.rank}: condition {one.condition}, trial {one.trial}",
+            "text": one.text,
+            "image": embedded_png(figure_png(one.figure), one.text),
+            "command": f"phasemark sweep frames {shlex.quote(str(folder))} {one.condition} {one.trial} -o frames.npz",
+        }
 
 
 def _facts(plan: SweepPlan, trials: SweepTrials) -> dict[str, Any]:
