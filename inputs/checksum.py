@@ -1,10 +1,13 @@
-"""SHA-256 checksums beside files, in the format of ``sha256sum``."""
+"""SHA-256 checksums beside files, in the format of ``sha256sum``, compared whenever a file is read."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import BinaryIO
 
@@ -13,7 +16,11 @@ from phasemark import InputFileError
 _BLOCK_BYTES = 1 << 20
 _MOST_BYTES = 1 << 14
 """A checksum file is one line: a digest and the name of a file."""
+_ATTEMPTS = 3
+"""How often file and checksum are compared while somebody replaces both."""
 _CHECKSUM_LINE = re.compile(r"\\?(?P<digest>[0-9a-fA-F]{64}) [ *](?P<name>[^\n]+)\n?")
+
+_verifying: ContextVar[bool] = ContextVar("verifying", default=True)
 
 
 def checksum_path(path: str | os.PathLike[str]) -> Path:
@@ -30,14 +37,6 @@ def checksum_path(path: str | os.PathLike[str]) -> Path:
     """
     path = Path(path)
     return path.with_name(path.name + ".sha256")
-
-
-def with_checksum(path: Path) -> Path:
-    """Return the name of a file that its checksum has: that of a link if a checksum lies beside it, or the file's."""
-    if not path.is_symlink():
-        return path
-    real, beside = Path(os.path.realpath(path)), checksum_path(path)
-    return real if not beside.exists() or os.path.realpath(beside) == str(checksum_path(real)) else path
 
 
 def sha256_of(source: str | os.PathLike[str] | BinaryIO) -> str:
@@ -79,7 +78,7 @@ def read_checksum(path: str | os.PathLike[str]) -> str:
     InputFileError
         There is no checksum file, it is not in the format of ``sha256sum``, or it is about another file.
     """
-    path = with_checksum(Path(path))
+    path = _with_checksum(Path(path))
     beside = checksum_path(path)
     try:
         with beside.open("rb") as file:
@@ -113,18 +112,68 @@ def verify_checksum(path: str | os.PathLike[str]) -> str:
         The file or its checksum cannot be read, or they do not agree.
     """
     stated = read_checksum(path)
-    try:
-        actual = sha256_of(path)
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    actual = _digest(Path(path), None)
     if stated != actual:
-        raise InputFileError(contradiction(Path(path), stated, actual))
+        raise InputFileError(_contradiction(Path(path), stated, actual))
     return actual
 
 
-def contradiction(path: Path, stated: str, actual: str) -> str:
-    """Return the message on a file that is not what its checksum says."""
-    return f"{path}: damaged: its SHA-256 is {actual}, but {checksum_path(path).name} says {stated}"
+def verifying() -> bool:
+    """Return whether files that are read are compared with their checksums."""
+    return _verifying.get()
+
+
+@contextmanager
+def unverified() -> Iterator[None]:
+    """Read files in the block without comparing them with their checksums, as ``--no-verify`` does.
+
+    Yields
+    ------
+    None
+    """
+    token = _verifying.set(False)
+    try:
+        yield
+    finally:
+        _verifying.reset(token)
+
+
+def is_vouched_for(path: Path, content: bytes | BinaryIO | None = None) -> bool:
+    """Return whether ``FILE.sha256`` is there and right.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    content : bytes or binary file, optional
+        The file's content, if it has been read, or the open file, which stands at its beginning afterwards.
+
+    Returns
+    -------
+    bool
+        False if there is no checksum, or within :func:`unverified`.
+
+    Raises
+    ------
+    InputFileError
+        The checksum is there and wrong, or the file cannot be read.
+    """
+    path = _with_checksum(path)
+    if not verifying() or not os.path.lexists(checksum_path(path)):
+        return False
+    for attempt in range(_ATTEMPTS):
+        try:
+            stated = read_checksum(path)
+        except InputFileError:
+            if attempt and not os.path.lexists(checksum_path(path)):
+                return False
+            raise
+        actual = _digest(path, content)
+        if stated == actual:
+            return True
+        if isinstance(content, bytes):
+            break
+    raise InputFileError(f"{_contradiction(path, stated, actual)} (unverified() reads it all the same)")
 
 
 def checksum_line(digest: str, name: str) -> bytes:
@@ -140,6 +189,33 @@ def checksum_line(digest: str, name: str) -> bytes:
     # sha256sum starts the line with a backslash when the name needed escaping.
     escaped = _escaped(name)
     return os.fsencode(f"{'' if escaped == name else chr(92)}{digest}  {escaped}\n")
+
+
+def _with_checksum(path: Path) -> Path:
+    """Return the name of a file that its checksum has: that of a link if a checksum lies beside it, or the file's."""
+    if not path.is_symlink():
+        return path
+    real, beside = Path(os.path.realpath(path)), checksum_path(path)
+    return real if not beside.exists() or os.path.realpath(beside) == str(checksum_path(real)) else path
+
+
+def _digest(path: Path, content: bytes | BinaryIO | None) -> str:
+    if isinstance(content, bytes):
+        return hashlib.sha256(content).hexdigest()
+    try:
+        if content is None:
+            return sha256_of(path)
+        content.seek(0)
+        digest = sha256_of(content)
+        content.seek(0)
+    except OSError as error:
+        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
+    return digest
+
+
+def _contradiction(path: Path, stated: str, actual: str) -> str:
+    """Return the message on a file that is not what its checksum says."""
+    return f"{path}: damaged: its SHA-256 is {actual}, but {checksum_path(path).name} says {stated}"
 
 
 def _escaped(name: str) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from phasemark import InputFileError
-from phasemark.inputs.vouching import is_vouched_for
+from phasemark.inputs.checksum import is_vouched_for
 
 MOST_TOML_BYTES = 1 << 22
 """Largest size of a plan, a map or a sensor file, bytes."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from phasemark import InputFileError, UsageError
-from phasemark.inputs.yaml_file import read_yaml
+from phasemark.inputs.reading import MOST_TOML_BYTES, read_text
 from phasemark.render.sensor.lens_fields import Lens, check_image_size
 
 _MODELS = {
@@ -55,7 +55,7 @@ def read_camera_info(path: str | Path) -> CameraInfo:
         The file is not YAML, lacks a key, or describes a camera that cannot be used; with one line.
     """
     path = Path(path)
-    table = read_yaml(path)
+    table = _read_yaml(path)
     try:
         return _camera_info(table)
     except (UsageError, ValueError) as error:
@@ -138,3 +138,26 @@ def _number(value: Any) -> float:
     if not math.isfinite(number):
         raise ValueError
     return number
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    """Read the first document of a YAML file, which holds nothing but data."""
+    import yaml
+
+    text = read_text(path, most_bytes=MOST_TOML_BYTES)
+    try:
+        found = next(yaml.safe_load_all(text), None)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = "" if mark is None else f", line {mark.line + 1}"
+        problem = getattr(error, "problem", None) or "it does not follow the rules of YAML"
+        raise InputFileError(f"{path}: not a YAML file ({' '.join(str(problem).split())}{where})") from None
+    except RecursionError:
+        raise InputFileError(f"{path}: not a YAML file that can be used (nested without end)") from None
+    except (ValueError, TypeError, OverflowError, AttributeError) as error:  # what is no number or date of Python's
+        raise InputFileError(
+            f"{path}: not a YAML file that can be used ({' '.join(str(error).split())[:80]})"
+        ) from None
+    if not isinstance(found, dict):
+        raise InputFileError(f"{path}: must hold a table of keys and values, as ROS writes a camera_info")
+    return found
