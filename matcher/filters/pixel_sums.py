@@ -85,7 +85,7 @@ class PixelSums:
         valid, other, n_other = self._sums[name]
         total = np.where(self.n_valid > 0, valid, other)
         number = np.where(self.n_valid > 0, self.n_valid, n_other)
-        return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
+        return np.asarray(np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0))
 
     def law_variance_m2(self) -> NDArray[np.float64] | None:
         """Return R of one frame by the noise law; None without amplitude or intensity of what the range is made of."""
