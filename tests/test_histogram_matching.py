@@ -322,7 +322,7 @@ def test_a_class_weighs_as_the_volume_of_its_posterior() -> None:
         root = np.linalg.cholesky(np.linalg.inv(information))
         x = np.linspace(-10, 10, 401)
         cells = (x[1] - x[0]) ** 2 * np.exp(-0.5 * (x[:, None] ** 2 + x**2)).sum()
-        return math.exp(-cost / 2) * cells * abs(np.linalg.det(root))
+        return float(math.exp(-cost / 2) * cells * abs(np.linalg.det(root)))
 
     want = evidence(20.0, narrow) / evidence(21.0, wide)
     assert share["narrow"] / share["wide"] == pytest.approx(want, rel=2e-3)  # narrower by 2π / |R I R| than the ranges
