@@ -15,9 +15,9 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.render import Sensor, camera_unit, capture, characterise, preset
-from phasemark.render.bench.data_sheet.transfer_curve import fit_line
 from phasemark.render.bench.figures import characterisation_figures
 from phasemark.render.bench.flat_field import board_image, expected_flat_field, flat_field
+from phasemark.render.bench.least_squares import weighted_fit
 from phasemark.render.sensor.range_noise import exact_phase_moments, phase_density
 
 N = 30  # frames a point, 7 680 readings of a 16 × 16 camera
@@ -210,9 +210,10 @@ def test_a_direct_sensor_says_what_it_does_not_have():
 
 def test_a_line_is_fitted_as_weighted_least_squares_does():
     x, y, e = np.array([0.0, 1, 2, 5]), np.array([1.0, 3.1, 4.9, 11.2]), np.array([0.1, 0.2, 0.1, 0.4])
-    (slope, offset), covariance = np.polyfit(x, y, 1, w=1 / e, cov="unscaled")
-    found = fit_line(x, y, e)
-    assert found == pytest.approx((slope, offset, math.sqrt(covariance[0, 0]), math.sqrt(covariance[1, 1])), rel=1e-9)
+    line, covariance = np.polyfit(x, y, 1, w=1 / e, cov="unscaled")
+    found, found_covariance = weighted_fit(np.column_stack([x, np.ones(4)]), y, e)
+    assert found == pytest.approx(line, rel=1e-9)
+    assert np.ravel(found_covariance) == pytest.approx(np.ravel(covariance), rel=1e-9)
 
 
 def test_too_few_frames_and_dead_cameras_are_refused():

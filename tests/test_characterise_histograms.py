@@ -83,7 +83,7 @@ def test_a_wrong_prediction_of_counts_is_noticed(monkeypatch: pytest.MonkeyPatch
     def brighter(sensor: Sensor, distance_m: float, albedo: float) -> np.ndarray:
         return plane_counts(sensor, distance_m, 1.03 * albedo)
 
-    monkeypatch.setattr("phasemark.render.bench.data_sheet.histograms.plane_counts", brighter)
+    monkeypatch.setattr("phasemark.render.bench.data_sheet.direct.plane_counts", brighter)
     found = characterise(ZONES, rng=np.random.default_rng(5), n_frames=300)
     assert {one.figure for one in found.disagreements} == {"histogram"}
 

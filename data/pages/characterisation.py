@@ -11,15 +11,11 @@ from phasemark.data.files.json_text import json_text
 from phasemark.data.files.provenance import versions
 from phasemark.data.pages.page import embedded_png, figure_png, page_template
 from phasemark.render.bench.data_sheet.bench import ALBEDOS
-from phasemark.render.bench.data_sheet.results import Z95, Characterisation, SheetQuantity
+from phasemark.render.bench.data_sheet.results import FIGURES, Z95, Characterisation, SheetQuantity
 from phasemark.render.integral.rounding import value_and_error
 from phasemark.render.sensor.range_noise import predicted_range_std
 
 REPORT = "report.html"
-FIGURES = (
-    "photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold", "histogram", "merging",
-    "ambient",
-)  # fmt: skip
 NAMES = (REPORT, "characterisation.json", "points.csv", *(f"{name}.png" for name in FIGURES))
 """What :func:`write_characterisation` may write; a sensor that lacks a figure lacks its picture."""
 

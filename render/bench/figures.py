@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from phasemark.render.bench.data_sheet.results import Characterisation, Comparison
+from phasemark.render.bench.data_sheet.results import FIGURES, Characterisation, Comparison
 from phasemark.render.figures import draw_map
 
 if TYPE_CHECKING:
@@ -47,11 +47,6 @@ _TITLES = {
 }
 _LEAST_REACH = 1e-6  # of an axis: nothing below is anything but rounding
 _LOGARITHMIC = ("photon_transfer", "range_noise")
-NAMES = (
-    "photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold", "histogram", "merging",
-    "ambient",
-)  # fmt: skip
-"""The figures that a data sheet may have, in its order."""
 _MAPS = {
     "range_offset_m": ("range offset", "mm", 1e3),
     "response_percent": ("sensitivity, mean of both taps", "% of the mean", 1.0),
@@ -69,10 +64,10 @@ def characterisation_figures(found: Characterisation) -> dict[str, Figure]:
     Returns
     -------
     dict of str to matplotlib.figure.Figure
-        By name, those of `NAMES` that it has.
+        By name, those of `FIGURES` that it has.
     """
     figures: dict[str, Figure] = {}
-    for name in NAMES:
+    for name in FIGURES:
         if name == "fixed_pattern":
             if found.maps:
                 figures[name] = _pattern_figure(found)

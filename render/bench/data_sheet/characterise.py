@@ -12,13 +12,10 @@ import math
 import numpy as np
 
 from phasemark import UsageError
-from phasemark.render.bench.data_sheet.bench import ALBEDOS, Bench, Part
-from phasemark.render.bench.data_sheet.direct import direct_parts
-from phasemark.render.bench.data_sheet.fixed_patterns import patterns
-from phasemark.render.bench.data_sheet.flagged_shares import saturation, threshold
-from phasemark.render.bench.data_sheet.range_curves import linearity, range_noise
-from phasemark.render.bench.data_sheet.results import Characterisation
-from phasemark.render.bench.data_sheet.transfer_curve import photon_transfer
+from phasemark.render.bench.data_sheet.bench import Bench
+from phasemark.render.bench.data_sheet.direct import direct_rows
+from phasemark.render.bench.data_sheet.phase import phase_rows
+from phasemark.render.bench.data_sheet.results import Characterisation, Comparison, SheetQuantity
 from phasemark.render.sensor.sensor import Sensor
 
 _SAMPLES_PER_POINT = 51_200  # σ is known to 0.3 %
@@ -57,25 +54,14 @@ def characterise(sensor: Sensor, *, rng: np.random.Generator, n_frames: int | No
     if n_frames < 2:
         raise UsageError(f"'n_frames' must be at least 2, for one frame has no noise, got {n_frames}")
     bench = Bench(sensor, rng, n_frames)
-    parts = direct_parts(bench) if sensor.kind == "direct" else _phase_parts(bench)
+    rows = list(direct_rows(bench) if sensor.kind == "direct" else phase_rows(bench))
     return Characterisation(
         sensor,
         n_frames,
         bench.reference_range_m,
-        tuple(one for part in parts for one in part.comparisons),
-        tuple(one for part in parts for one in part.quantities),
-        {name: values for part in parts for name, values in part.maps.items()},
+        tuple(row for row in rows if isinstance(row, Comparison)),
+        tuple(row for row in rows if isinstance(row, SheetQuantity)),
+        {name: values for row in rows if isinstance(row, dict) for name, values in row.items()},
         {"dead": bench.unit.dead, "hot": bench.unit.hot},
-        tuple(note for part in parts for note in part.notes),
+        tuple(row for row in rows if isinstance(row, str)),
     )
-
-
-def _phase_parts(bench: Bench) -> list[Part]:
-    return [
-        photon_transfer(bench),
-        *(range_noise(bench, albedo) for albedo in ALBEDOS),
-        linearity(bench),
-        patterns(bench),
-        saturation(bench),
-        *(threshold(bench, albedo) for albedo in ALBEDOS),
-    ]

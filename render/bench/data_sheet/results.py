@@ -18,9 +18,30 @@ AGREEMENT = 0.999
 Floats = NDArray[np.float64]
 
 
-def plain(value: float) -> float | None:
+FIGURES = (
+    "photon_transfer", "range_noise", "linearity", "fixed_pattern", "saturation", "threshold", "histogram", "merging",
+    "ambient",
+)  # fmt: skip
+"""The figures that a data sheet may have, in its order."""
+
+
+def _plain(value: float) -> float | None:
     """Return None for a number that JSON does not have."""
     return value if math.isfinite(value) else None
+
+
+def _tail(chi2: float, degrees_of_freedom: int) -> float:
+    """Return the probability of a larger χ²; 1 if nothing is compared."""
+    return float(special.chdtrc(degrees_of_freedom, chi2)) if degrees_of_freedom else 1.0
+
+
+def _agreement(one: Comparison | Characterisation) -> dict[str, float | None]:
+    """Return the test of simulated points, for JSON."""
+    return {
+        "chi2": _plain(one.chi2),
+        "degrees_of_freedom": one.degrees_of_freedom,
+        "p_value": _plain(one.p_value),
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,32 +109,24 @@ class Comparison:
     @property
     def p_value(self) -> float:
         """Probability of a larger χ² if the prediction is right; 1 if nothing is compared."""
-        return float(special.chdtrc(self.degrees_of_freedom, self.chi2)) if self.degrees_of_freedom else 1.0
+        return _tail(self.chi2, self.degrees_of_freedom)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists, for JSON."""
+        columns: dict[str, NDArray[Any]] = {
+            "x": self.x,
+            "predicted": self.predicted,
+            "simulated": self.simulated,
+            "low95": self.simulated - self.half95,
+            "high95": self.simulated + self.half95,
+            "samples": self.samples,
+            "compared": self.compared,
+        }
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         return {
-            "figure": self.figure,
-            "label": self.label,
-            "x_name": self.x_name,
-            "y_name": self.y_name,
-            "chi2": plain(self.chi2),
-            "degrees_of_freedom": self.degrees_of_freedom,
-            "p_value": plain(self.p_value),
-            "points": [
-                {
-                    "x": float(x),
-                    "predicted": float(predicted),
-                    "simulated": plain(float(simulated)),
-                    "low95": plain(float(simulated - half)),
-                    "high95": plain(float(simulated + half)),
-                    "samples": int(samples),
-                    "compared": bool(compared),
-                }
-                for x, predicted, simulated, half, samples, compared in zip(
-                    self.x, self.predicted, self.simulated, self.half95, self.samples, self.compared, strict=True
-                )
-            ],
+            **{name: getattr(self, name) for name in ("figure", "label", "x_name", "y_name")},
+            **_agreement(self),
+            "points": [dict(zip(columns, map(_plain, row), strict=True)) for row in rows],
         }
 
 
@@ -147,10 +160,10 @@ class SheetQuantity:
         half = Z95 * self.std_error
         return {
             "title": self.title,
-            "predicted": plain(self.predicted),
-            "simulated": plain(self.simulated),
-            "low95": plain(self.simulated - half),
-            "high95": plain(self.simulated + half),
+            "predicted": _plain(self.predicted),
+            "simulated": _plain(self.simulated),
+            "low95": _plain(self.simulated - half),
+            "high95": _plain(self.simulated + half),
             "samples": self.samples,
         }
 
@@ -220,7 +233,7 @@ class Characterisation:
     @property
     def p_value(self) -> float:
         """Probability of a larger χ² over all points if every prediction is right."""
-        return float(special.chdtrc(self.degrees_of_freedom, self.chi2)) if self.degrees_of_freedom else 1.0
+        return _tail(self.chi2, self.degrees_of_freedom)
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain numbers, lists and strings, for JSON; None where there is no number."""
@@ -233,15 +246,13 @@ class Characterisation:
             "agreement": {
                 "agrees": not self.disagreements,
                 "level": AGREEMENT,
-                "chi2": plain(self.chi2),
-                "degrees_of_freedom": self.degrees_of_freedom,
-                "p_value": plain(self.p_value),
+                **_agreement(self),
                 "disagreeing": [f"{one.figure}: {one.label}" for one in self.disagreements],
             },
             "quantities": {one.name: one.as_dict() for one in self.quantities},
             "comparisons": [one.as_dict() for one in self.comparisons],
             "maps": {
-                name: [[plain(float(value)) for value in row] for row in values] for name, values in self.maps.items()
+                name: [[_plain(float(value)) for value in row] for row in values] for name, values in self.maps.items()
             },
             "defects": {name: np.argwhere(mask).tolist() for name, mask in self.defects.items()},
             "notes": list(self.notes),
