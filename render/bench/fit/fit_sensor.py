@@ -7,24 +7,16 @@ electrons themselves. :func:`fit_sensor` says of every number whether it was mea
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render.bench.fit.boards import (
-    FEWEST_FRAMES,
-    PIXEL_STD_ERROR,
-    BoardData,
-    known_distance_std,
-    say_of_distances,
-)
-from phasemark.render.bench.fit.electron_noise import fit_noise, possible_contrast
-from phasemark.render.bench.fit.fitted_sensor import AmplitudeUnit, FittedField, SensorFit
-from phasemark.render.bench.fit.offsets import fit_offsets
-from phasemark.render.bench.fit.pixel_pattern import odd_pixels, pattern, pattern_fields, pattern_moved
+from phasemark.render.bench.fit.boards import FEWEST_FRAMES, PIXEL_STD_ERROR, BoardData, known_distance_std
+from phasemark.render.bench.fit.fitted_sensor import AmplitudeUnit, Findings, SensorFit
+from phasemark.render.bench.fit.light import fit_light, limit_contrast
+from phasemark.render.bench.fit.ranges import fit_offsets, fit_pixels, odd_pixels, pixel_offsets
 from phasemark.render.frames import Frames
 from phasemark.render.integral.rounding import with_error
 from phasemark.render.sensor.sensor import Sensor
@@ -91,7 +83,6 @@ def fit_sensor(
         )
     if amplitude_unit not in ("electrons", "arbitrary"):
         raise UsageError(f"'amplitude_unit' must be 'electrons' or 'arbitrary', got {amplitude_unit!r}")
-    assumed_albedo = albedo is None
     albedos = [0.8] if albedo is None else list(albedo)
     if len(albedos) == 1:
         albedos *= len(frames)
@@ -105,45 +96,37 @@ def fit_sensor(
                 f"too few frames at {distance:g} m: {one.n_frames}, but at least {FEWEST_FRAMES} are needed to know a "
                 f"pixel's noise to {100 * PIXEL_STD_ERROR:.0f} %"
             )
-    notes: list[str] = []
-    estimates: dict[str, FittedField] = {}
-    distance_std = known_distance_std(distance_m, distance_std_m)
-    data = BoardData.of(frames, distance_m, distance_std, albedos, base).of_usable_boards(distance_m, notes)
-    if assumed_albedo and base.kind == "phase":
-        notes.append("The board's albedo was assumed to be 0.8: only signal_e times albedo was measured.")
-    if not (data.variance_m2[:, data.good] > 0).any():
+    found = Findings()
+    distance_std = known_distance_std(distance_m, distance_std_m, found.notes)
+    data = BoardData.of(frames, distance_m, distance_std, albedos, base, found.notes)
+    if albedo is None and base.kind == "phase":
+        found.notes.append("The board's albedo was assumed to be 0.8: only signal_e times albedo was measured.")
+    if not (data.used(data.variance_m2) > 0).any():
         raise UsageError("the frames have no noise: every range is the same in all of them; is one frame repeated?")
-    notes.append(say_of_distances(distance_std, assumed=distance_std_m is None))
     correlation, correlation_error = data.frame_correlation()
     if abs(correlation) > _CORRELATED_SIGMAS * correlation_error:
-        notes.append(
+        found.notes.append(
             "Frames are not independent: the noise of a pixel correlates by "
             f"{with_error(correlation, correlation_error)} from one frame to the next, as behind a filter in time; "
             "standard errors allow for it, σ may be too small."
         )
-    widening = math.sqrt(max((1 + correlation) / (1 - correlation), 1.0)) if abs(correlation) < 1 else 1.0
-    changes = fit_offsets(data, base, estimates, notes, widening)
-    offset, offset_error = pattern(data, changes)
-    # the pixels that a flat field shows to be odd leave before anything else is measured
-    odd = odd_pixels(data, offset)
-    if odd.any():
-        data = data.without(odd)
-        changes = fit_offsets(data, base, estimates, [], widening)
-        offset, offset_error = pattern(data, changes)
-    offset_error, moved = offset_error * widening, pattern_moved(data, changes)
-    changes |= pattern_fields(data, base, offset, offset_error, moved, odd, estimates)
-    changes |= fit_noise(data, base, amplitude_unit, estimates, notes)
-    fields = {**base.model_dump(), **{name: rounded(value) for name, value in changes.items()}}
+    # the pixels that a flat field shows to be odd leave before anything is measured
+    first = Findings()
+    fit_offsets(data, first)
+    odd = odd_pixels(data, pixel_offsets(data, first)[0])
+    data = data.without(odd)
+    fit_offsets(data, found)
+    offset, offset_error = fit_pixels(data, odd, found)
+    fit_light(data, amplitude_unit, found)
+    fields = {**base.model_dump(), **{name: rounded(value) for name, value in found.fields.items()}}
     if base.kind == "phase":
-        fields["contrast"] = possible_contrast(fields, estimates, notes)
-    sensor = Sensor(**fields)
-    order = {name: position for position, name in enumerate(Sensor.model_fields)}
+        limit_contrast(fields, found)
     return SensorFit(
-        sensor,
-        {name: estimates[name] for name in sorted(estimates, key=order.__getitem__)},
-        tuple(notes),
+        Sensor(**fields),
+        {name: found.estimates[name] for name in Sensor.model_fields if name in found.estimates},
+        tuple(found.notes),
         offset,
-        np.sqrt(offset_error**2 + (moved**2).sum(axis=0)),
+        offset_error,
         np.sqrt(data.variance_m2),
         correlation,
         correlation_error,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -42,6 +42,21 @@ class FittedField:
             return f"assumed: {self.note}"
         error = f", ± {error_text(self.std_error)} (standard error)" if self.std_error > 0 else ""
         return f"measured{error}: {self.note}"
+
+
+@dataclass
+class Findings:
+    """Numbers found so far: fields of the sensor, their estimates, and notes."""
+
+    fields: dict[str, Any] = field(default_factory=dict)
+    estimates: dict[str, FittedField] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def add(self, name: str, value: float, std_error: float | None, note: str) -> None:
+        """Add a measured field; one without standard error is assumed and stays as it is."""
+        self.estimates[name] = FittedField(float(value), None if std_error is None else float(std_error), note)
+        if std_error is not None:
+            self.fields[name] = float(value)
 
 
 @dataclass(frozen=True, eq=False)
