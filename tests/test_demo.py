@@ -38,6 +38,7 @@ def made(tmp_path_factory):
     folder, printed = tmp_path_factory.mktemp("demo") / "out", io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         patch.setattr("phasemark.matcher.sweep.plan.read_sweep_plan", lambda name: small(name=name))
+        patch.setattr("phasemark.matcher.sweep.report._MOST_EXAMPLES", 2)  # a picture takes half a second
         assert main(["demo", "--out", str(folder), "--seed", "7", "--workers", "1"]) == 0
     return SimpleNamespace(folder=folder, printed=printed.getvalue(), trials=read_sweep(folder)[1])
 
@@ -114,7 +115,7 @@ def test_the_report_loads_nothing_and_its_tags_are_balanced(made, page):
     assert read.open == []
     pictures = [source for source in read.sources if source.startswith("data:image/png;base64,")]
     figures = list((made.folder / "figures").glob("*.png"))
-    assert len(pictures) == len(figures) + 2 * 2 + 2 * 5  # two a class; of each method one typical and four worst
+    assert len(pictures) == len(figures) + 2 * 2 + 2 * 2  # two a class; of each method a typical trial and the worst
     for link in set(read.sources) - set(pictures):
         assert f'id="{link[1:]}"' in page if link.startswith("#") else (made.folder / link).is_file()
 

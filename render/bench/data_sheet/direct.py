@@ -183,7 +183,7 @@ def _targets_near(
     by_range = histogram_of(sensor).reports != "z"
     ranges_m = found.distance_m if by_range else found.distance_m / sensor.axis_cosine()[..., None]
     near = (np.abs(ranges_m - range_m[:, None, None, None, None]) < width_m) & (found.status == Status.VALID)
-    return near.sum(axis=-1)[..., bench.alive]
+    return np.asarray(near.sum(axis=-1)[..., bench.alive])
 
 
 def _merging(bench: Bench) -> Iterator[Row]:
@@ -243,9 +243,9 @@ def _ambient(bench: Bench, albedo: float) -> Iterator[Row]:
         "ambient", f"albedo {albedo:g}", ("ambient_photons", "half_found_m"), zip(*rows, strict=True), samples=samples
     )
     title = f"distance at which half of the frames find albedo {albedo:g} (m)"
-    for ambient, *values, _ in rows:
+    for ambient, predicted, simulated, error, _ in rows:
         if np.isclose(ambient, own):
-            yield SheetQuantity(f"half_found_albedo_{albedo:g}_m", title, *values, samples)
+            yield SheetQuantity(f"half_found_albedo_{albedo:g}_m", title, predicted, simulated, error, samples)
 
 
 def _share_found(sensor: Sensor, distance_m: float, albedo: float) -> float:

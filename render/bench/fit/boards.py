@@ -98,7 +98,7 @@ class BoardData:
                 f"{dead.sum()} of {dead.size} pixels never answer and are called dead: does the board fill the image, "
                 "and is it bright enough?"
             )
-        boards = np.flatnonzero(kept)
+        boards: list[int] = np.flatnonzero(kept).tolist()
 
         def moments(name: str) -> tuple[Moments, ...]:
             values = [getattr(one, name) for one in frames]
