@@ -119,10 +119,9 @@ def section(path: str, command: Any, shared: list[str]) -> str:
 def page() -> str:
     """Return the whole page."""
     found = list(commands(typer.main.get_command(app), "phasemark"))
-    index = [f"- [`{path}`](#{path.replace(' ', '-')})" for path, _ in found]
     shared = shared_rows(found)
     common = [f"## {TITLE}", "", *HEADER, *shared, ""]
-    return "\n".join([INTRODUCTION, *index, "", *common, *(section(*one, shared) for one in found)])
+    return "\n".join([INTRODUCTION, *common, *(section(*one, shared) for one in found)])
 
 
 def main() -> None:

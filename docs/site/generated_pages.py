@@ -21,7 +21,7 @@ from public_names import ROOMS, described_at, public_names
 import phasemark
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data.plans.frame_plan import SPREAD_SCHEMA, Distribution
-from phasemark.matcher.plan_kinds import KINDS, plan_example, plan_schema
+from phasemark.matcher.plan_kinds import KINDS, plan_schema
 from phasemark.matcher.sweep.plan import AXES_SCHEMA, Condition
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -71,7 +71,7 @@ def reference_page(*, linked: bool) -> str:
     def label(module: str, name: str) -> str:
         return f"[`{name}`]({reference_path(module)}#{described_at(module, name)})" if linked else f"`{name}`"
 
-    modules = ["## Modules within the rooms", "", "| module | contents | names |", "|---|---|---|"]
+    modules = ["## Modules within the rooms", "", "| module | names |", "|---|---|"]
     for module, names in public_names().items():
         thing = importlib.import_module(module)
         if module in ROOMS:
@@ -82,7 +82,7 @@ def reference_page(*, linked: bool) -> str:
         else:
             place = f"[`{module}`]({reference_path(module)})" if linked else f"`{module}`"
             named = ", ".join(label(module, name) for name in names)
-            modules.append(f"| {place} | {first_line(thing)} | {named} |")
+            modules.append(f"| {place} | {named} |")
     return "\n".join([*lines, *modules, ""])
 
 
@@ -253,7 +253,7 @@ KEYS_HEADER = ("| key | takes | default | meaning |", "|---|---|---|---|")
 
 
 def plans_page() -> str:
-    """Return the page of plans: every key of every kind, with an example."""
+    """Return the page of plans: every key of every kind."""
     lines = [
         "# Plans",
         "",
@@ -273,8 +273,6 @@ def plans_page() -> str:
         named = [row.split()[1] for row in rows if row in shared]
         if named:
             lines += [f"Also [explained above](#keys-of-several-kinds-of-plan): {', '.join(named)}.", ""]
-        lines += [f"The example of kind `{kind}`:", "", "```toml"]
-        lines += [plan_example(kind).rstrip(), "```", ""]
         tables.update(schema.get("$defs", {}))
     tables[Distribution.__name__] = Distribution.model_json_schema()
     lines += ["## Tables within plans", "", *_axes_table()]
