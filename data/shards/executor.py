@@ -7,9 +7,8 @@ to another worker, and nothing changes.
 from __future__ import annotations
 
 import os
-import queue
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
@@ -51,48 +50,14 @@ def run_tasks(
     n_threads : int
     stop : callable, optional
     """
-    items = list(todo)
-    waiting = iter(items)
-    turn = threading.Lock()
-    ended = threading.Event()
-    answers: queue.SimpleQueue[tuple[T, R] | BaseException] = queue.SimpleQueue()
-
-    def work() -> None:
-        while not ended.is_set():
-            with turn:
-                try:
-                    item = next(waiting)
-                except StopIteration:
-                    return
-            try:
-                answers.put((item, task(item)))
-            except BaseException as error:
-                answers.put(error)
-                return
-
-    threads = [threading.Thread(target=work, daemon=True) for _ in range(min(n_threads, len(items)))]
-    finished = False
-    try:
-        for thread in threads:
-            thread.start()
-        for _ in items:
-            answer = _wait(answers)
-            if isinstance(answer, BaseException):
-                raise answer
-            yield answer
-        finished = True
-    finally:
-        ended.set()
-        if not finished and stop is not None:
-            stop()
-        for thread in threads:
-            if thread.ident is not None:
-                thread.join()
-
-
-def _wait(answers: queue.SimpleQueue[Any]) -> Any:
-    while True:
+    with ThreadPoolExecutor(max(n_threads, 1)) as pool:
+        items = {pool.submit(task, item): item for item in todo}
+        finished = False
         try:
-            return answers.get(timeout=0.5)  # a wait without end would hold back signals on some platforms
-        except queue.Empty:
-            continue
+            for future in as_completed(items):
+                yield items[future], future.result()
+            finished = True
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            if not finished and stop is not None:
+                stop()
