@@ -8,10 +8,12 @@ import os
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
@@ -117,6 +119,15 @@ class PlanModel(BaseModel):
         """Return where a key belongs that this table does not have, or None if nobody knows."""
         return None
 
+    @classmethod
+    def with_named_tables(cls, table: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """Return the content of a plan's file with the tables that it only names, read from files of its folder."""
+        return table
+
+    def in_folder(self, folder: Path) -> Self:
+        """Return the plan of a file in a folder: names of files are relative to it."""
+        return self
+
 
 class MeshPlan(PlanModel):
     """A landmark from a mesh file.
@@ -148,6 +159,16 @@ class MeshPlan(PlanModel):
     symmetry: Annotated[int, Field(ge=1, le=MAX_SYMMETRY)] | None = None
     albedo: _Albedo = 0.8
 
+    def read(self) -> trimesh.Trimesh:
+        """Return the mesh of the file, metres, landmark frame.
+
+        Raises
+        ------
+        InputFileError, UsageError
+            As :func:`phasemark.landmarks.read_mesh`.
+        """
+        return read_mesh(self.path, unit=self.unit, up=self.up, origin=self.origin)
+
 
 class ScenePlan(PlanModel, ABC):
     """Landmarks and camera of a plan.
@@ -171,6 +192,11 @@ class ScenePlan(PlanModel, ABC):
     meshes: tuple[MeshPlan, ...] = ()
     sensor: str = "pmd-16x16"
     sensor_overrides: dict[str, Any] = Field(default_factory=dict)
+
+    def in_folder(self, folder: Path) -> Self:
+        """Return the plan of a file in a folder: names of mesh files and of a sensor file are relative to it."""
+        meshes = tuple(mesh.model_copy(update={"path": str(folder / mesh.path)}) for mesh in self.meshes)
+        return self.model_copy(update={"meshes": meshes, "sensor": sensor_in_folder(self.sensor, folder)})
 
     @abstractmethod
     def resolve(self) -> Self:
@@ -225,14 +251,9 @@ def find_symmetries(meshes: Sequence[MeshPlan]) -> list[MeshPlan]:
     found = []
     for part in meshes:
         if part.symmetry is None:
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", MeshWarning)  # reading it for its images warns once
-                    mesh = read_mesh(part.path, unit=part.unit, up=part.up, origin=part.origin)
-            except PhasemarkError:
-                found.append(part)
-                continue
-            part = part.model_copy(update={"symmetry": mesh_symmetry(mesh)})
+            with suppress(PhasemarkError), warnings.catch_warnings():
+                warnings.simplefilter("ignore", MeshWarning)  # reading it for its images warns once
+                part = part.model_copy(update={"symmetry": mesh_symmetry(part.read())})
         found.append(part)
     return found
 
@@ -332,24 +353,21 @@ class BankPlan(ScenePlan):
         """
         specs, meshes = self.resolve_landmarks()
         if self.albedo is not None:
-            specs = [LandmarkSpec(**{**spec.model_dump(), "albedo": self.albedo}) for spec in specs]
-            meshes = [MeshPlan(**{**mesh.model_dump(), "albedo": self.albedo}) for mesh in meshes]
+            specs = [spec.model_copy(update={"albedo": self.albedo}) for spec in specs]
+            meshes = [mesh.model_copy(update={"albedo": self.albedo}) for mesh in meshes]
         meshes = find_symmetries(meshes)
         period_deg = 360 / common_symmetry([*specs, *meshes])
         delta_deg = parse_grid(self.delta_deg or f"0:{period_deg!r}:{DEFAULT_DELTA_STEP_DEG}", "delta_deg")
-        return type(self)(
-            landmarks=tuple(specs),
-            meshes=tuple(meshes),
-            sensor=self.sensor,
-            sensor_overrides=self.build_sensor().model_dump(mode="json"),
-            distance_m=self.distance_m,
-            delta_deg=drop_repeated_stop(delta_deg, period_deg).tolist(),
-            model=self.model,
-            layout=self.layout,
-            harmonics=self.harmonics,
-            region=self._resolved_region(specs, meshes),
-            binning=self.binning,
-            margin_deg=self.margin_deg,
+        return self.model_copy(
+            update={
+                "classes": (),
+                "landmarks": tuple(specs),
+                "meshes": tuple(meshes),
+                "sensor_overrides": self.build_sensor().model_dump(mode="json"),
+                "delta_deg": tuple(drop_repeated_stop(delta_deg, period_deg).tolist()),
+                "albedo": None,
+                "region": self._resolved_region(specs, meshes),
+            }
         )
 
     def _resolved_region(
@@ -363,7 +381,7 @@ class BankPlan(ScenePlan):
             region = whole_region(sensor, self.binning)
         elif self.region == "landmark":
             shapes = [build_mesh(spec) for spec in specs]
-            shapes += [read_mesh(part.path, unit=part.unit, up=part.up, origin=part.origin) for part in meshes]
+            shapes += [part.read() for part in meshes]
             margin_rad = math.radians(self.margin_deg)
             region = landmark_region(sensor, shapes, self.distance_m, self.binning, margin_rad)
         else:
@@ -394,7 +412,7 @@ class BankPlan(ScenePlan):
         return np.deg2rad(self.delta_deg)
 
 
-P = TypeVar("P", bound=ScenePlan)
+P = TypeVar("P", bound=PlanModel)
 
 
 def read_bank_plan(path: str | os.PathLike[str]) -> BankPlan:
@@ -427,11 +445,11 @@ def read_plan(path: str | os.PathLike[str], model: type[P]) -> P:
     path : path-like
         The file.
     model : type
-        :class:`BankPlan` or :class:`phasemark.data.FramePlan`.
+        :class:`BankPlan`, :class:`phasemark.data.FramePlan` or the class of another plan.
 
     Returns
     -------
-    ScenePlan
+    PlanModel
         Of the type `model`.
 
     Raises
@@ -442,14 +460,16 @@ def read_plan(path: str | os.PathLike[str], model: type[P]) -> P:
         With one line that names the file, the key, the value and what would be right.
     """
     path = Path(path)
-    table = read_toml(path)
+    table = model.with_named_tables(read_toml(path), path.parent)
     try:
-        plan = model(**table)
+        return model(**table).in_folder(path.parent)
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from None
-    meshes = [MeshPlan(**{**mesh.model_dump(), "path": str(path.parent / mesh.path)}) for mesh in plan.meshes]
-    sensor = str(path.parent / plan.sensor) if _is_file(plan.sensor) else plan.sensor
-    return plan.model_copy(update={"meshes": tuple(meshes), "sensor": sensor})
+
+
+def sensor_in_folder(sensor: str, folder: Path) -> str:
+    """Return the sensor of a plan: a preset's name, or a file, whose name is relative to the plan's folder."""
+    return str(folder / sensor) if _is_file(sensor) else sensor
 
 
 def _is_file(sensor: str) -> bool:

@@ -15,8 +15,7 @@ from pydantic import Field, model_validator
 
 from phasemark import UsageError
 from phasemark.data import BankPlan
-from phasemark.data.plans.bank_plan import PlanModel, factored_refusal
-from phasemark.inputs.toml_file import read_toml
+from phasemark.data.plans.bank_plan import PlanModel, factored_refusal, read_plan, sensor_in_folder
 from phasemark.render import Sensor
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -163,6 +162,10 @@ class DesignPlan(PlanModel):
             )
         return self
 
+    def in_folder(self, folder: Path) -> Self:
+        """Return the plan of a file in a folder: the name of a sensor file is relative to it."""
+        return self.model_copy(update={"sensor": sensor_in_folder(self.sensor, folder)})
+
     def build_sensor(self) -> Sensor:
         """Return the sensor, overrides applied.
 
@@ -212,15 +215,7 @@ def read_design_plan(path: str | os.PathLike[str]) -> DesignPlan:
     UsageError
         With one line that names the file, the key, the value and what would be right.
     """
-    path = Path(path)
-    table = read_toml(path)
-    sensor = table.get("sensor")
-    if isinstance(sensor, str) and (sensor.endswith(".toml") or "/" in sensor):
-        table["sensor"] = str(path.parent / sensor)
-    try:
-        return DesignPlan(**table)
-    except UsageError as error:
-        raise UsageError(f"{path}: {error}") from None
+    return read_plan(path, DesignPlan)
 
 
 def example_design() -> str:

@@ -7,15 +7,14 @@ import os
 import tomllib
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from phasemark import UsageError
-from phasemark.data.plans.bank_plan import PlanModel
-from phasemark.inputs.toml_file import read_toml
+from phasemark.data.plans.bank_plan import PlanModel, read_plan
 from phasemark.matcher.position.landmark_map import LandmarkMap, Point, Std, read_landmark_map
 from phasemark.render import Sensor, preset
 
@@ -200,6 +199,12 @@ class DrivePlan(PlanModel):
     camera: CameraPlan = CameraPlan()
     stop: StopPlan = StopPlan()
 
+    @classmethod
+    def with_named_tables(cls, table: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """Return the content of a plan's file with its map, which may be the name of a file of its folder."""
+        named = table.get("map")
+        return {**table, "map": read_landmark_map(folder / named)} if isinstance(named, str) else table
+
     @model_validator(mode="after")
     def _fits_the_room(self) -> Self:
         for k, point in enumerate(self.path.waypoints_m):
@@ -248,14 +253,7 @@ def read_drive_plan(path: str | os.PathLike[str]) -> DrivePlan:
     UsageError
         With one line that names the file, the key, the value and what would be right.
     """
-    path = Path(path)
-    table = read_toml(path)
-    if isinstance(table.get("map"), str):
-        table["map"] = read_landmark_map(path.parent / table["map"])
-    try:
-        return DrivePlan(**table)
-    except UsageError as error:
-        raise UsageError(f"{path}: {error}") from None
+    return read_plan(path, DrivePlan)
 
 
 def example_drive() -> str:

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict, Field, model_validator
 
 from phasemark import UsageError
-from phasemark.data.plans.bank_plan import PlanModel
-from phasemark.inputs.toml_file import read_toml
+from phasemark.data.plans.bank_plan import PlanModel, read_plan
 from phasemark.matcher.position.robot_pose import RobotPose, ViewEstimate, robot_poses
 
 Coordinate = Annotated[float, Field(allow_inf_nan=False)]
@@ -226,8 +225,4 @@ def read_landmark_map(path: str | os.PathLike[str]) -> LandmarkMap:
     UsageError
         With one line that names the file, the key, the value and what would be right.
     """
-    table = read_toml(path)
-    try:
-        return LandmarkMap(**table)
-    except UsageError as error:
-        raise UsageError(f"{os.fspath(path)}: {error}") from None
+    return read_plan(path, LandmarkMap)
