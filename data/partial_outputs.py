@@ -7,8 +7,9 @@ import math
 import os
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -98,18 +99,15 @@ class PartJob:
         Which of how many, counted from 1.
     """
 
+    maker = "phasemark.data.partial_outputs:job_of"
+
     def __init__(self, job: Job, part: int, parts: int) -> None:
         self._job, self._part, self._parts = job, part, parts
         self._total = sum(job.items)
-        self.start, self.stop = self._total * (part - 1) // parts, self._total * part // parts
+        self.start, self.stop = _shared(self._total, part, parts)
         if self.start == self.stop:
             raise UsageError(f"part={part}/{parts} would be empty: there are only {self._total} items to share")
         self._pieces = list(pieces(job.items, self.start, self.stop))
-
-    @property
-    def maker(self) -> str:
-        """What makes this job in another process."""
-        return "phasemark.data.partial_outputs:job_of"
 
     def spec(self) -> dict[str, Any]:
         """Return a description from which another process makes the same job."""
@@ -129,17 +127,20 @@ class PartJob:
         whole, whole_places = self._job.lay_out()
         places = []
         with Layout() as layout:
-            file = layout.file
-            file.attrs["format"] = FORMAT
-            file.attrs["schema_version"] = SCHEMA_VERSION
-            file.attrs["spec"] = json_text(self._job.spec())
-            file.attrs["identity"] = json_text(self._job.identity(), sort_keys=True)
-            file.attrs["header_sha256"] = whole.sha256()
-            file.attrs["items"] = np.array([self.start, self.stop, self._total], dtype="<i8")
+            layout.file.attrs.update(
+                {
+                    "format": FORMAT,
+                    "schema_version": SCHEMA_VERSION,
+                    "spec": json_text(self._job.spec()),
+                    "identity": json_text(self._job.identity(), sort_keys=True),
+                    "header_sha256": whole.sha256(),
+                    "items": np.array([self.start, self.stop, self._total], dtype="<i8"),
+                }
+            )
             for k, (slab, start, stop) in enumerate(self._pieces):
                 fields = []
                 for field, where in enumerate(whole_places[slab]):
-                    _, offset = layout.reserve(file, _name(k, field), (stop - start, where.stride), "|u1")
+                    _, offset = layout.reserve(layout.file, _name(k, field), (stop - start, where.stride), "|u1")
                     fields.append(Place(offset, where.stride))
                 places.append(fields)
         return layout, places
@@ -148,6 +149,11 @@ class PartJob:
         """Make some items of a piece."""
         of, first, _ = self._pieces[slab]
         return self._job.make(of, first + start, first + stop)
+
+
+def _shared(total: int, part: int, parts: int) -> tuple[int, int]:
+    """Return first and stop of the items of a part."""
+    return total * (part - 1) // parts, total * part // parts
 
 
 def _name(piece: int, field: int) -> str:
@@ -193,16 +199,12 @@ def build_part(
 
 
 def _finished_identity(path: Path) -> dict[str, Any]:
-    with open_hdf5(path, "shard", untrusted=True) as file, reading(path):
-        check_format(file, path, "shard", FORMAT, SCHEMA_VERSION)
-        spec: dict[str, Any] = json.loads(file.attrs["identity"])
-        start, stop, total = (int(k) for k in file.attrs["items"])
-        parts = round(total / (stop - start))
-        for n in range(max(1, parts - 1), parts + 2):
-            for i in range(1, n + 1):
-                if (total * (i - 1) // n, total * i // n) == (start, stop):
-                    return {**spec, "shard": f"{i}/{n}"}
-    return {**spec, "shard": None}
+    with ExitStack() as stack:
+        found = _opened(path, stack)
+    parts = round(found.total / (found.stop - found.start))
+    named = ((part, n) for n in range(max(1, parts - 1), parts + 2) for part in range(1, n + 1))
+    which = next((name for name in named if _shared(found.total, *name) == (found.start, found.stop)), None)
+    return {**found.identity, "shard": which and "{}/{}".format(*which)}
 
 
 def merge_parts(
@@ -239,32 +241,33 @@ def merge_parts(
     refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=map(Path, parts))
     if not parts:
         raise UsageError("give the shards to merge")
-    opened = [_Part(Path(part)) for part in parts]
-    try:
-        job = MergeJob(opened)
+    with ExitStack() as stack:
+        for part in parts:
+            verify_checksum(part)
+        job = MergeJob([_opened(Path(part), stack) for part in parts])
         return produce(job, path, finished=lambda _: job.identity(), force=force, resume=resume, progress=progress)
-    finally:
-        for part in opened:
-            part.file.close()
 
 
-class _Part:
+class _Part(NamedTuple):
     """An open part."""
 
-    def __init__(self, path: Path) -> None:
-        verify_checksum(path)
-        self.path = path
-        self.file: h5py.File = open_hdf5(path, "shard", untrusted=True)
-        try:
-            with reading(path):
-                check_format(self.file, path, "shard", FORMAT, SCHEMA_VERSION)
-                self.spec: dict[str, Any] = json.loads(self.file.attrs["spec"])
-                self.identity: dict[str, Any] = json.loads(self.file.attrs["identity"])
-                self.header_sha256 = str(self.file.attrs["header_sha256"])
-                self.start, self.stop, self.total = (int(k) for k in self.file.attrs["items"])
-        except BaseException:
-            self.file.close()
-            raise
+    path: Path
+    file: h5py.File
+    spec: dict[str, Any]
+    identity: dict[str, Any]
+    header_sha256: str
+    start: int
+    stop: int
+    total: int
+
+
+def _opened(path: Path, stack: ExitStack) -> _Part:
+    """Open a part, which the stack closes."""
+    file = stack.enter_context(open_hdf5(path, "shard", untrusted=True))
+    with reading(path):
+        check_format(file, path, "shard", FORMAT, SCHEMA_VERSION)
+        spec, identity = (json.loads(file.attrs[name]) for name in ("spec", "identity"))
+        return _Part(path, file, spec, identity, str(file.attrs["header_sha256"]), *map(int, file.attrs["items"]))
 
 
 class MergeJob:
@@ -286,29 +289,13 @@ class MergeJob:
         if reached < first.total:
             raise InputFileError(f"shards are missing: no items {reached} … {first.total - 1} of {first.total}")
         with reading(first.path):
-            self._job = job_of(first.spec)
-        if changes := difference(first.identity, json.loads(json.dumps(self._job.identity()))):
+            job = job_of(first.spec)
+        if changes := difference(first.identity, json.loads(json.dumps(job.identity()))):
             raise OutputExistsError(
                 f"{first.path}: was built elsewhere with something else ({'; '.join(changes[:4])}): merge it there"
             )
-
-    @property
-    def maker(self) -> str:
-        """What makes this job in another process."""
-        return "phasemark.data.partial_outputs:job_of"
-
-    def spec(self) -> dict[str, Any]:
-        """Return the description that the parts were made from."""
-        return self._job.spec()
-
-    @property
-    def items(self) -> Sequence[int]:
-        """How many items each slab has."""
-        return self._job.items
-
-    def identity(self) -> dict[str, Any]:
-        """Return all that the file's bytes depend on."""
-        return self._job.identity()
+        self._job = job
+        self.maker, self.spec, self.items, self.identity = job.maker, job.spec, job.items, job.identity
 
     def lay_out(self) -> tuple[Layout, list[list[Place]]]:
         """Return all but the values, and where these go."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError
-from phasemark.data.bank.bank_file import Bank, open_bank
+from phasemark.data.bank.bank_file import Bank
 from phasemark.data.bank.build_bank import BankJob
 from phasemark.data.files.hdf5_reading import reading
 from phasemark.data.files.provenance import mesh_sha256
 from phasemark.data.frames.build_frames import FrameJob
-from phasemark.data.frames.frame_set_file import FrameSet, open_frames
+from phasemark.data.frames.frame_set_file import FrameSet
 from phasemark.data.plans.arrays import HISTOGRAM_FIELDS
+from phasemark.data.scene_job import SceneJob, StoredMesh
 from phasemark.data.seeds import stream
+from phasemark.data.stored_scene import StoredScene, open_scene
 from phasemark.inputs import verify_checksum
 from phasemark.render.phasor_images import wrap_difference_m
 
@@ -55,10 +58,7 @@ def verify_bank(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0
     InputFileError
         Naming the first thing that is wrong.
     """
-    digest = verify_checksum(path)
-    with open_bank(path, untrusted=True) as bank:
-        job = BankJob(bank.plan, bank.mesh)
-        return _verify(Path(path), digest, bank, job, sample, seed)
+    return _verify(Path(path), Bank, BankJob, sample, seed)
 
 
 def verify_frames(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0) -> dict[str, Any]:
@@ -83,15 +83,15 @@ def verify_frames(path: str | os.PathLike[str], *, sample: int = 16, seed: int =
     InputFileError
         Naming the first thing that is wrong.
     """
-    digest = verify_checksum(path)
-    with open_frames(path, untrusted=True) as frames:
-        job = FrameJob(frames.plan, frames.mesh)
-        return _verify(Path(path), digest, frames, job, sample, seed)
+    return _verify(Path(path), FrameSet, FrameJob, sample, seed)
 
 
 def _verify(
-    path: Path, digest: str, opened: Bank | FrameSet, job: BankJob | FrameJob, sample: int, seed: int
+    path: Path, kind: type[StoredScene], job_of: Callable[[Any, StoredMesh], SceneJob[Any]], sample: int, seed: int
 ) -> dict[str, Any]:
+    digest = verify_checksum(path)
+    with open_scene(kind, path, untrusted=True) as opened:
+        job = job_of(opened.plan, opened.mesh)
     with h5py.File(path, "r") as file, reading(path):
         values = _check_values(file, path)
         if isinstance(job, FrameJob):
@@ -159,7 +159,7 @@ def _close(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _compare(
-    path: Path, item: int, job: BankJob | FrameJob, stored: dict[str, NDArray[Any]], made: dict[str, NDArray[Any]]
+    path: Path, item: int, job: SceneJob[Any], stored: dict[str, NDArray[Any]], made: dict[str, NDArray[Any]]
 ) -> None:
     for name, old in stored.items():
         new = made[name].reshape(old.shape)

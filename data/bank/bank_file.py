@@ -6,34 +6,22 @@ import os
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import h5py
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, UsageError
-from phasemark.data.files.hdf5_reading import (
-    check_format,
-    dataset_of,
-    frozen,
-    group_of,
-    json_attribute,
-    open_hdf5,
-    reading,
-    whole_numbers,
-)
+from phasemark.data.files.hdf5_reading import dataset_of, frozen, group_of, json_attribute, reading
 from phasemark.data.pages.notebook import facts_html
-from phasemark.data.plans.arrays import IMAGE_DIMS, LAYOUT_GROUPS, PHASOR_DIMS, VIEW_DIMS, GroupName, group_rows
+from phasemark.data.plans.arrays import IMAGE_ARRAYS, LAYOUT_GROUPS, PHASOR_DIMS, VIEW_DIMS, GroupName, group_rows
 from phasemark.data.plans.bank_plan import BankPlan
 from phasemark.data.plans.grid_axis import format_grid
+from phasemark.data.stored_scene import StoredScene, open_scene
 from phasemark.inputs.numbers import in_words
 from phasemark.render import PhasorImages, Sensor, Views
 
-FORMAT = "phasemark-bank"
-SCHEMA_VERSION = 1
 _IMAGES = ("_phasors", "intensity", "coverage")
 _PART_BYTES = 1 << 24
 _COVERAGE_SLACK = 0.01
@@ -78,9 +66,9 @@ class BankGroup:
         view_dims = VIEW_DIMS[name]
         coordinates = {dim: self._coordinate(dim) for dim in (*view_dims, *PHASOR_DIMS)}
         sizes = {dim: len(values) for dim, values in coordinates.items()}
-        for field, dims in (("phasor", PHASOR_DIMS), ("intensity", IMAGE_DIMS), ("coverage", IMAGE_DIMS)):
+        for field, array in IMAGE_ARRAYS.items():
             dataset = dataset_of(group, field, self._path)
-            expected = tuple(sizes[dim] for dim in (*view_dims, *dims))
+            expected = tuple(sizes[dim] for dim in (*view_dims, *array.dims))
             if dataset.shape != expected or dataset.dtype.kind != "f":
                 raise InputFileError(
                     f"{path}: '{name}/{field}' must be floats of shape {expected},"
@@ -221,8 +209,10 @@ class BankGroup:
         return bool(missing) or not _increases(held)
 
 
-class Bank:
+class Bank(StoredScene):
     """Model images over distance, angle and class; made by :func:`open_bank`, and a context manager.
+
+    ``mesh(class_name)`` returns the mesh of a class, and ``close()`` closes the file.
 
     Parameters
     ----------
@@ -257,15 +247,15 @@ class Bank:
         What the bank was made with.
     """
 
+    WHAT = "bank"
+    FORMAT = "phasemark-bank"
+    plan: BankPlan
+
     def __init__(self, file: h5py.File, path: Path) -> None:
-        self._file = file
-        self.path = path
-        check_format(file, path, "bank", FORMAT, SCHEMA_VERSION)
-        self.sensor = Sensor(**json_attribute(file, path, "sensor"))
+        super().__init__(file, path)
         self.plan = BankPlan(**json_attribute(file, path, "plan"))
         self.region = self.plan.pixel_region()
         self.camera = self.sensor if self.region is None else self.plan.build_sensor()
-        self.versions: dict[str, str] = json_attribute(file, path, "versions")
         self.layout = self.plan.layout
         groups: dict[str, BankGroup] = {
             name: BankGroup(name, group_of(file, name, path), path, self.sensor) for name in LAYOUT_GROUPS[self.layout]
@@ -281,27 +271,6 @@ class Bank:
             raise InputFileError(f"{path}: 'lower/distance' and 'upper/distance' must agree")
         for name in self.classes:
             group_of(file, f"meshes/{name}", path)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Copy and pickle a bank as the file that it is: it is opened again."""
-        return open_bank, (self.path.absolute(),)
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the file can be read."""
-        return bool(self._file)
-
-    def close(self) -> None:
-        """Close the file; arrays read before stay usable."""
-        self._file.close()
 
     def __repr__(self) -> str:
         """Return one line with the content of the bank, open or closed."""
@@ -365,35 +334,15 @@ class Bank:
             },
         )
 
-    def mesh(self, class_name: str) -> trimesh.Trimesh:
-        """Return the mesh of a class, metres, landmark frame; ``metadata`` has `symmetry` and `albedo`.
-
-        Raises
-        ------
-        UsageError
-            The bank does not have the class.
-        InputFileError
-            The mesh in the file is damaged.
-        """
-        self._class_index(class_name)
-        return read_mesh_group(self._file, class_name, self.path)
-
-    def identity(self) -> dict[str, Any]:
-        """Return everything that the bank's bytes depend on: resolved plan, versions, mesh hashes."""
-        with reading(self.path):
-            hashes = {name: str(self._file[f"meshes/{name}"].attrs["sha256"]) for name in self.classes}
-        return {"plan": json_attribute(self._file, self.path, "plan"), "versions": self.versions, "mesh_sha256": hashes}
-
     def info(self) -> dict[str, Any]:
         """Return the content of the bank in plain numbers and text."""
         groups = [group for group in (self.lower, self.upper, self.full) if group is not None]
-        views = {group.name: int(np.prod(self._file[group.name]["phasor"].shape[:-4])) for group in groups}
-        with reading(self.path):
-            hashes = {name: str(self._file[f"meshes/{name}"].attrs["sha256"]) for name in self.classes}
+        file = self._open()
+        views = {group.name: int(np.prod(file[group.name]["phasor"].shape[:-4])) for group in groups}
         return {
             "path": str(self.path),
-            "size_bytes": int(self._file.id.get_filesize()),
-            "schema_version": int(self._file.attrs["schema_version"]),
+            "size_bytes": int(file.id.get_filesize()),
+            "schema_version": int(file.attrs["schema_version"]),
             "layout": self.layout,
             "model": self.plan.model,
             "classes": list(self.classes),
@@ -407,7 +356,7 @@ class Bank:
             "cols": self.sensor.cols,
             **self._region_info(),
             **self._kind_info(groups[0]),
-            "mesh_sha256": hashes,
+            "mesh_sha256": self.identity()["mesh_sha256"],
             "versions": self.versions,
         }
 
@@ -448,11 +397,6 @@ class Bank:
             return np.asarray(images(self.full)[k, i, j])
         return np.concatenate([images(self.upper)[k, i], images(self.lower)[i, j]])
 
-    def _class_index(self, class_name: str) -> int:
-        if class_name not in self.classes:
-            raise UsageError(f"unknown class {class_name!r}: {self.path} has {', '.join(self.classes)}")
-        return self.classes.index(class_name)
-
 
 def open_bank(path: str | os.PathLike[str], *, untrusted: bool = False) -> Bank:
     """Open a bank.
@@ -474,43 +418,7 @@ def open_bank(path: str | os.PathLike[str], *, untrusted: bool = False) -> Bank:
     InputFileError
         The file cannot be read, is not a bank, was made by a newer version, or is damaged.
     """
-    path = Path(path)
-    file = open_hdf5(path, "bank", untrusted=untrusted)
-    try:
-        with reading(path):
-            return Bank(file, path)
-    except BaseException:
-        file.close()
-        raise
-
-
-_FARTHEST_VERTEX_M = 1e3
-"""No landmark is so large; damage that leaves a number often is."""
-
-
-def read_mesh_group(file: h5py.File, class_name: str, path: Path) -> trimesh.Trimesh:
-    """Return the mesh of a class as a bank or a frame set holds it, checked."""
-    group = group_of(file, f"meshes/{class_name}", path)
-    with reading(path):
-        vertices = group["vertices"][...].astype(np.float64)
-        faces = whole_numbers(group["faces"], path)
-        part = whole_numbers(group["part"], path) if "part" in group else None
-        period_deg, albedo = float(group.attrs["delta_period_deg"]), float(group.attrs["albedo"])
-    if not 1 <= period_deg <= 360:  # as the plan has it: a symmetry of 1 … 360
-        raise InputFileError(f"{path}: 'delta_period_deg' of '{class_name}' must be in [1, 360], got {period_deg:g}")
-    if not (vertices.ndim == faces.ndim == 2 and vertices.shape[1:] == faces.shape[1:] == (3,) and faces.size):
-        raise InputFileError(f"{path}: 'meshes/{class_name}' must hold rows of three, of vertices and faces")
-    if not (np.abs(vertices) <= _FARTHEST_VERTEX_M).all() or faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputFileError(f"{path}: 'meshes/{class_name}' has vertices that are not within 1 km, or not there")
-    if part is not None and (part.shape != faces.shape[:1] or part.min() < 0 or part.max() > 1):
-        raise InputFileError(f"{path}: 'meshes/{class_name}/part' must have one value for each face, 0 or 1")
-    return trimesh.Trimesh(
-        vertices,
-        faces,
-        process=False,
-        face_attributes=None if part is None else {"part": part.astype(np.uint8)},
-        metadata={"name": class_name, "symmetry": round(360 / period_deg), "albedo": albedo},
-    )
+    return open_scene(Bank, path, untrusted=untrusted)
 
 
 def _increases(values: NDArray[Any]) -> bool:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-import json
 import os
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,18 +11,14 @@ from typing import Any, Literal
 
 import h5py
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.data.bank.bank_file import FORMAT, SCHEMA_VERSION, Bank, open_bank
+from phasemark.data.bank.bank_file import Bank, open_bank
 from phasemark.data.files.hdf5_layout import Layout
-from phasemark.data.files.json_text import json_text
-from phasemark.data.files.narrow import narrowed
-from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.files.same_file import named_files
 from phasemark.data.plans.arrays import (
-    IMAGE_DIMS,
+    IMAGE_ARRAYS,
     LAYOUT_GROUPS,
     PHASOR_DIMS,
     VIEW_DIMS,
@@ -33,32 +26,19 @@ from phasemark.data.plans.arrays import (
     bank_frequencies_hz,
     group_rows,
 )
-from phasemark.data.plans.bank_plan import BankPlan, MeshPlan, factored_refusal
+from phasemark.data.plans.bank_plan import BankPlan, factored_refusal
 from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
+from phasemark.data.scene_job import Landmark, SceneJob, StoredMesh, make_scale, reserve_array
 from phasemark.data.shards.build import Place
 from phasemark.data.shards.run import produce, refuse_unwritable_output
-from phasemark.landmarks import LandmarkSpec, build_mesh, mesh_symmetry, read_mesh
-from phasemark.landmarks.mesh_files import MeshWarning
+from phasemark.landmarks import LandmarkSpec, build_mesh
 from phasemark.landmarks.spec import Revolution
-from phasemark.landmarks.symmetry import has_symmetry, is_same_shape, symmetry_tolerance_m
 from phasemark.render import PhasorImages, Renderer, Sensor, Views
 from phasemark.render.planar import PlanarLandmark, planar_images
 from phasemark.render.renderer import Variant
 
 ImagesOf = Callable[[Views], PhasorImages]
-StoredMesh = Callable[[str], trimesh.Trimesh]
-
-
-@dataclass(frozen=True)
-class Landmark:
-    """A class of the bank: its mesh, and its description unless it came from a file."""
-
-    name: str
-    mesh: trimesh.Trimesh
-    symmetry: int
-    albedo: float
-    spec: LandmarkSpec | None = None
 
 
 def build_bank(
@@ -127,15 +107,10 @@ def build_bank(
     refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=inputs)
     job = BankJob(plan)
     produce(
-        job, path, finished=_finished_identity, force=force, resume=resume, workers=workers, shard_items=shard_items,
-        scheduler=scheduler, progress=progress,
+        job, path, finished=job.finished_identity, force=force, resume=resume, workers=workers,
+        shard_items=shard_items, scheduler=scheduler, progress=progress,
     )  # fmt: skip
     return open_bank(path)
-
-
-def _finished_identity(path: Path) -> dict[str, Any]:
-    with open_bank(path, untrusted=True) as bank:
-        return bank.identity()
 
 
 def rebuild_bank(
@@ -188,7 +163,8 @@ def rebuild_bank(
     )
     with TemporaryDirectory(prefix="phasemark-") as folder:
         path = Path(folder) / "bank.h5"
-        produce(BankJob(plan, bank.mesh), path, finished=_finished_identity, workers=workers)
+        job = BankJob(plan, bank.mesh)
+        produce(job, path, finished=job.finished_identity, workers=workers)
         return open_bank(path)
 
 
@@ -203,8 +179,8 @@ class _Slab:
     renderer: Renderer | None
 
 
-class BankJob:
-    """A bank to be built (:class:`phasemark.data.shards.build.Job`): one slab of images for each class or part.
+class BankJob(SceneJob[BankPlan]):
+    """A bank to be built: one slab of images for each class or part.
 
     Parameters
     ----------
@@ -213,21 +189,13 @@ class BankJob:
         Returns the mesh of a class, in place of the mesh file that the plan names.
     """
 
+    KIND, STORED, fields = "bank", Bank, tuple(IMAGE_ARRAYS)
+
     def __init__(self, plan: BankPlan, stored_mesh: StoredMesh | None = None) -> None:
-        self.plan = plan.resolve()
-        _refuse_impossible(self.plan)
-        self.sensor = self.plan.image_sensor()
-        self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
+        plan = plan.resolve()
+        _refuse_impossible(plan)
+        super().__init__(plan, plan.image_sensor(), stored_mesh)
         self._slabs = list(_slabs(self.plan, self.sensor, self.landmarks))
-
-    @property
-    def maker(self) -> str:
-        """What makes this job in another process."""
-        return "phasemark.data.partial_outputs:job_of"
-
-    def spec(self) -> dict[str, Any]:
-        """Return a description from which another process makes the same job."""
-        return {"kind": "bank", "plan": self.plan.model_dump(mode="json")}
 
     @property
     def items(self) -> list[int]:
@@ -251,43 +219,48 @@ class BankJob:
             if slab.renderer is not None:
                 slab.renderer.check_can_be_seen(slab.views.in_camera(self.sensor), None)
 
-    def identity(self) -> dict[str, Any]:
-        """Return all that the bank's bytes depend on."""
-        return {
-            "plan": self.plan.model_dump(mode="json"),
-            "versions": versions(),
-            "mesh_sha256": {landmark.name: mesh_sha256(landmark.mesh) for landmark in self.landmarks},
-        }
+    def attributes(self) -> dict[str, str]:
+        """Return layout and model."""
+        return {"layout": self.plan.layout, "model": self.plan.model}
 
-    def lay_out(self) -> tuple[Layout, list[list[Place]]]:
-        """Return all but the images, and for each slab where phasor, intensity and coverage go."""
-        plan = self.plan
+    def lay_out_arrays(self, layout: Layout) -> list[list[Place]]:
+        """Write coordinates, and return for each slab where phasor, intensity and coverage go."""
         places: dict[tuple[GroupName, str], Place] = {}
-        with Layout() as layout:
-            file = layout.file
-            file.attrs["format"] = FORMAT
-            file.attrs["schema_version"] = SCHEMA_VERSION
-            file.attrs["layout"] = plan.layout
-            file.attrs["model"] = plan.model
-            file.attrs["plan"] = json_text(plan)
-            file.attrs["sensor"] = json_text(self.sensor)
-            file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
-            for name in LAYOUT_GROUPS[plan.layout]:
-                names = [landmark.name for landmark in self.landmarks]
-                places |= _lay_out_group(layout, name, plan, self.sensor, names)
-            for landmark in self.landmarks:
-                write_mesh(file.create_group(f"meshes/{landmark.name}"), landmark)
-        by_slab = []
-        for slab in self._slabs:
-            found = [places[slab.group, field] for field in _FIELDS]
-            by_slab.append([Place(at.offset + slab.first * at.stride, at.stride) for at in found])
-        return layout, by_slab
+        for name in LAYOUT_GROUPS[self.plan.layout]:
+            group = layout.file.create_group(name)
+            known = self._coordinates(name)
+            scales = {dim: make_scale(group, dim, *known[dim]) for dim in (*VIEW_DIMS[name], *PHASOR_DIMS)}
+            for field, array in IMAGE_ARRAYS.items():
+                of_views = array._replace(dims=(*VIEW_DIMS[name], *array.dims))
+                _, places[name, field] = reserve_array(layout, group, scales, field, of_views, len(VIEW_DIMS[name]))
+        return [
+            [
+                Place(at.offset + slab.first * at.stride, at.stride)
+                for at in (places[slab.group, f] for f in self.fields)
+            ]
+            for slab in self._slabs
+        ]
+
+    def _coordinates(self, name: GroupName) -> dict[str, tuple[Any, str, str]]:
+        """Return values, units and long name of every dimension a group can have."""
+        plan, sensor = self.plan, self.sensor
+        frequencies_hz = np.array(bank_frequencies_hz(sensor, plan.harmonics))
+        row, col = np.arange(*group_rows(name, sensor), dtype=np.int32), np.arange(sensor.cols, dtype=np.int32)
+        return {
+            "landmark_class": ([landmark.name for landmark in self.landmarks], "", "landmark class"),
+            "distance": (np.array(plan.distance_m), "m", "horizontal distance from the lens to the landmark's axis"),
+            "delta": (np.array(plan.delta_deg), "degree", "angle from which the landmark is seen"),
+            "frequency": (frequencies_hz, "Hz", "harmonic order times modulation frequency"),
+            "row": (row, "1", "pixel row, 0 at the top"),
+            "col": (col, "1", "pixel column, 0 on the left"),
+            "iq": (["i", "q"], "", "real and imaginary part"),
+        }
 
     def make(self, slab: int, start: int, stop: int) -> list[NDArray[Any]]:
         """Render some images of a slab."""
         job = self._slabs[slab]
         stored = _stored(job.images_of(job.views[start:stop]))
-        return [stored[field] for field in _FIELDS]
+        return [stored[field] for field in self.fields]
 
     def read(self, file: h5py.File, slab: int, item: int) -> dict[str, NDArray[Any]]:
         """Return one image of a file in the form of :meth:`make`."""
@@ -295,14 +268,7 @@ class BankJob:
         group = file[at.group]
         n_dims = len(VIEW_DIMS[at.group])
         place = np.unravel_index(at.first + item, group["phasor"].shape[:n_dims])
-        return {field: group[field][tuple(int(k) for k in place)] for field in _FIELDS}
-
-    def remake(self, slab: int, item: int) -> dict[str, NDArray[Any]]:
-        """Return the same, rendered again."""
-        return {field: values[0] for field, values in zip(_FIELDS, self.make(slab, item, item + 1), strict=True)}
-
-
-_FIELDS = ("phasor", "intensity", "coverage")
+        return {field: group[field][tuple(int(k) for k in place)] for field in self.fields}
 
 
 def _slabs(plan: BankPlan, sensor: Sensor, landmarks: list[Landmark]) -> Iterator[_Slab]:
@@ -330,56 +296,6 @@ def _refuse_impossible(plan: BankPlan) -> None:
         raise UsageError(
             f"'model' must be 'ray' or 'hard' for '{plan.meshes[0].name}', which comes from a mesh file, got 'planar'"
         )
-
-
-def read_landmarks(
-    landmarks: Sequence[LandmarkSpec], meshes: Sequence[MeshPlan], stored_mesh: StoredMesh | None = None
-) -> list[Landmark]:
-    """Build the meshes of landmarks, and read those that come from files (or are stored in one of ours)."""
-    found = [Landmark(spec.name, build_mesh(spec), spec.symmetry, spec.albedo, spec) for spec in landmarks]
-    for part in meshes:
-        if stored_mesh is None:
-            mesh = read_mesh(part.path, unit=part.unit, up=part.up, origin=part.origin)
-            _doubt_symmetry(part, mesh)
-        else:
-            mesh = stored_mesh(part.name)
-        found.append(Landmark(part.name, mesh, part.symmetry or 1, part.albedo))
-    if stored_mesh is None:
-        _doubt_classes(found)
-    return found
-
-
-def _doubt_symmetry(part: MeshPlan, mesh: trimesh.Trimesh) -> None:
-    """Warn of a stated symmetry that the mesh has not, or of one that it has more of."""
-    if part.symmetry is None:
-        return
-    stated, found = f"{part.path}: symmetry {part.symmetry} is stated for '{part.name}'", mesh_symmetry(mesh)
-    if not has_symmetry(mesh, part.symmetry):
-        warnings.warn(
-            f"{stated}, but turned by {360 / part.symmetry:g}° it differs from itself by more than"
-            f" {1e3 * symmetry_tolerance_m(mesh):.2g} mm; found: {found}",
-            MeshWarning,
-            stacklevel=2,
-        )
-    elif found > part.symmetry:
-        warnings.warn(
-            f"{stated}, but turned by {360 / found:g}° it is the same: views that far apart look alike, and no answer"
-            f" about it can be accepted; found: {found}",
-            MeshWarning,
-            stacklevel=2,
-        )
-
-
-def _doubt_classes(landmarks: Sequence[Landmark]) -> None:
-    """Warn of classes that are the same part."""
-    for first, second in itertools.combinations(landmarks, 2):
-        if is_same_shape(first.mesh, second.mesh):
-            warnings.warn(
-                f"'{first.name}' and '{second.name}' look alike from everywhere, and no answer"
-                " about them can be accepted; leave one out",
-                MeshWarning,
-                stacklevel=2,
-            )
 
 
 def _images_of(
@@ -428,69 +344,3 @@ def _stored(images: PhasorImages) -> dict[str, NDArray[np.float32]]:
         if not np.isfinite(values).all():
             raise FloatingPointError(f"the renderer returned a {name} that is not finite")
     return stored
-
-
-def _lay_out_group(
-    layout: Layout, name: GroupName, plan: BankPlan, sensor: Sensor, classes: list[str]
-) -> dict[tuple[GroupName, str], Place]:
-    group = layout.file.create_group(name)
-    coordinates = _coordinates(name, plan, sensor, classes)
-    scales = {}
-    for dim in (*VIEW_DIMS[name], *PHASOR_DIMS):
-        values, units, long_name = coordinates[dim]
-        kind = h5py.string_dtype() if isinstance(values[0], str) else np.asarray(values).dtype.newbyteorder("<")
-        scales[dim] = group.create_dataset(dim, data=values, dtype=kind)
-        scales[dim].make_scale(dim)
-        scales[dim].attrs["long_name"] = long_name
-        if units:
-            scales[dim].attrs["units"] = units
-    places: dict[tuple[GroupName, str], Place] = {}
-    for field, dims, long_name in (
-        ("phasor", PHASOR_DIMS, "phasor S_k of the landmark alone"),
-        ("intensity", IMAGE_DIMS, "mean amplitude of the landmark alone"),
-        ("coverage", IMAGE_DIMS, "share of the pixel that sees the landmark"),
-    ):
-        shape = [len(scales[dim]) for dim in (*VIEW_DIMS[name], *dims)]
-        dataset, offset = layout.reserve(group, field, shape, "<f4")
-        for axis, dim in enumerate((*VIEW_DIMS[name], *dims)):
-            dataset.dims[axis].attach_scale(scales[dim])
-        dataset.attrs["long_name"] = long_name
-        dataset.attrs["units"] = "1"
-        stride = int(np.prod(shape[len(VIEW_DIMS[name]) :])) * 4
-        places[name, field] = Place(offset, stride)
-    return places
-
-
-def _coordinates(
-    name: GroupName, plan: BankPlan, sensor: Sensor, classes: list[str]
-) -> dict[str, tuple[Any, str | None, str]]:
-    """Return values, units and long name of every dimension a group can have."""
-    rows = group_rows(name, sensor)
-    return {
-        "landmark_class": (classes, None, "landmark class"),
-        "distance": (np.array(plan.distance_m), "m", "horizontal distance from the lens to the landmark's axis"),
-        "delta": (np.array(plan.delta_deg), "degree", "angle from which the landmark is seen"),
-        "frequency": (
-            np.array(bank_frequencies_hz(sensor, plan.harmonics)),
-            "Hz",
-            "harmonic order times modulation frequency",
-        ),
-        "row": (np.arange(*rows, dtype=np.int32), "1", "pixel row, 0 at the top"),
-        "col": (np.arange(sensor.cols, dtype=np.int32), "1", "pixel column, 0 on the left"),
-        "iq": (["i", "q"], None, "real and imaginary part"),
-    }
-
-
-def write_mesh(group: h5py.Group, landmark: Landmark) -> None:
-    """Write the mesh of a class into its group."""
-    vertices = group.create_dataset("vertices", data=np.asarray(landmark.mesh.vertices, dtype="<f8"))
-    vertices.attrs["units"] = "m"
-    vertices.attrs["long_name"] = "vertices x', y', z' in the landmark frame"
-    faces = group.create_dataset("faces", data=narrowed(landmark.mesh.faces, "<i4", "vertices of a face"))
-    faces.attrs["long_name"] = "three vertex indices of each face"
-    if "part" in landmark.mesh.face_attributes:
-        part = group.create_dataset("part", data=narrowed(landmark.mesh.face_attributes["part"], "|u1", "parts"))
-        part.attrs["long_name"] = "0 on faces of the lower part, 1 on those of the upper one"
-    group.attrs["delta_period_deg"] = 360 / landmark.symmetry
-    group.attrs["albedo"] = landmark.albedo
-    group.attrs["sha256"] = mesh_sha256(landmark.mesh)

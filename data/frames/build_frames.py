@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,25 +14,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.data.bank.build_bank import StoredMesh, read_landmarks, write_mesh
 from phasemark.data.files.hdf5_layout import Layout
-from phasemark.data.files.json_text import json_text
 from phasemark.data.files.narrow import narrowed
-from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.files.same_file import named_files
-from phasemark.data.frames.frame_set_file import FORMAT, SCHEMA_VERSION, FrameSet, open_frames
-from phasemark.data.plans.arrays import FRAME_FIELDS, VIEW_FIELDS, frame_set_fields
+from phasemark.data.frames.frame_set_file import FrameSet, open_frames
+from phasemark.data.plans.arrays import FIELDS, FRAME_FIELDS, TRUTH, frame_set_fields
 from phasemark.data.plans.frame_plan import TILT, FramePlan
 from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
+from phasemark.data.scene_job import SceneJob, StoredMesh, attach_scales, make_scale, reserve_array
 from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
 from phasemark.data.shards.run import produce, refuse_unwritable_output
 from phasemark.render import Background, Flag, Frames, PhasorImages, Renderer, Sensor, Views, capture
-from phasemark.render.direct import HistogramRenderer
+from phasemark.render.direct import HistogramImages, HistogramRenderer
 from phasemark.render.direct.targets import Status
 
 _FLAGS = tuple(Flag)
+_SUFFIXES = {"m": "_m", "degree": "_deg", "1": ""}
+"""Of the keys of quantities in a plan, by their units in a file."""
 _KEYS = ("class_index", "albedo", "wall_m", "floor_m")
 
 
@@ -91,19 +90,14 @@ def build_frames(
     job = FrameJob(plan)
     job.check_views()
     produce(
-        job, path, finished=_finished_identity, force=force, resume=resume, workers=workers, shard_items=shard_items,
-        scheduler=scheduler, progress=progress,
+        job, path, finished=job.finished_identity, force=force, resume=resume, workers=workers,
+        shard_items=shard_items, scheduler=scheduler, progress=progress,
     )  # fmt: skip
     return open_frames(path)
 
 
-def _finished_identity(path: Path) -> dict[str, Any]:
-    with open_frames(path, untrusted=True) as frames:
-        return frames.identity()
-
-
-class FrameJob:
-    """A frame set to be built (:class:`phasemark.data.shards.build.Job`): one slab, its items are views.
+class FrameJob(SceneJob[FramePlan]):
+    """A frame set to be built: one slab, its items are views.
 
     Parameters
     ----------
@@ -112,11 +106,13 @@ class FrameJob:
         Returns the mesh of a class, in place of the mesh file that the plan names.
     """
 
+    KIND, STORED = "frames", FrameSet
+
     def __init__(self, plan: FramePlan, stored_mesh: StoredMesh | None = None) -> None:
-        self.plan = plan.resolve()
-        refuse_too_many(self.plan)
-        self.sensor = self.plan.build_sensor()
-        self.landmarks = read_landmarks(self.plan.landmarks, self.plan.meshes, stored_mesh)
+        plan = plan.resolve()
+        refuse_too_many(plan)
+        super().__init__(plan, plan.build_sensor(), stored_mesh)
+        self.fields = frame_set_fields(self.plan, self.sensor)
         self._renderers = [Renderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks]
         self._histograms: list[HistogramRenderer] = []
         if self.plan.histograms:
@@ -126,31 +122,9 @@ class FrameJob:
         self._shot_sensor = self.sensor.without_errors(shot_noise=True) if "shot" in self.plan.variants else None
 
     @property
-    def maker(self) -> str:
-        """What makes this job in another process."""
-        return "phasemark.data.partial_outputs:job_of"
-
-    def spec(self) -> dict[str, Any]:
-        """Return a description from which another process makes the same job."""
-        return {"kind": "frames", "plan": self.plan.model_dump(mode="json")}
-
-    @property
     def items(self) -> list[int]:
         """The number of views."""
         return [self.plan.views]
-
-    @property
-    def fields(self) -> list[str]:
-        """Names of the large datasets, in the order in which :meth:`make` returns them."""
-        return frame_set_fields(self.plan, self.sensor)
-
-    def identity(self) -> dict[str, Any]:
-        """Return all that the file's bytes depend on."""
-        return {
-            "plan": self.plan.model_dump(mode="json"),
-            "versions": versions(),
-            "mesh_sha256": {landmark.name: mesh_sha256(landmark.mesh) for landmark in self.landmarks},
-        }
 
     def check_views(self) -> None:
         """Refuse a plan with views that cannot be rendered, before any is.
@@ -192,52 +166,35 @@ class FrameJob:
                         reason = str(error).replace(" in view 0", "")
                         raise UsageError(f"view {first + int(view)} of the plan cannot be rendered: {reason}") from None
 
-    def lay_out(self) -> tuple[Layout, list[list[Place]]]:
-        """Return all but the large datasets, and where these go."""
-        plan, sensor = self.plan, self.sensor
-        n = plan.views
-        per = plan.frames_per_view
-        with Layout() as layout:
-            file = layout.file
-            file.attrs["format"] = FORMAT
-            file.attrs["schema_version"] = SCHEMA_VERSION
-            file.attrs["plan"] = json_text(plan)
-            file.attrs["sensor"] = json_text(sensor)
-            file.attrs["versions"] = json.dumps(versions(), sort_keys=True)
-            scales = {
-                name: _scale(file, name, values, units, long_name)
-                for name, values, units, long_name in _coordinates(plan, sensor)
-            }
-            for name, values, dims, attributes in self._small(n, per):
-                dataset = file.create_dataset(name, data=values)
-                for axis, dim in enumerate(dims):
-                    dataset.dims[axis].attach_scale(scales[dim])
-                dataset.attrs.update(attributes)
-            places = []
-            for name in self.fields:
-                dims, kind, units, long_name = {**FRAME_FIELDS, **VIEW_FIELDS}[name]
-                shape = [len(scales[dim]) for dim in dims]
-                dataset, offset = layout.reserve(file, name, shape, kind)
-                for axis, dim in enumerate(dims):
-                    dataset.dims[axis].attach_scale(scales[dim])
-                dataset.attrs["long_name"] = long_name
-                dataset.attrs["units"] = units
-                if name in ("range", "range_shot", "range_hard", "range_mixed", "frequency_range"):
-                    dataset.attrs["quantity"] = "range"
-                if name == "target_distance" and sensor.histogram is not None:
-                    dataset.attrs["quantity"] = sensor.histogram.reports
-                if name == "target_status":
-                    dataset.attrs["flag_values"] = np.array([int(status) for status in Status], np.uint8)
-                    dataset.attrs["flag_meanings"] = " ".join(status.name.lower() for status in Status)
-                if name in ("flags", "frequency_flags"):
-                    known = _FLAGS if len(sensor.frequencies_hz) > 1 else _FLAGS[:-1]
-                    dataset.attrs["flag_masks"] = np.array([int(flag) for flag in known], np.uint8)
-                    dataset.attrs["flag_meanings"] = " ".join(str(flag.name).lower() for flag in known)
-                rows_of_item = per if dims[0] == "frame" else 1
-                places.append(Place(offset, rows_of_item * int(np.prod(shape[1:])) * np.dtype(kind).itemsize))
-            for landmark in self.landmarks:
-                write_mesh(file.create_group(f"meshes/{landmark.name}"), landmark)
-        return layout, [places]
+    def lay_out_arrays(self, layout: Layout) -> list[list[Place]]:
+        """Write coordinates and truth, and return where the large datasets go."""
+        file, per = layout.file, self.plan.frames_per_view
+        scales = {name: make_scale(file, name, *about) for name, *about in _coordinates(self.plan, self.sensor)}
+        for name, values, dims, attributes in self._small(self.plan.views, per):
+            dataset = file.create_dataset(name, data=values)
+            attach_scales(dataset, scales, dims)
+            dataset.attrs.update(attributes)
+        places = []
+        for name in self.fields:
+            dataset, of_row = reserve_array(layout, file, scales, name, FIELDS[name])
+            dataset.attrs.update(self._meaning(name))
+            places.append(Place(of_row.offset, of_row.stride * (per if name in FRAME_FIELDS else 1)))
+        return [places]
+
+    def _meaning(self, name: str) -> dict[str, Any]:
+        """Return the attributes of a large dataset that say what its numbers stand for."""
+        if name in ("range", "range_shot", "range_hard", "range_mixed", "frequency_range"):
+            return {"quantity": "range"}
+        if name == "target_distance" and self.sensor.histogram is not None:
+            return {"quantity": self.sensor.histogram.reports}
+        if name == "target_status":
+            names = " ".join(status.name.lower() for status in Status)
+            return {"flag_values": np.array([int(status) for status in Status], np.uint8), "flag_meanings": names}
+        if name in ("flags", "frequency_flags"):
+            known = _FLAGS if len(self.sensor.frequencies_hz) > 1 else _FLAGS[:-1]
+            names = " ".join(str(flag.name).lower() for flag in known)
+            return {"flag_masks": np.array([int(flag) for flag in known], np.uint8), "flag_meanings": names}
+        return {}
 
     def columns(self) -> Iterator[tuple[str, NDArray[Any]]]:
         """Yield name and values of every column of the file: which view each frame shows, and what is true of it."""
@@ -258,10 +215,11 @@ class FrameJob:
                 "flag_meanings": " ".join(names),
             },
         )  # fmt: skip
-        for name, key, units, long_name in _TRUTH:
-            if key in TILT and getattr(self.plan, key) is None:
-                continue
-            yield name, truth[key].astype("<f8"), ("view",), {"units": units, "long_name": long_name}
+        for name, array in TRUTH.items():
+            key = f"{name}{_SUFFIXES[array.units]}"
+            if key not in TILT or getattr(self.plan, key) is not None:
+                about = {"units": array.units, "long_name": array.long_name}
+                yield name, truth[key].astype(array.kind), array.dims, about
         yield (
             "split", truth["split_index"], ("view",),
             {
@@ -274,13 +232,13 @@ class FrameJob:
         """Render and capture some views."""
         plan = self.plan
         truth = plan.draw_truth(start, stop)
-        image, hard_range_m = self._render(truth)
+        image = self._render(truth)
         stored: dict[str, NDArray[Any]] = {
             "coverage": image.coverage.astype("<f4"),
             "range_mixed": image.range_m.astype("<f4"),
         }
-        if hard_range_m is not None:
-            stored["range_hard"] = hard_range_m.astype("<f4")
+        if "hard" in plan.variants:
+            stored["range_hard"] = self._render(truth, variant="hard").range_m.astype("<f4")
         frames = self._captured(image, truth, start, stored)
         stored["range"] = frames.range_m.astype("<f4")
         stored["flags"] = frames.flags
@@ -307,11 +265,6 @@ class FrameJob:
             for name in self.fields
         }
 
-    def remake(self, slab: int, item: int) -> dict[str, NDArray[Any]]:
-        """Return the same, rendered and captured again."""
-        made = self.make(slab, item, item + 1)
-        return {name: values[0] for name, values in zip(self.fields, made, strict=True)}
-
     def _captured(
         self, image: PhasorImages, truth: dict[str, NDArray[Any]], start: int, stored: dict[str, NDArray[Any]]
     ) -> Frames:
@@ -321,16 +274,9 @@ class FrameJob:
             return capture(
                 image, self.sensor, rng=rng, n_frames=plan.frames_per_view, first_view=start, keep_taps=plan.keep_taps
             )
-        views, expected = _views(truth), None
-        for members, group in _alike(truth):
-            renderer = copy.copy(self._histograms[group.class_index])
-            renderer.albedo = group.albedo
-            background = _background(group.wall_m, group.floor_m, plan)
-            part = renderer.render_views(views[members], background=background)
-            if expected is None:
-                expected = replace(part, expected=np.empty((len(views), *part.expected.shape[1:])), views=views)
-            expected.expected[members] = part.expected
-        assert expected is not None
+        parts, order = self._renderings(self._histograms, truth)
+        counts = np.concatenate([part.expected for part in parts])[order]
+        expected: HistogramImages = replace(parts[0], expected=counts, views=_views(truth))
         frames = capture(expected, self.sensor, rng=rng, n_frames=plan.frames_per_view, first_view=start)
         stored["histogram"] = narrowed(frames.counts, "<u4", "counts")
         stored["target_distance"] = frames.targets.distance_m.astype("<f4")
@@ -339,51 +285,35 @@ class FrameJob:
         stored["target_status"] = frames.targets.status
         return frames.ranges
 
-    def _render(self, truth: dict[str, NDArray[Any]]) -> tuple[PhasorImages, NDArray[np.float64] | None]:
-        """Return noise-free images of views, and what their centre rays see; views that share all else go together."""
-        views = _views(truth)
-        image: PhasorImages | None = None
-        shape = (len(views), self.sensor.rows, self.sensor.cols)
-        hard = np.empty(shape) if "hard" in self.plan.variants else None
+    def _render(self, truth: dict[str, NDArray[Any]], **options: Any) -> PhasorImages:
+        """Return noise-free images of views."""
+        parts, order = self._renderings(self._renderers, truth, **options)
+
+        def joined(values: list[NDArray[Any]]) -> NDArray[Any]:
+            return np.concatenate(values)[order]
+
+        return PhasorImages(
+            phasor=joined([part.phasor for part in parts]),
+            intensity=joined([part.intensity for part in parts]),
+            coverage=joined([part.coverage for part in parts]),
+            sensor=self.sensor,
+            views=_views(truth),
+            harmonics={k: joined([part.harmonics[k] for part in parts]) for k in parts[0].harmonics},
+            by_hz={hz: joined([part.by_hz[hz] for part in parts]) for hz in parts[0].by_hz},
+        )
+
+    def _renderings(
+        self, renderers: Sequence[Any], truth: dict[str, NDArray[Any]], **options: Any
+    ) -> tuple[list[Any], NDArray[np.intp]]:
+        """Return images of views, those that share all else together, and the order in which they are the views."""
+        views, parts, shown = _views(truth), [], []
         for members, group in _alike(truth):
-            renderer = copy.copy(self._renderers[group.class_index])
+            renderer = copy.copy(renderers[group.class_index])
             renderer.albedo = group.albedo
             background = _background(group.wall_m, group.floor_m, self.plan)
-            part = renderer.render_views(views[members], background=background)
-            if image is None:
-                image = PhasorImages(
-                    phasor=np.empty(shape, np.complex128),
-                    intensity=np.empty(shape),
-                    coverage=np.empty(shape),
-                    sensor=self.sensor,
-                    views=views,
-                    harmonics={order: np.empty(shape, np.complex128) for order in part.harmonics},
-                    by_hz={hz: np.empty(shape, np.complex128) for hz in part.by_hz},
-                )
-            image.phasor[members], image.intensity[members] = part.phasor, part.intensity
-            image.coverage[members] = part.coverage
-            for order, values in part.harmonics.items():
-                image.harmonics[order][members] = values
-            for hz, values in part.by_hz.items():
-                image.by_hz[hz][members] = values
-            if hard is not None:
-                centre = renderer.render_views(views[members], background=background, variant="hard")
-                hard[members] = centre.range_m
-        assert image is not None
-        return image, hard
-
-
-_TRUTH = (
-    ("distance", "distance_m", "m", "horizontal distance from the lens to the landmark's axis"),
-    ("delta", "delta_deg", "degree", "angle from which the landmark is seen"),
-    ("bearing", "bearing_deg", "degree", "azimuth of the landmark's axis in the camera frame"),
-    ("height", "height_m", "m", "height of the landmark's origin above the optical axis"),
-    ("pitch", "pitch_deg", "degree", "pitch of the camera, positive looking down"),
-    ("roll", "roll_deg", "degree", "roll of the camera"),
-    ("albedo", "albedo", "1", "share of light that the landmark returns"),
-    ("wall", "wall_m", "m", "distance of the wall behind, NaN if there is none"),
-    ("floor", "floor_m", "m", "how far the floor lies below the lens, NaN if there is none"),
-)
+            parts.append(renderer.render_views(views[members], background=background, **options))
+            shown.append(members)
+        return parts, np.argsort(np.concatenate(shown))
 
 
 class _Group(NamedTuple):
@@ -464,13 +394,3 @@ def _coordinates(plan: FramePlan, sensor: Sensor) -> Iterator[tuple[str, Any, st
         yield "target", np.arange(histogram.max_targets, dtype="<i4"), "1", "target of a zone, nearest first"
     yield "row", np.arange(sensor.rows, dtype="<i4"), "1", "pixel row, 0 at the top"
     yield "col", np.arange(sensor.cols, dtype="<i4"), "1", "pixel column, 0 on the left"
-
-
-def _scale(file: h5py.File, name: str, values: Any, units: str, long_name: str) -> h5py.Dataset:
-    kind = h5py.string_dtype() if isinstance(values[0], str) else values.dtype
-    scale = file.create_dataset(name, data=values, dtype=kind)
-    scale.make_scale(name)
-    scale.attrs["long_name"] = long_name
-    if units:
-        scale.attrs["units"] = units
-    return scale

@@ -7,68 +7,55 @@ import os
 import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, Self, overload
+from typing import Any, Literal, overload
 
 import h5py
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, UsageError
-from phasemark.data.bank.bank_file import read_mesh_group
-from phasemark.data.files.hdf5_reading import (
-    check_format,
-    dataset_of,
-    frozen,
-    group_of,
-    json_attribute,
-    open_hdf5,
-    reading,
-    whole_numbers,
-)
+from phasemark.data.files.hdf5_reading import dataset_of, frozen, group_of, json_attribute, reading, whole_numbers
 from phasemark.data.pages.notebook import facts_html
 from phasemark.data.plans.arrays import (
+    FIELDS,
     FRAME_FIELDS,
     FREQUENCY_FIELDS,
     HISTOGRAM_FIELDS,
     TARGET_FIELDS,
-    VIEW_FIELDS,
+    TRUTH,
     dimension_sizes,
 )
 from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.data.stored_scene import StoredScene, open_scene
 from phasemark.inputs.numbers import in_words
 from phasemark.render import Frames, Sensor
 from phasemark.render.direct import HistogramFrames, Targets
 
-FORMAT = "phasemark-frames"
-SCHEMA_VERSION = 1
-
-"""Dimensions, type, units and long name of the large datasets."""
-
+_SUFFIXES = {"m": "_m", "e-": "_e", "degree": "_rad", "1": ""}
+"""Of the keys of a sample, by the units in the file."""
 _MOST = 1e12
 """More electrons than any pixel holds."""
 
-_TRUTH = ("distance", "delta", "bearing", "height", "pitch", "roll", "albedo", "wall", "floor")
 _TILT = ("pitch", "roll")
 """Absent from files of a level camera."""
 
 Sample = dict[str, Any]
 
 
-class FrameSet:
+class FrameSet(StoredScene):
     """Noisy frames with their truth; made by :func:`open_frames`.
 
     A sequence of frames: ``frames[17]`` is a dictionary of that frame's arrays and truth, ``frames[10:20]`` the same
     with one more axis in front. Nothing is read before it is asked for. It can be pickled and used after a fork, so a
-    PyTorch ``DataLoader`` takes it as it is; a context manager.
+    PyTorch ``DataLoader`` takes it as it is; a context manager. ``mesh(class_name)`` returns the mesh of a class, and
+    ``close()`` closes the file.
 
     Parameters
     ----------
-    path : Path
-        The file.
     file : h5py.File
-        The file, open for reading and checked.
+        The file, open for reading; the frame set closes it.
+    path : Path
+        Its name, for messages.
 
     Attributes
     ----------
@@ -91,15 +78,13 @@ class FrameSet:
         Which view each frame shows.
     """
 
-    def __init__(self, path: Path, file: h5py.File) -> None:
-        self.path = path
-        self._file: h5py.File | None = file
-        self._process = os.getpid()
-        self._closed = False
-        check_format(file, path, "frame set", FORMAT, SCHEMA_VERSION)
-        self.sensor = Sensor(**json_attribute(file, path, "sensor"))
+    WHAT = "frame set"
+    FORMAT = "phasemark-frames"
+    plan: FramePlan
+
+    def __init__(self, file: h5py.File, path: Path) -> None:
+        super().__init__(file, path)
         self.plan = FramePlan(**_with_histograms_stated(json_attribute(file, path, "plan"), self.sensor))
-        self.versions: dict[str, str] = json_attribute(file, path, "versions")
         self.classes = tuple(self.plan.landmark_names())
         self.splits = tuple(self.plan.splits)
         sizes = {dim: len(dataset_of(file, dim, path)) for dim in ("frame", "view", "row", "col")}
@@ -136,7 +121,7 @@ class FrameSet:
 
     def _field(self, file: h5py.File, name: str, sizes: dict[str, int]) -> tuple[tuple[int, ...], np.dtype[Any], int]:
         """Return shape, type and offset of a dataset; the offset is −1 if its values are not in one piece."""
-        dims, kind, _, _ = {**FRAME_FIELDS, **VIEW_FIELDS}[name]
+        dims, kind, _, _ = FIELDS[name]
         dataset = dataset_of(file, name, self.path)
         shape = tuple(sizes[dim] for dim in dims)
         if dataset.shape != shape or dataset.dtype.kind != np.dtype(kind).kind:
@@ -167,51 +152,17 @@ class FrameSet:
         for name, count in (("class_index", len(self.classes)), ("split_index", len(self.splits))):
             if truth[name].min() < 0 or truth[name].max() >= count:
                 raise InputFileError(f"{self.path}: '{name}' has numbers outside 0 … {count - 1}")
-        for name in _TRUTH:
+        for name, array in TRUTH.items():
             if name in _TILT and name not in file:
-                truth[f"{name}_rad"] = np.zeros(n)
+                truth[_key(name)] = np.zeros(n)
                 continue
             values = self._column(file, name, n).astype(np.float64)
             if name not in ("wall", "floor") and not np.isfinite(values).all():
                 raise InputFileError(f"{self.path}: '{name}' must be finite")
             if name == "distance" and not (values > 0).all():
                 raise InputFileError(f"{self.path}: 'distance' must be positive, got {values.min():g}")
-            if name in ("delta", "bearing", *_TILT):
-                truth[f"{name}_rad"] = np.deg2rad(values)
-            else:
-                truth[name if name == "albedo" else f"{name}_m"] = values
+            truth[_key(name)] = np.deg2rad(values) if array.units == "degree" else values
         return {name: frozen(values) for name, values in truth.items()}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file; arrays read before stay usable."""
-        if self._file is not None and self._process == os.getpid():
-            self._file.close()
-        self._file, self._closed = None, True
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"path": self.path, "closed": self._closed}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        with_file = open_hdf5(state["path"], "frame set")
-        with reading(state["path"]):
-            self.__init__(state["path"], with_file)  # type: ignore[misc]
-        if state["closed"]:
-            self.close()
-
-    def _open(self) -> h5py.File:
-        if self._closed:
-            raise UsageError(f"{self.path}: the frame set is closed")
-        if self._file is None or self._process != os.getpid():  # after a fork HDF5's handles are not ours to use
-            self._file, self._process = h5py.File(self.path, "r"), os.getpid()
-        return self._file
 
     def __len__(self) -> int:
         return len(self.view_index)
@@ -430,25 +381,6 @@ class FrameSet:
             },
         )
 
-    def mesh(self, class_name: str) -> trimesh.Trimesh:
-        """Return the mesh of a class, metres, landmark frame.
-
-        Raises
-        ------
-        UsageError
-            The frame set does not have the class.
-        """
-        if class_name not in self.classes:
-            raise UsageError(f"unknown class {class_name!r}: {self.path} has {', '.join(self.classes)}")
-        return read_mesh_group(self._open(), class_name, self.path)
-
-    def identity(self) -> dict[str, Any]:
-        """Return everything that the file's bytes depend on: resolved plan, versions, mesh hashes."""
-        file = self._open()
-        with reading(self.path):
-            hashes = {name: str(file[f"meshes/{name}"].attrs["sha256"]) for name in self.classes}
-        return {"plan": json_attribute(file, self.path, "plan"), "versions": self.versions, "mesh_sha256": hashes}
-
     def info(self) -> dict[str, Any]:
         """Return the content of the frame set in plain numbers and text."""
         file = self._open()
@@ -509,19 +441,8 @@ def _with_histograms_stated(plan: dict[str, Any], sensor: Sensor) -> dict[str, A
 
 
 def _key(name: str) -> str:
-    return {
-        "amplitude": "amplitude_e",
-        "intensity": "intensity_e",
-        "taps": "taps_e",
-        "flags": "flags",
-        "coverage": "coverage",
-        "frequency_amplitude": "frequency_amplitude_e",
-        "frequency_intensity": "frequency_intensity_e",
-        "frequency_flags": "frequency_flags",
-        "histogram": "histogram",
-        "target_signal": "target_signal",
-        "target_status": "target_status",
-    }.get(name, f"{name}_m")
+    """Return the key of a sample that holds a dataset of the file."""
+    return f"{name}{_SUFFIXES[{**FIELDS, **TRUTH}[name].units]}"
 
 
 def open_frames(path: str | os.PathLike[str], *, untrusted: bool = False) -> FrameSet:
@@ -544,14 +465,7 @@ def open_frames(path: str | os.PathLike[str], *, untrusted: bool = False) -> Fra
     InputFileError
         The file cannot be read, is not a frame set, was made by a newer version, or is damaged.
     """
-    path = Path(path)
-    file = open_hdf5(path, "frame set", untrusted=untrusted)
-    try:
-        with reading(path):
-            return FrameSet(path, file)
-    except BaseException:
-        file.close()
-        raise
+    return open_scene(FrameSet, path, untrusted=untrusted)
 
 
 def is_frame_set(path: str | os.PathLike[str]) -> bool:
@@ -573,6 +487,6 @@ def is_frame_set(path: str | os.PathLike[str]) -> bool:
         with open(path, "rb") as file:
             if file.read(8) != b"\x89HDF\r\n\x1a\n":
                 return False
-            return FORMAT.encode() in file.read(1 << 16)
+            return FrameSet.FORMAT.encode() in file.read(1 << 16)
     except OSError:
         return False

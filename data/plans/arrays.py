@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.render import Sensor
+
+
+class Array(NamedTuple):
+    """Array of a file: its dimensions, the type of its values, their unit, and its long name."""
+
+    dims: tuple[str, ...]
+    kind: str
+    units: str
+    long_name: str
+
 
 GroupName = Literal["lower", "upper", "full"]
 VIEW_DIMS: dict[GroupName, tuple[str, ...]] = {
@@ -15,7 +25,12 @@ VIEW_DIMS: dict[GroupName, tuple[str, ...]] = {
     "full": ("landmark_class", "distance", "delta"),
 }
 PHASOR_DIMS = ("frequency", "row", "col", "iq")
-IMAGE_DIMS = ("row", "col")
+IMAGE_ARRAYS = {
+    "phasor": Array(PHASOR_DIMS, "<f4", "1", "phasor S_k of the landmark alone"),
+    "intensity": Array(("row", "col"), "<f4", "1", "mean amplitude of the landmark alone"),
+    "coverage": Array(("row", "col"), "<f4", "1", "share of the pixel that sees the landmark"),
+}
+"""Arrays of a bank, by one image."""
 LAYOUT_GROUPS: dict[str, tuple[GroupName, ...]] = {"factored": ("lower", "upper"), "full": ("full",)}
 
 
@@ -32,28 +47,41 @@ _OF_TARGET = ("frame", "row", "col", "target")
 TARGET_FIELDS = ("target_distance", "target_sigma", "target_signal", "target_status")
 HISTOGRAM_FIELDS = ("histogram", *TARGET_FIELDS)
 """What a frame set holds of a direct sensor's histograms; `range` is then that of the nearest target."""
-FRAME_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
-    "range": (("frame", "row", "col"), "<f4", "m", "range along the ray, NaN where invalid"),
-    "amplitude": (("frame", "row", "col"), "<f4", "e-", "amplitude per phase image"),
-    "intensity": (("frame", "row", "col"), "<f4", "e-", "intensity per phase image"),
-    "flags": (("frame", "row", "col"), "|u1", "1", "why a pixel is not valid, 0 where it is"),
-    "taps": (("frame", "phase", "tap", "row", "col"), "<f4", "e-", "what each tap reported"),
-    "range_shot": (("frame", "row", "col"), "<f4", "m", "range with shot noise alone, NaN where invalid"),
-    "frequency_range": (_OF_FREQUENCY, "<f4", "m", "range at each frequency, wrapped, NaN where invalid"),
-    "frequency_amplitude": (_OF_FREQUENCY, "<f4", "e-", "amplitude per phase image at each frequency"),
-    "frequency_intensity": (_OF_FREQUENCY, "<f4", "e-", "intensity per phase image at each frequency"),
-    "frequency_flags": (_OF_FREQUENCY, "|u1", "1", "why a frequency's range is not valid, 0 where it is"),
-    "histogram": (("frame", "row", "col", "bin"), "<u4", "1", "photons counted in each bin of a zone"),
-    "target_distance": (_OF_TARGET, "<f4", "m", "what the chip reports, nearest first, NaN without a target"),
-    "target_sigma": (_OF_TARGET, "<f4", "m", "standard deviation that the counts of the peak leave"),
-    "target_signal": (_OF_TARGET, "<f4", "1", "counts of the peak above ambient light"),
-    "target_status": (_OF_TARGET, "|u1", "1", "whether there is a target"),
+FRAME_FIELDS: dict[str, Array] = {
+    "range": Array(("frame", "row", "col"), "<f4", "m", "range along the ray, NaN where invalid"),
+    "amplitude": Array(("frame", "row", "col"), "<f4", "e-", "amplitude per phase image"),
+    "intensity": Array(("frame", "row", "col"), "<f4", "e-", "intensity per phase image"),
+    "flags": Array(("frame", "row", "col"), "|u1", "1", "why a pixel is not valid, 0 where it is"),
+    "taps": Array(("frame", "phase", "tap", "row", "col"), "<f4", "e-", "what each tap reported"),
+    "range_shot": Array(("frame", "row", "col"), "<f4", "m", "range with shot noise alone, NaN where invalid"),
+    "frequency_range": Array(_OF_FREQUENCY, "<f4", "m", "range at each frequency, wrapped, NaN where invalid"),
+    "frequency_amplitude": Array(_OF_FREQUENCY, "<f4", "e-", "amplitude per phase image at each frequency"),
+    "frequency_intensity": Array(_OF_FREQUENCY, "<f4", "e-", "intensity per phase image at each frequency"),
+    "frequency_flags": Array(_OF_FREQUENCY, "|u1", "1", "why a frequency's range is not valid, 0 where it is"),
+    "histogram": Array(("frame", "row", "col", "bin"), "<u4", "1", "photons counted in each bin of a zone"),
+    "target_distance": Array(_OF_TARGET, "<f4", "m", "what the chip reports, nearest first, NaN without a target"),
+    "target_sigma": Array(_OF_TARGET, "<f4", "m", "standard deviation that the counts of the peak leave"),
+    "target_signal": Array(_OF_TARGET, "<f4", "1", "counts of the peak above ambient light"),
+    "target_status": Array(_OF_TARGET, "|u1", "1", "whether there is a target"),
 }
-VIEW_FIELDS: dict[str, tuple[tuple[str, ...], str, str, str]] = {
-    "coverage": (("view", "row", "col"), "<f4", "1", "share of the pixel that sees the landmark"),
-    "range_hard": (("view", "row", "col"), "<f4", "m", "range that the centre ray sees, without noise"),
-    "range_mixed": (("view", "row", "col"), "<f4", "m", "range mixed over the pixel, without noise"),
+VIEW_FIELDS: dict[str, Array] = {
+    "coverage": Array(("view", "row", "col"), "<f4", "1", "share of the pixel that sees the landmark"),
+    "range_hard": Array(("view", "row", "col"), "<f4", "m", "range that the centre ray sees, without noise"),
+    "range_mixed": Array(("view", "row", "col"), "<f4", "m", "range mixed over the pixel, without noise"),
 }
+FIELDS = {**FRAME_FIELDS, **VIEW_FIELDS}
+TRUTH = {
+    "distance": Array(("view",), "<f8", "m", "horizontal distance from the lens to the landmark's axis"),
+    "delta": Array(("view",), "<f8", "degree", "angle from which the landmark is seen"),
+    "bearing": Array(("view",), "<f8", "degree", "azimuth of the landmark's axis in the camera frame"),
+    "height": Array(("view",), "<f8", "m", "height of the landmark's origin above the optical axis"),
+    "pitch": Array(("view",), "<f8", "degree", "pitch of the camera, positive looking down"),
+    "roll": Array(("view",), "<f8", "degree", "roll of the camera"),
+    "albedo": Array(("view",), "<f8", "1", "share of light that the landmark returns"),
+    "wall": Array(("view",), "<f8", "m", "distance of the wall behind, NaN if there is none"),
+    "floor": Array(("view",), "<f8", "m", "how far the floor lies below the lens, NaN if there is none"),
+}
+"""True quantities of a view; those of a tilt are absent from files of a level camera."""
 
 
 def bank_frequencies_hz(sensor: Sensor, harmonics: Sequence[int]) -> list[float]:

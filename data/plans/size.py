@@ -10,10 +10,9 @@ import numpy as np
 
 from phasemark import UsageError
 from phasemark.data.plans.arrays import (
-    FRAME_FIELDS,
+    FIELDS,
     LAYOUT_GROUPS,
     VIEW_DIMS,
-    VIEW_FIELDS,
     bank_frequencies_hz,
     dimension_sizes,
     frame_set_fields,
@@ -131,7 +130,7 @@ def _frames_size(plan: FramePlan, sensor: Sensor) -> dict[str, int]:
     }  # fmt: skip
     size = _BYTES_OF_A_FRAME * counts["frame"] + _BYTES_OF_A_VIEW * counts["view"]
     for name in frame_set_fields(plan, sensor):
-        dims, kind, _, _ = {**FRAME_FIELDS, **VIEW_FIELDS}[name]
+        dims, kind, _, _ = FIELDS[name]
         size += math.prod(counts[dim] for dim in dims) * np.dtype(kind).itemsize
     return {"views": plan.views, "frames": counts["frame"], "bytes": size}
 

@@ -47,6 +47,10 @@ class Place:
     offset: int
     stride: int
 
+    def moved(self, items: int) -> Place:
+        """Return the place some items further on."""
+        return Place(self.offset + items * self.stride, self.stride)
+
 
 class Job(Protocol):
     """Layout of a file: slabs of items, each item with the same fields.

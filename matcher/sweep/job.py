@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from phasemark import PhasemarkError, UsageError
 from phasemark.data import Bank, build_bank
-from phasemark.data.bank.build_bank import read_landmarks
 from phasemark.data.files.hdf5_layout import Layout
 from phasemark.data.files.json_text import json_text
 from phasemark.data.files.narrow import narrowed
 from phasemark.data.files.provenance import mesh_sha256, versions
+from phasemark.data.scene_job import read_landmarks
 from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
