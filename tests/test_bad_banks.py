@@ -16,8 +16,7 @@ from phasemark.matcher.nearest.grid import is_in_range
 from phasemark.render import Renderer, Views, capture
 
 GRID = {"distance_m": "0.6:1.5:0.02", "delta_deg": "0:360:2"}
-FREE = [None, ("distance_m", "delta_rad")]
-FEWER = [pytest.param(None, marks=pytest.mark.soak), FREE[1]]
+FREE = [pytest.param(None, marks=pytest.mark.soak), ("distance_m", "delta_rad")]
 HEXAGON = trimesh.creation.cylinder(0.2, 0.5, sections=6)
 TRIANGLE = trimesh.creation.cylinder(0.25, 0.5, sections=3)
 BOX = trimesh.creation.box((0.3, 0.2, 0.5))
@@ -44,7 +43,7 @@ def right(matches, views, symmetry):
     return (np.abs(matches.distance_m - views.distance_m) < 0.03) & (np.abs(turn) < math.radians(6))
 
 
-@pytest.mark.parametrize("free", FEWER, ids=["default", "fixed"])
+@pytest.mark.parametrize("free", FREE, ids=["default", "fixed"])
 def test_of_two_classes_of_one_shape_none_is_accepted(tmp_path, free):
     with pytest.warns(MeshWarning, match="'one' and 'two' look alike from everywhere, .* leave one out"):
         bank = bank_of(tmp_path, {"one": BOX, "two": BOX})
@@ -62,7 +61,7 @@ def test_classes_of_other_shapes_are_not_doubted(tmp_path):
         ).close()
 
 
-@pytest.mark.parametrize("free", FEWER, ids=["default", "fixed"])
+@pytest.mark.parametrize("free", FREE, ids=["default", "fixed"])
 def test_a_symmetry_that_was_not_stated_makes_every_view_ambiguous(tmp_path, free):
     with pytest.warns(MeshWarning, match="turned by 60° it is the same"):
         bank = bank_of(tmp_path, {"hexagon": HEXAGON}, symmetry=1)

@@ -5,11 +5,10 @@ import os
 import re
 import shutil
 import struct
-import subprocess
-import sys
 import threading
 import zipfile
 import zlib
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,14 @@ import pytest
 
 from phasemark import InputFileError, UsageError
 from phasemark.cli import main
-from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_bank, read_frames
+from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_bank, open_frames, read_frames
 from phasemark.data.export import export_frames
 from phasemark.data.files import write_checksum
 from phasemark.data.files.narrow import narrowed
 from phasemark.data.verify import verify_frames
 from phasemark.inputs import checksum_path, is_vouched_for, read_whole, unverified
 from phasemark.landmarks import read_mesh
+from phasemark.matcher.plan_kinds import plan_example
 from phasemark.render import Sensor, preset
 
 SENSOR = preset("pmd-16x16")
@@ -76,7 +76,10 @@ READ = {
 
 
 @pytest.mark.parametrize("command", READ)
-def test_a_file_that_its_checksum_contradicts_is_refused_by_every_command(folder, capsys, command):
+def test_a_file_that_its_checksum_contradicts_is_refused_before_it_is_opened(folder, capsys, monkeypatch, command):
+    def opened(*given, **options):
+        raise AssertionError("opened before it was compared")
+
     victim = {"match frames": "z.csv", "frames import": "z.csv"}.get(command)
     victim = folder / (victim or ("bank.h5" if "bank.h5" in READ[command] else "frames.h5"))
     if victim.suffix == ".csv":
@@ -84,6 +87,8 @@ def test_a_file_that_its_checksum_contradicts_is_refused_by_every_command(folder
         victim.write_bytes(victim.read_bytes() + b"\n")
     else:
         flip_last_value(victim)
+        monkeypatch.setattr("phasemark.data.files.hdf5_reading.refusal", opened)
+        monkeypatch.setattr(h5py, "File", opened)
     before = sorted(os.listdir(folder))
     assert main(READ[command]) == 3
     out, err = capsys.readouterr()
@@ -137,61 +142,43 @@ def test_a_changed_byte_is_found_whatever_the_size_and_time_of_the_file(tmp_path
         is_vouched_for(path)
 
 
-@pytest.mark.parametrize("command", ["bank info", "frames info", "frames export", "frames show", "match"])
-def test_a_file_that_its_checksum_contradicts_is_refused_before_hdf5_opens_it(folder, capsys, monkeypatch, command):
-    def opened(*given, **options):
-        raise AssertionError("opened before it was compared")
-
-    victim = folder / ("bank.h5" if "bank.h5" in READ[command] else "frames.h5")
-    flip_last_value(victim)
-    monkeypatch.setattr("phasemark.data.files.hdf5_reading.refusal", opened)
-    monkeypatch.setattr(h5py, "File", opened)
-    assert main(READ[command]) == 3
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith(f"error: {victim.name}: damaged: its SHA-256 is ")
-
-
-def test_a_pipe_delivers_every_frame(folder, capsys):
-    frames = np.random.default_rng(1).uniform(0.5, 2, (40, 256))
-    text = "# unit=m quantity=range\n" + "\n".join(",".join(f"{v:.6f}" for v in row) for row in frames) + "\n"
-    out = folder / "o.npz"
-    command = [sys.executable, "-m", "phasemark", "frames", "import", "/dev/stdin", "-o", str(out)]
-    subprocess.run(command, input=text.encode(), check=True, capture_output=True)
-    np.testing.assert_allclose(np.load(out)["range"].reshape(40, 256), frames, atol=1e-6)
+@contextmanager
+def pipe_of(content, folder):
+    """A named pipe that delivers some bytes once."""
+    pipe = folder / "pipe"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=pipe.write_bytes, args=(content,))
+    writer.start()
+    yield pipe
+    writer.join(10)
+    assert not writer.is_alive()
 
 
 @pytest.mark.parametrize("kind", ["npy", "npz", "csv", "png"])
-def test_a_named_pipe_is_read_once_for_every_kind(folder, tmp_path, kind):
-    with build_frames(FRAMES, folder / "again.h5") as frames:
-        values = np.nan_to_num(frames[:]["range_m"])
-        export_frames(frames, folder / "png", "png16", quantity="range")
+def test_a_named_pipe_is_read_once_and_whole_for_every_kind(folder, tmp_path, kind):
+    values = np.random.default_rng(1).uniform(0.5, 2, (40, 16, 16))  # more than a pipe holds
     np.save(folder / "a.npy", values)
     np.savez(folder / "a.npz", range=values)
     np.savetxt(folder / "a.csv", values.reshape(len(values), -1), delimiter=",")
+    with open_frames(folder / "frames.h5") as frames:
+        export_frames(frames, folder / "png", "png16", quantity="range")
     source = folder / f"a.{kind}" if kind != "png" else folder / "png" / "00000000.png"
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    writer = threading.Thread(target=lambda: pipe.write_bytes(source.read_bytes()))
-    writer.start()
     stated = {} if kind == "png" else STATED
-    through = read_frames(pipe, sensor=SENSOR, **stated)
-    writer.join(10)
+    with pipe_of(source.read_bytes(), tmp_path) as pipe:
+        through = read_frames(pipe, sensor=SENSOR, **stated)
     np.testing.assert_array_equal(through.range_m, read_frames(source, sensor=SENSOR, **stated).range_m)
 
 
-def test_a_plan_and_its_camera_may_come_from_a_pipe_that_is_asked_twice(folder):
-    run = [sys.executable, "-m", "phasemark", "plan", "check", "/dev/stdin"]
-    plan = subprocess.run([*run[:4], "example", "frames"], capture_output=True, check=True).stdout
-    done = subprocess.run(run, input=plan, capture_output=True, check=False)
-    assert (done.returncode, done.stderr) == (0, b"")
+def test_a_plan_may_come_from_a_pipe_that_is_asked_twice(tmp_path, capsys):
+    with pipe_of(plan_example("frames").encode(), tmp_path) as pipe:
+        assert main(["plan", "check", str(pipe)]) == 0
+    assert capsys.readouterr().err == ""
 
 
-def test_hdf5_from_a_pipe_is_one_line(folder):
-    run = [sys.executable, "-m", "phasemark", "frames", "info", "/dev/stdin"]
-    done = subprocess.run(run, input=(folder / "frames.h5").read_bytes(), capture_output=True, check=False)
-    assert done.returncode == 3
-    assert b"copy it to a file first" in done.stderr
+def test_hdf5_from_a_pipe_is_one_line(tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe")
+    assert main(["frames", "info", str(tmp_path / "pipe")]) == 3
+    assert "copy it to a file first" in capsys.readouterr().err
 
 
 def test_more_splits_than_their_numbers_have_bytes_for_are_refused(tmp_path):

@@ -209,7 +209,9 @@ def sweep_folder(tmp_path_factory):
 
 
 @pytest.mark.parametrize("command", ["sensor fit", "sweep compare", "sweep report"])
-def test_fits_and_sweeps_read_hdf5_through_the_guard(command, sweep_folder, tmp_path, canary, capsys, recwarn):
+def test_fits_and_sweeps_read_hdf5_through_checksum_child_and_guard(
+    command, sweep_folder, tmp_path, canary, capsys, recwarn, monkeypatch
+):
     folder = tmp_path / "sweep"
     shutil.copytree(sweep_folder, folder)
     (trials,) = folder.glob("*.h5")
@@ -218,41 +220,26 @@ def test_fits_and_sweeps_read_hdf5_through_the_guard(command, sweep_folder, tmp_
         "sweep compare": [sweep_folder, folder],
         "sweep report": [folder],
     }[command]
-    checksum_path(trials).unlink(missing_ok=True)
-    for trick in (external_link, virtual_dataset, declares_8_terabytes):
-        trials.unlink()
-        write(trick, trials, canary)
+
+    def refused():
         before = trials.read_bytes()
         capsys.readouterr()
         assert main([*command.split(), *map(str, arguments)]) == 3
+        assert trials.read_bytes() == before
         (line,) = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("note: ")]
         assert line.startswith(f"error: {trials}: ")
-        assert TRICKS[trick] in line
-        assert trials.read_bytes() == before
+        return line
 
-
-def test_a_first_reading_by_a_child_precedes_fits_and_sweeps(sweep_folder, tmp_path, monkeypatch, capsys):
-    folder = tmp_path / "sweep"
-    shutil.copytree(sweep_folder, folder)
-    (trials,) = folder.glob("*.h5")
-    checksum_path(trials).unlink(missing_ok=True)
-    monkeypatch.setattr("phasemark.data.files.hdf5_reading.first_reading", lambda path: f"looked at {path.name}")
-    fit = ["sensor", "fit", trials, "--distance", "1", "--unit", "m", "--quantity", "range", "-o", tmp_path / "a.toml"]
-    for command in (fit, ["sweep", "compare", sweep_folder, folder], ["sweep", "report", folder]):
-        assert main(list(map(str, command))) == 3
-        assert f"looked at {trials.name}" in capsys.readouterr().err
-
-
-def test_trials_that_their_checksum_contradicts_are_refused(sweep_folder, tmp_path, capsys):
-    folder = tmp_path / "sweep"
-    shutil.copytree(sweep_folder, folder)
-    (trials,) = folder.glob("*.h5")
     content = bytearray(trials.read_bytes())
     content[-1] ^= 1
     trials.write_bytes(content)
-    for command in (["sweep", "compare", str(sweep_folder), str(folder)], ["sweep", "report", str(folder)]):
-        assert main(command) == 3
-        assert f"{trials}: damaged" in capsys.readouterr().err
+    assert "damaged" in refused()
+    checksum_path(trials).unlink()
+    for trick in (external_link, virtual_dataset, declares_8_terabytes):
+        trials.unlink()
+        assert TRICKS[trick] in (write(trick, trials, canary) and refused())
+    monkeypatch.setattr("phasemark.data.files.hdf5_reading.first_reading", lambda path: f"looked at {path.name}")
+    assert f"looked at {trials.name}" in refused()
 
 
 def elapsed_s(work):

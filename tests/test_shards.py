@@ -1,6 +1,7 @@
 """Large files are built in shards: whole or not there, continued after any end, the same bytes however made."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import tempfile
 import threading
 import time
 
+import numpy as np
 import pytest
 from builders import HELPERS_IN_PATH, run_program
 from programs.toy_job import ToyJob, check_toy_file
@@ -15,16 +17,28 @@ from programs.toy_job import ToyJob, check_toy_file
 from phasemark import OutputExistsError, StorageError, UsageError
 from phasemark.data.shards.build import build, difference, manifest_path, partial_path
 from phasemark.data.shards.remote import open_maker
-from phasemark.inputs import verify_checksum
+from phasemark.inputs import checksum_path, verify_checksum
 
 
 def names(folder):
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def start_text(text, **options):
-    """Start a Python program that can import the tests' helpers."""
-    return subprocess.Popen([sys.executable, "-c", text], env=HELPERS_IN_PATH, text=True, **options)
+@pytest.fixture
+def disk(tmp_path):
+    """A function that makes a small disk, or changes its size, and returns its folder."""
+    folder = tmp_path / "disk"
+
+    def sized(size, remount=False):
+        folder.mkdir(exist_ok=True)
+        options = f"{'remount,' if remount else ''}size={size}"
+        mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", folder], check=False)
+        if mounted.returncode:
+            pytest.skip("mounting a small disk needs privileges")
+        return folder
+
+    yield sized
+    subprocess.run(["umount", folder], stderr=subprocess.DEVNULL, check=False)
 
 
 class Stop(Exception):
@@ -158,7 +172,8 @@ def test_a_second_run_on_one_output_is_refused_while_the_first_goes_on(tmp_path)
     assert names(tmp_path) == ["toy", "toy.sha256"]
 
 
-def test_readers_see_the_old_file_or_the_new_one(tmp_path):
+@pytest.mark.parametrize("n", [10, pytest.param(1000, marks=pytest.mark.soak)])
+def test_readers_see_the_old_file_or_the_new_one(tmp_path, n):
     path = tmp_path / "toy"
     build(ToyJob(mark=0), path)
     contents = {path.read_bytes()}
@@ -173,12 +188,13 @@ def test_readers_see_the_old_file_or_the_new_one(tmp_path):
     readers = [threading.Thread(target=read) for _ in range(4)]
     for reader in readers:
         reader.start()
-    for mark in (1, 0, 1, 0):
-        build(ToyJob(mark=mark), path, force=True)
+    turn = 0
+    while len(seen) <= n or turn < 4:
+        turn += 1
+        build(ToyJob(mark=turn % 2), path, force=True)
     ended.set()
     for reader in readers:
         reader.join()
-    assert len(seen) > 10
     assert all(seen)
 
 
@@ -191,58 +207,84 @@ def test_a_build_ended_at_any_call_to_the_system_leaves_old_or_new_and_resumes(a
     assert int(printed) > 30
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interrupted_command_exits_with_its_code_and_can_be_resumed(tmp_path, number, code):
-    path = tmp_path / "toy"
-    program = f"""
+INTERRUPTED = """
 import sys
 from phasemark import cli
 from phasemark.data.shards.build import build
 from programs.toy_job import ToyJob
-
-def run(arguments):
-    build(ToyJob(items=(400, 3), seconds=0.02), {str(path)!r}, workers=2, shard_items=1)
-
-cli._run = run
-sys.exit(cli.main([]))
+cli._run = lambda arguments: build(ToyJob(items=(400, 3), seconds=0.02), arguments[0], workers=2, shard_items=1)
+sys.exit(cli.main(sys.argv[1:]))
 """
-    with start_text(program, stderr=subprocess.PIPE) as child:
-        wait_for(lambda: manifest_path(path).exists() and manifest_path(path).read_bytes().count(b"\n") > 1)
-        child.send_signal(number)
-        child.communicate(timeout=20)
-    assert child.returncode == code
-    assert names(tmp_path) == ["toy.manifest", "toy.partial"]
-    build(ToyJob(items=(400, 3)), path, resume=True)
-    check_toy_file(path, (400, 3))
 
 
-def wait_for(condition, seconds=20.0):
+@pytest.mark.parametrize("n", [1, pytest.param(25, marks=pytest.mark.soak)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_command_exits_with_its_code_and_can_be_resumed(tmp_path, number, code, n):
+    moments = np.random.default_rng(4).uniform(0, 2, n - 1)
+    for wait_s in (0.0, *moments):
+        path = tmp_path / "toy"
+        with subprocess.Popen(
+            [sys.executable, "-c", INTERRUPTED, path], env=HELPERS_IN_PATH, stderr=subprocess.PIPE
+        ) as child:
+            wait_for_a_shard(path)
+            time.sleep(wait_s)
+            child.send_signal(number)
+            child.communicate(timeout=20)
+        assert child.returncode == code
+        assert names(tmp_path) == ["toy.manifest", "toy.partial"]
+        build(ToyJob(items=(400, 3)), path, resume=True)
+        check_toy_file(path, (400, 3))
+        assert names(tmp_path) == ["toy", "toy.sha256"]
+        path.unlink()
+        checksum_path(path).unlink()
+
+
+def wait_for_a_shard(path, seconds=20.0):
     end = time.monotonic() + seconds
-    while not condition():
+    while not manifest_path(path).exists() or manifest_path(path).read_bytes().count(b"\n") < 2:
         assert time.monotonic() < end, "nothing happened"
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize("size_kb", [64, 256, 700, 900])
-def test_a_full_disk_is_an_error_and_the_run_resumes_when_there_is_room(tmp_path, size_kb):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={size_kb}k", "tmpfs", disk], capture_output=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip("mounting a small disk needs privileges")
+SOAKED_KB = [pytest.param(size, marks=pytest.mark.soak) for size in (4, 128, 400, 512, 640, 720, 760, 780)]
+
+
+@pytest.mark.parametrize("size_kb", [64, 256, 700, 900, *SOAKED_KB])
+def test_a_full_disk_is_an_error_and_the_run_resumes_when_there_is_room(disk, size_kb):
+    path = disk(f"{size_kb}k") / "toy"
+    if size_kb < 800:  # the file has 800 kB
+        with pytest.raises(StorageError, match="No space left"):
+            build(ToyJob(), path)
+        assert names(path.parent) == []
+        disk("2m", remount=True)
+    build(ToyJob(), path, resume=True)
+    check_toy_file(path)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("spare_kb", [0, 2000])
+def test_a_disk_that_fills_while_a_file_is_made_ends_the_run_or_leaves_it_alone(disk, spare_kb):
+    """The space is claimed at the start, so only manifest and checksum can still fail."""
+    path = disk("3m") / "toy"
+    filler = path.with_name("filler")
+
+    def fill(done, total):
+        if done == 1:
+            free = shutil.disk_usage(path.parent).free
+            filler.write_bytes(bytes(max(0, free - 1024 * spare_kb)))
+
     try:
-        path = disk / "toy"
-        if size_kb < 800:  # the file has 800 kB
-            with pytest.raises(StorageError, match="No space left"):
-                build(ToyJob(), path)
-            assert names(disk) == []
-            subprocess.run(["mount", "-o", "remount,size=2m", disk], check=True)
+        build(ToyJob(), path, workers=1, shard_items=1, progress=fill)
+    except StorageError:
+        filler.unlink()
         build(ToyJob(), path, resume=True)
-        check_toy_file(path)
-    finally:
-        subprocess.run(["umount", disk], check=True)
+    check_toy_file(path)
+
+
+@pytest.mark.soak
+def test_every_command_that_writes_survives_disks_of_ten_sizes(tmp_path, disk):
+    disk("64m")
+    print(run_program("full_disks", tmp_path))
 
 
 def test_differences_are_named_by_key():

@@ -74,7 +74,9 @@ def stated_frames(path: Path) -> None:
 
 
 def mesh(path: Path) -> None:
-    read_mesh(path, unit="m")
+    found = read_mesh(path, unit="m")
+    assert len(found.faces) > 0
+    assert np.isfinite(found.vertices).all()
 
 
 def plan(kind: str) -> Callable[[Path], object]:
