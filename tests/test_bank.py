@@ -1,12 +1,10 @@
 """Banks of model images: what is written, what is read, what is refused."""
 
-import errno
 import hashlib
 import json
 import os
 import resource
 import shutil
-import subprocess
 
 import h5py
 import numpy as np
@@ -64,9 +62,19 @@ def painted(monkeypatch):
     monkeypatch.setattr("phasemark.data.bank.build_bank.Renderer", Painter)
 
 
+@pytest.fixture(scope="module")
+def painted_bank(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bank") / "bank.h5"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("phasemark.data.bank.build_bank.Renderer", Painter)
+        build_bank(PLAN, path).close()
+    return path
+
+
 @pytest.fixture
-def bank_file(tmp_path, painted):
-    build_bank(PLAN, tmp_path / "bank.h5").close()
+def bank_file(tmp_path, painted_bank, painted):
+    for path in (painted_bank, checksum_path(painted_bank)):
+        shutil.copy(path, tmp_path)
     return tmp_path / "bank.h5"
 
 
@@ -87,10 +95,9 @@ def expected_images(class_name, layout):
     return np.concatenate([upper[:, :, :8], lower[:, :, 8:]], axis=2)
 
 
-@pytest.mark.parametrize("shard_items", [1, 5, None])
 @pytest.mark.parametrize("plan", [PLAN, FULL], ids=["factored", "full"])
-def test_every_image_lies_where_its_coordinates_say(painted, tmp_path, plan, shard_items):
-    with build_bank(plan, tmp_path / "bank.h5") as bank:
+def test_every_image_lies_where_its_coordinates_say(painted, tmp_path, plan):
+    with build_bank(plan, tmp_path / "bank.h5", shard_items=5) as bank:
         assert bank.classes == ("cone", "post")
         assert bank.distance_m.tolist() == [0.8, 1.0, 1.2]
         assert bank.delta_rad.tolist() == np.deg2rad([0, 45, 90, 135]).tolist()
@@ -158,13 +165,6 @@ def test_the_bank_holds_what_the_renderer_renders():
         np.testing.assert_allclose(stored.coverage, rendered.coverage, rtol=rtol)
 
 
-@pytest.mark.parametrize("plan", [PLAN, FULL], ids=["factored", "full"])
-def test_the_same_plan_gives_the_same_bytes_for_any_number_of_workers(tmp_path, plan):
-    build_bank(plan, tmp_path / "a.h5", workers=1).close()
-    build_bank(plan, tmp_path / "b.h5", workers=3).close()
-    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
-
-
 def test_a_bank_of_a_stored_plan_is_the_same_bank(bank_file):
     with open_bank(bank_file) as bank:
         again = bank_file.with_name("again.h5")
@@ -173,6 +173,8 @@ def test_a_bank_of_a_stored_plan_is_the_same_bank(bank_file):
 
 
 def test_the_file_says_where_it_comes_from(bank_file):
+    assert names(bank_file.parent) == ["bank.h5", "bank.h5.sha256"]
+    verify_checksum(bank_file)
     with h5py.File(bank_file) as file:
         assert file.attrs["format"] == "phasemark-bank"
         assert file.attrs["schema_version"] == 1
@@ -280,18 +282,6 @@ def test_xarray_shows_labelled_axes_with_units(bank_file, group, dims):
             assert np.array_equal(picked.sel(iq="i") + 1j * picked.sel(iq="q"), expected)
 
 
-def test_other_tools_read_the_header(bank_file):
-    if shutil.which("h5dump") is None:
-        pytest.skip("needs h5dump of hdf5-tools")
-    header = subprocess.run(["h5dump", "-H", bank_file], check=True, capture_output=True, text=True).stdout
-    assert 'DATASET "phasor"' in header
-
-
-def test_the_checksum_lies_beside_the_bank(bank_file):
-    assert names(bank_file.parent) == ["bank.h5", "bank.h5.sha256"]
-    verify_checksum(bank_file)
-
-
 def test_a_bank_without_a_path_leaves_no_file(painted, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with build_bank(PLAN) as bank:
@@ -335,22 +325,6 @@ def test_an_interrupted_build_leaves_the_old_bank_and_can_be_resumed(bank_file, 
     build_bank(FULL, tmp_path / "again.h5").close()
     assert bank_file.read_bytes() == (tmp_path / "again.h5").read_bytes()
     assert names(bank_file.parent) == ["again.h5", "again.h5.sha256", "bank.h5", "bank.h5.sha256"]
-
-
-@pytest.mark.parametrize("call", ["posix_fallocate", "pwrite", "fsync"])
-def test_a_full_disk_is_an_error_and_leaves_the_old_bank(bank_file, monkeypatch, call):
-    before = bank_file.read_bytes()
-
-    def fail(*arguments):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, call, fail)
-        with pytest.raises(StorageError, match="No space left on device"):
-            build_bank(FULL, bank_file, force=True)
-    assert bank_file.read_bytes() == before
-    verify_checksum(bank_file)
-    assert names(bank_file.parent) == ["bank.h5", "bank.h5.sha256"]
 
 
 def test_a_file_size_limit_of_the_system_is_an_error_not_a_crash(tmp_path, painted):
@@ -410,6 +384,12 @@ def spoiled(name, value):
     return change
 
 
+def damage(path, change):
+    checksum_path(path).unlink()
+    with h5py.File(path, "r+") as file:
+        change(file)
+
+
 def changed_sensor(file):
     file.attrs["sensor"] = preset("pmd-16x16").with_(rows=8).model_dump_json()
 
@@ -418,7 +398,6 @@ def changed_sensor(file):
     ("change", "reason"),
     [
         (with_attribute("format", "phasemark-frames"), "not a bank .*'phasemark-frames'"),
-        (with_attribute("schema_version", 2), "schema version 2, this phasemark reads 1: update phasemark"),
         (with_attribute("schema_version", 0), "build it again"),
         (with_attribute("plan", "{"), "damaged"),
         (with_attribute("plan", "[1]"), "must be a JSON object"),
@@ -446,31 +425,30 @@ def changed_sensor(file):
     ],
 )
 def test_a_damaged_bank_is_refused_when_opened(bank_file, change, reason):
-    checksum_path(bank_file).unlink(missing_ok=True)
-    with h5py.File(bank_file, "r+") as file:
-        change(file)
+    damage(bank_file, change)
     with pytest.raises(InputFileError, match=reason) as caught:
         open_bank(bank_file)
     assert str(caught.value).startswith(f"{bank_file}: ")
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("field", ["phasor", "intensity", "coverage"])
-def test_values_that_are_not_finite_are_refused_when_read(bank_file, field):
-    checksum_path(bank_file).unlink(missing_ok=True)
-    with h5py.File(bank_file, "r+") as file:
-        spoiled(f"lower/{field}", np.inf)(file)
-    with open_bank(bank_file) as bank, pytest.raises(InputFileError, match=f"'lower/{field}' must be finite"):
-        getattr(bank.lower, field)
-
-
-@pytest.mark.parametrize(("name", "value"), [("vertices", np.nan), ("vertices", 1e60), ("faces", -1), ("faces", 10**6)])
-def test_a_damaged_mesh_is_refused_when_read(bank_file, name, value):
-    checksum_path(bank_file).unlink(missing_ok=True)
-    with h5py.File(bank_file, "r+") as file:
-        spoiled(f"meshes/cone/{name}", value)(file)
-    with open_bank(bank_file) as bank, pytest.raises(InputFileError, match="'meshes/cone' has vertices"):
-        bank.mesh("cone")
+@pytest.mark.parametrize(
+    ("name", "value", "read", "reason"),
+    [
+        *(
+            (f"lower/{field}", np.inf, lambda bank, field=field: getattr(bank.lower, field), f"'lower/{field}' must be")
+            for field in ("phasor", "intensity", "coverage")
+        ),
+        *(
+            (f"meshes/cone/{field}", value, lambda bank: bank.mesh("cone"), "'meshes/cone' has vertices")
+            for field, value in (("vertices", np.nan), ("vertices", 1e60), ("faces", -1), ("faces", 10**6))
+        ),
+    ],
+)
+def test_values_that_cannot_be_are_refused_when_read(bank_file, name, value, read, reason):
+    damage(bank_file, spoiled(name, value))
+    with open_bank(bank_file) as bank, pytest.raises(InputFileError, match=reason):
+        read(bank)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
@@ -504,20 +482,18 @@ def test_a_layout_of_a_terabyte_takes_a_few_pages_of_memory():
 
 def test_sparse_memory_is_a_file(tmp_path):
     rng = np.random.default_rng(3)
-    memory = SparseMemory()
     with open(tmp_path / "f", "w+b") as file:
+        both = (SparseMemory(), file)
         for at, size in zip(rng.integers(0, 400_000, 50), rng.integers(0, 200_000, 50), strict=True):
             data = rng.bytes(int(size))
-            for target in (memory, file):
+            for target in both:
                 target.seek(int(at))
                 assert target.write(memoryview(data)) == size
         for at, size in zip(rng.integers(0, 700_000, 50), rng.integers(0, 200_000, 50), strict=True):
-            answers = []
-            for target in (memory, file):
-                buffer = bytearray(int(size))
-                target.seek(int(at))
-                answers.append((target.readinto(memoryview(buffer)), bytes(buffer)))
-            assert answers[0] == answers[1]
-        for target in (memory, file):
+            buffers = bytearray(int(size)), bytearray(int(size))
+            assert both[0].seek(int(at)) == both[1].seek(int(at))
+            assert both[0].readinto(memoryview(buffers[0])) == both[1].readinto(buffers[1])
+            assert buffers[0] == buffers[1]
+        for target in both:
             target.truncate(300_000)
-        assert memory.seek(0, os.SEEK_END) == file.seek(0, os.SEEK_END) == 300_000
+            assert target.seek(0, os.SEEK_END) == 300_000

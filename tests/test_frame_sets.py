@@ -2,13 +2,14 @@
 
 import hashlib
 import pickle
-import subprocess
-import sys
+import shutil
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import xarray
+from programs.system_calls import in_fork
 
 from phasemark import InputFileError, OutputExistsError, UsageError
 from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_frames, read_frames
@@ -40,7 +41,7 @@ PLAN = FramePlan(
 @pytest.fixture(scope="module")
 def frames_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("frames") / "frames.h5"
-    build_frames(PLAN, path).close()
+    build_frames(PLAN, path, workers=1).close()
     return path
 
 
@@ -146,11 +147,7 @@ def test_quantities_are_independent_of_one_another():
 # --- bytes -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"workers": 1}, {"workers": 3, "shard_items": 7}, {"workers": 8, "shard_items": 1}],
-    ids=str,
-)
+@pytest.mark.parametrize("options", [{"workers": 3, "shard_items": 7}, {"workers": 8, "shard_items": 1}], ids=str)
 def test_workers_and_shards_do_not_change_the_bytes(frames_file, tmp_path, options):
     build_frames(PLAN, tmp_path / "again.h5", **options).close()
     assert sha256(tmp_path / "again.h5") == sha256(frames_file)
@@ -169,9 +166,9 @@ def test_parts_built_apart_merge_to_the_bytes_of_one_run(frames_file, tmp_path):
         merge_parts([parts[0], stranger, parts[2]], tmp_path / "other.h5")
 
 
-def test_parts_of_a_bank_merge_too(tmp_path):
+def test_parts_of_a_bank_merge_too_whatever_workers_and_shards(tmp_path):
     plan = BankPlan(classes=["cone", "post"], distance_m="0.9:1.1:0.1", delta_deg="0:180:30")
-    build_bank(plan, tmp_path / "whole.h5").close()
+    build_bank(plan, tmp_path / "whole.h5", workers=1, shard_items=7).close()
     parts = [build_part(plan, (i, 4), tmp_path / f"part{i}.h5") for i in (1, 2, 3, 4)]
     merge_parts(parts, tmp_path / "merged.h5")
     assert sha256(tmp_path / "merged.h5") == sha256(tmp_path / "whole.h5")
@@ -194,10 +191,10 @@ def test_resuming_a_finished_set_changes_nothing_and_of_another_plan_is_refused(
 @pytest.mark.parametrize(
     ("small", "large"),
     [
-        (FramePlan(views=100, frames_per_view=3), {"views": 300}),
-        (FramePlan(views=100), {"frames_per_view": 4}),
-        (FramePlan(views=100, variants=["shot"], keep_taps=True), {"views": 300}),
-        (FramePlan(views=100, sensor="vl53l5cx-8x8", variants=["mixed"]), {"views": 300}),
+        (FramePlan(classes=["cone"], views=100, frames_per_view=3), {"views": 300}),
+        (FramePlan(classes=["cone"], views=100), {"frames_per_view": 4}),
+        (FramePlan(classes=["cone"], views=100, variants=["shot"], keep_taps=True), {"views": 300}),
+        (FramePlan(classes=["cone"], views=100, sensor="vl53l5cx-8x8", variants=["mixed"]), {"views": 300}),
         (BankPlan(classes=["cone"], distance_m=[1, 2], delta_deg=[0, 10], layout="full", harmonics=[3, 5]),
          {"distance_m": "1:2:0.02"}),
         (BankPlan(classes=["cone", "cylinder"], distance_m=[1, 2], delta_deg="0:170:5"), {"distance_m": "1:2:0.02"}),
@@ -209,20 +206,15 @@ def test_a_larger_plan_makes_the_file_larger_by_what_the_arithmetic_says(small, 
     planned = [planned_size(plan)["bytes"] for plan in (small, large)]
     # coordinates and the text of the plan are not counted
     assert files[1] - files[0] == pytest.approx(planned[1] - planned[0], abs=4096)
-    assert 0 < files[0] - planned[0] < 2_000_000  # the meshes of the whole catalogue
+    assert 0 < files[0] - planned[0] < 1_000_000  # the meshes
 
 
-def test_a_trial_that_has_no_time_still_estimates_the_time():
-    facts = estimate_build(PLAN, trial_seconds=0.0)
-    assert facts["views"] == 20
-    assert 0 < facts["seconds"] < 600
-
-
-def test_a_dry_run_knows_the_size(frames_file):
-    facts = estimate_build(PLAN)
+@pytest.mark.parametrize("trial_seconds", [None, 0.0])
+def test_a_dry_run_knows_the_size_and_estimates_the_time(frames_file, trial_seconds):
+    facts = estimate_build(PLAN, trial_seconds=trial_seconds)
     assert facts["bytes"] == frames_file.stat().st_size
     assert (facts["views"], facts["frames"]) == (20, 60)
-    assert facts["seconds"] > 0
+    assert 0 < facts["seconds"] < 600
 
 
 # --- content ---------------------------------------------------------------------------------------------------------
@@ -288,16 +280,8 @@ def test_it_is_a_map_style_data_set_that_other_processes_can_read(frames, frames
     subset = frames.subset("train", transform=distance_of)
     again = pickle.loads(pickle.dumps(subset))
     assert [again[k] for k in range(len(again))] == [subset[k] for k in range(len(subset))]
-    program = (
-        "import multiprocessing as mp, sys, numpy as np\n"
-        "from phasemark.data import open_frames\n"
-        "frames = open_frames(sys.argv[1])\n"
-        "def total(k): return float(np.nansum(frames[k]['range_m']))\n"
-        "with mp.get_context('fork').Pool(2) as pool:\n"
-        "    assert pool.map(total, range(60)) == [total(k) for k in range(60)]\n"
-        "assert 'torch' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-W", "ignore", "-c", program, frames_file], check=True)
+    expected = frames[17]["range_m"]  # and after a fork, which leaves the child no handle of the file
+    assert in_fork(lambda: int(not np.array_equal(frames[17]["range_m"], expected, equal_nan=True))) == 0
 
 
 def test_a_closed_set_says_so(frames_file):
@@ -380,9 +364,7 @@ def test_verify_reports_every_flipped_bit_and_every_cut(frames_file, tmp_path, n
     ],
 )
 def test_verify_finds_what_a_forged_checksum_hides(frames_file, tmp_path, name, change, message):
-    path = tmp_path / "frames.h5"
-    path.write_bytes(frames_file.read_bytes())
-    checksum_path(path).unlink(missing_ok=True)
+    path = Path(shutil.copy(frames_file, tmp_path))
     with h5py.File(path, "r+") as file:
         if np.isfinite(change) and name.startswith("range"):
             file[name][...] = file[name][...] + np.float32(change)
@@ -405,16 +387,6 @@ def test_verify_renders_a_bank_again(tmp_path):
         verify_bank(path, sample=100)
 
 
-def test_a_file_of_a_newer_version_names_it(frames_file, tmp_path):
-    path = tmp_path / "frames.h5"
-    path.write_bytes(frames_file.read_bytes())
-    checksum_path(path).unlink(missing_ok=True)
-    with h5py.File(path, "r+") as file:
-        file.attrs["schema_version"] = 9
-    with pytest.raises(InputFileError, match="has schema version 9, this phasemark reads 1: update phasemark"):
-        open_frames(path)
-
-
 def test_a_distribution_knows_its_bounds():
     assert Distribution(normal=(1, 2)).lowest == -np.inf
     assert Distribution(normal=(1, 2), within=(0, 3)).highest == 3
@@ -431,9 +403,7 @@ def test_a_distribution_knows_its_bounds():
     ],
 )
 def test_values_that_no_run_writes_are_refused_when_they_are_read(frames_file, tmp_path, name, value, message):
-    path = tmp_path / "frames.h5"
-    path.write_bytes(frames_file.read_bytes())
-    checksum_path(path).unlink(missing_ok=True)
+    path = Path(shutil.copy(frames_file, tmp_path))
     with h5py.File(path, "r+") as file:
         file[name][0, 8, 8] = value
     with open_frames(path) as frames, pytest.raises(InputFileError, match=message):
