@@ -83,12 +83,7 @@ def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bo
         with storage_errors(path):
             _create(parts[0], private=real.exists())
             yield parts[0]
-            _take_over(parts[0], real)
-            sync(parts[0])
-            if checksum:
-                parts[1].write_bytes(checksum_line(sha256_of(parts[0]), real.name))
-                _take_over(parts[1], targets[1])
-                sync(parts[1])
+            _finish(parts, targets, sha256_of(parts[0]) if checksum else None)
         _move_into_place(parts, targets, force=force)
     finally:
         for leftover in parts:
@@ -115,18 +110,23 @@ def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
     OutputExistsError, StorageError
         As :func:`write_atomically`; `part` and what was there before are untouched.
     """
-    checksum_part, _ = _publishing_names(path)
+    parts, targets = [part, _publishing_names(path)[0]], [path, checksum_path(path)]
     try:
         with storage_errors(path):
-            _take_over(part, path)
-            sync(part)
-            checksum_part.write_bytes(checksum_line(digest, path.name))
-            _take_over(checksum_part, checksum_path(path))
-            sync(checksum_part)
-        _move_into_place([part, checksum_part], [path, checksum_path(path)], force=force)
+            _finish(parts, targets, digest)
+        _move_into_place(parts, targets, force=force)
     finally:
         with suppress(OSError):
-            checksum_part.unlink(missing_ok=True)
+            parts[1].unlink(missing_ok=True)
+
+
+def _finish(parts: list[Path], targets: list[Path], digest: str | None) -> None:
+    """Write the checksum, if any, and have files with the permissions of those that they replace on the disk."""
+    if digest is not None:
+        parts[1].write_bytes(checksum_line(digest, targets[0].name))
+    for part, target in zip(parts, targets, strict=True):
+        take_over(part, target)
+        sync(part)
 
 
 def finish_publishing(path: Path) -> None:
@@ -164,7 +164,7 @@ def _replace(parts: list[Path], targets: list[Path], *, force: bool) -> None:
             if len(targets) > 1 and targets[1].exists():
                 os.replace(targets[1], aside)
             for part, target in zip(parts, targets, strict=True):
-                _move(part, target, force=force)
+                move(part, target, force=force)
             sync(targets[0].parent)
     except BaseException:
         if aside.exists() and parts[0].exists():  # the file is still the old one: give it its checksum back
@@ -177,7 +177,8 @@ def _replace(parts: list[Path], targets: list[Path], *, force: bool) -> None:
                 aside.unlink(missing_ok=True)
 
 
-def _move(part: Path, target: Path, *, force: bool) -> None:
+def move(part: Path, target: Path, *, force: bool) -> None:
+    """Rename a file or folder, and refuse one that exists unless `force` allows it."""
     if force:
         os.replace(part, target)
         return
@@ -249,8 +250,8 @@ def _create(path: Path, *, private: bool) -> None:
     os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600 if private else 0o666))
 
 
-def _take_over(part: Path, target: Path) -> None:
-    """Copy the permissions of the replaced file to a finished one, and its owner where the system allows it."""
+def take_over(part: Path, target: Path) -> None:
+    """Copy permissions of what is replaced to a finished file or folder, and its owner where the system allows it."""
     try:
         old = target.stat()
     except FileNotFoundError:

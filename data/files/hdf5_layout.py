@@ -29,18 +29,6 @@ class SparseMemory(io.RawIOBase):
         self._position = 0
         self._size = 0
 
-    def readable(self) -> bool:
-        """Return True."""
-        return True
-
-    def writable(self) -> bool:
-        """Return True."""
-        return True
-
-    def seekable(self) -> bool:
-        """Return True."""
-        return True
-
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Move to a position, beyond the end if need be."""
         start = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
@@ -55,30 +43,30 @@ class SparseMemory(io.RawIOBase):
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
         """Read from the position on and return how many bytes there were."""
         view = memoryview(buffer).cast("B")
-        length = max(0, min(len(view), self._size - self._position))
-        done = 0
-        while done < length:
-            page, start = divmod(self._position + done, _PAGE_BYTES)
-            count = min(length - done, _PAGE_BYTES - start)
+        view = view[: max(0, self._size - self._position)]
+        for page, of_page, of_view in self._spans(len(view)):
             held = self._pages.get(page)
-            view[done : done + count] = bytes(count) if held is None else held[start : start + count]
-            done += count
-        self._position += length
-        return length
+            view[of_view] = bytes(of_page.stop - of_page.start) if held is None else held[of_page]
+        self._position += len(view)
+        return len(view)
 
     def write(self, data: memoryview) -> int:  # type: ignore[override]
         """Write at the position and return the number of bytes."""
         view = memoryview(data).cast("B")
-        done = 0
-        while done < len(view):
-            page, start = divmod(self._position + done, _PAGE_BYTES)
-            count = min(len(view) - done, _PAGE_BYTES - start)
-            held = self._pages.setdefault(page, bytearray(_PAGE_BYTES))
-            held[start : start + count] = view[done : done + count]
-            done += count
-        self._position += done
+        for page, of_page, of_view in self._spans(len(view)):
+            self._pages.setdefault(page, bytearray(_PAGE_BYTES))[of_page] = view[of_view]
+        self._position += len(view)
         self._size = max(self._size, self._position)
-        return done
+        return len(view)
+
+    def _spans(self, length: int) -> Iterator[tuple[int, slice, slice]]:
+        """Yield the pages of the next bytes, with their places in the page and among these bytes."""
+        done = 0
+        while done < length:
+            page, start = divmod(self._position + done, _PAGE_BYTES)
+            count = min(length - done, _PAGE_BYTES - start)
+            yield page, slice(start, start + count), slice(done, done + count)
+            done += count
 
     def __len__(self) -> int:
         return self._size

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import shutil
-import stat
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from phasemark import OutputExistsError, UsageError
 from phasemark.data.files import renames
-from phasemark.data.files.atomic_write import followed, storage_errors, sync
+from phasemark.data.files.atomic_write import followed, move, storage_errors, sync, take_over
 from phasemark.data.files.folder_marker import (
     MARKER,
     entries_of,
@@ -65,13 +64,15 @@ def replacing_folder(path: Path, content: str, *, force: bool = False) -> Iterat
         try:
             write_marker(staging, content, None)
             yield staging
-            _seal(staging, content)
+            entries = list(entries_of(staging))
+            for entry in entries:
+                sync(staging / entry)
+            write_marker(staging, content, entries)
             refuse_folder(path, force=force)
-            if real.exists():
-                _take_over(staging, real)
-                _exchange(staging, real, aside)
-            else:
-                _rename(staging, real)
+            take_over(staging, real)
+            # the old folder gets the temporary name, in one step where the file system can
+            if not (real.exists() and renames.exchange(staging, real)):
+                _give_name(staging, real, aside)
             sync(real.parent)
         finally:
             _discard(staging)
@@ -114,40 +115,17 @@ def _followed(path: Path) -> Path:
     return Path(os.path.realpath(path)) if path.name in ("", "..") else followed(path)
 
 
-def _seal(folder: Path, content: str) -> None:
-    """List what a folder holds in its marker, and have all of it written to the disk."""
-    entries = list(entries_of(folder))
-    for entry in entries:
-        sync(folder / entry)
-    write_marker(folder, content, entries)
-
-
-def _take_over(staging: Path, real: Path) -> None:
-    """Copy the permissions of the replaced folder to a new one, and its owner where the system allows it."""
-    old = real.stat()
-    with suppress(PermissionError):
-        os.chown(staging, old.st_uid, old.st_gid)
-    os.chmod(staging, stat.S_IMODE(old.st_mode))
-
-
-def _exchange(staging: Path, real: Path, aside: Path) -> None:
-    """Rename the new folder to the name of the old one, and remove the old one."""
-    if renames.exchange(staging, real):
-        return  # the old folder has the temporary name now
-    os.replace(real, aside)
+def _give_name(staging: Path, real: Path, aside: Path) -> None:
+    """Rename the new folder to its name; an old one steps aside first, and returns if the new one cannot go."""
+    if real.exists():
+        os.replace(real, aside)
     try:
-        os.replace(staging, real)
+        move(staging, real, force=False)
     except BaseException:
-        os.replace(aside, real)
+        if aside.exists():
+            os.replace(aside, real)
         raise
     _discard(aside)
-
-
-def _rename(staging: Path, real: Path) -> None:
-    try:
-        renames.rename_new(staging, real)
-    except FileExistsError:
-        raise OutputExistsError(f"{real}: exists; use force=True to replace it") from None
 
 
 def _recover(real: Path, staging: Path, aside: Path) -> None:
@@ -168,16 +146,13 @@ def _discard(folder: Path) -> None:
     """
     if not os.path.lexists(folder):
         return
-    marked, listed = read_marker(folder)
-    if marked and listed is None:  # nobody but the run that was killed knows the name
-        shutil.rmtree(folder)
-        return
-    if marked and listed is not None:
-        remove_listed(folder, listed)
-    ours = folder.is_dir() and not folder.is_symlink()
-    names = os.listdir(folder) if ours else []
-    if not ours or not all(name == MARKER or is_marker_part(name) for name in names):
-        raise OutputExistsError(f"{folder}: is not phasemark's, or holds what phasemark did not write: move it away")
-    for name in names:
-        (folder / name).unlink()
-    folder.rmdir()
+    if folder.is_dir() and not folder.is_symlink():
+        marked, listed = read_marker(folder)
+        if marked and listed is None:  # nobody but the run that was killed knows the name
+            shutil.rmtree(folder)
+            return
+        remove_listed(folder, listed or set())
+        if all(name == MARKER or is_marker_part(name) for name in os.listdir(folder)):
+            shutil.rmtree(folder)
+            return
+    raise OutputExistsError(f"{folder}: is not phasemark's, or holds what phasemark did not write: move it away")
