@@ -103,7 +103,6 @@ def sensor_show(
         typer.echo(f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {scales} m per radian")
     typer.echo(f"# {_sources_counted(sources)}")
     from phasemark.render.sensor.sensor_fields import DIRECT_ONLY, PHASE_ONLY, TABLES
-    from phasemark.render.sensor.sensor_file import TABLE_MODELS
 
     fields = sensor.model_dump(mode="json")
     tables = {name: fields.pop(name) for name in TABLES if name in fields}  # they stand behind all fields
@@ -117,7 +116,7 @@ def sensor_show(
         _echo_group(f"# {title}", {name: fields[name] for name in names if name in fields}, type(sensor), sources)
     for title, table in tables.items():
         own = {name.removeprefix(f"{title}."): text for name, text in sources.items() if name.startswith(f"{title}.")}
-        _echo_group(f"[{title}]", table, TABLE_MODELS[title], own)
+        _echo_group(f"[{title}]", table, TABLES[title], own)
     for line in source_lines(sources):
         typer.echo(line)
 

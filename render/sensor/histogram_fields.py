@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from phasemark import UsageError
-from phasemark.inputs import refuse_truth_values
+from phasemark.inputs.field_table import FieldTable
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 _Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 _NonNegative = Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False)]
@@ -19,7 +22,7 @@ MOST_TARGETS = 4
 _LEAST_IRF_SAMPLES = 3
 
 
-class Histogram(BaseModel):
+class Histogram(FieldTable):
     """Histograms of a direct sensor's zones, and the estimator of its chip (PHYSICS section 11).
 
     The expected counts of bin j are cycles · [photons · h ∗ p + ambient + dark] + crosstalk, where h is the zone's
@@ -98,8 +101,6 @@ class Histogram(BaseModel):
         A value is out of range, or two contradict each other.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
-
     bins: Annotated[int, Field(ge=8, le=4096)]
     bin_width_m: Annotated[float, Field(ge=1e-4, le=10, allow_inf_nan=False)]
     start_m: _Number = 0.0
@@ -132,17 +133,11 @@ class Histogram(BaseModel):
     min_separation_m: _NonNegative = 0.0
     reports: Literal["range", "z"] = "range"
 
-    def __init__(self, **data: Any) -> None:
-        refuse_truth_values({k: v for k, v in data.items() if k != "pile_up"}, type(self).model_fields)
-        try:
-            super().__init__(**data)
-        except ValidationError as error:
-            first = error.errors()[0]
-            if not first["loc"]:  # a finding about several fields names them itself
-                raise UsageError(first["msg"].removeprefix("Value error, ")) from None
-            if first["type"] == "extra_forbidden":
-                raise UsageError(f"'{first['loc'][0]}' is no key of [histogram]") from None
-            raise UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"]) from None
+    @classmethod
+    def _refusal(cls, first: ErrorDetails) -> UsageError:
+        if first["type"] == "extra_forbidden":
+            return UsageError(f"'{first['loc'][0]}' is no key of [histogram]")
+        return super()._refusal(first)
 
     @model_validator(mode="after")
     def _fields_agree(self) -> Self:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from phasemark import UsageError
-from phasemark.inputs import refuse_truth_values
+from phasemark.inputs.field_table import FieldTable
 from phasemark.render.sensor.lens_map import LensMap, lens_map
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 _Focal = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
 _Centre = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
@@ -41,7 +44,7 @@ DERIVED = ("half_angle_h_deg", "half_angle_v_deg", "principal_point_px")
 """Fields of a sensor that follow from its lens."""
 
 
-class Lens(BaseModel):
+class Lens(FieldTable):
     """A lens with distortion, as OpenCV and ROS state it: the table ``[lens]`` of a sensor file.
 
     OpenCV counts pixels from the *centre* of the first one, this program from the corner of the image: OpenCV's point
@@ -65,8 +68,6 @@ class Lens(BaseModel):
         A value is out of range, or the number of coefficients does not belong to the model.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
-
     model: Literal["opencv", "fisheye"] = "opencv"
     fx: _Focal
     fy: _Focal
@@ -74,20 +75,11 @@ class Lens(BaseModel):
     cy: _Centre
     distortion: tuple[_Coefficient, ...] = ()
 
-    def __init__(self, **data: Any) -> None:
-        refuse_truth_values(data, type(self).model_fields)
-        try:
-            super().__init__(**data)
-        except ValidationError as error:
-            first = error.errors()[0]
-            if not first["loc"]:  # a finding about several fields names them itself
-                raise UsageError(first["msg"].removeprefix("Value error, ")) from None
-            if first["type"] == "extra_forbidden":
-                raise UsageError(
-                    f"'{first['loc'][0]}' is no key of [lens]: it has {', '.join(Lens.model_fields)}"
-                ) from None
-            loc = ("lens", *first["loc"])
-            raise UsageError.of_field(loc, first["type"], first["msg"], first["input"]) from None
+    @classmethod
+    def _refusal(cls, first: ErrorDetails) -> UsageError:
+        if first["type"] == "extra_forbidden":
+            return UsageError(f"'{first['loc'][0]}' is no key of [lens]: it has {', '.join(cls.model_fields)}")
+        return super()._refusal({**first, "loc": ("lens", *first["loc"])})
 
     @model_validator(mode="after")
     def _coefficients_belong_to_the_model(self) -> Self:
@@ -253,7 +245,7 @@ def changed_lens(lens: Lens, rows: int, cols: int, changes: Mapping[str, Any]) -
     """
     point = changes.get("principal_point_px")
     if point is not None:
-        lens = Lens(**{**lens.model_dump(), "cx": point[0] - 0.5, "cy": point[1] - 0.5})
+        lens = lens.with_terms(cx=point[0] - 0.5, cy=point[1] - 0.5)
     for name, focal, axis in (("half_angle_h_deg", "fx", 0), ("half_angle_v_deg", "fy", 1)):
         if name not in changes:
             continue
@@ -262,7 +254,7 @@ def changed_lens(lens: Lens, rows: int, cols: int, changes: Mapping[str, Any]) -
             ratio = lens.before(rows, cols).tan_half_angles[axis] / wanted
             if abs(ratio - 1) < _SOLVED:
                 break
-            lens = Lens(**{**lens.model_dump(), focal: getattr(lens, focal) * ratio})
+            lens = lens.with_terms(**{focal: getattr(lens, focal) * ratio})
     return lens
 
 

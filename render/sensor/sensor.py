@@ -17,7 +17,7 @@ from phasemark.inputs.numbers import in_words
 from phasemark.inputs.toml_file import read_toml
 from phasemark.render.sensor.lens_fields import DERIVED, LENS_FIELD, Lens, changed_lens, check_image_size
 from phasemark.render.sensor.sensor_checks import check_fields
-from phasemark.render.sensor.sensor_fields import CALIBRATION, OPTICS
+from phasemark.render.sensor.sensor_fields import CALIBRATION, FIELD_GROUPS, OPTICS
 from phasemark.render.sensor.sensor_quantities import SensorQuantities
 from phasemark.render.sensor.sources import without_sources
 
@@ -461,25 +461,7 @@ class Sensor(SensorQuantities):
     @classmethod
     def field_groups(cls) -> dict[str, tuple[str, ...]]:
         """Return the fields in groups, in the order of light's way through the camera: title → names."""
-        titles = {
-            "kind": "kind",
-            "rows": "geometry",
-            "modulation_hz": "modulation and timing",
-            "signal_e": "electrons per phase image",
-            "full_well_e": "read-out",
-            "phase_offset_std_rad": "offsets of one physical camera",
-            "blur_share": "stray light",
-            "dead_share": "defects",
-            "max_phase_std_rad": "validity",
-            "max_range_m": "direct time of flight only",
-            "calibration_fields": "what a calibration leaves",
-        }
-        groups: dict[str, tuple[str, ...]] = {}
-        title = ""
-        for name in cls.model_fields:
-            title = titles.get(name, title)
-            groups[title] = (*groups.get(title, ()), name)
-        return groups
+        return FIELD_GROUPS
 
 
 @lru_cache(maxsize=32)

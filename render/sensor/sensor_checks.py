@@ -53,15 +53,12 @@ def check_kind(sensor: SensorQuantities) -> None:
         raise ValueError(
             "'lens' must be left out beside 'histogram': the zones of a direct sensor are rectangles of tangents"
         )
-    foreign = PHASE_ONLY if sensor.kind == "direct" else DIRECT_ONLY
+    foreign, why = DIRECT_ONLY, "it belongs to 'kind' = 'direct'"
+    if sensor.kind == "direct":
+        foreign, why = PHASE_ONLY, "a direct sensor has no taps, harmonics or phasors"
     for name in foreign:
         value = getattr(sensor, name)
         if value != SensorFields.model_fields[name].default:
-            why = (
-                "a direct sensor has no taps, harmonics or phasors"
-                if sensor.kind == "direct"
-                else "it belongs to 'kind' = 'direct'"
-            )
             shown = "a table" if name == "histogram" else value
             raise ValueError(f"'{name}' must be left out for 'kind' = '{sensor.kind}', got {shown}: {why}")
     if sensor.kind == "direct" and len(sensor.frequencies_hz) > 1:
@@ -114,14 +111,10 @@ def check_times_and_shares(sensor: SensorQuantities) -> None:
             f"'phase_interval_s' must be at most 1 / ({sensor.n_phase_images} · frame_rate_hz) = {longest:.6g}, got "
             f"{sensor.phase_interval_s:g}"
         )
-    if sensor.blur_share + sensor.veil_share >= 1:
-        raise ValueError(
-            f"'blur_share' + 'veil_share' must be below 1, got {sensor.blur_share:g} + {sensor.veil_share:g}"
-        )
-    if sensor.dead_share + sensor.hot_share >= 1:
-        raise ValueError(
-            f"'dead_share' + 'hot_share' must be below 1, got {sensor.dead_share:g} + {sensor.hot_share:g}"
-        )
+    for names in (("blur_share", "veil_share"), ("dead_share", "hot_share")):
+        one, other = (getattr(sensor, name) for name in names)
+        if one + other >= 1:
+            raise ValueError(f"'{names[0]}' + '{names[1]}' must be below 1, got {one:g} + {other:g}")
     for name in ("dead_pixels", "hot_pixels"):
         for row, col in getattr(sensor, name):
             if row >= sensor.rows or col >= sensor.cols:

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Discriminator,
     Field,
     SerializerFunctionWrapHandler,
     Tag,
-    ValidationError,
     model_serializer,
+    model_validator,
 )
 
 from phasemark import UsageError
-from phasemark.inputs import refuse_truth_values
+from phasemark.inputs.field_table import FieldTable
 from phasemark.render.sensor.histogram_fields import Histogram
 from phasemark.render.sensor.lens_fields import Lens, with_geometry_of_lens
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 _LARGEST = 1e12
 """Of any number of a sensor: the square of none overflows, and the reciprocal of none is infinite."""
@@ -64,85 +65,12 @@ _Frequencies = Annotated[
     BeforeValidator(_without_list_of_one),
 ]
 
-# What an image's rays and phases depend on: cameras that agree in these see the same noise-free image.
-OPTICS = (
-    "rows",
-    "cols",
-    "lens",
-    "half_angle_h_deg",
-    "half_angle_v_deg",
-    "centre_px",
-    "pitch_deg",
-    "roll_deg",
-    "bearing_offset_deg",
-    "height_offset_m",
-    "fill_factor",
-    "vignetting",
-    "modulation_hz",
-)
-
-# What is a table of its own in a sensor file, and left out where there is none.
-TABLES = ("lens", "histogram")
-
-# What only a camera with taps has, and what only a direct one has.
-PHASE_ONLY = (
-    "phase_interval_s",
-    "contrast",
-    "modulation",
-    "max_harmonic",
-    "harmonics",
-    "emitted_pulse",
-    "reference_pulse",
-    "signal_e",
-    "ambient_e",
-    "dark_e",
-    "shot_noise",
-    "read_noise_e",
-    "prnu",
-    "dsnu_e",
-    "full_well_e",
-    "adc_bits",
-    "gain",
-    "black_level",
-    "phase_offset_std_rad",
-    "tap_phase_offset_std_rad",
-    "blur_share",
-    "blur_px",
-    "veil_share",
-    "veil_px",
-    "hot_share",
-    "hot_pixels",
-    "hot_e",
-    "max_phase_std_rad",
-    "min_amplitude_e",
-    "wrap_guard_m",
-)
-DIRECT_ONLY = (
-    "max_range_m",
-    "min_intensity",
-    "range_std_m",
-    "range_shot_std_m",
-    "range_ambient_std_m",
-    "zone_offset_m",
-    "histogram",
-)
-
-# What a calibration leaves: it moves no image and adds no noise to a frame.
-CALIBRATION = (
-    "calibration_fields",
-    "calibration_covariance",
-    "systematic_distance_m",
-    "systematic_delta_deg",
-    "systematic_bearing_deg",
-    "systematic_height_m",
-    "systematic_time_s",
-)
+TABLES: dict[str, type[FieldTable]] = {"lens": Lens, "histogram": Histogram}
+"""Fields that are tables of their own in a sensor file, and left out where there is none."""
 
 
-class SensorFields(BaseModel):
+class SensorFields(FieldTable):
     """Define the fields of a camera; :class:`~phasemark.render.Sensor` documents each."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
 
     kind: Literal["phase", "direct"] = "phase"
     # geometry
@@ -220,17 +148,15 @@ class SensorFields(BaseModel):
     systematic_height_m: _NonNegative = 0.0
     systematic_time_s: _NonNegative = 0.0
 
-    def __init__(self, **data: Any) -> None:
-        refuse_truth_values(data, type(self).model_fields)
-        data = with_geometry_of_lens(data)
-        try:
-            super().__init__(**data)
-        except ValidationError as error:
-            first = error.errors()[0]
-            if not first["loc"]:  # a finding about several fields names them itself
-                raise UsageError(first["msg"].removeprefix("Value error, ")) from None
-            location = tuple(part for part in first["loc"] if part not in (_ONE, _SEVERAL))
-            raise UsageError.of_field(location, first["type"], first["msg"], first["input"]) from None
+    @model_validator(mode="before")
+    @classmethod
+    def _complete_geometry(cls, data: dict[str, Any]) -> dict[str, Any]:
+        return with_geometry_of_lens(data)
+
+    @classmethod
+    def _refusal(cls, first: ErrorDetails) -> UsageError:
+        location = tuple(part for part in first["loc"] if part not in (_ONE, _SEVERAL))
+        return super()._refusal({**first, "loc": location})
 
     @model_serializer(mode="wrap")
     def _without_absent_tables(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -240,3 +166,47 @@ class SensorFields(BaseModel):
             if fields.get(name, ...) is None:
                 del fields[name]
         return fields
+
+
+def _in_groups() -> dict[str, tuple[str, ...]]:
+    titles = {
+        "kind": "kind",
+        "rows": "geometry",
+        "modulation_hz": "modulation and timing",
+        "signal_e": "electrons per phase image",
+        "full_well_e": "read-out",
+        "phase_offset_std_rad": "offsets of one physical camera",
+        "blur_share": "stray light",
+        "dead_share": "defects",
+        "max_phase_std_rad": "validity",
+        "max_range_m": "direct time of flight only",
+        "calibration_fields": "what a calibration leaves",
+    }
+    groups: dict[str, tuple[str, ...]] = {}
+    title = ""
+    for name in SensorFields.model_fields:
+        title = titles.get(name, title)
+        groups[title] = (*groups.get(title, ()), name)
+    return groups
+
+
+FIELD_GROUPS = _in_groups()
+"""The fields in groups, in the order of light's way through the camera: title → names."""
+
+OPTICS = tuple(
+    "centre_px" if name == "principal_point_px" else name
+    for name in (*FIELD_GROUPS["geometry"], "modulation_hz")
+    if name != "whole_image_px"
+)
+"""What an image's rays and phases depend on: cameras that agree in these see the same noise-free image."""
+
+DIRECT_ONLY = FIELD_GROUPS["direct time of flight only"]
+CALIBRATION = FIELD_GROUPS["what a calibration leaves"]
+"""Fields that move no image and add no noise to a frame."""
+
+_NOT_PHASE_ONLY = {
+    *FIELD_GROUPS["kind"], *FIELD_GROUPS["geometry"], *DIRECT_ONLY, *CALIBRATION, "modulation_hz", "frame_rate_hz",
+    "delay_s", "range_offset_m", "unit_seed", "dead_share", "dead_pixels",
+}  # fmt: skip
+PHASE_ONLY = tuple(name for name in SensorFields.model_fields if name not in _NOT_PHASE_ONLY)
+"""Fields that only a camera with taps has."""

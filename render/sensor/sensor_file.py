@@ -12,14 +12,11 @@ from pydantic import BaseModel
 from phasemark import UsageError
 from phasemark.inputs.reading import MOST_TOML_BYTES, read_text
 from phasemark.inputs.toml_file import read_toml, toml_value
-from phasemark.render.sensor.histogram_fields import Histogram
-from phasemark.render.sensor.lens_fields import DERIVED, Lens
+from phasemark.render.sensor.lens_fields import DERIVED
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.sensor_fields import TABLES
 from phasemark.render.sensor.sources import SOURCE_TABLE, kind_of_source, without_sources
 
-TABLE_MODELS: dict[str, type[BaseModel]] = {"lens": Lens, "histogram": Histogram}
-"""What a table of its own in a sensor file holds."""
 _DIGITS = 7  # of a number in a sensor file
 
 
@@ -46,7 +43,7 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
             name
             for name in names
             if name in comments
-            or (fields.get(name) is not None and fields[name] != _plain_default(name))
+            or (fields.get(name) is not None and fields[name] != _default_of(Sensor, name))
             or Sensor.model_fields[name].is_required()
         ]
         own = [name for name in own if name not in TABLES and (name in comments or name not in derived)]
@@ -58,7 +55,7 @@ def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence
         lines += ["", f"[{title}]"]
         for name, value in table.items():
             comment = comments.get(f"{title}.{name}")
-            if comment is not None or (value is not None and value != _default_of(TABLE_MODELS[title], name)):
+            if comment is not None or (value is not None and value != _default_of(TABLES[title], name)):
                 lines.append(f"{name} = {toml_value(value)}  # {comment or otherwise}")
                 sources[f"{title}.{name}"] = comment or otherwise
     lines += source_lines({name: _as_source(text) for name, text in sources.items()})
@@ -108,10 +105,6 @@ def rounded(value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(rounded(one) for one in value)
     return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
-
-
-def _plain_default(name: str) -> object:
-    return _default_of(Sensor, name)
 
 
 def _default_of(model: type[BaseModel], name: str) -> object:
