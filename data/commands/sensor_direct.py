@@ -83,8 +83,8 @@ def sensor_fit_direct(
 
 def _echo_fit(fit: DirectFit, spread_mm: list[float]) -> None:
     """Print the fitted parameters, and how well each zone measures the plane."""
-    names = fit.parameters.names
-    rows = [(n, f"{fit.parameters[n]:.5g}", f"{fit.std[n]:.2g}" if n in fit.std else "fixed") for n in names]
+    values = fit.parameters.items()
+    rows = [(name, f"{value:.5g}", f"{fit.std[name]:.2g}" if name in fit.std else "fixed") for name, value in values]
     glass = fit.crosstalk
     rows.append(("crosstalk", f"{glass.counts:.5g}", f"{glass.counts_std:.2g}"))
     if glass.counts:

@@ -58,7 +58,7 @@ def bin_response(sensor: Sensor, axis: RangeAxis) -> NDArray[np.float64]:
     histogram = histogram_of(sensor)
     n = sensor.rows * sensor.cols
     offsets = (sensor.zone_offsets + sensor.range_offset_m).ravel()
-    scales = np.array(histogram.zone_bin_scale or ((1.0,) * sensor.cols,) * sensor.rows).ravel()
+    scales = sensor.zone_values("zone_bin_scale").ravel()
     alike = len(histogram.irf) <= 1 and np.ptp(offsets) == 0 and np.ptp(scales) == 0
     zones = 1 if alike else n
     out = np.empty((zones, axis.n, histogram.bins))
@@ -108,8 +108,7 @@ def counts_of_light(light: NDArray[np.float64], sensor: Sensor, axis: RangeAxis)
     """
     histogram = histogram_of(sensor)
     response = bin_response(sensor, axis)
-    gain = np.array(histogram.zone_gain or ((1.0,) * sensor.cols,) * sensor.rows).ravel()
-    light = light * gain[:, None]
+    light = light * sensor.zone_values("zone_gain").reshape(-1, 1)
     if histogram.stray > 0:
         light = light + histogram.stray * light.mean(axis=1, keepdims=True)
     counts = np.zeros((*light.shape[:2], histogram.bins))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import overload
+from typing import TypedDict, Unpack, overload
 
 import numpy as np
 
 from phasemark import UsageError
 from phasemark.render.background import Background
+from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames, capture_histograms
 from phasemark.render.direct.histogram_images import HistogramImages, HistogramRenderer
 from phasemark.render.exposure import capture as phase_chain
@@ -23,17 +24,17 @@ ON_CHIP = ("estimator", "estimator_bins", "max_targets", "threshold", "min_separ
 """Fields of [histogram] that say what becomes of counts, not what is counted."""
 
 
+class _Options(TypedDict, total=False):
+    n_frames: int
+    first_view: int
+    first_frame: int
+    keep_taps: bool
+    workers: int
+
+
 @overload
 def capture(
-    image: HistogramImages,
-    sensor: Sensor,
-    *,
-    rng: np.random.Generator,
-    n_frames: int = 1,
-    first_view: int = 0,
-    first_frame: int = 0,
-    keep_taps: bool = False,
-    workers: int = 1,
+    image: HistogramImages, sensor: Sensor, *, rng: np.random.Generator, **options: Unpack[_Options]
 ) -> HistogramFrames: ...
 @overload
 def capture(
@@ -41,11 +42,7 @@ def capture(
     sensor: Sensor,
     *,
     rng: np.random.Generator,
-    n_frames: int = 1,
-    first_view: int = 0,
-    first_frame: int = 0,
-    keep_taps: bool = False,
-    workers: int = 1,
+    **options: Unpack[_Options],
 ) -> Frames: ...
 def capture(
     image: PhasorImages | Sequence[PhasorImages] | HistogramImages,
@@ -153,11 +150,9 @@ def capture_ranges(
 
 def _refuse_other_sensor(rendered: Sensor, sensor: Sensor) -> None:
     """Refuse histograms that were rendered for a sensor that counts otherwise."""
-    if sensor.histogram is None or rendered.histogram is None:
-        raise UsageError("the sensor has no [histogram] table: its histograms are not described")
+    own, other = histogram_of(sensor).model_dump(), histogram_of(rendered).model_dump()
     if difference := sensor.optics_difference(rendered):
         raise UsageError(f"the histograms were rendered for another sensor: {difference}")
-    own, other = sensor.histogram.model_dump(), rendered.histogram.model_dump()
     names = [f"histogram.{name}" for name in own if name not in ON_CHIP and own[name] != other[name]]
     names += [name for name in ("range_offset_m", "zone_offset_m") if getattr(sensor, name) != getattr(rendered, name)]
     if names:

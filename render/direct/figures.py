@@ -16,6 +16,7 @@ from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.direct.targets import Status
 from phasemark.render.figures import draw_range, view_in_words
+from phasemark.render.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,14 +46,7 @@ def histogram_figure(frames: HistogramFrames, index: int = 0, frame: int = 0) ->
     """
     _check("position", index, len(frames))
     _check("frame", frame, frames.n_frames)
-    counts = frames.counts[index, frame]
-    one = HistogramFrames(counts, sensor=frames.sensor)
-    figure, left, right = _panels()
-    _draw_histograms(left, counts, one, "counts")
-    right.set_title("range of the nearest target")
-    draw_range(right, one.ranges.range_m[0, 0])
-    figure.suptitle(f"position {index}, frame {frame}")
-    return figure
+    return _figure(frames.counts[index, frame], frames.sensor, "counts", f"position {index}, frame {frame}")
 
 
 def expected_figure(images: HistogramImages, index: int = 0) -> Figure:
@@ -69,14 +63,8 @@ def expected_figure(images: HistogramImages, index: int = 0) -> Figure:
     matplotlib.figure.Figure
     """
     _check("view", index, len(images))
-    expected = images.expected[index]
-    one = HistogramFrames(expected, sensor=images.sensor)
-    figure, left, right = _panels()
-    _draw_histograms(left, expected, one, "expected counts")
-    right.set_title("range of the nearest target")
-    draw_range(right, one.ranges.range_m[0, 0])
-    figure.suptitle(f"view {index}: {view_in_words(images.views, index)}")
-    return figure
+    title = f"view {index}: {view_in_words(images.views, index)}"
+    return _figure(images.expected[index], images.sensor, "expected counts", title)
 
 
 def _check(what: str, index: int, count: int) -> None:
@@ -84,10 +72,15 @@ def _check(what: str, index: int, count: int) -> None:
         raise UsageError(f"there is no {what} {index}: they count from 0 to {count - 1}")
 
 
-def _panels() -> tuple[Figure, Axes, Axes]:
+def _figure(counts: NDArray[np.float64], sensor: Sensor, what: str, title: str) -> Figure:
     figure = Figure(figsize=(12.4, 6.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    return figure, left, right
+    one = HistogramFrames(counts, sensor=sensor)
+    _draw_histograms(left, counts, one, what)
+    right.set_title("range of the nearest target")
+    draw_range(right, one.ranges.range_m[0, 0])
+    figure.suptitle(title)
+    return figure
 
 
 def _draw_histograms(axes: Axes, counts: NDArray[np.float64], one: HistogramFrames, what: str) -> None:
@@ -130,9 +123,9 @@ def _places(one: HistogramFrames) -> NDArray[np.object_]:
     """Return where the targets of one frame lie in each zone's histogram, bins."""
     found, sensor, histogram = one.targets, one.sensor, histogram_of(one.sensor)
     cosine = sensor.axis_cosine()[..., None] if histogram.reports == "z" else 1.0
-    scale = np.array(histogram.zone_bin_scale or ((1.0,) * sensor.cols,) * sensor.rows)[..., None]
     delay = (sensor.zone_offsets + sensor.range_offset_m)[..., None]
-    bins = (found.distance_m[0, 0] / cosine + delay - histogram.start_m) / (histogram.bin_width_m * scale)
+    width_m = histogram.bin_width_m * sensor.zone_values("zone_bin_scale")[..., None]
+    bins = (found.distance_m[0, 0] / cosine + delay - histogram.start_m) / width_m
     valid = found.status[0, 0] == Status.VALID
     out = np.empty((sensor.rows, sensor.cols), object)
     for row in range(sensor.rows):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from phasemark.render.direct.bin_counts import piled_up
 from phasemark.render.direct.footprints import Footprints, footprint_grid, histogram_of
-from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.recordings import ObjectRecording, PlaneRecording, turn_about, world2cam
 from phasemark.render.direct.scene_samples import SceneSamples, plane_samples
 from phasemark.render.direct.transients import RangeAxis, zone_transients
@@ -25,7 +24,7 @@ PEAK_FLOOR = 0.01
 """Share of a histogram's highest count that the model may be off anywhere."""
 
 _CELLS, _MARGIN_CELLS = 5, 4  # of the grid: per zone, and beyond the field of view that the fit starts with
-_AMBIENT_BINS = (2, 9)
+AMBIENT_BINS = slice(2, 9)
 _GEOMETRY = (
     "pitch_h", "pitch_v", "centre_left", "centre_up", "roll", "width", "height", "blur", "light", "light_left",
     "light_up",
@@ -34,28 +33,14 @@ _LEAST_LEFT = 0.05  # of the first photons, when pile-up is undone
 _AXIS_M = 0.9
 
 
-@dataclass(frozen=True, eq=False)
-class Parameters:
-    """Values, scales and names of what is fitted."""
-
-    names: tuple[str, ...]
-    values: NDArray[np.float64]
-    scales: NDArray[np.float64]
-
-    def __getitem__(self, name: str) -> float:
-        """Return one value."""
-        return float(self.values[self.names.index(name)])
-
-    def with_values(self, **values: float) -> Parameters:
-        """Return a copy with some values changed."""
-        new = self.values.copy()
-        for name, value in values.items():
-            new[self.names.index(name)] = value
-        return replace(self, values=new)
+Parameters = dict[str, float]
+"""Values of what is fitted, by name."""
 
 
-def start_parameters(sensor: Sensor, objects: Sequence[ObjectRecording], converters: Sequence[int]) -> Parameters:
-    """Return where a fit starts: the sensor as it is described.
+def start_parameters(
+    sensor: Sensor, objects: Sequence[ObjectRecording], converters: Sequence[int]
+) -> tuple[Parameters, dict[str, float]]:
+    """Return where a fit starts, the sensor as it is described, and the scale of each parameter.
 
     Parameters
     ----------
@@ -93,8 +78,12 @@ def start_parameters(sensor: Sensor, objects: Sequence[ObjectRecording], convert
     for one in objects:
         table += [(f"{one.name}_{axis}", 0.0, 0.003) for axis in "xyz"]
         table += [(f"{one.name}_yaw", 0.0, 0.03), (f"{one.name}_support", 1.0, 0.3)]
-    names, values, scales = zip(*table, strict=True)
-    return Parameters(names, np.array(values), np.array(scales))
+    return {name: value for name, value, _ in table}, {name: scale for name, _, scale in table}
+
+
+def cycles_of(p: Parameters) -> float:
+    """Return the cycles of a frame, whose reciprocal is fitted."""
+    return 1e6 / max(p["inverse_cycles"], 1e-9)
 
 
 class Responses(NamedTuple):
@@ -113,6 +102,11 @@ class Responses(NamedTuple):
     first: float
     step: float
     crosstalk: NDArray[np.float64]
+
+    @property
+    def delays(self) -> NDArray[np.float64]:
+        """Delays of the nodes, bins."""
+        return np.asarray(self.first + self.step * np.arange(self.cumulative.shape[1]), dtype=np.float64)
 
     def counts_beside_crosstalk(self, measured: NDArray[np.float64], cycles: float) -> NDArray[np.float64]:
         """Return counts (n, zones, bins) without pile-up and crosstalk."""
@@ -149,8 +143,15 @@ class FitModel:
         self.grid = footprint_grid(sensor.with_(roll_deg=0.0), _MARGIN_CELLS, _CELLS)
         self.gain = np.ones(sensor.rows * sensor.cols) if gain is None else gain / gain.mean()
         self.axis = RangeAxis(-0.002, 0.001, int(min(_AXIS_M, self.histogram.length_m) * 1000))
-        self._transients: dict[tuple[object, ...], NDArray[np.float64]] = {}
-        self._seen: dict[tuple[object, ...], SceneSamples] = {}
+        self._kept_light, self._kept_samples = lru_cache(4)(self._light), lru_cache(12)(self._samples)
+
+    def bin_scales(self, p: Parameters) -> NDArray[np.float64]:
+        """Return the bin width of each zone over that of the sensor, (zones,)."""
+        return np.array([p[f"converter_{k}"] for k in self.converters])
+
+    def bin_widths_m(self, p: Parameters) -> NDArray[np.float64]:
+        """Return the bin width of each zone, (zones,)."""
+        return self.histogram.bin_width_m * self.bin_scales(p)
 
     def footprints(self, p: Parameters) -> Footprints:
         """Return the footprints that parameters describe, in the sensor's own axes."""
@@ -166,15 +167,10 @@ class FitModel:
 
     def transients(self, p: Parameters, recording: PlaneRecording | ObjectRecording) -> NDArray[np.float64]:
         """Return the transients of a recording's scene in each zone, support and object separate, with stray light."""
-        key = (recording, *(p[name] for name in _GEOMETRY), *self._scene_key(p, recording))
-        if key not in self._transients:
-            if len(self._transients) >= 4:
-                self._transients.clear()
-            samples = self._samples(p, recording)
-            c, s = math.cos(p["roll"]), math.sin(p["roll"])
-            turned = samples._replace(tangents=np.ascontiguousarray(samples.tangents @ np.array([[c, -s], [s, c]])))
-            self._transients[key] = zone_transients(turned, self.sensor, self.axis, footprints=self.footprints(p))
-        seen = self._transients[key].copy()
+        scene = ["tilt_left", "tilt_up"]
+        if isinstance(recording, ObjectRecording):
+            scene = ["forward", *(f"{recording.name}_{axis}" for axis in ("x", "y", "z", "yaw"))]
+        seen = self._kept_light(recording, tuple(p[n] for n in _GEOMETRY), tuple(p[n] for n in scene)).copy()
         if isinstance(recording, ObjectRecording):
             seen[:, 0] *= p[f"{recording.name}_support"]
         own = seen * self.gain[:, None]
@@ -186,16 +182,15 @@ class FitModel:
         light = seen.sum(axis=1)
         measured = recording.frames.zone_counts
         drift = p["reference_gain"] * recording.frames.reference_shift_bins
-        cycles = 1e6 / max(p["inverse_cycles"], 1e-9)
-        scales = np.array([p[f"converter_{k}"] for k in self.converters])
         delays = np.array([p[f"delay_{zone}"] for zone in range(light.shape[1])]) + drift[:, None]
         shape = np.zeros_like(measured)
         _spread(
-            light, self.axis.first_m, self.axis.step_m, self.histogram.bin_width_m * scales, delays,
-            responses.cumulative, responses.first, responses.step, shape,
+            light, self.axis.first_m, self.axis.step_m, self.bin_widths_m(p), delays, responses.cumulative,
+            responses.first, responses.step, shape,
         )  # fmt: skip
+        cycles = cycles_of(p)
         counts = responses.counts_beside_crosstalk(measured, cycles)
-        ambient = counts[..., _AMBIENT_BINS[0] : _AMBIENT_BINS[1]].mean(axis=-1, keepdims=True)
+        ambient = counts[..., AMBIENT_BINS].mean(axis=-1, keepdims=True)
         window = signal_window(measured)
         bright = np.where(window, counts - ambient, 0).sum(axis=-1) / np.maximum(
             np.where(window, shape, 0).sum(axis=-1), 1e-300
@@ -216,30 +211,22 @@ class FitModel:
             parts.append(((got.expected - got.measured) / tolerance(got.measured)).ravel())
         return np.concatenate(parts)
 
-    def _samples(self, p: Parameters, recording: PlaneRecording | ObjectRecording) -> SceneSamples:
-        key = (recording, *self._scene_key(p, recording))
-        if key not in self._seen:
-            if isinstance(recording, PlaneRecording):
-                samples = plane_samples(recording.distance_m, self.grid, (p["tilt_left"], p["tilt_up"]))
-            else:
-                forward, *placement, yaw = self._scene_key(p, recording)
-                transforms = world2cam(recording.sensor2world, (0.0, 0.0, forward), placement)
-                transforms = transforms @ turn_about(recording.centre_m, yaw)
-                samples = recording.scene.samples(transforms, self.grid)
-            self._remember(key, samples)
-        return self._seen[key]
+    def _light(
+        self, recording: PlaneRecording | ObjectRecording, geometry: tuple[float, ...], scene: tuple[float, ...]
+    ) -> NDArray[np.float64]:
+        """Return the transients of a recording's scene for values of `_GEOMETRY` and of the scene's parameters."""
+        p = dict(zip(_GEOMETRY, geometry, strict=True))
+        samples = self._kept_samples(recording, scene)
+        c, s = math.cos(p["roll"]), math.sin(p["roll"])
+        turned = samples._replace(tangents=np.ascontiguousarray(samples.tangents @ np.array([[c, -s], [s, c]])))
+        return zone_transients(turned, self.sensor, self.axis, footprints=self.footprints(p))
 
-    @staticmethod
-    def _scene_key(p: Parameters, recording: PlaneRecording | ObjectRecording) -> tuple[float, ...]:
-        """Return the parameters on which the scene's samples depend."""
+    def _samples(self, recording: PlaneRecording | ObjectRecording, scene: tuple[float, ...]) -> SceneSamples:
         if isinstance(recording, PlaneRecording):
-            return p["tilt_left"], p["tilt_up"]
-        return (p["forward"], *(p[f"{recording.name}_{name}"] for name in ("x", "y", "z", "yaw")))
-
-    def _remember(self, key: tuple[object, ...], samples: SceneSamples) -> None:
-        if len(self._seen) > 12:
-            self._seen.clear()
-        self._seen[key] = samples
+            return plane_samples(recording.distance_m, self.grid, (scene[0], scene[1]))
+        forward, *placement, yaw = scene
+        transforms = world2cam(recording.sensor2world, (0.0, 0.0, forward), placement)
+        return recording.scene.samples(transforms @ turn_about(recording.centre_m, yaw), self.grid)
 
 
 def undo_pile_up(counts: NDArray[np.float64], cycles: float) -> NDArray[np.float64]:
@@ -264,18 +251,12 @@ def signal_window(counts: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 def peak_centroids(counts: NDArray[np.float64], before: int = 3, behind: int = 8) -> NDArray[np.float64]:
     """Return the centroid of each histogram about its highest bin, bins; (..., bins) to (...)."""
-    level = counts[..., _AMBIENT_BINS[0] : _AMBIENT_BINS[1]].mean(axis=-1, keepdims=True)
+    level = counts[..., AMBIENT_BINS].mean(axis=-1, keepdims=True)
     top = counts.argmax(axis=-1)[..., None]
     j = np.arange(counts.shape[-1])
     signal = np.where((j >= top - before) & (j < top + behind), np.maximum(counts - level, 0), 0)
     total = signal.sum(axis=-1)
     return np.asarray((signal @ j) / np.where(total > 0, total, 1))
-
-
-def expected_frames(prediction: Prediction, frames: HistogramFrames) -> HistogramFrames:
-    """Return a prediction as frames of the same sensor, for what works on frames."""
-    shape = (len(frames), 1, *frames.counts.shape[2:])
-    return HistogramFrames(prediction.expected.reshape(shape), sensor=frames.sensor)
 
 
 @kernel

@@ -8,13 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from phasemark.render.direct.fit_model import (
-    FitModel,
-    Parameters,
-    Responses,
-    peak_centroids,
-    undo_pile_up,
-)
+from phasemark.render.direct.fit_model import AMBIENT_BINS, FitModel, Parameters, Responses, cycles_of, undo_pile_up
 from phasemark.render.direct.recordings import PlaneRecording
 
 SHAPE_FLOOR = 0.01
@@ -27,7 +21,6 @@ _KNOTS = np.concatenate([_FOOT, _FINE, _TAIL])
 """Knots of a cubic spline, bins after the highest bin: a quarter of a bin about the peak, wider in the tail."""
 
 _STEP = 1 / 32
-_AMBIENT_BINS = slice(2, 9)
 _WINDOW = (8, 32)  # bins before and behind the highest that are fitted
 _ROUNDS = 4
 _RIDGE = 1e-6
@@ -52,9 +45,7 @@ def _at(delay: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(inside[..., None], table[k] * (1 - f) + table[k + 1] * f, 0.0)
 
 
-def fit_responses(
-    model: FitModel, p: Parameters, plane: PlaneRecording, crosstalk: NDArray[np.float64]
-) -> tuple[Responses, NDArray[np.float64]]:
+def fit_responses(model: FitModel, p: Parameters, plane: PlaneRecording, crosstalk: NDArray[np.float64]) -> Responses:
     """Fit the response of each zone.
 
     Parameters
@@ -68,22 +59,16 @@ def fit_responses(
 
     Returns
     -------
-    responses : Responses
-    coefficients : (zones, splines) float64
-        Of :func:`bin_curve`, per zone; the last entry is the delay of the highest bin, bins.
+    Responses
     """
     light = model.transients(p, plane).sum(axis=1)
     measured = plane.frames.zone_counts
     drift = p["reference_gain"] * plane.frames.reference_shift_bins
-    cycles = 1e6 / max(p["inverse_cycles"], 1e-9)
-    rows = []
-    for zone in range(light.shape[1]):
-        width = model.histogram.bin_width_m * p[f"converter_{model.converters[zone]}"]
-        rows.append(
-            _fit_zone(light[:, zone], model.axis.nodes_m / width, measured[:, zone], drift, cycles, crosstalk[zone])
-        )
-    coefficients = np.stack(rows)
-    return responses_of(coefficients, crosstalk), coefficients
+    coefficients = [
+        _fit_zone(light[:, k], model.axis.nodes_m / width, measured[:, k], drift, cycles_of(p), crosstalk[k])
+        for k, width in enumerate(model.bin_widths_m(p))
+    ]
+    return _responses_of(np.stack(coefficients), crosstalk)
 
 
 def _fit_zone(
@@ -94,7 +79,7 @@ def _fit_zone(
     cycles: float,
     crosstalk: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the spline of one zone, and its delay."""
+    """Return the spline of one zone, and at its end the delay of the highest bin, bins."""
     tops = measured.argmax(axis=1)
     mean_range = (light @ nodes_bins) / light.sum(axis=1)
     delay = float(np.median(tops - mean_range - drift))
@@ -104,7 +89,7 @@ def _fit_zone(
         left = np.exp(-np.cumsum(counts) / cycles)  # how much an error of a count grows
         std = np.sqrt(np.maximum(measured[i], 1.0) / left**2 + (SHAPE_FLOOR * counts) ** 2)
         counts = counts - crosstalk
-        ambient = counts[_AMBIENT_BINS].mean()
+        ambient = counts[AMBIENT_BINS].mean()
         window = slice(max(top - _WINDOW[0], 0), min(top + _WINDOW[1], len(counts)))
         at, weight = _gathered(nodes_bins, light[i])
         bins = np.arange(len(counts))[window]
@@ -134,7 +119,7 @@ def _gathered(
     return np.bincount(group, light[lit] * nodes[lit]) / total, total / total.sum()
 
 
-def responses_of(coefficients: NDArray[np.float64], crosstalk: NDArray[np.float64]) -> Responses:
+def _responses_of(coefficients: NDArray[np.float64], crosstalk: NDArray[np.float64]) -> Responses:
     """Return cumulative responses from splines, beside the crosstalk that was taken out.
 
     The spline is the mean of the response over a bin about a delay. Its integral over delays, taken at the lower
@@ -169,8 +154,5 @@ def responses_of(coefficients: NDArray[np.float64], crosstalk: NDArray[np.float6
 
 def delays_of(responses: Responses) -> NDArray[np.float64]:
     """Return where half of each zone's response has arrived, bins; (zones,)."""
-    x = responses.first + responses.step * np.arange(responses.cumulative.shape[1])
+    x = responses.delays
     return np.array([np.interp(0.5, row, x) for row in np.maximum.accumulate(responses.cumulative, axis=1)])
-
-
-__all__ = ["delays_of", "fit_responses", "peak_centroids", "responses_of"]

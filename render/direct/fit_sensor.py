@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +21,12 @@ from phasemark import UsageError
 from phasemark.render.direct.bin_counts import expected_counts
 from phasemark.render.direct.fit_crosstalk import NO_CROSSTALK, Crosstalk, fit_crosstalk, peak_shapes
 from phasemark.render.direct.fit_model import (
+    AMBIENT_BINS,
     FitModel,
     Parameters,
     Prediction,
     Responses,
+    cycles_of,
     peak_centroids,
     start_parameters,
     undo_pile_up,
@@ -44,7 +45,6 @@ _EVALUATIONS = 6
 _MOST_PLANES = 40
 _IRF_STEP_BINS = 1 / 6
 _RANGE_WINDOW = (5, 12)
-_AMBIENT_BINS = slice(2, 9)
 _PLANE_ALBEDO = 0.8
 
 
@@ -56,7 +56,7 @@ class DirectFit:
     ----------
     sensor : Sensor
         The camera.
-    parameters : Parameters
+    parameters : dict of str to float
         Fitted numbers.
     responses : Responses
         Response of each zone.
@@ -94,9 +94,9 @@ class DirectFit:
 
     def as_dict(self) -> dict[str, object]:
         """Return the fitted values as plain numbers, for JSON."""
-        names = self.parameters.names
+        values = self.parameters.items()
         return {
-            "parameters": {name: {"value": self.parameters[name], "std": self.std.get(name)} for name in names},
+            "parameters": {name: {"value": value, "std": self.std.get(name)} for name, value in values},
             "crosstalk": self.crosstalk._asdict(),
             "reduced_chi2": self.reduced_chi2.tolist(),
             "sensor": self.sensor.as_dict(),
@@ -142,9 +142,9 @@ def fit_direct_sensor(
     if len(groups) != n:
         raise UsageError(f"'converters' must name the converter of each of {n} zones, got {len(groups)}")
     model = FitModel(base, groups, zone_brightness(plane, histogram_of(base).cycles))
-    p = start_parameters(base, objects, groups)
+    p, scales = start_parameters(base, objects, groups)
     crosstalk, counts = NO_CROSSTALK, np.zeros((n, model.histogram.bins))
-    responses, _ = fit_responses(model, p, plane, counts)
+    responses = fit_responses(model, p, plane, counts)
     free = _free_parameters(p, objects)
     shifts = [one.frames.reference_shift_bins for one in objects] + [plane.frames.reference_shift_bins]
     if not any(shift.any() for shift in shifts):
@@ -154,15 +154,12 @@ def fit_direct_sensor(
     jacobian = np.zeros((0, 0))
     cost = 1.0
     for _ in range(rounds):
-        p, jacobian, cost = _fit_parameters(model, p, responses, recordings, free)
-        p = _anchored(p, n)
-        responses, _ = fit_responses(model, p, plane, counts)
+        p, jacobian, cost = _fit_parameters(model, p, responses, recordings, {name: scales[name] for name in free})
+        p |= {f"delay_{k}": 0.0 for k in range(n)}  # the responses take them over
+        responses = fit_responses(model, p, plane, counts)
         crosstalk, counts = _crosstalk(model, p, responses, plane)
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * max(cost, 1.0)
-    std = {
-        name: float(math.sqrt(max(covariance[k, k], 0.0)) * p.scales[p.names.index(name)])
-        for k, name in enumerate(free)
-    }
+    std = {name: math.sqrt(max(covariance[k, k], 0.0)) * scales[name] for k, name in enumerate(free)}
     responses = responses._replace(crosstalk=counts)
     sensor = _as_sensor(base, model, p, responses, crosstalk, plane)
     return DirectFit(sensor, p, responses, crosstalk, std, _reduced_chi2(model, p, responses, plane), model)
@@ -182,7 +179,7 @@ def zone_brightness(plane: PlaneRecording, cycles: float) -> NDArray[np.float64]
     """Return the relative brightness of the zones before a plane, (zones,): the median over the farther half."""
     far = plane.distance_m >= np.median(plane.distance_m)
     counts = undo_pile_up(plane.frames.zone_counts[far], cycles)
-    signal = (counts - counts[..., _AMBIENT_BINS].mean(axis=-1, keepdims=True)).sum(axis=-1)
+    signal = (counts - counts[..., AMBIENT_BINS].mean(axis=-1, keepdims=True)).sum(axis=-1)
     return np.asarray(np.median(signal / signal.mean(axis=1, keepdims=True), axis=0))
 
 
@@ -228,15 +225,10 @@ def score_zone_orders(logged: ObjectRecording, base: Sensor) -> dict[str, float]
 
 def _free_parameters(p: Parameters, objects: Sequence[ObjectRecording]) -> list[str]:
     """Return the parameters that the recordings tell."""
-    converters = sorted(name for name in p.names if name.startswith("converter_"))
-    free = [
-        "inverse_cycles",
-        "reference_gain",
-        *converters[1:],
-        *(name for name in p.names if name.startswith("delay_")),
-    ]
+    converters = sorted(name for name in p if name.startswith("converter_"))
+    free = ["inverse_cycles", "reference_gain", *converters[1:], *(name for name in p if name.startswith("delay_"))]
     if objects:
-        free += [name for name in p.names if name not in free and not name.startswith("converter_")]
+        free += [name for name in p if name not in free and not name.startswith("converter_")]
         free.append(converters[0])
     return free
 
@@ -246,16 +238,16 @@ def _fit_parameters(
     p: Parameters,
     responses: Responses,
     recordings: Sequence[PlaneRecording | ObjectRecording],
-    free: Sequence[str],
+    scales: dict[str, float],
 ) -> tuple[Parameters, NDArray[np.float64], float]:
-    """Fit the free parameters with the responses fixed; returns also the Jacobian in scales, and χ²/ν."""
-    where = np.array([p.names.index(name) for name in free])
-    scales = p.scales[where]
+    """Fit parameters, of which scales are given; returns also the Jacobian in scales, and χ²/ν. Responses are fixed."""
+    scale = np.array(list(scales.values()))
+
+    def moved(x: NDArray[np.float64]) -> Parameters:
+        return {**p, **dict(zip(scales, (x * scale).tolist(), strict=True))}
 
     def at(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        values = p.values.copy()
-        values[where] = x * scales
-        return model.residuals(replace(p, values=values), responses, recordings)
+        return model.residuals(moved(x), responses, recordings)
 
     def slope(x: NDArray[np.float64]) -> NDArray[np.float64]:
         here = at(x)
@@ -266,23 +258,17 @@ def _fit_parameters(
             columns.append((at(x + step) - here) / _STEP)
         return np.stack(columns, axis=1)
 
-    found = least_squares(at, p.values[where] / scales, jac=slope, loss="soft_l1", max_nfev=_EVALUATIONS)
-    values = p.values.copy()
-    values[where] = found.x * scales
-    return replace(p, values=values), np.asarray(found.jac), float(2 * found.cost / max(len(found.fun) - len(where), 1))
-
-
-def _anchored(p: Parameters, zones: int) -> Parameters:
-    """Return parameters whose delays are 0: the responses take them over."""
-    return p.with_values(**{f"delay_{k}": 0.0 for k in range(zones)})
+    start = np.array([p[name] for name in scales]) / scale
+    found = least_squares(at, start, jac=slope, loss="soft_l1", max_nfev=_EVALUATIONS)
+    return moved(found.x), np.asarray(found.jac), float(2 * found.cost / max(len(found.fun) - len(scale), 1))
 
 
 def _crosstalk(
     model: FitModel, p: Parameters, responses: Responses, plane: PlaneRecording
 ) -> tuple[Crosstalk, NDArray[np.float64]]:
     """Return the crosstalk of the sensor's window, and the counts that it adds, (zones, bins)."""
-    widths = model.histogram.bin_width_m * np.array([p[f"converter_{k}"] for k in model.converters])
-    counts = undo_pile_up(plane.frames.zone_counts, 1e6 / max(p["inverse_cycles"], 1e-9))
+    widths = model.bin_widths_m(p)
+    counts = undo_pile_up(plane.frames.zone_counts, cycles_of(p))
     found = fit_crosstalk(counts, responses.cumulative, responses.first, responses.step, widths)
     shapes = peak_shapes(
         responses.cumulative, responses.first, responses.step, found.range_m / widths, model.histogram.bins
@@ -292,55 +278,36 @@ def _crosstalk(
 
 def _plane_ranges(model: FitModel, p: Parameters, responses: Responses, plane: PlaneRecording) -> NDArray[np.float64]:
     """Return each zone's own best distance, by weighted least squares about the peak."""
-    n, zones = len(plane.frames), model.sensor.rows * model.sensor.cols
     unit = PlaneRecording(plane.frames[np.array([0])], np.array([0.5]))
     light = model.transients(p, unit)[0].sum(axis=0)
     measured = plane.frames.zone_counts
     drift = p["reference_gain"] * plane.frames.reference_shift_bins
-    cycles = 1e6 / max(p["inverse_cycles"], 1e-9)
-    out = np.empty((n, zones))
-    x = np.asarray(responses.first + responses.step * np.arange(responses.cumulative.shape[1]), dtype=np.float64)
-    for zone in range(zones):
-        width = model.histogram.bin_width_m * p[f"converter_{model.converters[zone]}"]
+    cycles, widths, delays = cycles_of(p), model.bin_widths_m(p), responses.delays
+
+    def best(i: int, zone: int) -> float:
         lit = light[zone] != 0
-        path = model.axis.nodes_m[lit] / 0.5  # range over distance
-        weight = light[zone][lit]
-        for i in range(n):
-            counts = undo_pile_up(measured[i, zone], cycles) - responses.crosstalk[zone]
-            signal = counts - counts[_AMBIENT_BINS].mean()
-            top = int(measured[i, zone].argmax())
-            low, high = max(top - _RANGE_WINDOW[0], 0), min(top + _RANGE_WINDOW[1], len(counts))
-            left = np.exp(-np.cumsum(counts + responses.crosstalk[zone]) / cycles)
-            std = np.sqrt(np.maximum(measured[i, zone], 1.0) / left**2 + (0.01 * counts) ** 2)[low:high]
-            edges = np.arange(low, high + 1)
-            target = signal[low:high] / std
+        weight, cumulative = light[zone][lit], responses.cumulative[zone]
+        path_bins = model.axis.nodes_m[lit] / 0.5 / widths[zone]  # for each metre of distance
+        counts = undo_pile_up(measured[i, zone], cycles) - responses.crosstalk[zone]
+        top = int(measured[i, zone].argmax())
+        window = slice(max(top - _RANGE_WINDOW[0], 0), min(top + _RANGE_WINDOW[1], len(counts)))
+        left = np.exp(-np.cumsum(counts + responses.crosstalk[zone]) / cycles)
+        std = np.sqrt(np.maximum(measured[i, zone], 1.0) / left**2 + (0.01 * counts) ** 2)[window]
+        target = (counts - counts[AMBIENT_BINS].mean())[window] / std
+        edges = np.arange(window.start, window.stop + 1)[:, None]
 
-            misfit = _Misfit(path / width, weight, drift[i], edges, x, responses.cumulative[zone], std, target)
-            middle = plane.distance_m[i]
-            out[i, zone] = minimize_scalar(misfit.at, bracket=(middle - 0.003, middle + 0.003), tol=1e-7).x
-    return out
+        def misfit(distance: float) -> float:
+            delay = edges - distance * path_bins - drift[i]
+            share = np.interp(delay, delays, cumulative, left=0.0, right=1.0)
+            shape = np.diff(share @ weight, axis=0) / std
+            brightness = float(shape @ target) / max(float(shape @ shape), 1e-300)
+            rest = brightness * shape - target
+            return float(rest @ rest)
 
+        middle = plane.distance_m[i]
+        return float(minimize_scalar(misfit, bracket=(middle - 0.003, middle + 0.003), tol=1e-7).x)
 
-class _Misfit(NamedTuple):
-    """The squared residual of one histogram about its peak, brightness taken out, at a distance of the plane."""
-
-    path_bins: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    drift: float
-    edges: NDArray[np.int64]
-    delays: NDArray[np.float64]
-    cumulative: NDArray[np.float64]
-    std: NDArray[np.float64]
-    target: NDArray[np.float64]
-
-    def at(self, distance: float, *_: object) -> float:
-        """Return the squared residual at a distance, metres."""
-        delay = self.edges[:, None] - distance * self.path_bins - self.drift
-        share = np.interp(delay, self.delays, self.cumulative, left=0.0, right=1.0)
-        shape = np.diff(share @ self.weight, axis=0) / self.std
-        brightness = float(shape @ self.target) / max(float(shape @ shape), 1e-300)
-        rest = brightness * shape - self.target
-        return float(rest @ rest)
+    return np.array([[best(i, zone) for zone in range(len(widths))] for i in range(len(plane.frames))])
 
 
 def _reduced_chi2(model: FitModel, p: Parameters, responses: Responses, plane: PlaneRecording) -> NDArray[np.float64]:
@@ -367,20 +334,19 @@ def _as_sensor(
     delays = delays_of(responses)
     width_m = h.bin_width_m
     start_bins = float(delays.mean())
-    scales = np.array([p[f"converter_{k}"] for k in model.converters])
-    x = responses.first + responses.step * np.arange(responses.cumulative.shape[1])
+    scales, cycles = model.bin_scales(p), cycles_of(p)
     grid = np.arange(-7.0, 32.0, _IRF_STEP_BINS)
     irf = []
     for zone in range(rows * cols):
-        cumulative = np.interp(grid / scales[zone] + delays[zone], x, responses.cumulative[zone], left=0.0, right=1.0)
+        at = grid / scales[zone] + delays[zone]
+        cumulative = np.interp(at, responses.delays, responses.cumulative[zone], left=0.0, right=1.0)
         density = np.maximum(np.gradient(cumulative, grid), 0.0)  # rounding alone makes it negative
         irf.append(tuple(float(f"{v:.4g}") for v in density / density.max()))
-    measured = responses.counts_beside_crosstalk(plane.frames.zone_counts, 1e6 / p["inverse_cycles"])
-    ambient = measured[..., _AMBIENT_BINS].mean(axis=-1)
+    measured = responses.counts_beside_crosstalk(plane.frames.zone_counts, cycles)
+    ambient = measured[..., AMBIENT_BINS].mean(axis=-1)
     signal = (measured - ambient[..., None]).sum(axis=-1)
     intensity = model.transients(p, plane).sum(axis=(1, 3)) / model.gain
     per_light = np.median(signal / (intensity * _PLANE_ALBEDO), axis=0)
-    cycles = 1e6 / p["inverse_cycles"]
     tan_h, tan_v = p["pitch_h"] * cols / 2, p["pitch_v"] * rows / 2
     offsets = (delays * scales - start_bins) * width_m
     return base.with_(

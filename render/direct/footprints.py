@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark import UsageError
 from phasemark.render.integral.arguments import Camera
 from phasemark.render.kernel import kernel
 from phasemark.render.sensor.histogram_fields import Histogram
@@ -68,11 +69,11 @@ def histogram_of(sensor: Sensor) -> Histogram:
 
     Raises
     ------
-    ValueError
+    UsageError
         The sensor has none.
     """
     if sensor.histogram is None:
-        raise ValueError("the sensor has no [histogram] table: its histograms are not described")
+        raise UsageError("the sensor has no [histogram] table: its histograms are not described")
     return sensor.histogram
 
 

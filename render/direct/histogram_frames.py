@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Self
 
@@ -19,6 +18,7 @@ from phasemark.render.exposure.random_streams import draw_key
 from phasemark.render.frames import Flag, Frames
 from phasemark.render.sensor.camera_unit import camera_unit
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.threads import mapped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,10 +59,7 @@ class HistogramFrames:
         reference: ArrayLike | None = None,
         time_s: ArrayLike | None = None,
     ) -> None:
-        try:
-            histogram = histogram_of(sensor)
-        except ValueError as error:
-            raise UsageError(str(error)) from None
+        histogram = histogram_of(sensor)
         array = real_array("counts", counts)
         if array.ndim not in (3, 4, 5):
             raise UsageError(f"'counts' must have shape (n, frames, rows, cols, bins), got {array.shape}")
@@ -236,17 +233,11 @@ def capture_histograms(
     total = len(means) * n_frames
     out = np.empty((total, flat.shape[1]))
     share = -(-total // workers)
-    lanes = [(k, min(k + share, total)) for k in range(0, total, share)] if total else []
 
-    def run(lane: tuple[int, int]) -> None:
-        draw_counts(flat, *lane, n_frames, first_view, first_frame, key, out)
+    def draw(first: int) -> None:
+        draw_counts(flat, first, min(first + share, total), n_frames, first_view, first_frame, key, out)
 
-    if workers == 1:
-        for lane in lanes:
-            run(lane)
-    else:
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(run, lanes))
+    mapped(draw, range(0, total, share) if total else (), workers)
     shape = (len(means), n_frames, sensor.rows, sensor.cols, histogram.bins)
     frames = HistogramFrames.__new__(HistogramFrames)
     frames.counts, frames.sensor, frames.reference, frames.time_s = out.reshape(shape), sensor, None, None

@@ -7,7 +7,6 @@ of the same shape. What it makes of views is the expected count of every bin (PH
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -23,6 +22,7 @@ from phasemark.render.direct.transients import range_axis, zone_transients
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.threads import mapped
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:
@@ -101,8 +101,7 @@ class HistogramRenderer:
         albedo: float = 0.8,
         intersector: str = "auto",
     ) -> None:
-        if sensor.histogram is None:
-            raise UsageError("the sensor has no [histogram] table: its histograms are not described")
+        histogram_of(sensor)
         self.sensor = sensor
         self.albedo = float(albedo)
         self._exact = Renderer(mesh, sensor, albedo=albedo, intersector=intersector)
@@ -191,23 +190,17 @@ class HistogramRenderer:
         bin_response(self.sensor, self.axis)  # cached before threads ask for it
         tasks = [slice(k, min(k + _VIEWS_AT_ONCE, len(views))) for k in range(0, len(views), _VIEWS_AT_ONCE)]
 
-        def run(lane: list[slice]) -> None:
-            scene = self._scene.for_thread()
-            for task in lane:
-                samples = scene.samples_of_views(
-                    seen[task], self.grid, background=background, finest_m=0.5 * histogram.bin_width_m,
-                    farthest_m=self.axis.nodes_m[-1],
-                )  # fmt: skip
-                samples = samples._replace(part=(samples.part >= WALL).astype(np.int8))
-                light = zone_transients(samples, self.sensor, self.axis)
-                for part in range(1 if background is None else 2):
-                    out[task, part] = counts_of_light(light[:, part], self.sensor, self.axis)
+        def run(task: slice) -> None:
+            samples = self._scene.samples_of_views(
+                seen[task], self.grid, background=background, finest_m=0.5 * histogram.bin_width_m,
+                farthest_m=self.axis.nodes_m[-1],
+            )  # fmt: skip
+            samples = samples._replace(part=(samples.part >= WALL).astype(np.int8))
+            light = zone_transients(samples, self.sensor, self.axis)
+            for part in range(1 if background is None else 2):
+                out[task, part] = counts_of_light(light[:, part], self.sensor, self.axis)
 
-        if workers == 1 or len(tasks) <= 1:
-            run(tasks)
-        else:
-            with ThreadPoolExecutor(workers) as pool:
-                list(pool.map(run, [tasks[k::workers] for k in range(workers)]))
+        mapped(run, tasks, workers)
         return out
 
     def check_in_view(self, views: Views) -> None:

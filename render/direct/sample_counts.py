@@ -110,11 +110,7 @@ def _signals(
     response = optics.response
     # zones of one response are lit alike by stray light, which is then added to their counts in the end
     alike = len(response.share) == 1 and np.ptp(response.start_m) == 0 and np.ptp(response.width_m) == 0
-    _add_samples(
-        samples.start, samples.tangents, samples.range_m, samples.amplitude, samples.part, albedos, place, optics.zones,
-        sensor.cols, optics.scale, response.share, response.first_m, response.steps_per_m, response.start_m,
-        response.width_m, 0.0 if alike else histogram.stray, out,
-    )  # fmt: skip
+    _add_samples(samples, albedos, place, optics, sensor.cols, 0.0 if alike else histogram.stray, out)
     if alike and histogram.stray > 0:
         out += histogram.stray * out.mean(axis=2, keepdims=True)
     out *= histogram.cycles * histogram.photons
@@ -134,11 +130,10 @@ def _optics_of(sensor: Sensor) -> _Optics:
     delay = low + step * np.arange(int(np.ceil((high - low) / step)) + 1)
     alike = len(histogram.irf) <= 1
     share = np.stack([response_share(delay, histogram, zone) for zone in range(1 if alike else n_zones)])
-    gain = np.array(histogram.zone_gain or ((1.0,) * sensor.cols,) * sensor.rows).ravel()
-    bin_scale = np.array(histogram.zone_bin_scale or ((1.0,) * sensor.cols,) * sensor.rows).ravel()
     offset = np.broadcast_to(sensor.zone_offsets + sensor.range_offset_m, (sensor.rows, sensor.cols)).ravel()
-    response = _Response(share, float(low), 1 / step, histogram.start_m - offset, histogram.bin_width_m * bin_scale)
-    return _Optics(zones, gain / footprint_areas(zones), response)
+    width_m = histogram.bin_width_m * sensor.zone_values("zone_bin_scale").ravel()
+    response = _Response(share, float(low), 1 / step, histogram.start_m - offset, width_m)
+    return _Optics(zones, sensor.zone_values("zone_gain").ravel() / footprint_areas(zones), response)
 
 
 @kernel
@@ -153,9 +148,11 @@ def _share(table, x):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _add_to_bins(light, range_m, table, first, density, start_m, width_m, out):  # type: ignore[no-untyped-def]
+def _add_to_bins(light, range_m, response, zone, out):  # type: ignore[no-untyped-def]
     """Share light from one range among the bins of a zone."""
-    nearest = range_m - start_m
+    table = response.share[min(zone, len(response.share) - 1)]
+    first, density, width_m = response.first_m, response.steps_per_m, response.width_m[zone]
+    nearest = range_m - response.start_m[zone]
     j = max(math.floor((nearest + first) / width_m), 0)
     stop = min(math.ceil((nearest + first + (len(table) - 1) / density) / width_m), len(out))
     x = (j * width_m - nearest - first) * density
@@ -170,18 +167,15 @@ def _add_to_bins(light, range_m, table, first, density, start_m, width_m, out): 
 
 
 @kernel
-def _add_samples(  # type: ignore[no-untyped-def]
-    start, tangents, range_m, amplitude, part, albedo, place, zones, cols, scale, share, first, density, start_m,
-    width_m, stray, out,
-):  # fmt: skip
+def _add_samples(samples, albedo, place, optics, cols, stray, out):  # type: ignore[no-untyped-def]
     """Add every sample to the bins of the zones that count its light."""
     n_zones = out.shape[2]
-    own = share.shape[0] > 1
-    for view in range(len(start) - 1):
-        for k in range(start[view], start[view + 1]):
-            y, z = tangents[k, 0], tangents[k, 1]
-            light = amplitude[k] * albedo[part[k]]
-            zones_of = out[view, place[part[k]]]
+    zones, scale, response = optics
+    for view in range(len(samples.start) - 1):
+        for k in range(samples.start[view], samples.start[view + 1]):
+            y, z = samples.tangents[k, 0], samples.tangents[k, 1]
+            light = samples.amplitude[k] * albedo[samples.part[k]]
+            counts = out[view, place[samples.part[k]]]
             total = 0.0
             for row in range(0, n_zones, cols):
                 if abs(z - zones.centre[row, 1]) > zones.half[row, 1] + _REACH * zones.blur[1]:
@@ -191,10 +185,8 @@ def _add_samples(  # type: ignore[no-untyped-def]
                     if w != 0.0:
                         w *= scale[q] * light
                         total += w
-                        table = share[q if own else 0]
-                        _add_to_bins(w, range_m[k], table, first, density, start_m[q], width_m[q], zones_of[q])
+                        _add_to_bins(w, samples.range_m[k], response, q, counts[q])
             if stray > 0.0 and total > 0.0:
                 total *= stray / n_zones
                 for q in range(n_zones):
-                    table = share[q if own else 0]
-                    _add_to_bins(total, range_m[k], table, first, density, start_m[q], width_m[q], zones_of[q])
+                    _add_to_bins(total, samples.range_m[k], response, q, counts[q])

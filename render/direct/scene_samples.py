@@ -7,8 +7,8 @@ landmark leaves free, cell by cell.
 
 from __future__ import annotations
 
-import copy
 import math
+from collections import defaultdict
 from typing import NamedTuple
 
 import numpy as np
@@ -84,13 +84,8 @@ class SceneMesh:
     def __init__(self, mesh: SurfaceMesh | None, *, intersector: str = "auto") -> None:
         self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
-        self._room: tuple[tuple[int, int], _Buffers] | None = None
-
-    def for_thread(self) -> SceneMesh:
-        """Return the same scene with scratch of its own, for another thread."""
-        other = copy.copy(self)
-        other._room = None
-        return other
+        self._idle: defaultdict[tuple[int, int], list[_Buffers]] = defaultdict(list)
+        """Scratch that no thread is using, by the size of its grid."""
 
     def samples(self, landmark2cam: ArrayLike, grid: Camera) -> SceneSamples:
         """Sample what a grid of cells sees.
@@ -155,7 +150,10 @@ class SceneMesh:
         return self._of_poses(_poses(views, behind, grid), grid, (finest_m, farthest_m))
 
     def _of_poses(self, poses: Poses, grid: Camera, scale: tuple[float, float]) -> SceneSamples:
-        found = [self._of_pose(poses._replace(**_only(poses, k)), grid, scale) for k in range(len(poses.lens))]
+        found = [
+            self._of_pose(Poses(*(np.ascontiguousarray(column[k : k + 1]) for column in poses)), grid, scale)
+            for k in range(len(poses.lens))
+        ]
         counts = [len(range_m) for _, range_m, _, _ in found]
         start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         columns = [np.concatenate([columns[k] for columns in found]) for k in range(4)]
@@ -165,7 +163,12 @@ class SceneMesh:
         mesh, background = self.topology, pose.background[0]
         rows, cols = grid.stop_row - grid.first_row, grid.cols
         state = np.zeros((1, rows, cols), np.uint8)
-        buffers = self._buffers(rows, cols)
+        idle = self._idle[rows, cols]
+        try:
+            buffers = idle.pop()
+        except IndexError:  # every thread has scratch of its own
+            n_edges = len(mesh.creases) + len(mesh.folds)
+            buffers = _Buffers(n_edges, (rows, cols), n_samples=_SAMPLES)
         behind = bool(background[:2].any())
         fastest = _RADIANS_PER_SCALE / scale[0] if behind else 0.0
         while True:
@@ -186,19 +189,12 @@ class SceneMesh:
         rest = share_faces(n, mesh, mesh.closed, scouts, samples, pose, grid, state)
         samples.face[samples.chosen[:rest]] = cast(rest)
         more = _count_free(state[0], pose, grid, background, scale) if behind else 0
-        tangents, range_m = np.empty((n + more, 2)), np.empty(n + more)
-        amplitude, part = np.empty(n + more), np.empty(n + more, np.int8)
-        kept = _hits(n, samples, mesh, pose, grid, background, tangents, range_m, amplitude, part)
+        columns = np.empty((n + more, 2)), np.empty(n + more), np.empty(n + more), np.empty(n + more, np.int8)
+        kept = _hits(n, samples, mesh, pose, grid, background, columns)
+        idle.append(buffers)
         if more:
-            kept = _fill_free(kept, state[0], pose, grid, background, scale, tangents, range_m, amplitude, part)
-        return tangents[:kept], range_m[:kept], amplitude[:kept], part[:kept]
-
-    def _buffers(self, rows: int, cols: int) -> _Buffers:
-        """Return the scratch for a grid, made once for each size."""
-        if self._room is None or self._room[0] != (rows, cols):
-            n_edges = len(self.topology.creases) + len(self.topology.folds)
-            self._room = (rows, cols), _Buffers(n_edges, (rows, cols), n_samples=_SAMPLES)
-        return self._room[1]
+            kept = _fill_free(kept, state[0], pose, grid, background, scale, columns)
+        return tuple(column[:kept] for column in columns)
 
 
 def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float] = (0.0, 0.0)) -> SceneSamples:
@@ -241,12 +237,20 @@ def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float]
     )
 
 
-def _only(poses: Poses, k: int) -> dict[str, NDArray[np.float64]]:
-    return {name: np.ascontiguousarray(getattr(poses, name)[k : k + 1]) for name in poses._fields}
+@kernel
+def _keep(columns, k, y, z, t, reflected, weight, area, part):  # type: ignore[no-untyped-def]
+    """Write a point of the ray (1, y, z) in line k of the columns of :class:`SceneSamples`; returns the next line."""
+    length = math.sqrt(1.0 + y * y + z * z)
+    tangents, range_m, amplitude, parts = columns
+    tangents[k, 0], tangents[k, 1] = y, z
+    range_m[k] = t * length
+    amplitude[k] = reflected / length / (t * length * t * length) * weight * area
+    parts[k] = part
+    return k + 1
 
 
 @kernel
-def _hits(n, samples, mesh, poses, camera, background, tangents, range_m, amplitude, part):  # type: ignore[no-untyped-def]
+def _hits(n, samples, mesh, poses, camera, background, columns):  # type: ignore[no-untyped-def]
     """Fill path length and amplitude of the samples that meet something; returns how many there are."""
     kept = 0
     area = 1.0 / (camera.scale_u * camera.scale_v)
@@ -257,7 +261,6 @@ def _hits(n, samples, mesh, poses, camera, background, tangents, range_m, amplit
         if face < 0 and not behind:
             continue
         y, z = samples.rays[k, 0], samples.rays[k, 1]
-        length = math.sqrt(1.0 + y * y + z * z)
         if face >= 0:
             t, reflected = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], y, z)
             seen = mesh.part[face]
@@ -265,13 +268,8 @@ def _hits(n, samples, mesh, poses, camera, background, tangents, range_m, amplit
             dx, dy, dz = towards_level(poses.level[0], y, z)
             t, rho, facing = background_hit(background, cos_b, sin_b, dx, dy, dz)
             reflected, seen = rho * facing, _BEFORE_WALL + nearer_plane(background, cos_b, sin_b, dx, dy, dz)
-        if not t > 0.0:
-            continue
-        tangents[kept, 0], tangents[kept, 1] = y, z
-        range_m[kept] = t * length
-        amplitude[kept] = reflected / length / (t * length * t * length) * samples.weights[k] * area
-        part[kept] = seen
-        kept += 1
+        if t > 0.0:
+            kept = _keep(columns, kept, y, z, t, reflected, samples.weights[k], area, seen)
     return kept
 
 
@@ -311,7 +309,7 @@ def _count_free(state, poses, camera, background, scale):  # type: ignore[no-unt
 
 
 @kernel
-def _fill_free(kept, state, poses, camera, background, scale, tangents, range_m, amplitude, part):  # type: ignore[no-untyped-def]
+def _fill_free(kept, state, poses, camera, background, scale, columns):  # type: ignore[no-untyped-def]
     """Append the background's points in cells that the landmark does not touch; returns how many points there are.
 
     Two Gauss points a side of a box.
@@ -329,13 +327,8 @@ def _fill_free(kept, state, poses, camera, background, scale, tangents, range_m,
                     y, z = ray_of(camera, c + (j // 2 + G2X[j % 2]) / n_u, v)
                     dx, dy, dz = towards_level(level, y, z)
                     t, rho, facing = background_hit(background, cos_b, sin_b, dx, dy, dz)
-                    if not t > 0.0:
-                        continue
-                    length = math.sqrt(1.0 + y * y + z * z)
-                    weight = G2W[i % 2] * G2W[j % 2] / (n_u * n_v) * area
-                    tangents[kept, 0], tangents[kept, 1] = y, z
-                    range_m[kept] = t * length
-                    amplitude[kept] = rho * facing / length / (t * length * t * length) * weight
-                    part[kept] = _BEFORE_WALL + nearer_plane(background, cos_b, sin_b, dx, dy, dz)
-                    kept += 1
+                    if t > 0.0:
+                        weight = G2W[i % 2] * G2W[j % 2] / (n_u * n_v) * area
+                        part = _BEFORE_WALL + nearer_plane(background, cos_b, sin_b, dx, dy, dz)
+                        kept = _keep(columns, kept, y, z, t, rho * facing, weight, 1.0, part)
     return kept

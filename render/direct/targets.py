@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.kernel import kernel
 from phasemark.render.sensor.sensor import Sensor
+
+if TYPE_CHECKING:
+    from phasemark.render.direct.histogram_frames import HistogramFrames
 
 
 class Status(IntEnum):
@@ -44,14 +47,7 @@ class Targets(NamedTuple):
     status: NDArray[np.uint8]
 
 
-class Counted(Protocol):
-    """Interface of objects with histograms: :class:`~phasemark.render.direct.HistogramFrames`."""
-
-    counts: NDArray[np.float64]
-    sensor: Sensor
-
-
-def find_targets(frames: Counted) -> Targets:
+def find_targets(frames: HistogramFrames) -> Targets:
     """Run the chip's estimator on histograms.
 
     The ambient level is the median bin. Peaks are local maxima that rise above it by `threshold` standard deviations
@@ -92,8 +88,7 @@ def place_to_range(place: NDArray[np.float64], sensor: Sensor) -> tuple[NDArray[
     sensor : Sensor
     """
     histogram = histogram_of(sensor)
-    scale = np.array(histogram.zone_bin_scale or ((1.0,) * sensor.cols,) * sensor.rows)[..., None]
-    width = histogram.bin_width_m * scale
+    width = histogram.bin_width_m * sensor.zone_values("zone_bin_scale")[..., None]
     mean_delay = np.array(response_means(sensor)).reshape(sensor.rows, sensor.cols, 1)
     offset = (sensor.zone_offsets + sensor.range_offset_m)[..., None] + mean_delay
     cosine = sensor.axis_cosine()[..., None] if histogram.reports == "z" else np.ones((1, 1, 1))

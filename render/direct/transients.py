@@ -84,23 +84,19 @@ def zone_transients(
     """
     zones = footprints_of(sensor) if footprints is None else footprints
     out = np.zeros((samples.n_views, PARTS, len(zones.centre), axis.n))
-    amplitude = samples.amplitude
     if sensor.vignetting:
-        amplitude = amplitude / (1 + (samples.tangents**2).sum(axis=1)) ** 2
-    _add_samples(
-        samples.start, samples.tangents, samples.range_m, amplitude, samples.part, zones,
-        1 / footprint_areas(zones), axis.first_m, axis.step_m, out,
-    )  # fmt: skip
+        samples = samples._replace(amplitude=samples.amplitude / (1 + (samples.tangents**2).sum(axis=1)) ** 2)
+    _add_samples(samples, zones, 1 / footprint_areas(zones), axis, out)
     return out
 
 
 @kernel
-def _add_samples(start, tangents, range_m, amplitude, part, zones, scale, first, step, out):  # type: ignore[no-untyped-def]
+def _add_samples(samples, zones, scale, axis, out):  # type: ignore[no-untyped-def]
     """Add every sample to the zones that see it."""
     n_zones, n = out.shape[2], out.shape[3]
-    for view in range(len(start) - 1):
-        for k in range(start[view], start[view + 1]):
-            x = (range_m[k] - first) / step
+    for view in range(len(samples.start) - 1):
+        for k in range(samples.start[view], samples.start[view + 1]):
+            x = (samples.range_m[k] - axis.first_m) / axis.step_m
             i = int(x)
             if i < 1 or i + 2 >= n:
                 continue
@@ -110,11 +106,11 @@ def _add_samples(start, tangents, range_m, amplitude, part, zones, scale, first,
             c = -(f + 1) * f * (f - 2) / 2
             d = (f + 1) * f * (f - 1) / 6
             for q in range(n_zones):
-                w = footprint_weight(zones, q, tangents[k, 0], tangents[k, 1])
+                w = footprint_weight(zones, q, samples.tangents[k, 0], samples.tangents[k, 1])
                 if w == 0.0:
                     continue
-                w *= amplitude[k] * scale[q]
-                row = out[view, part[k], q]
+                w *= samples.amplitude[k] * scale[q]
+                row = out[view, samples.part[k], q]
                 row[i - 1] += w * a
                 row[i] += w * b
                 row[i + 1] += w * c

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +15,7 @@ from phasemark.render.direct.sample_counts import signal_of_samples, signal_of_s
 from phasemark.render.direct.scene_samples import SceneMesh
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.threads import mapped
 from phasemark.render.view import VIEW_FIELDS, Views
 
 STEPS: dict[str, float] = {
@@ -72,12 +71,11 @@ class ViewSignals:
         self.vertices = np.empty((0, 3)) if mesh is None else np.asarray(mesh.vertices, dtype=np.float64)
         self._grid = footprint_grid(sensor)
         self._scene = SceneMesh(mesh)
-        self._own = threading.local()  # a scene has scratch that two threads must not share
 
     def seen_by(self, sensor: Sensor) -> ViewSignals:
         """Return the counts of another direct sensor from the same landmark."""
         other = copy.copy(self)
-        other.sensor, other._grid, other._own = sensor, footprint_grid(sensor), threading.local()
+        other.sensor, other._grid = sensor, footprint_grid(sensor)
         return other
 
     def counts(self, views: Views, workers: int = 1) -> NDArray[np.float64]:
@@ -89,7 +87,12 @@ class ViewSignals:
         workers : int
             Threads; the result does not depend on their number.
         """
-        return self._in_parts(views, self._counts, workers)
+
+        def counts(part: Views) -> NDArray[np.float64]:
+            samples = self._scene.samples_of_views(part.in_camera(self.sensor), self._grid)
+            return signal_of_samples(samples, self.sensor, self.albedo)
+
+        return _in_parts(counts, views, workers)
 
     def surfaces(
         self, views: Views, background: Background, workers: int = 1, finest_m: float | None = None
@@ -112,29 +115,14 @@ class ViewSignals:
         farthest = histogram.start_m + histogram.bins * histogram.bin_width_m
 
         def counts(part: Views) -> NDArray[np.float64]:
-            samples = self._own_scene().samples_of_views(
+            samples = self._scene.samples_of_views(
                 part.in_camera(self.sensor), self._grid, background=background, finest_m=finest, farthest_m=farthest
             )
             return signal_of_surfaces(samples, self.sensor, self.albedo)
 
-        return self._in_parts(views, counts, workers)
+        return _in_parts(counts, views, workers)
 
-    def _in_parts(
-        self, views: Views, counts: Callable[[Views], NDArray[np.float64]], workers: int
-    ) -> NDArray[np.float64]:
-        parts = [views[k : k + _VIEWS_AT_ONCE] for k in range(0, len(views), _VIEWS_AT_ONCE)]
-        if workers == 1 or len(parts) < 2:
-            return np.concatenate([counts(part) for part in parts])
-        with ThreadPoolExecutor(workers) as pool:
-            return np.concatenate(list(pool.map(counts, parts)))
 
-    def _counts(self, views: Views) -> NDArray[np.float64]:
-        samples = self._own_scene().samples_of_views(views.in_camera(self.sensor), self._grid)
-        return signal_of_samples(samples, self.sensor, self.albedo)
-
-    def _own_scene(self) -> SceneMesh:
-        """Return the scene of this thread."""
-        if not hasattr(self._own, "scene"):
-            self._own.scene = self._scene.for_thread()
-        scene: SceneMesh = self._own.scene
-        return scene
+def _in_parts(counts: Callable[[Views], NDArray[np.float64]], views: Views, workers: int) -> NDArray[np.float64]:
+    parts = [views[k : k + _VIEWS_AT_ONCE] for k in range(0, len(views), _VIEWS_AT_ONCE)]
+    return np.concatenate(mapped(counts, parts, workers))

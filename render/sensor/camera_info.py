@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from phasemark import InputFileError, UsageError
 from phasemark.inputs.reading import MOST_TOML_BYTES, read_text
 from phasemark.render.sensor.lens_fields import Lens, check_image_size
 
-_MODELS = {
+_MODELS: dict[str, tuple[Literal["opencv", "fisheye"], tuple[int, ...]]] = {
     "plumb_bob": ("opencv", (4, 5)),
     "rational_polynomial": ("opencv", (8,)),
     "equidistant": ("fisheye", (4,)),

@@ -65,6 +65,11 @@ class SensorQuantities(SensorFields):
         table = self.zone_offset_m or ((0.0,) * self.cols,) * self.rows
         return np.array(table, dtype=np.float64)
 
+    def zone_values(self, name: Literal["zone_gain", "zone_bin_scale"]) -> NDArray[np.float64]:
+        """Return a table of [histogram] that has a number for each zone, (rows, cols); ones where none is stated."""
+        table = getattr(self.histogram, name) or ((1.0,) * self.cols,) * self.rows
+        return np.array(table, dtype=np.float64)
+
     @property
     def calibration_matrix(self) -> NDArray[np.float64]:
         """Covariance of `calibration_fields` in their units, (p, p); (0, 0) without a calibration."""
