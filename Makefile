@@ -1,10 +1,11 @@
 # Every target sets itself up: a virtual environment in VENV, the package in it (editable), and then the work.
 #   make demo          the paper's experiment, with a report in out/demo
-#   make test          the tests (ARGS="-k name" for some of them), about six minutes on two cores with nothing compiled yet
+#   make test          the tests (ARGS="-k name" for some of them), about five minutes on two cores with nothing compiled yet
 #   make lint types    style, import direction, types (of the tests too)
 #   make bench soak    speed; the long statistical and fault tables
 #   make figures       the pictures of the documentation
-#   make docs          the site in out/site, and its check: links, names, nothing from elsewhere, widths of pages
+#   make docs          the tests of pages, notebooks and examples; the site in out/site, and its check: links, names,
+#                      nothing from elsewhere, widths of pages
 #   make pages         the pages of docs/ that are made from the program
 #   make wheel-check   what a release would ship, built from a clean clone
 #   make dist          wheel and sdist, built twice and compared bit for bit
@@ -23,7 +24,7 @@ demo: $(VENV)/.installed
 	$(BIN)/phasemark demo --out out/demo --force
 
 test: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not soak" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not soak and not docs" $(ARGS)
 
 soak: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m soak $(ARGS)
@@ -46,6 +47,7 @@ types: $(VENV)/.installed-test
 	$(BIN)/mypy --config-file tests/mypy.ini
 
 docs: $(VENV)/.installed-docs
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "docs and not soak" $(ARGS)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 	$(BIN)/python docs/site/check.py out/site
 

@@ -1,5 +1,6 @@
 """The frame of the command line: exit codes, one line for every mistake, output that other programs can read."""
 
+import io
 import json
 import os
 import re
@@ -48,7 +49,7 @@ def test_without_arguments_the_first_steps_are_printed_and_run(run: Callable[...
     code, out, err = run()
     steps = [line.split("   ")[0].split()[1:] for line in out.splitlines() if line.startswith("  phasemark ")]
     assert (code, err) == (0, "")
-    assert steps
+    assert steps[0] == ["demo"]
     for step in steps:
         assert run(*step, "--help").code == 0
 
@@ -179,20 +180,20 @@ def test_results_that_find_no_space_exit_with_5() -> None:
     assert (done.returncode, done.stderr) == (5, "error: No space left on device\n")
 
 
-def test_a_terminal_without_the_signs_still_gets_the_table() -> None:
-    environment = {**os.environ, "PYTHONIOENCODING": "cp1251"}  # has a degree sign, but no multiplication sign
-    done = subprocess.run([PHASEMARK, "sensor", "list"], env=environment, capture_output=True)
-    assert done.returncode == 0
-    assert re.search(r"16 \\xd7 16 +22° \\xd7 22°", done.stdout.decode("cp1251"))
+def test_a_terminal_without_the_signs_still_gets_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = io.TextIOWrapper(io.BytesIO(), encoding="cp1251")  # has a degree sign, but no multiplication sign
+    monkeypatch.setattr(sys, "stdout", terminal)
+    assert cli.main(["sensor", "list"]) == 0
+    assert re.search(r"16 \\xd7 16 +22° \\xd7 22°", terminal.buffer.getvalue().decode("cp1251"))
 
 
-@pytest.mark.parametrize(("arguments", "code"), [(["--version"], 0), (["snesor"], 2)])
-def test_the_package_runs_as_a_module(arguments: list[str], code: int, tmp_path: Path) -> None:
-    as_module = [sys.executable, "-m", "phasemark", *arguments]
-    done = subprocess.run(as_module, cwd=tmp_path, capture_output=True, text=True)
-    as_program = subprocess.run([PHASEMARK, *arguments], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == code
-    assert (done.stdout, done.stderr) == (as_program.stdout, as_program.stderr)
+def test_the_package_runs_as_a_module_and_as_a_program(tmp_path: Path) -> None:
+    as_module, as_program = (
+        subprocess.run([*command, "snesor"], cwd=tmp_path, capture_output=True, text=True)
+        for command in ([sys.executable, "-m", "phasemark"], [PHASEMARK])
+    )
+    assert as_module.returncode == as_program.returncode == 2
+    assert (as_module.stdout, as_module.stderr) == (as_program.stdout, as_program.stderr)
 
 
 class Clock:
@@ -259,13 +260,41 @@ def test_long_work_writes_lines_where_stderr_is_no_terminal(
     assert [line.partition(":")[0] for line in lines[:2]] == [what] * 2
 
 
-def test_help_imports_nothing_heavy() -> None:
-    # What makes a start slow, checked by name: a measured time would depend on the machine.
-    heavy = {"embreex", "h5py", "jinja2", "manifold3d", "matplotlib", "numba", "numpy", "pydantic", "scipy", "trimesh"}
-    program = "import sys; from phasemark import cli; code = cli.main(['--help']); print(*sys.modules); sys.exit(code)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0
-    assert heavy.isdisjoint(done.stdout.splitlines()[-1].split())
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("phasemark ba", "bank"),
+        ("phasemark bank bu", "build"),
+        ("phasemark match --me", "--method"),
+        ("phasemark match bank.h5 frames.csv --quantity ", "range z"),
+        ("phasemark bank build --class c", "cylinder cone"),
+        ("phasemark sensor show vl53l5cx-8", "vl53l5cx-8x8"),
+        ("phasemark match ban", ""),  # the shell goes on with files
+    ],
+)
+def test_a_shell_is_told_what_may_follow(
+    words: str,
+    found: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name, value in {
+        "COMP_WORDS": words, "COMP_CWORD": str(words.count(" ")), "_PHASEMARK_COMPLETE": "complete_bash"
+    }.items():  # fmt: skip
+        monkeypatch.setenv(name, value)
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert (end.value.code, capsys.readouterr().out.split()) == (0, found.split())
+
+
+def test_completion_can_be_installed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv(
+        "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1"
+    )  # which shell runs the tests does not matter
+    with pytest.raises(SystemExit) as end:
+        cli.main(["--show-completion", "bash"])
+    assert end.value.code == 0
+    assert "_PHASEMARK_COMPLETE=complete_bash" in capsys.readouterr().out
 
 
 def test_the_accuracy_of_a_class_loads_no_mesh_library_and_nothing_of_files() -> None:

@@ -4,8 +4,6 @@ import itertools
 import pydoc
 import re
 import runpy
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +12,8 @@ from phasemark.data.commands.command import OUTPUTS
 from phasemark.render import preset, preset_names
 from phasemark.render.sensor.shipped_sensors import preset_sources
 from phasemark.render.sensor.sources import kind_of_source
+
+pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -141,43 +141,3 @@ def test_no_page_or_message_installs_extras_from_an_index():
 def test_the_tutorials_explain_every_example():
     tutorials = (ROOT / "docs" / "tutorials.md").read_text(encoding="utf-8")
     assert [path.name for path in (ROOT / "examples").glob("*.py") if path.name not in tutorials] == []
-
-
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [
-        ("phasemark ba", "bank"),
-        ("phasemark bank bu", "build"),
-        ("phasemark match --me", "--method"),
-        ("phasemark match bank.h5 frames.csv --quantity ", "range z"),
-        ("phasemark bank build --class c", "cylinder cone"),
-        ("phasemark sensor show vl53l5cx-8", "vl53l5cx-8x8"),
-        ("phasemark match ban", ""),  # the shell goes on with files
-    ],
-)
-def test_a_shell_is_told_what_may_follow(words, found):
-    environment = {
-        "COMP_WORDS": words,
-        "COMP_CWORD": str(words.count(" ")),
-        "_PHASEMARK_COMPLETE": "complete_bash",
-        "PATH": "",
-    }
-    program = [str(Path(sys.executable).with_name("phasemark"))]
-    done = subprocess.run(program, env=environment, capture_output=True, text=True)
-    assert (done.returncode, done.stdout.split()) == (0, found.split())
-
-
-def test_completion_can_be_installed(tmp_path):
-    program = [str(Path(sys.executable).with_name("phasemark")), "--show-completion", "bash"]
-    # which shell runs the tests does not matter
-    environment = {"HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    done = subprocess.run(program, capture_output=True, text=True, env=environment)
-    assert done.returncode == 0
-    assert "_PHASEMARK_COMPLETE=complete_bash" in done.stdout
-
-
-def test_without_arguments_the_first_step_is_the_demo():
-    done = subprocess.run([Path(sys.executable).with_name("phasemark")], capture_output=True, text=True)
-    commands = [line for line in done.stdout.splitlines() if "phasemark " in line and line.startswith("  ")]
-    assert done.returncode == 0
-    assert commands[0].split()[:2] == ["phasemark", "demo"]

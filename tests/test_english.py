@@ -5,9 +5,12 @@ import io
 import re
 import tokenize
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
+
+pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("inputs", "data", "landmarks", "matcher", "render", "benchmarks", "docs", "examples", "tests", ".ci")
@@ -47,8 +50,11 @@ NAMES = ("classes told apart, d", "sides told apart, d")
 NO_VERBS = QUESTIONS | {"The", "A", "An", "It", "If", "One", "Names", "Sides", "That", "This", "These", "There"}
 
 
-MENDED = ("calibration", "commands", "design", "drive", "sweep")
-"""Packages of the matcher whose functions name their result."""
+MENDED = (
+    *("inputs/", "data/", "landmarks/", "render/"),
+    *(f"matcher/{package}/" for package in ("calibration", "commands", "design", "drive", "sweep")),
+)
+"""Folders whose functions name their result."""
 
 
 def _words(text: str) -> list[str]:
@@ -88,13 +94,16 @@ def _page_without_code(path: Path) -> str:
     return re.sub(r"`[^`\n]+`", "`…`", text)
 
 
-def _docstrings(path: Path) -> Iterator[tuple[ast.AST, str]]:
-    """Yield each documented module, class and function of a program, with the first line of its docstring."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            docstring = ast.get_docstring(node)
-            if docstring:
-                yield node, docstring.splitlines()[0]
+@cache
+def _first_lines() -> list[tuple[ast.Module | ast.ClassDef | ast.FunctionDef, str, str]]:
+    """Return each documented module, class and function of the program, its place and its docstring's first line."""
+    return [
+        (node, f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}", docstring.splitlines()[0])
+        for path in PROGRAMS
+        if ROOT / "tests" not in path.parents
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (docstring := ast.get_docstring(node))
+    ]
 
 
 def _is_property(node: ast.AST) -> bool:
@@ -126,10 +135,8 @@ def test_no_page_has_a_riddling_word() -> None:
 
 def test_the_first_line_of_a_function_is_an_imperative() -> None:
     found = [
-        f"{path.relative_to(ROOT)}:{node.lineno}: {line}"
-        for path in PROGRAMS
-        if ROOT / "tests" not in path.parents
-        for node, line in _docstrings(path)
+        f"{place}: {line}"
+        for node, place, line in _first_lines()
         if isinstance(node, ast.FunctionDef) and not _is_property(node) and line.split()[0] in NO_VERBS
     ]
     assert found == []
@@ -137,24 +144,19 @@ def test_the_first_line_of_a_function_is_an_imperative() -> None:
 
 def test_a_result_is_named_and_not_paraphrased() -> None:
     # "Return the fitted values", not "Return what was fitted"; private functions too
-    mended = ("inputs", "data", "landmarks", "render", *(f"matcher/{part}" for part in MENDED))
     found = [
-        f"{path.relative_to(ROOT)}:{node.lineno}: {line}"
-        for room in mended
-        for path in (ROOT / room).rglob("*.py")
-        for node, line in _docstrings(path)
-        if isinstance(node, ast.FunctionDef) and line.startswith("Return what ")
+        f"{place}: {line}"
+        for node, place, line in _first_lines()
+        if isinstance(node, ast.FunctionDef) and line.startswith("Return what ") and place.startswith(MENDED)
     ]
     assert found == []
 
 
 def test_modules_and_classes_are_described_by_a_statement_and_not_by_a_question() -> None:
     found = [
-        f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}: {line}"
-        for path in PROGRAMS
-        if ROOT / "tests" not in path.parents
-        for node, line in _docstrings(path)
-        if isinstance(node, ast.Module | ast.ClassDef) and line.split()[0] in QUESTIONS
+        f"{place}: {line}"
+        for node, place, line in _first_lines()
+        if not isinstance(node, ast.FunctionDef) and line.split()[0] in QUESTIONS
     ]
     assert found == []
 

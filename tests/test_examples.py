@@ -17,6 +17,8 @@ import pytest
 
 from phasemark.cli import main
 
+pytestmark = pytest.mark.docs
+
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "real_recording.py"
 NOISE_M = 0.004
 TAN = np.tan(np.radians(22.5))

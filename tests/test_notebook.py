@@ -1,8 +1,5 @@
 """What notebooks show: pictures are PNG, tables escape what files and users call things."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -81,12 +78,3 @@ def test_banks_and_frame_sets_tell_what_they_hold_open_or_closed(tmp_path):
         assert "6: 2 of each of 3 views" in frames._repr_html_()
         bank.close()
         frames.close()
-
-
-def test_what_is_slow_to_import_is_not_loaded_before_it_is_used():
-    code = (
-        "import sys, phasemark.landmarks, phasemark.render, phasemark.data, phasemark.matcher.plan_kinds;"
-        "sys.exit(' '.join({'matplotlib', 'scipy.stats', 'dask', 'rosbags'} & set(sys.modules)) or 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr

@@ -1,6 +1,4 @@
 import io
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -152,14 +150,6 @@ def test_terminal_picture_fills_the_width_by_whole_pixels():
 def test_pictures_are_of_one_image():
     with pytest.raises(UsageError, match=r"must be one image, \(rows, cols\), got shape \(1, 16, 16\)"):
         range_figure(range_image()[None])
-
-
-def test_matplotlib_loads_only_when_a_picture_is_drawn_and_pyplot_never():
-    code = (
-        "import sys, phasemark.render; assert 'matplotlib' not in sys.modules; import phasemark.render.figures;"
-        "assert 'matplotlib' in sys.modules; assert 'matplotlib.pyplot' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_unknown_names_are_attribute_errors():

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from readme_commands import RUN, Block, read_blocks, run_page, shell_commands
 
+pytestmark = pytest.mark.docs
+
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = ROOT / "docs" / "notebooks"  # their cells share names: tests/test_site.py runs them
 PAGES = sorted({*ROOT.glob("*.md"), *(ROOT / "docs").glob("**/*.md")} - {*NOTEBOOKS.glob("*.md")})
