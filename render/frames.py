@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from enum import IntFlag
-from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -207,31 +207,19 @@ class Frames:
 
     def __getitem__(self, index: slice | NDArray[np.integer]) -> Self:
         """Return some of the positions."""
-        return type(self)(
-            self.range_m[index],
-            None if self.amplitude_e is None else self.amplitude_e[index],
-            None if self.intensity_e is None else self.intensity_e[index],
-            sensor=self.sensor,
-            flags=self.flags[index],
-            taps_e=None if self.taps_e is None else self.taps_e[index],
-            time_s=None if self.time_s is None else self.time_s[index],
-            by_frequency=[part[index] for part in self._by_frequency],
-        )
+        return self._rearranged(lambda values: values[index])
 
     def each_a_position(self) -> Self:
         """Return the frames of a moving camera: every frame a position of its own, (n · frames, 1, rows, cols)."""
-        flat = (-1, 1, self.sensor.rows, self.sensor.cols)
-        taps = self.taps_e
-        return type(self)(
-            self.range_m.reshape(flat),
-            None if self.amplitude_e is None else self.amplitude_e.reshape(flat),
-            None if self.intensity_e is None else self.intensity_e.reshape(flat),
-            sensor=self.sensor,
-            flags=self.flags.reshape(flat),
-            taps_e=None if taps is None else taps.reshape(-1, 1, *taps.shape[2:]),
-            time_s=None if self.time_s is None else self.time_s.reshape(-1, 1),
-            by_frequency=[part.each_a_position() for part in self._by_frequency],
-        )
+        return self._rearranged(lambda values: values.reshape(-1, 1, *values.shape[2:]))
+
+    def as_one_position(self) -> Self:
+        """Return positions of one frame each as the frames of one position, (1, n, rows, cols)."""
+        return self._rearranged(lambda values: values.reshape(1, -1, *values.shape[2:]))
+
+    def some_frames(self, start: int, stop: int) -> Self:
+        """Return frames `start` to `stop` of every position, without taps and stamps."""
+        return self._rearranged(lambda values: values[:, start:stop], ranges_alone=True)
 
     def taken_by(self, sensor: Sensor) -> Self:
         """Return the same ranges, amplitudes and flags as frames of another camera, without taps and stamps.
@@ -241,43 +229,27 @@ class Frames:
         sensor : Sensor
             With as many pixels and the same modulation frequencies.
         """
-        parts = zip(self._by_frequency, sensor.by_frequency, strict=True) if self._by_frequency else ()
-        return type(self)(
-            self.range_m,
-            self.amplitude_e,
-            self.intensity_e,
-            flags=self.flags,
-            sensor=sensor,
-            by_frequency=[part.taken_by(camera) for part, camera in parts],
-        )
+        return self._rearranged(lambda values: values, sensor, ranges_alone=True)
 
-    def some_frames(self, start: int, stop: int) -> Self:
-        """Return frames `start` to `stop` of every position, without taps and stamps."""
-        part = slice(start, stop)
-        return type(self)(
-            self.range_m[:, part],
-            None if self.amplitude_e is None else self.amplitude_e[:, part],
-            None if self.intensity_e is None else self.intensity_e[:, part],
-            sensor=self.sensor,
-            flags=self.flags[:, part],
-            by_frequency=[one.some_frames(start, stop) for one in self._by_frequency],
-        )
-
-    def as_one_position(self) -> Self:
-        """Return positions of one frame each as the frames of one position, (1, n, rows, cols)."""
-        n = len(self) * self.n_frames
-        whole = (1, n, self.sensor.rows, self.sensor.cols)
-        taps = self.taps_e
-        return type(self)(
-            self.range_m.reshape(whole),
-            None if self.amplitude_e is None else self.amplitude_e.reshape(whole),
-            None if self.intensity_e is None else self.intensity_e.reshape(whole),
-            sensor=self.sensor,
-            flags=self.flags.reshape(whole),
-            taps_e=None if taps is None else taps.reshape(1, n, *taps.shape[2:]),
-            time_s=None if self.time_s is None else self.time_s.reshape(1, n),
-            by_frequency=[part.as_one_position() for part in self._by_frequency],
-        )
+    def _rearranged(
+        self,
+        change: Callable[[NDArray[Any]], NDArray[Any]],
+        sensor: Sensor | None = None,
+        *,
+        ranges_alone: bool = False,
+    ) -> Self:
+        """Return frames with `change` made to each array, (n, frames, ...); without taps and stamps if asked for."""
+        arrays = {
+            name: change(values)
+            for name in ("amplitude_e", "intensity_e", "flags", *(() if ranges_alone else ("taps_e", "time_s")))
+            if (values := getattr(self, name)) is not None
+        }
+        cameras = [part.sensor for part in self._by_frequency] if sensor is None else sensor.by_frequency
+        by_frequency = [
+            part._rearranged(change, camera, ranges_alone=ranges_alone)
+            for part, camera in zip(self._by_frequency, cameras, strict=False)
+        ]
+        return type(self)(change(self.range_m), sensor=sensor or self.sensor, by_frequency=by_frequency, **arrays)
 
     @property
     def valid(self) -> NDArray[np.bool_]:

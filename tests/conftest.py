@@ -26,10 +26,11 @@ def pytest_configure(config: pytest.Config) -> None:
     if not config.getoption("numprocesses", None) or config.option.collectonly:
         return
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    command = [sys.executable, "-m", "programs.compile_kernels"]
-    running = [subprocess.Popen([*command, *parts], env=environment) for parts in (["rendering", "matching"], ["rest"])]
-    if any([process.wait() for process in running]):
-        raise pytest.UsageError("compiling what the tests share failed")
+    for pair in (("rendering", "rest"), ("matching", "histograms")):  # the second two use what the first compile
+        commands = [[sys.executable, "-m", "programs.compile_kernels", part] for part in pair]
+        running = [subprocess.Popen(command, env=environment) for command in commands]
+        if any([process.wait() for process in running]):
+            raise pytest.UsageError("compiling what the tests share failed")
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """Compile what many tests call, before the processes that share them start.
 
-``python -m programs.compile_kernels PART …``. Processes that start together would each compile all of it.
+``python -m programs.compile_kernels PART``. Processes that start together would each compile all of it.
 """
 
 import sys
@@ -37,6 +37,12 @@ def the_rest() -> None:
     exact_pixels("cylinder", PMD, Views.broadcast(1.0, 0.3), np.array([[8, 8]]), background=BEHIND)
 
 
+PARTS = {
+    "rendering": rendering,
+    "rest": the_rest,
+    "matching": lambda: warm("match"),
+    "histograms": lambda: warm("histograms"),
+}
+
 if __name__ == "__main__":
-    for part in sys.argv[1:]:
-        {"rendering": rendering, "matching": lambda: warm("match"), "rest": the_rest}[part]()
+    PARTS[sys.argv[1]]()
