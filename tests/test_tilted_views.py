@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from test_derivative import PMD, TAN, WAVE, W, X, by_complex_step
+from test_slopes import PMD, TAN, WAVE, W, X, by_complex_step
 
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog
