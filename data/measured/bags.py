@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark.data.measured.recording import Recording
 from phasemark.inputs import is_vouched_for
 
 Z_TOPIC = "/camera/depth/image_rect"
@@ -34,7 +35,7 @@ def ros_types() -> Any:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def read_rosbag(path: Path, topic: str | None) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+def read_rosbag(path: Path, topic: str | None) -> Recording:
     """Return the images of a bag, (frames, rows, cols), and what the bag says of unit and quantity.
 
     Parameters
@@ -61,7 +62,7 @@ def read_rosbag(path: Path, topic: str | None) -> tuple[dict[str, NDArray[Any]],
         raise InputFileError(f"{path}: damaged, or no ROS 2 bag ({' '.join(str(error).split())[:300]})") from None
 
 
-def _read(path: Path, topic: str | None, store: Any) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+def _read(path: Path, topic: str | None, store: Any) -> Recording:
     from rosbags.rosbag2 import Reader
 
     images: list[NDArray[Any]] = []
@@ -92,7 +93,7 @@ def _read(path: Path, topic: str | None, store: Any) -> tuple[dict[str, NDArray[
     stated = {"unit": units.pop()}
     if chosen in (RANGE_TOPIC, Z_TOPIC):
         stated["quantity"] = "range" if chosen == RANGE_TOPIC else "z"
-    return arrays, stated
+    return Recording(arrays, stated)
 
 
 def _pixels(message: Any, path: Path) -> NDArray[Any]:
@@ -102,5 +103,4 @@ def _pixels(message: Any, path: Path) -> NDArray[Any]:
     order = ">" if message.is_bigendian else "<"
     kind = np.dtype(order + kinds[message.encoding])
     rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
-    pixels = rows[:, : message.width * kind.itemsize].copy().view(kind).astype(np.float64)
-    return pixels
+    return rows[:, : message.width * kind.itemsize].copy().view(kind).astype(np.float64)

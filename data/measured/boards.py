@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.measured import board_prints as prints
 from phasemark.data.measured.board_prints import BoardLog, Printed
 from phasemark.data.measured.orientation import Orientation
+from phasemark.data.measured.recording import Recording
+from phasemark.render import Sensor
 
 MOST_LOG_BYTES = 1 << 27
 """Most of a log of a board that is read: two hours of 8 × 8 zones, 15 frames a second, of the longest print."""
@@ -73,23 +74,6 @@ BOARDS = {
 """Boards by name. Sources: docs/formats.md."""
 
 
-@dataclass(frozen=True)
-class BoardFrames:
-    """Frames of a log.
-
-    Parameters
-    ----------
-    board : Board
-    arrays : dict of str to (frames, rows · cols) float32
-        "range", millimetres, and "status" if the board prints it.
-    time_s : (frames,) float64, optional
-    """
-
-    board: Board
-    arrays: dict[str, NDArray[np.float32]]
-    time_s: NDArray[np.float64] | None
-
-
 def find_board(name: str | None, head: bytes, n_pixels: int, path: Path) -> Board | None:
     """Return the board that printed a text, None if it is of none.
 
@@ -135,15 +119,17 @@ def find_board(name: str | None, head: bytes, n_pixels: int, path: Path) -> Boar
     return (named or found)[0]
 
 
-def read_board_log(file: BinaryIO, board: Board, shape: tuple[int, int], path: Path) -> BoardFrames:
+def read_board_log(file: BinaryIO, board: Board, sensor: Sensor, shape: tuple[int, int], path: Path) -> Recording:
     """Read the frames of a log line by line.
 
     Parameters
     ----------
     file : binary file
     board : Board
+    sensor : Sensor
+        The camera; its quantity is that of a board without one of its own.
     shape : (rows, cols)
-        Of the sensor.
+        Pixels of a frame in the file's own orientation.
     path : Path
         For messages.
 
@@ -185,11 +171,13 @@ def read_board_log(file: BinaryIO, board: Board, shape: tuple[int, int], path: P
         if len(values) not in (0, expected):
             raise InputFileError(f"{path}: some frames have a {name}, others have none")
     arrays = {"range": distance, "status": status} if status else {"range": distance}
-    return BoardFrames(
-        board,
+    return Recording(
         {
             name: board.orientation.apply(np.frombuffer(values, np.float32).reshape(-1, *shape)).reshape(-1, n_zones)
             for name, values in arrays.items()
         },
+        {"unit": "mm", "quantity": board.quantity or sensor.quantity},
         np.frombuffer(times) if times else None,
+        flat=True,
+        valid_status=board.valid_status,
     )

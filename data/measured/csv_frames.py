@@ -7,7 +7,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,11 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError
-
-MILLISECONDS = "t_ms"
-SECONDS = "t_s"
-SECONDS_PER_TIME_UNIT: dict[str, float] = {MILLISECONDS: 1e-3, SECONDS: 1.0}
-"""Names of time stamps, in CSV columns and in arrays, with the length of their unit."""
+from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, Recording, note_disorder, one_time
 
 _SEPARATORS = (";", "\t", ",")
 _STATED = re.compile(r"\b(unit|quantity)=(\S+)")
@@ -30,28 +26,6 @@ _OTHER_GROUPS = ("status", "amplitude", "intensity")
 _NOT_A_NUMBER = ("", "nan")
 _OUR_OWN = re.compile(r"truth_\w+")
 _MOST_NAMED = 8
-
-
-@dataclass(frozen=True)
-class CsvFrames:
-    """Content of a text file of frames.
-
-    Parameters
-    ----------
-    arrays : mapping of str to (frames, rows · cols) float64
-        "range", and "status", "amplitude" and "intensity" if the file has them.
-    stated : mapping of str to str
-        "unit" and "quantity", where the file states them.
-    time_s : (frames,) float64, optional
-        Time stamps, seconds.
-    named : bool
-        Whether a header named the columns.
-    """
-
-    arrays: Mapping[str, NDArray[np.float64]]
-    stated: Mapping[str, str]
-    time_s: NDArray[np.float64] | None = None
-    named: bool = False
 
 
 @dataclass(frozen=True)
@@ -66,7 +40,7 @@ class _Text:
     names: Mapping[int, str] = field(default_factory=dict)  # by column
 
 
-def parse_csv(content: bytes, shape: tuple[int, int], path: Path, n_frequencies: int = 1) -> CsvFrames:
+def parse_csv(content: bytes, shape: tuple[int, int], path: Path, n_frequencies: int = 1) -> Recording:
     """Read the frames of a text file.
 
     Parameters
@@ -118,7 +92,7 @@ def parse_csv(content: bytes, shape: tuple[int, int], path: Path, n_frequencies:
         expected, name = n_frequencies * expected, "frequency_range"
         pixels = f"{pixels} at each of {n_frequencies} frequencies"
     body = _Text(path, lines[1 if header else 0 :], separator, expected, pixels)
-    return CsvFrames({name: _numbers(body, range(body.expected))}, stated)
+    return Recording({name: _numbers(body, range(body.expected))}, stated, flat=True)
 
 
 def _parse_named(
@@ -129,7 +103,7 @@ def _parse_named(
     shape: tuple[int, int],
     path: Path,
     n_frequencies: int,
-) -> CsvFrames:
+) -> Recording:
     """Read a file whose header names its columns."""
     place = f"{path}: line {lines[0][0]}"
     groups = _groups(names, shape, place, n_frequencies)
@@ -140,26 +114,26 @@ def _parse_named(
             f"{place}: names no columns of pixels, which must be mm_0 … mm_{last}, range_0 … range_{last} or"
             f" z_0 … z_{last}"
         )
-    times = [name for name in SECONDS_PER_TIME_UNIT if name in names]
-    if len(times) > 1:
-        raise InputFileError(f"{place}: has both '{MILLISECONDS}' and '{SECONDS}': leave one of them out")
+    time = one_time(names, place)
     for key, value in _PIXELS[pixels].items():
         if stated.get(key, value) != value:
             raise InputFileError(f"{place}: has columns {pixels}_0 …, but the first line says {key}={stated[key]}")
         stated[key] = value
 
-    columns = [names.index(time) for time in times] + [column for group in groups.values() for column in group]
+    columns = [names.index(time)] if time else []
+    start = len(columns)
+    columns += [column for group in groups.values() for column in group]
     body = _Text(path, lines[1:], separator, len(names), "the columns that the header names", dict(enumerate(names)))
     numbers = _numbers(body, columns)
-    time_s = _times_s(numbers[:, 0], times[0], body) if times else None
-    arrays, start = {}, len(times)
+    time_s = _times_s(numbers[:, 0], time, body) if time else None
+    arrays = {}
     for prefix, group in groups.items():
         name = "range" if prefix in _PIXELS else prefix
         name = f"frequency_{name}" if len(group) > math.prod(shape) else name
         arrays[name] = numbers[:, start : start + len(group)]
         start += len(group)
     _note_ignored(names, columns, path)
-    return CsvFrames(arrays, stated, time_s, named=True)
+    return Recording(arrays, stated, time_s, flat=True, named=True)
 
 
 def _groups(names: list[str], shape: tuple[int, int], place: str, n_frequencies: int) -> dict[str, list[int]]:
@@ -207,36 +181,6 @@ def _times_s(values: NDArray[np.float64], name: str, body: _Text) -> NDArray[np.
         )
     note_disorder(values, body.path, lambda k: f"line {body.lines[k][0]}")
     return values * SECONDS_PER_TIME_UNIT[name]
-
-
-def note_disorder(times: NDArray[np.float64], path: Path, place: Callable[[int], str]) -> None:
-    """Warn of time stamps that repeat or run backwards; the frames keep their order.
-
-    Parameters
-    ----------
-    times : (frames,) float64
-    path : Path
-        For the message.
-    place : callable
-        Turns the number of a frame into the place where it stands.
-
-    Warns
-    -----
-    UserWarning
-        Says how many stamps there are, and where the first is.
-    """
-    steps = np.diff(times)
-    repeat, backwards = int((steps == 0).sum()), int((steps < 0).sum())
-    if repeat + backwards:
-        counts = " and ".join(
-            f"{count} of {len(times)} time stamps {what}"
-            for count, what in ((repeat, "repeat"), (backwards, "run backwards"))
-            if count
-        )
-        first = int(np.flatnonzero(steps <= 0)[0]) + 1
-        warnings.warn(
-            f"{path}: {counts}, the first in {place(first)}; the frames keep their order", UserWarning, stacklevel=2
-        )
 
 
 def _note_ignored(names: list[str], used: list[int], path: Path) -> None:

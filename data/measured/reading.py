@@ -7,8 +7,7 @@ import math
 import os
 import warnings
 import zipfile
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -19,14 +18,22 @@ from PIL import Image
 
 from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.data.files.atomic_write import write_atomically
-from phasemark.data.files.guard import EXPANSION, FREE_BYTES
+from phasemark.data.files.guard import FREE_BYTES
 from phasemark.data.files.hdf5_reading import open_hdf5
 from phasemark.data.measured.bags import read_rosbag
 from phasemark.data.measured.boards import HEAD_BYTES, MOST_LOG_BYTES, find_board, read_board_log
-from phasemark.data.measured.csv_frames import MILLISECONDS, SECONDS, SECONDS_PER_TIME_UNIT, note_disorder, parse_csv
-from phasemark.data.measured.frequency_layers import LAYERED, layers_of
+from phasemark.data.measured.csv_frames import parse_csv
 from phasemark.data.measured.orientation import Orientation
+from phasemark.data.measured.recording import (
+    SECONDS,
+    SECONDS_PER_TIME_UNIT,
+    Recording,
+    note_disorder,
+    one_time,
+    opened_npz,
+)
 from phasemark.inputs import opened
+from phasemark.inputs.numbers import in_words
 from phasemark.render import Frames, Sensor
 from phasemark.render.unwrapped_frames import unwrap_frames
 
@@ -39,7 +46,8 @@ QUANTITIES = ("range", "z")
 
 _NUMBERS = ("range", "amplitude", "intensity")
 _OF_FREQUENCY = tuple(f"frequency_{name}" for name in _NUMBERS)
-_FIELDS = (*_NUMBERS, "status", "valid", *_OF_FREQUENCY, "frequency", "taps")
+_COLUMNS = (*_NUMBERS, "status", "valid", *_OF_FREQUENCY, "frequency", "taps", *SECONDS_PER_TIME_UNIT)
+"""Arrays of NPZ and HDF5 files that are read."""
 _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
 _BEYOND_MAX_RANGE = 1.25
@@ -52,18 +60,6 @@ _VALUES_PER_BYTE = 2
 """How many a file may hold for each of its bytes; what is packed more tightly than this was made to fill the memory."""
 _WORD_BYTES = 256
 """Most that the words for unit and quantity take."""
-
-
-@dataclass(frozen=True)
-class _Raw:
-    """Arrays as the file has them, and what it says about them."""
-
-    arrays: Mapping[str, NDArray[Any]]
-    stated: Mapping[str, str] = field(default_factory=dict)  # "unit" and "quantity", where the file states them
-    time_s: NDArray[np.float64] | None = None
-    flat: bool = False  # frames are rows of rows · cols values
-    named: bool = False  # names of columns state unit or quantity
-    valid_status: tuple[int, ...] | None = None  # of the board that printed it
 
 
 def read_frames(
@@ -171,24 +167,9 @@ def read_frames(
             " quantity=range (along the ray)|z (along the optical axis)"
         )
     settled_unit = _settled("unit", unit, raw, tuple(METRES_PER_UNIT), path)
-    unit_scale = METRES_PER_UNIT[settled_unit]
     settled_quantity = _settled("quantity", quantity, raw, QUANTITIES, path)
 
-    layered = layers_of(raw.arrays, sensor, shape, raw.flat, path)
-    plain = {name: values for name, values in raw.arrays.items() if name not in LAYERED}
-    arrays = {name: _as_frames(values, name, shape, raw.flat, path) for name, values in plain.items()}
-    if "frequency_range" in layered:
-        arrays["range"] = layered["frequency_range"][:, :, 0]
-    for name, values in arrays.items():
-        if values.shape != arrays["range"].shape:
-            raise InputFileError(
-                f"{path}: '{name}' must have the shape of 'range', {arrays['range'].shape}, got {values.shape}"
-            )
-    for name, values in layered.items():
-        if values.shape[:2] != arrays["range"].shape[:2]:
-            raise InputFileError(
-                f"{path}: '{name}' must have the frames of 'range', {arrays['range'].shape[:2]}, got {values.shape[:2]}"
-            )
+    arrays = _shaped(raw, sensor, shape, path)
     valid = np.ones(arrays["range"].shape, dtype=bool)
     if "valid" in arrays:
         valid &= arrays["valid"] != 0
@@ -200,17 +181,16 @@ def read_frames(
                 " and VL53L8CX)"
             )
         valid &= np.isin(arrays["status"], list(valid_status))
-    arrays, layered = (
-        {name: _upright(values, flip_h, flip_v, rotate) for name, values in some.items()} for some in (arrays, layered)
-    )
-    valid = _upright(valid, flip_h, flip_v, rotate)
     time_s = _frame_times_s(raw, valid.shape[:2], path)
-    taps_e = None if "taps" not in layered else layered["taps"].astype(np.float64)
+    upright = Orientation(flip_h, rotate)
+    arrays = {name: upright.apply(values[..., ::-1, :] if flip_v else values) for name, values in arrays.items()}
+    valid = upright.apply(valid[..., ::-1, :] if flip_v else valid)
+    taps_e = arrays["taps"].astype(np.float64) if "taps" in arrays else None
 
     def frames_of(own: Mapping[str, NDArray[Any]], camera: Sensor, taps: NDArray[np.float64] | None) -> Frames:
         with np.errstate(invalid="ignore", over="ignore"):  # what becomes NaN or infinite is invalid
             numbers = {name: own[name].astype(np.float64) for name in _NUMBERS if name in own}
-            range_m = numbers["range"] * unit_scale
+            range_m = numbers["range"] * METRES_PER_UNIT[settled_unit]
         if settled_quantity == "z":
             range_m = range_m / sensor.axis_cosine()
         usable = valid & np.isfinite(range_m)
@@ -222,11 +202,11 @@ def read_frames(
         )  # fmt: skip
 
     try:
-        if "frequency_range" not in layered:
+        if "frequency_range" not in arrays:
             return frames_of(arrays, sensor, taps_e)
-        held = [name for name in _NUMBERS if f"frequency_{name}" in layered]
+        held = [name for name in _NUMBERS if f"frequency_{name}" in arrays]
         parts = [
-            frames_of({name: layered[f"frequency_{name}"][:, :, j] for name in held}, camera, None)
+            frames_of({name: arrays[f"frequency_{name}"][:, :, j] for name in held}, camera, None)
             for j, camera in enumerate(sensor.by_frequency)
         ]
         return unwrap_frames(parts, sensor, taps_e=taps_e)
@@ -234,7 +214,7 @@ def read_frames(
         raise InputFileError(f"{path}: {error}") from None
 
 
-def _frame_times_s(raw: _Raw, shape: tuple[int, ...], path: Path) -> NDArray[np.float64] | None:
+def _frame_times_s(raw: Recording, shape: tuple[int, ...], path: Path) -> NDArray[np.float64] | None:
     """Return the time stamps as (n, frames)."""
     if raw.time_s is None:
         return None
@@ -243,10 +223,6 @@ def _frame_times_s(raw: _Raw, shape: tuple[int, ...], path: Path) -> NDArray[np.
             f"{path}: the time stamps must have one number for each frame, shape {shape}, got {raw.time_s.shape}"
         )
     return raw.time_s.reshape(shape)
-
-
-def _upright(values: NDArray[Any], flip_h: bool, flip_v: bool, rotate: int) -> NDArray[Any]:
-    return Orientation(flip_h, rotate).apply(values[..., ::-1, :] if flip_v else values)
 
 
 def _range_limit(sensor: Sensor) -> tuple[float, str]:
@@ -290,7 +266,7 @@ def _fitting_units(readings_m: NDArray[np.float64], limit_m: float, unit: str) -
     return f" All would fit with {' or '.join(fitting)}" if fitting else ""
 
 
-def _settled(name: str, given: str | None, raw: _Raw, known: tuple[str, ...], path: Path) -> str:
+def _settled(name: str, given: str | None, raw: Recording, known: tuple[str, ...], path: Path) -> str:
     """Return unit or quantity, from the caller or the file, which must agree."""
     if given is not None and given not in known:
         raise UsageError(f"{name}=… must be one of {', '.join(known)}, got {given!r}")
@@ -308,24 +284,78 @@ def _settled(name: str, given: str | None, raw: _Raw, known: tuple[str, ...], pa
     return value
 
 
-def _as_frames(values: NDArray[Any], name: str, shape: tuple[int, int], flat: bool, path: Path) -> NDArray[Any]:
-    """Return an array as (n, frames, rows, cols) of the file's own orientation."""
-    if values.dtype.kind not in "fiub":
-        raise InputFileError(f"{path}: '{name}' must hold real numbers, got {values.dtype}")
-    if not values.size:
-        raise InputFileError(f"{path}: '{name}' holds no frames")
-    if flat:
-        return values.reshape(1, -1, *shape)
-    if values.ndim not in (2, 3, 4):
+def _shaped(raw: Recording, sensor: Sensor, shape: tuple[int, int], path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a recording as (n, frames, rows, cols) of the file's own orientation.
+
+    Those of each frequency are (n, frames, m, rows, cols), and taps (n, frames, 4 m, 2, rows, cols).
+
+    Raises
+    ------
+    InputFileError
+        Pixels, frequencies or phase images are not as many as the sensor's, or other ones, or arrays do not fit each
+        other.
+    """
+    m, n_images = len(sensor.frequencies_hz), sensor.n_phase_images
+    of_frequency = f"frequencies, but the sensor has {m}: {in_words(sensor.frequencies_hz)} Hz"
+    of_taps = f"phase images a frame, but the sensor takes {n_images}: 4 at each of {m} modulation frequencies"
+    layers: dict[str, tuple[tuple[int, ...], str, str]] = {
+        **dict.fromkeys(_OF_FREQUENCY, ((m,), "m, ", of_frequency)),
+        "taps": ((n_images, 2), "phase images, 2, ", of_taps),
+    }
+    given = dict(raw.arrays)
+    _check_frequencies(given.pop("frequency", None), sensor, path)
+    arrays = {}
+    for name, values in given.items():
+        own, axes, what = layers.get(name, ((), "", ""))
+        if values.dtype.kind not in ("fiu" if own else "fiub"):
+            raise InputFileError(f"{path}: '{name}' must hold real numbers, got {values.dtype}")
+        if not values.size:
+            raise InputFileError(f"{path}: '{name}' holds no frames")
+        if raw.flat:
+            arrays[name] = values.reshape(1, -1, *own, *shape)
+            continue
+        n_axes = len(own) + 2
+        if not n_axes <= values.ndim <= n_axes + 2:
+            right = f"(frames, {axes}rows, cols)" + ("" if own else " or (n, frames, rows, cols)")
+            raise InputFileError(f"{path}: '{name}' must have shape {right}, got {values.shape}")
+        if values.shape[-2:] != shape:
+            raise InputFileError(
+                f"{path}: the frames in '{name}' have {values.shape[-2]} × {values.shape[-1]} pixels, but the sensor's"
+                f" have {shape[0]} × {shape[1]}"
+            )
+        if values.shape[-n_axes:-2] != own:
+            raise InputFileError(f"{path}: '{name}' has {values.shape[-n_axes]} {what}")
+        arrays[name] = values.reshape((1,) * (n_axes + 2 - values.ndim) + values.shape)
+    layered = [name for name in arrays if name in layers]
+    main = "frequency_range" if "frequency_range" in arrays else "range"
+    if main not in arrays or (m > 1 and main == "range" and set(layered) - {"taps"}):
+        raise InputFileError(f"{path}: has {' and '.join(layered)} without 'frequency_range'")
+    if main == "frequency_range":
+        arrays["range"] = arrays[main][:, :, 0]
+    frames = arrays["range"].shape
+    for name, values in arrays.items():
+        if name in layers and values.shape[:2] != frames[:2]:
+            raise InputFileError(
+                f"{path}: '{name}' must have the frames of '{main}', {frames[:2]}, got {values.shape[:2]}"
+            )
+        if name not in layers and values.shape != frames:
+            raise InputFileError(f"{path}: '{name}' must have the shape of 'range', {frames}, got {values.shape}")
+    return arrays
+
+
+def _check_frequencies(stated: NDArray[Any] | None, sensor: Sensor, path: Path) -> None:
+    """Refuse a file that says it has other frequencies than the sensor."""
+    if stated is None:
+        return
+    own = sensor.frequencies_hz
+    if stated.dtype.kind not in "fiu" or stated.ndim > 1:
+        raise InputFileError(f"{path}: 'frequency' must be the modulation frequencies in hertz, got {stated.dtype}")
+    told = np.atleast_1d(stated).astype(np.float64)
+    if len(told) != len(own) or not np.allclose(told, own, rtol=1e-9, atol=0):
         raise InputFileError(
-            f"{path}: '{name}' must have shape (frames, rows, cols) or (n, frames, rows, cols), got {values.shape}"
+            f"{path}: has frames at {in_words(told) if len(told) else 'no'} Hz, but the sensor modulates at"
+            f" {in_words(own)} Hz, in this order"
         )
-    if values.shape[-2:] != shape:
-        raise InputFileError(
-            f"{path}: the frames in '{name}' have {values.shape[-2]} × {values.shape[-1]} pixels, but the sensor's"
-            f" have {shape[0]} × {shape[1]}"
-        )
-    return values.reshape((1,) * (4 - values.ndim) + values.shape)
 
 
 def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool = False) -> Path:
@@ -373,10 +403,10 @@ def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool 
 
 def _read(
     path: Path, shape: tuple[int, int], untrusted: bool, topic: str | None, sensor: Sensor, board: str | None
-) -> _Raw:
+) -> Recording:
     try:
         if path.is_dir():
-            return _Raw(*read_rosbag(path, topic)) if (path / "metadata.yaml").exists() else _read_pngs(path)
+            return read_rosbag(path, topic) if (path / "metadata.yaml").exists() else _read_pngs(path)
         with opened(path, most_bytes=_MOST_BYTES) as file:
             start = file.read(8)
             file.seek(0)
@@ -394,35 +424,28 @@ def _read(
 
 def _read_open(
     file: BinaryIO, start: bytes, shape: tuple[int, int], path: Path, sensor: Sensor, board: str | None
-) -> _Raw:
+) -> Recording:
     """Read an open file of any kind but HDF5."""
     if not start:
         raise InputFileError(f"{path}: is empty")
-    if start.startswith(b"\x93NUMPY"):
-        room = _Room(path, _size(file))
-        room.take_array(file, "range")
-        file.seek(0)
-        return _Raw({"range": np.lib.format.read_array(file, allow_pickle=False)})
-    if start.startswith(b"PK"):
-        return _read_npz(file, path)
-    if start == b"\x89PNG\r\n\x1a\n":
-        return _of_images([_read_png(file, path)], path)
-    printed_by = find_board(board, file.read(HEAD_BYTES), math.prod(shape), path)
-    most_bytes = _MOST_BYTES if printed_by is None else MOST_LOG_BYTES
-    if _size(file) > most_bytes:
-        raise InputFileError(f"{path}: has more than {most_bytes / 1e6:.3g} MB of text: give it in parts, or as NPZ")
-    if printed_by is not None:
-        log = read_board_log(file, printed_by, shape, path)
-        stated = {"unit": "mm", "quantity": printed_by.quantity or sensor.quantity}
-        return _Raw(log.arrays, stated, log.time_s, flat=True, valid_status=printed_by.valid_status)
-    found = parse_csv(file.read(), shape, path, len(sensor.frequencies_hz))
-    return _Raw(found.arrays, found.stated, found.time_s, flat=True, named=found.named)
-
-
-def _size(file: BinaryIO) -> int:
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
-    return size
+    if start.startswith(b"\x93NUMPY"):
+        _Room(path, size).take("range", *_npy_header(file))
+        file.seek(0)
+        return Recording({"range": np.lib.format.read_array(file, allow_pickle=False)})
+    if start.startswith(b"PK"):
+        return _read_npz(file, size, path)
+    if start == b"\x89PNG\r\n\x1a\n":
+        return _of_images([_read_png(file, size, path)], path)
+    printed_by = find_board(board, file.read(HEAD_BYTES), math.prod(shape), path)
+    file.seek(0)
+    most_bytes = _MOST_BYTES if printed_by is None else MOST_LOG_BYTES
+    if size > most_bytes:
+        raise InputFileError(f"{path}: has more than {most_bytes / 1e6:.3g} MB of text: give it in parts, or as NPZ")
+    if printed_by is not None:
+        return read_board_log(file, printed_by, sensor, shape, path)
+    return parse_csv(file.read(), shape, path, len(sensor.frequencies_hz))
 
 
 class _Room:
@@ -432,11 +455,14 @@ class _Room:
         self._path = path
         self._left = max(_FREE_VALUES, _VALUES_PER_BYTE * size)
 
-    def take(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    def take(self, name: str, shape: tuple[int, ...] | None, dtype: np.dtype[Any]) -> None:
         """Refuse an array that is not of plain numbers, or holds more of them than is left."""
+        if shape is None:
+            raise InputFileError(f"{self._path}: '{name}' holds nothing")
         if dtype.kind not in "fiub" or dtype.shape:
             raise InputFileError(f"{self._path}: '{name}' must hold real numbers, got {dtype}")
-        if not all(isinstance(size, int) and size >= 0 for size in map(_plain_size, shape)):
+        # a truth value is no size, though Python takes it for a number
+        if not all(isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 0 for n in shape):
             raise InputFileError(f"{self._path}: '{name}' has the shape {shape}, which no array has")
         count = math.prod(map(int, shape))
         self._left -= count
@@ -444,16 +470,6 @@ class _Room:
             raise InputFileError(
                 f"{self._path}: refused: '{name}' declares {count} values, far more than a file of this size holds"
             )
-
-    def take_array(self, file: BinaryIO | zipfile.ZipExtFile, name: str) -> None:
-        """Take what the header of an NPY array declares."""
-        shape, dtype = _npy_header(file)
-        self.take(name, shape, dtype)
-
-
-def _plain_size(size: object) -> object:
-    """Return a size of a shape; a truth value is none, though Python takes it for a number."""
-    return None if isinstance(size, bool) else int(size) if isinstance(size, np.integer) else size
 
 
 def _npy_header(file: BinaryIO | zipfile.ZipExtFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -463,9 +479,12 @@ def _npy_header(file: BinaryIO | zipfile.ZipExtFile) -> tuple[tuple[int, ...], n
     return shape, dtype
 
 
-def _read_png(file: BinaryIO, path: Path) -> tuple[NDArray[np.float64], str | None, str | None]:
-    """Return the codes of a 16-bit grey image, and what it says of scale and quantity."""
-    if _size(file) > FREE_BYTES:
+_Image = tuple[NDArray[np.float64], str | None, str | None]
+"""Codes of a 16-bit grey image, and what it says of scale and quantity."""
+
+
+def _read_png(file: BinaryIO, size: int, path: Path) -> _Image:
+    if size > FREE_BYTES:
         raise InputFileError(f"{path}: refused: is far too large for a frame")
     header = file.read(24)
     file.seek(0)
@@ -480,17 +499,17 @@ def _read_png(file: BinaryIO, path: Path) -> tuple[NDArray[np.float64], str | No
         return codes, text.get("metres_per_unit"), text.get("quantity")
 
 
-def _read_pngs(path: Path) -> _Raw:
+def _read_pngs(path: Path) -> Recording:
     """Read a folder of 16-bit grey images."""
-    files = sorted(path.glob("*.png"))
-    if not files:
+    sizes = {name: name.stat().st_size for name in sorted(path.glob("*.png"))}
+    if not sizes:
         raise InputFileError(f"{path}: is a folder without PNG images, and no ROS bag")
     found = []
-    room = _Room(path, sum(file.stat().st_size for file in files))
-    for name in files:
+    room = _Room(path, sum(sizes.values()))
+    for name, size in sizes.items():
         with opened(name, most_bytes=FREE_BYTES) as file:
             try:
-                found.append(_read_png(file, name))
+                found.append(_read_png(file, size, name))
             except (PhasemarkError, MemoryError):
                 raise
             except Exception as error:  # whatever a damaged image makes Pillow say
@@ -499,7 +518,7 @@ def _read_pngs(path: Path) -> _Raw:
     return _of_images(found, path)
 
 
-def _of_images(found: Sequence[tuple[NDArray[np.float64], str | None, str | None]], path: Path) -> _Raw:
+def _of_images(found: Sequence[_Image], path: Path) -> Recording:
     images, told = [image for image, *_ in found], {(scale, quantity) for _, scale, quantity in found}
     if len(told) > 1 or len({image.shape for image in images}) > 1:
         raise InputFileError(f"{path}: its images must all have one size, scale and quantity")
@@ -512,75 +531,64 @@ def _of_images(found: Sequence[tuple[NDArray[np.float64], str | None, str | None
         except ValueError:
             raise InputFileError(f"{path}: its 'metres_per_unit' must be a number, got {scale[:80]!r}") from None
         stated["unit"] = "m"
-    return _Raw({"range": np.where(codes == 0, np.nan, codes)}, stated)
+    return Recording({"range": np.where(codes == 0, np.nan, codes)}, stated)
 
 
-def _read_npz(file: BinaryIO, path: Path) -> _Raw:
-    size = _size(file)
-    with np.load(file, allow_pickle=False) as archive:
-        declared = sum(member.file_size for member in archive.zip.infolist())
-        if declared > FREE_BYTES + EXPANSION * size:
-            raise InputFileError(f"{path}: refused: declares {declared} bytes, far more than its size can hold")
+def _read_npz(file: BinaryIO, size: int, path: Path) -> Recording:
+    with opened_npz(file, size, path) as archive:
         members = {member.filename.removesuffix(".npy"): member for member in archive.zip.infolist()}
-        room = _Room(path, size)
-        for name in (*_FIELDS, *SECONDS_PER_TIME_UNIT):
-            if name in members:
-                with archive.zip.open(members[name]) as inner:
-                    room.take_array(inner, name)
-        for name in ("unit", "quantity"):
-            if name in members and members[name].file_size > _WORD_BYTES + 128:
+        room, own = _Room(path, size), [name for name in _COLUMNS if name in members]
+        for name in own:
+            with archive.zip.open(members[name]) as inner:
+                room.take(name, *_npy_header(inner))
+        words = [name for name in ("unit", "quantity") if name in members]
+        for name in words:
+            if members[name].file_size > _WORD_BYTES + 128:
                 raise InputFileError(f"{path}: '{name}' must be a word, got {members[name].file_size} bytes")
         if not {"range", "frequency_range"} & set(archive):
             if "histogram" in archive:
                 raise InputFileError(f"{path}: a log of histograms, not of ranges: match it on histograms")
             raise InputFileError(f"{path}: must have an array 'range', got {', '.join(archive) or 'nothing'}")
-        arrays = {name: np.asarray(archive[name]) for name in _FIELDS if name in archive}
-        stated = {name: str(archive[name]) for name in ("unit", "quantity") if name in archive}
-        times = {name: np.asarray(archive[name]) for name in SECONDS_PER_TIME_UNIT if name in archive}
-    return _Raw(arrays, stated, _times_s(times, path))
+        return _of_arrays(archive, own, {name: str(archive[name]) for name in words}, path)
 
 
-def _read_hdf5(path: Path, untrusted: bool) -> _Raw:
+def _read_hdf5(path: Path, untrusted: bool) -> Recording:
     with open_hdf5(path, "file of frames", untrusted=untrusted, foreign=True) as file:
-        main = next((name for name in ("frequency_range", "range") if isinstance(file.get(name), h5py.Dataset)), None)
+        datasets = {name: file[name] for name in _COLUMNS if isinstance(file.get(name), h5py.Dataset)}
+        main = datasets.get("frequency_range", datasets.get("range"))
         if main is None:
             kind = file.attrs.get("format")
             raise InputFileError(
                 f"{path}: must have a dataset 'range', "
                 + (f"but is a {kind}" if kind else f"got {', '.join(file) or 'nothing'}")
             )
-        datasets = {name: file[name] for name in _FIELDS if isinstance(file.get(name), h5py.Dataset)}
         for name in (*_NUMBERS[1:], *_OF_FREQUENCY[1:]):
             units = datasets[name].attrs.get("units") if name in datasets else None
             if units is not None and units not in _ELECTRONS:
                 raise InputFileError(f"{path}: '{name}' must be in electrons (units 'e-'), got {units!r}")
-        stamps = {name: file[name] for name in SECONDS_PER_TIME_UNIT if isinstance(file.get(name), h5py.Dataset)}
         room = _Room(path, path.stat().st_size)
-        for name, dataset in {**datasets, **stamps}.items():
-            if dataset.shape is None:
-                raise InputFileError(f"{path}: '{name}' holds nothing")
+        for name, dataset in datasets.items():
             room.take(name, dataset.shape, dataset.dtype)
         attributes = {"unit": "units", "quantity": "quantity"}
-        stated = {
-            name: str(datasets[main].attrs[key]) for name, key in attributes.items() if key in datasets[main].attrs
-        }
-        times = {name: np.asarray(dataset[...]) for name, dataset in stamps.items()}
-        arrays = {name: np.asarray(dataset[...]) for name, dataset in datasets.items()}
-        return _Raw(arrays, stated, _times_s(times, path))
+        stated = {name: str(main.attrs[key]) for name, key in attributes.items() if key in main.attrs}
+        return _of_arrays(datasets, datasets, stated, path)
 
 
-def _times_s(found: Mapping[str, NDArray[Any]], path: Path) -> NDArray[np.float64] | None:
-    """Return time stamps in seconds from the array of that name; None if there is none."""
-    if len(found) > 1:
-        raise InputFileError(f"{path}: has both '{MILLISECONDS}' and '{SECONDS}': leave one of them out")
-    for name, values in found.items():
-        if values.dtype.kind not in "fiu":
-            raise InputFileError(f"{path}: '{name}' must hold real numbers, got {values.dtype}")
-        times = values.astype(np.float64)
-        if not np.isfinite(times).all():
-            k = int(np.flatnonzero(~np.isfinite(times.ravel()))[0])
-            raise InputFileError(f"{path}: frame {k} has no time: '{name}' must be finite, got {times.ravel()[k]}")
-        for position in times.reshape(-1, times.shape[-1] if times.ndim else 1):
-            note_disorder(position, path, "frame {}".format)
-        return times * SECONDS_PER_TIME_UNIT[name]
-    return None
+def _of_arrays(file: Mapping[str, Any], names: Iterable[str], stated: Mapping[str, str], path: Path) -> Recording:
+    """Return the named arrays of a file, with time stamps in seconds."""
+    arrays = {name: np.asarray(file[name][...]) for name in names}
+    name = one_time(arrays, path)
+    time_s = None if name is None else _times_s(arrays.pop(name), name, path)
+    return Recording(arrays, stated, time_s)
+
+
+def _times_s(values: NDArray[Any], name: str, path: Path) -> NDArray[np.float64]:
+    if values.dtype.kind not in "fiu":
+        raise InputFileError(f"{path}: '{name}' must hold real numbers, got {values.dtype}")
+    times = values.astype(np.float64)
+    if not np.isfinite(times).all():
+        k = int(np.flatnonzero(~np.isfinite(times.ravel()))[0])
+        raise InputFileError(f"{path}: frame {k} has no time: '{name}' must be finite, got {times.ravel()[k]}")
+    for position in times.reshape(-1, times.shape[-1] if times.ndim else 1):
+        note_disorder(position, path, "frame {}".format)
+    return times * SECONDS_PER_TIME_UNIT[name]

@@ -1,0 +1,98 @@
+"""Columns of a recording, whatever file they come from, and the checks that do not depend on its kind."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import InputFileError
+from phasemark.data.files.guard import EXPANSION, FREE_BYTES
+
+MILLISECONDS, SECONDS = "t_ms", "t_s"
+SECONDS_PER_TIME_UNIT: dict[str, float] = {MILLISECONDS: 1e-3, SECONDS: 1.0}
+"""Names of time stamps, in CSV columns and in arrays, with the length of their unit."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Columns of a recording as the file has them, and what it says about them.
+
+    Parameters
+    ----------
+    arrays : mapping of str to array
+        "range" or "frequency_range", and others of :func:`phasemark.data.read_frames` if the file has them.
+    stated : mapping of str to str
+        "unit" and "quantity", where the file states them.
+    time_s : array of float64, optional
+        Time stamps, seconds.
+    flat : bool
+        Whether frames are rows of rows · cols values.
+    named : bool
+        Whether names of columns state unit or quantity.
+    valid_status : tuple of int, optional
+        Of the board that printed it.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
+    stated: Mapping[str, str] = field(default_factory=dict)
+    time_s: NDArray[np.float64] | None = None
+    flat: bool = False
+    named: bool = False
+    valid_status: tuple[int, ...] | None = None
+
+
+def one_time(names: Collection[str], where: object) -> str | None:
+    """Return the name of the time stamps among the names of columns, None if there are none.
+
+    Raises
+    ------
+    InputFileError
+        There are stamps in two units; names the place.
+    """
+    times = [name for name in SECONDS_PER_TIME_UNIT if name in names]
+    if len(times) > 1:
+        raise InputFileError(f"{where}: has both '{MILLISECONDS}' and '{SECONDS}': leave one of them out")
+    return times[0] if times else None
+
+
+def note_disorder(times: NDArray[np.float64], path: Path, place: Callable[[int], str]) -> None:
+    """Warn of time stamps that repeat or run backwards; the frames keep their order.
+
+    Parameters
+    ----------
+    times : (frames,) float64
+    path : Path
+        For the message.
+    place : callable
+        Turns the number of a frame into the place where it stands.
+
+    Warns
+    -----
+    UserWarning
+        Says how many stamps there are, and where the first is.
+    """
+    steps = np.diff(times)
+    found = (int((steps == 0).sum()), "repeat"), (int((steps < 0).sum()), "run backwards")
+    counts = " and ".join(f"{count} of {len(times)} time stamps {what}" for count, what in found if count)
+    if counts:
+        first = int(np.flatnonzero(steps <= 0)[0]) + 1
+        warnings.warn(
+            f"{path}: {counts}, the first in {place(first)}; the frames keep their order", UserWarning, stacklevel=2
+        )
+
+
+@contextmanager
+def opened_npz(file: BinaryIO, size: int, path: Path) -> Iterator[Any]:
+    """Open an NPZ file, unless it announces far more than a file of its size can hold."""
+    with np.load(file, allow_pickle=False) as archive:
+        declared = sum(member.file_size for member in archive.zip.infolist())
+        if declared > FREE_BYTES + EXPANSION * size:
+            raise InputFileError(f"{path}: refused: declares {declared} bytes, far more than its size can hold")
+        yield archive
