@@ -10,7 +10,7 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -100,95 +100,53 @@ def _start(
         typer.echo(_FIRST_STEPS, nl=False)
 
 
-def _add(group: Commands, commands: Mapping[str, Callable[..., None]]) -> None:
-    """Add commands, in the order in which help lists them."""
-    for word, function in commands.items():
-        group.command(word)(function)
+def _add_commands(group: str, purpose: str, *functions: Callable[..., None]) -> None:
+    """Add functions as commands, in the order in which help lists them.
+
+    A command of a group is called as its function, without the name of the group; ``sensor_fit_direct`` becomes
+    ``sensor fit-direct``. Without a group it is called by the first word: ``match_frames`` becomes ``match``.
+    """
+    commands = Commands(help=purpose) if group else app
+    for function in functions:
+        word = function.__name__.removeprefix(f"{group}_") if group else function.__name__.partition("_")[0]
+        commands.command(word.replace("_", "-"))(function)
+    if group:
+        app.add_typer(commands, name=group)
 
 
-def _add_group(name: str, purpose: str, commands: Mapping[str, Callable[..., None]]) -> None:
-    """Add commands under a word of their own."""
-    group = Commands(help=purpose)
-    _add(group, commands)
-    app.add_typer(group, name=name)
-
-
-_add(
-    app,
-    {
-        "render": render.render_frame,
-        "match": match.match_frames,
-        "calibrate": calibrate.calibrate_camera,
-        "accuracy": accuracy.accuracy_line,
-        "demo": demo.demo_report,
-        "drive": drive.drive_robot,
-        "warm": warm.warm_kernels,
-    },
-)
-_add_group(
-    "landmark",
-    "The landmarks: the catalogue and mesh files.",
-    {
-        "list": landmark.landmark_list,
-        "show": landmark.landmark_show,
-        "export": landmark.landmark_export,
-        "design": design.landmark_design,
-        "check": landmark.landmark_check,
-    },
-)
-_add_group(
-    "sensor",
-    "The cameras: shipped presets and sensor files.",
-    {
-        "list": sensor.sensor_list,
-        "show": sensor.sensor_show,
-        "import": sensor.sensor_import,
-        "characterise": characterise.sensor_characterise,
-        "fit": sensor.sensor_fit,
-        "fit-direct": sensor_direct.sensor_fit_direct,
-    },
-)
-_add_group(
-    "bank",
-    "Banks of model images.",
-    {
-        "build": bank.bank_build,
-        "info": bank.bank_info,
-        "verify": verify.bank_verify,
-        "strangers": strangers.bank_strangers,
-        "merge": bank.bank_merge,
-    },
-)
-_add_group(
-    "sweep",
-    "Accuracy sweeps: errors of each method over conditions, with intervals.",
-    {
-        "run": sweep.sweep_run,
-        "report": sweep.sweep_report,
-        "frames": sweep.sweep_frames_again,
-        "compare": sweep.sweep_compare,
-    },
-)
-_add_group("pose", "Measured poses against true ones.", {"report": pose.pose_report_command})
-_add_group(
-    "frames",
-    "Sets of noisy frames with their truth.",
-    {
-        "build": frames.frames_build,
-        "info": frames.frames_info,
-        "verify": frames.frames_verify,
-        "merge": frames.frames_merge,
-        "export": frames.frames_export,
-        "import": frames.frames_import,
-        "simulate": frames.frames_simulate,
-        "show": frames.frames_show,
-    },
-)
-_add_group(
-    "plan",
-    "Plans: what banks and frame sets are built from, and sweeps and drives run from.",
-    {"example": plan.plan_example, "schema": plan.plan_schema, "check": plan.plan_check},
-)
+_add_commands(
+    "", "",
+    render.render_frame, match.match_frames, calibrate.calibrate_camera, accuracy.accuracy_line, demo.demo_report,
+    drive.drive_robot, warm.warm_kernels,
+)  # fmt: skip
+_add_commands(
+    "landmark", "The landmarks: the catalogue and mesh files.",
+    landmark.landmark_list, landmark.landmark_show, landmark.landmark_export, design.landmark_design,
+    landmark.landmark_check,
+)  # fmt: skip
+_add_commands(
+    "sensor", "The cameras: shipped presets and sensor files.",
+    sensor.sensor_list, sensor.sensor_show, sensor.sensor_import, characterise.sensor_characterise, sensor.sensor_fit,
+    sensor_direct.sensor_fit_direct,
+)  # fmt: skip
+_add_commands(
+    "bank", "Banks of model images.",
+    bank.bank_build, bank.bank_info, verify.bank_verify, strangers.bank_strangers, bank.bank_merge,
+)  # fmt: skip
+_add_commands(
+    "sweep", "Accuracy sweeps: errors of each method over conditions, with intervals.",
+    sweep.sweep_run, sweep.sweep_report, sweep.sweep_frames, sweep.sweep_compare,
+)  # fmt: skip
+_add_commands("pose", "Measured poses against true ones.", pose.pose_report)
+_add_commands(
+    "frames", "Sets of noisy frames with their truth.",
+    frames.frames_build, frames.frames_info, frames.frames_verify, frames.frames_merge, frames.frames_export,
+    frames.frames_import, frames.frames_simulate, frames.frames_show,
+)  # fmt: skip
+_add_commands(
+    "plan", "Plans: what banks and frame sets are built from, and sweeps and drives run from.",
+    plan.plan_example, plan.plan_schema, plan.plan_check,
+)  # fmt: skip
 
 
 def _open_closed_streams() -> None:

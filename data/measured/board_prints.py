@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -67,15 +67,20 @@ class Printed:
     time_s: float | None = None
     damage: str = ""
 
+    def spoil(self, damage: str) -> None:
+        """Note what is wrong with the frame, unless something is noted already."""
+        self.damage = self.damage or damage
+
 
 @dataclass
 class BoardLog:
-    """Lines of a log, and what of them is left out."""
+    """Lines of a log, the frame that has begun, and what of the log is left out."""
 
     file: BinaryIO
     path: Path
     n_zones: int
     others: Mapping[str, re.Pattern[str]] = field(default_factory=dict)
+    frame: Printed | None = None
     n_damaged: int = 0
     first_damage: str | None = None
     last_is_cut: bool = False
@@ -95,16 +100,25 @@ class BoardLog:
                     " each board as a file of its own"
                 )
 
-    def whole(self, frame: Printed | None, *, at_end: bool = False) -> Iterator[Printed]:
-        """Yield a frame if it is whole, and count it otherwise.
+    def begun(self, number: int) -> Printed:
+        """Return the frame that has begun, or begin one."""
+        self.frame = self.frame or Printed(number)
+        return self.frame
 
-        At the end of a log fewer zones than the sensor has are a frame that was cut, whatever their number.
+    def ended(self, *, cut: bool = False, at_end: bool = False) -> Iterator[Printed]:
+        """End the frame that has begun, if one has: yield it if it is whole, and count it otherwise.
+
+        A frame that is cut by the end is not whole. At the end of a log fewer zones than the sensor has are a frame
+        that was cut, whatever their number.
         """
+        frame, self.frame = self.frame, None
         if frame is None:
             return
         n = len(frame.distance_mm)
-        if not frame.damage and n != self.n_zones and (at_end or n not in _ZONES):
-            frame.damage = f"line {frame.number}: a frame of {n} zones, must be of {self.n_zones}"
+        if cut:
+            frame.spoil(f"line {frame.number}: a frame that is cut by the end")
+        if n != self.n_zones and (at_end or n not in _ZONES):
+            frame.spoil(f"line {frame.number}: a frame of {n} zones, must be of {self.n_zones}")
         if not frame.damage:
             yield frame
             return
@@ -118,139 +132,122 @@ def _garbled(number: int, text: str, right: str) -> str:
 
 def tabs_before(log: BoardLog) -> Iterator[Printed]:
     """Yield frames of rows whose cells begin with a tab, an empty line between two frames."""
-    return _grid(log, TABS_BEFORE, lambda text: text.split("\t")[1:])
+    return _grid(log, TABS_BEFORE, slice(1, None))
 
 
 def tabs_behind(log: BoardLog) -> Iterator[Printed]:
     """Yield frames of rows whose cells end with a tab, an empty line between two frames."""
-    return _grid(log, TABS_BEHIND, lambda text: text.split("\t")[:-1])
+    return _grid(log, TABS_BEHIND, slice(None, -1))
 
 
-def _grid(log: BoardLog, line: re.Pattern[str], cells: Callable[[str], list[str]]) -> Iterator[Printed]:
-    """Yield frames of square blocks of rows."""
-    frame: Printed | None = None
+def _grid(log: BoardLog, line: re.Pattern[str], cells: slice) -> Iterator[Printed]:
+    """Yield frames of square blocks of rows, some of whose parts between tabs are cells."""
     width = 0
     for number, text in log.lines():
         if not text.strip("\t "):
-            yield from _square(log, frame, width)
-            frame = None
+            yield from _square(log, width)
         elif line.match(text):
-            row = cells(text)
-            frame, width = frame or Printed(number), len(row) if frame is None else width
+            row = text.split("\t")[cells]
+            width = len(row) if log.frame is None else width
+            frame = log.begun(number)
             if len(row) != width:
-                frame.damage = frame.damage or _garbled(number, text, f"a row of {width} cells")
+                frame.spoil(_garbled(number, text, f"a row of {width} cells"))
             frame.distance_mm.extend(math.nan if cell == "----" else float(cell) for cell in row)
-        elif frame is not None or "\t" in text:
-            log.other(number, text)
-            frame = frame or Printed(number)
-            frame.damage = frame.damage or _garbled(number, text, "a row of 4 or 8 cells")
         else:
             log.other(number, text)
-    if frame is not None and log.last_is_cut:
-        frame.damage = frame.damage or f"line {frame.number}: a frame whose last line is cut"
-    yield from _square(log, frame, width, at_end=True)
+            if log.frame is not None or "\t" in text:
+                log.begun(number).spoil(_garbled(number, text, "a row of 4 or 8 cells"))
+    if log.frame is not None and log.last_is_cut:
+        log.frame.spoil(f"line {log.frame.number}: a frame whose last line is cut")
+    yield from _square(log, width, at_end=True)
 
 
-def _square(log: BoardLog, frame: Printed | None, width: int, at_end: bool = False) -> Iterator[Printed]:
+def _square(log: BoardLog, width: int, at_end: bool = False) -> Iterator[Printed]:
+    frame = log.frame
     if frame is not None and len(frame.distance_mm) != width**2:
         rows = len(frame.distance_mm) // max(width, 1)
-        frame.damage = frame.damage or f"line {frame.number}: a frame of {rows} rows, must be {width}"
-    yield from log.whole(frame, at_end=at_end)
+        frame.spoil(f"line {frame.number}: a frame of {rows} rows, must be {width}")
+    yield from log.ended(at_end=at_end)
 
 
 def webserial(log: BoardLog) -> Iterator[Printed]:
     """Yield frames of a line D: of distances and a line S: of status codes, between FRAME_START and FRAME_END."""
-    frame: Printed | None = None
     for number, text in log.lines():
+        frame = log.frame
         if WEBSERIAL.match(text):
-            yield from log.whole(frame)
-            frame = Printed(number)
+            yield from log.ended()
+            log.begun(number)
         elif frame is not None and text.startswith(("D:", "S:")):
             try:
                 values = [float(int(cell)) for cell in text[2:].split(",")]
             except ValueError:
-                frame.damage = frame.damage or _garbled(number, text, "whole numbers between commas")
+                frame.spoil(_garbled(number, text, "whole numbers between commas"))
                 continue
             frame.distance_mm, frame.status = (values, frame.status) if text[0] == "D" else (frame.distance_mm, values)
         elif frame is not None and text == "FRAME_END":
-            if len(frame.status) != len(frame.distance_mm):
-                frame.damage = frame.damage or (
-                    f"line {frame.number}: a frame of {len(frame.distance_mm)} distances and {len(frame.status)} codes"
-                )
-            yield from log.whole(frame)
-            frame = None
+            n, n_codes = len(frame.distance_mm), len(frame.status)
+            if n_codes != n:
+                frame.spoil(f"line {frame.number}: a frame of {n} distances and {n_codes} codes")
+            yield from log.ended()
         else:
             log.other(number, text)
-    yield from _cut(log, frame)
-
-
-def _cut(log: BoardLog, frame: Printed | None) -> Iterator[Printed]:
-    """Count a frame that had begun when its log ended."""
-    if frame is not None:
-        frame.damage = frame.damage or f"line {frame.number}: a frame that is cut by the end"
-    yield from log.whole(frame)
+    yield from log.ended(cut=True)
 
 
 def zone_lines(log: BoardLog) -> Iterator[Printed]:
     """Yield frames of a line a zone; of several targets in a zone the first counts."""
-    frame: Printed | None = None
     for number, text in log.lines():
         match = ZONE.match(text)
         if match:
             zone = int(match["zone"] or match["of_several"])
             if zone == 0:
-                yield from log.whole(frame)
-                frame = Printed(number)
-            frame = frame or Printed(number)
+                yield from log.ended()
+            frame = log.begun(number)
             if zone != len(frame.distance_mm):
-                frame.damage = frame.damage or f"line {number}: got zone {zone}, must be {len(frame.distance_mm)}"
+                frame.spoil(f"line {number}: got zone {zone}, must be {len(frame.distance_mm)}")
             seen = match["found"] is None or int(match["found"]) > 0
             frame.distance_mm.append(float(match["mm"] or match["first_mm"]) if seen else math.nan)
             frame.status.append(float(match["status"] or match["first_status"]) if seen else math.nan)
         elif not text.strip() or "Print data no" in text:
-            yield from log.whole(frame)
-            frame = None
+            yield from log.ended()
         else:
             log.other(number, text)
-            if frame is not None:
-                frame.damage = frame.damage or _garbled(number, text, f"zone {len(frame.distance_mm)}")
-    yield from log.whole(frame, at_end=True)
+            if log.frame is not None:
+                log.frame.spoil(_garbled(number, text, f"zone {len(log.frame.distance_mm)}"))
+    yield from log.ended(at_end=True)
 
 
 def boxes(log: BoardLog) -> Iterator[Printed]:
     """Yield frames of boxes of ``distance : status``; of several lines in a box the first counts."""
-    frame: Printed | None = None
     width, row_begins = 0, False
     for number, text in log.lines():
         if BOX.match(text):
-            if frame is not None and len(frame.distance_mm) == width**2:
-                yield from log.whole(frame)
-                frame, row_begins = None, False
-                continue
-            frame, row_begins = frame or Printed(number), True
-            width = text.count(" ")
-        elif text.startswith("|") and frame is not None:
+            row_begins = log.frame is None or len(log.frame.distance_mm) != width**2
+            if row_begins:
+                log.begun(number)
+                width = text.count(" ")
+            else:
+                yield from log.ended()
+        elif text.startswith("|") and log.frame is not None:
             if not row_begins or not text.strip("| "):
                 continue
             cells = [_BOX_CELL.match(cell) for cell in text.split("|")[1:-1]]
             row_begins = False
             if len(cells) != width or not all(cells):
-                frame.damage = frame.damage or _garbled(number, text, f"{width} boxes of distance : status")
+                log.frame.spoil(_garbled(number, text, f"{width} boxes of distance : status"))
             for cell in filter(None, cells):
-                frame.distance_mm.append(math.nan if cell[1] == "X" else float(cell[1]))
-                frame.status.append(math.nan if cell[2] == "X" else float(cell[2]))
+                log.frame.distance_mm.append(math.nan if cell[1] == "X" else float(cell[1]))
+                log.frame.status.append(math.nan if cell[2] == "X" else float(cell[2]))
         else:
             log.other(number, text)
-            if frame is not None:
-                frame.damage = frame.damage or _garbled(number, text, "a box")
-                yield from log.whole(frame)
-                frame = None
-    yield from _cut(log, frame)
+            if log.frame is not None:
+                log.frame.spoil(_garbled(number, text, "a box"))
+                yield from log.ended()
+    yield from log.ended(cut=True)
 
 
 def esphome(log: BoardLog) -> Iterator[Printed]:
     """Yield frames of a text sensor's state in a log, as CSV or as a table, in millimetres or metres."""
-    frame: Printed | None = None
     names: set[str] = set()
     for number, text in log.lines():
         begins = _ESPHOME_BEGINS.match(text)
@@ -262,38 +259,33 @@ def esphome(log: BoardLog) -> Iterator[Printed]:
                     f"{log.path}: line {number}: has states of the text sensors {several}: keep the lines of one, which"
                     " has distances"
                 )
-            yield from _cut(log, frame)
-            frame, text = Printed(number), begins["row"]
-        elif frame is None:
+            yield from log.ended(cut=True)
+            text = begins["row"]
+        elif log.frame is None:
             log.other(number, text)
             continue
-        text = _ESPHOME_PREFIX.sub("", text)
+        frame, text = log.begun(number), _ESPHOME_PREFIX.sub("", text)
         if text and not text.strip("-"):
             continue
-        is_last = text.endswith("'")
         cells = [_ESPHOME_CELL.match(cell) for cell in re.split(r"[,|]", text.rstrip("'").rstrip(","))]
         if not all(cells):
-            frame.damage = frame.damage or _garbled(number, text, "numbers between commas or bars")
+            frame.spoil(_garbled(number, text, "numbers between commas or bars"))
             log.other(number, text)
-        frame.distance_mm.extend(_millimetres(cell[1]) for cell in cells if cell)
-        if is_last or frame.damage:
-            yield from log.whole(frame)
-            frame = None
-    yield from _cut(log, frame)
-
-
-def _millimetres(text: str) -> float:
-    """Return a state's number, which has three decimals if it is in metres."""
-    return float(text) * (1000.0 if "." in text else 1.0)
+        # a state that is in metres has three decimals
+        frame.distance_mm.extend(float(cell[1]) * (1000.0 if "." in cell[1] else 1.0) for cell in cells if cell)
+        if text.endswith("'") or frame.damage:
+            yield from log.ended()
+    yield from log.ended(cut=True)
 
 
 def json_lines(log: BoardLog) -> Iterator[Printed]:
     """Yield frames of an object a line: distances in millimetres, optionally status codes and a time."""
     for number, text in log.lines():
-        if not text.startswith("{"):
+        if text.startswith("{"):
+            log.frame = _of_object(number, text)
+            yield from log.ended()
+        else:
             log.other(number, text)
-            continue
-        yield from log.whole(_of_object(number, text))
 
 
 def _of_object(number: int, text: str) -> Printed:
@@ -303,52 +295,49 @@ def _of_object(number: int, text: str) -> Printed:
         row = json.loads(text)
         distance = row["distances"] if "distances" in row else row["distance_mm"]
         status = row["status"] if "status" in row else row.get("target_status", [])
-        frame.distance_mm, frame.status = _floats(distance), _floats(status)
+        frame.distance_mm, frame.status = (
+            [math.nan if value is None else float(value) for value in values] for values in (distance, status)
+        )
         time = next((name for name in _JSON_TIMES if name in row), None)
         frame.time_s = None if time is None else float(row[time]) * _JSON_TIMES[time]
         if not math.isfinite(frame.time_s or 0.0):
             raise ValueError
     except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
-        frame.damage = _garbled(number, text, "an object with lists of numbers, 'distances' and 'status'")
-        return frame
-    if frame.status and len(frame.status) != len(frame.distance_mm):
-        frame.damage = f"line {number}: has {len(frame.distance_mm)} distances and {len(frame.status)} status codes"
+        frame.spoil(_garbled(number, text, "an object with lists of numbers, 'distances' and 'status'"))
+    n, n_codes = len(frame.distance_mm), len(frame.status)
+    if n_codes not in (0, n):
+        frame.spoil(f"line {number}: has {n} distances and {n_codes} status codes")
     return frame
-
-
-def _floats(values: Sequence[float | None]) -> list[float]:
-    return [math.nan if value is None else float(value) for value in values]
 
 
 def obj_lines(log: BoardLog) -> Iterator[Printed]:
     """Yield frames of four captures, each a line of 36 results, of which the first objects of 16 zones count."""
-    frame: Printed | None = None
     n_captures = 0
     for number, text in log.lines():
         if not OBJ.match(text):
             log.other(number, text)
             continue
-        cells = text.split(",")
+        _, *cells = text.split(",")
         try:
-            numbers = [int(cell) for cell in cells[1:]]
+            numbers = [int(cell) for cell in cells]
         except ValueError:
             numbers = []
-        if len(cells) != _OBJ_LENGTH or not numbers:
-            frame = frame or Printed(number)
-            frame.damage = frame.damage or _garbled(number, text, f"#Obj and {_OBJ_LENGTH - 1} whole numbers")
+        if len(numbers) != _OBJ_LENGTH - 1:
+            log.begun(number).spoil(_garbled(number, text, f"#Obj and {_OBJ_LENGTH - 1} whole numbers"))
             continue
         capture = numbers[1] % 4
         if capture == 0:
-            yield from _cut(log, frame)
-            frame, n_captures = Printed(number, [math.nan] * 64), 0
-        frame = frame or Printed(number, [math.nan] * 64)
+            yield from log.ended(cut=True)
+            n_captures = 0
+        frame = log.begun(number)
+        frame.distance_mm = frame.distance_mm or [math.nan] * 64
         if capture != n_captures:
-            frame.damage = frame.damage or f"line {number}: got capture {capture} of a frame, must be {n_captures}"
+            frame.spoil(f"line {number}: got capture {capture} of a frame, must be {n_captures}")
         for k, result in enumerate(_OBJ_RESULTS):
             place = 8 * _OBJ_ROWS[capture][k // 4] + _OBJ_COLS[capture][k % 4]
             frame.distance_mm[place] = float(numbers[5 + 2 * result])
         n_captures += 1
         if capture == 3:
-            yield from log.whole(frame)
-            frame, n_captures = None, 0
-    yield from _cut(log, frame)
+            yield from log.ended()
+            n_captures = 0
+    yield from log.ended(cut=True)

@@ -328,7 +328,7 @@ def _shaped(raw: Recording, sensor: Sensor, shape: tuple[int, int], path: Path) 
         arrays[name] = values.reshape((1,) * (n_axes + 2 - values.ndim) + values.shape)
     layered = [name for name in arrays if name in layers]
     main = "frequency_range" if "frequency_range" in arrays else "range"
-    if main not in arrays or (m > 1 and main == "range" and set(layered) - {"taps"}):
+    if m > 1 and main == "range" and set(layered) - {"taps"}:
         raise InputFileError(f"{path}: has {' and '.join(layered)} without 'frequency_range'")
     if main == "frequency_range":
         arrays["range"] = arrays[main][:, :, 0]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from phasemark.render import Views
 
 
-def pose_report_command(
+def pose_report(
     measured: Annotated[Path, Shown(metavar="ESTIMATES")],
     truth: Path,
     *,
@@ -51,7 +51,8 @@ def pose_report_command(
     """
     import numpy as np
 
-    from phasemark.matcher.accuracy.pose_errors import pose_report, views_as_poses
+    from phasemark.matcher.accuracy.pose_errors import pose_report as report_of
+    from phasemark.matcher.accuracy.pose_errors import views_as_poses
     from phasemark.matcher.recordings.pose_table import read_pose_table
 
     found, true = read_pose_table(measured), read_pose_table(truth)
@@ -62,7 +63,7 @@ def pose_report_command(
         from phasemark.render import Views
 
         poses[counted] = views_as_poses(Views.broadcast(*found.view[rows[counted]].T))
-    report = pose_report(poses, views, symmetry=symmetry)
+    report = report_of(poses, views, symmetry=symmetry)
     if as_json:
         echo_json({"estimates": str(measured), "truth": str(truth), **report.as_dict()})
         return

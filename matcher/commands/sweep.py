@@ -92,7 +92,7 @@ def sweep_report(folder: Folder, *, as_json: Json = False) -> None:
     typer.echo(report)
 
 
-def sweep_frames_again(folder: Folder, condition: Index, trial: Index, *, out: Out, force: Force = False) -> None:
+def sweep_frames(folder: Folder, condition: Index, trial: Index, *, out: Out, force: Force = False) -> None:
     """Take the frames of one trial of a sweep again, bit for bit.
 
     Parameters
@@ -107,11 +107,11 @@ def sweep_frames_again(folder: Folder, condition: Index, trial: Index, *, out: O
     from phasemark.data.files.folder_marker import read_marker
     from phasemark.data.files.same_file import refuse_inputs
     from phasemark.data.measured.reading import write_measured
-    from phasemark.matcher.sweep.examples import sweep_frames
+    from phasemark.matcher.sweep import examples
 
     refuse_inputs([out], map(folder.joinpath, read_marker(folder)[1] or ()))
     refuse_existing([out], force)
-    typer.echo(write_measured(sweep_frames(folder, condition, trial), out, force=force))
+    typer.echo(write_measured(examples.sweep_frames(folder, condition, trial), out, force=force))
 
 
 def sweep_compare(
