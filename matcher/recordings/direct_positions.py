@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -13,14 +13,10 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data.frames.frame_set_file import is_frame_set, open_frames
 from phasemark.data.measured.histogram_logs import read_histograms, read_targets
-from phasemark.matcher.match import Matches
-from phasemark.matcher.matcher import Matcher
 from phasemark.render import Sensor
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
-
-_VALID_STATUS = (5, 9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,21 +38,11 @@ class DirectPositions:
     def __getitem__(self, positions: slice) -> Self:
         """Return some positions."""
         frames = self.frames
-        some = (
-            frames[positions]
-            if isinstance(frames, HistogramFrames)
-            else _each(frames, lambda values: values[positions])
-        )
+        if isinstance(frames, HistogramFrames):
+            some: HistogramFrames | Targets = frames[positions]
+        else:
+            some = _each(frames, lambda values: values[positions])
         return type(self)(some, None if self.time_s is None else self.time_s[positions])
-
-
-@dataclass(frozen=True, eq=False)
-class DirectBatch:
-    """The answers to some positions; as :class:`~phasemark.matcher.recordings.estimates_table.MatchedBatch`."""
-
-    start: int
-    filtered: DirectPositions
-    matches: Matches
 
 
 def read_positions(
@@ -89,7 +75,7 @@ def read_positions(
     if path.suffix.lower() == ".csv":
         if on == "histograms":
             raise UsageError(f"{path}: CSV holds targets, not histograms: match it on targets")
-        targets = read_targets(path, sensor=sensor, valid_status=valid_status or _VALID_STATUS)
+        targets = read_targets(path, sensor=sensor, **({"valid_status": valid_status} if valid_status else {}))
         return DirectPositions(_each(targets, lambda values: np.swapaxes(values, 0, 1)) if moving else targets)
     if valid_status is not None:
         raise UsageError(f"{path}: has histograms, and a valid status goes with targets from CSV")
@@ -115,26 +101,6 @@ def _of_frame_set(path: Path, sensor: Sensor, *, moving: bool) -> DirectPosition
     if not moving:
         frames = HistogramFrames(frames.counts.reshape(n_views, -1, *found), sensor=frames.sensor)
     return DirectPositions(frames)
-
-
-def match_directly(matcher: Matcher, positions: DirectPositions, *, at_once: int) -> Iterator[DirectBatch]:
-    """Match positions in batches; the answers do not depend on the size of a batch.
-
-    Parameters
-    ----------
-    matcher : Matcher
-        On histograms or on targets.
-    positions : DirectPositions
-    at_once : int
-        Positions in a batch.
-
-    Yields
-    ------
-    DirectBatch
-    """
-    for start in range(0, len(positions), at_once):
-        some = positions[start : start + at_once]
-        yield DirectBatch(start, some, matcher.match(some.frames))
 
 
 def _each(targets: Targets, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Targets:

@@ -13,24 +13,13 @@ import numpy as np
 
 from phasemark.data.files.csv_cell import as_cell
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
-from phasemark.matcher.match import Match, Matches
+from phasemark.matcher.match import Match, Matches, named_in_degrees, scale_of_degrees
 from phasemark.matcher.matcher import Matcher
-from phasemark.matcher.recordings.direct_positions import DirectBatch
+from phasemark.matcher.recordings.direct_positions import DirectPositions
 from phasemark.render import Frames
 
 POSITIONS_AT_ONCE = 256
 """Largest batch: as many answers as a reader of the output waits for."""
-
-_DEGREES = 180 / math.pi
-_COLUMNS = {
-    "distance_m": ("distance", "_m", 1.0),
-    "delta_rad": ("delta", "_deg", _DEGREES),
-    "bearing_rad": ("bearing", "_deg", _DEGREES),
-    "height_m": ("height", "_m", 1.0),
-    "pitch_rad": ("pitch", "_deg", _DEGREES),
-    "roll_rad": ("roll", "_deg", _DEGREES),
-}
-"""Parameters of a view: name, unit and scale of their columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,18 +30,18 @@ class MatchedBatch:
     ----------
     start : int
         Number of the first position.
-    filtered : FilteredFrames
+    filtered : FilteredFrames, or DirectPositions of a log of a direct sensor
     matches : Matches
     """
 
     start: int
-    filtered: FilteredFrames
+    filtered: FilteredFrames | DirectPositions
     matches: Matches
 
 
 def match_in_batches(
     matcher: Matcher,
-    frames: Frames,
+    positions: Frames | DirectPositions,
     filter_frames: Callable[[Frames], FilteredFrames],
     *,
     at_once: int = POSITIONS_AT_ONCE,
@@ -62,10 +51,10 @@ def match_in_batches(
     Parameters
     ----------
     matcher : Matcher
-    frames : Frames
+    positions : Frames or DirectPositions
         n positions; of a moving camera, ``frames.each_a_position()``.
     filter_frames : callable
-        For instance :func:`~phasemark.matcher.kalman_filter`.
+        For instance :func:`~phasemark.matcher.kalman_filter`; histograms and targets are not filtered.
     at_once : int
         Positions in a batch.
 
@@ -73,9 +62,13 @@ def match_in_batches(
     ------
     MatchedBatch
     """
-    for start in range(0, len(frames), at_once):
-        filtered = matcher.read_out(filter_frames(frames[start : start + at_once]))
-        yield MatchedBatch(start, filtered, matcher.match(filtered))
+    for start in range(0, len(positions), at_once):
+        some = positions[start : start + at_once]
+        if isinstance(some, DirectPositions):
+            yield MatchedBatch(start, some, matcher.match(some.frames))
+        else:
+            filtered = matcher.read_out(filter_frames(some))
+            yield MatchedBatch(start, filtered, matcher.match(filtered))
 
 
 class EstimateTable:
@@ -97,35 +90,37 @@ class EstimateTable:
 
     def __init__(self, free: Sequence[str], pose_time_s: Sequence[float] | None = None) -> None:
         self._free, self._pose_time_s = tuple(free), pose_time_s
-        self._text = io.StringIO()
-        self._writer = csv.writer(self._text, lineterminator="\n")
-        header = ["index", "time_s", "pose_time_s", "class", "accepted"]
-        for name, unit, _ in (_COLUMNS[parameter] for parameter in self._free):
-            header += [f"{name}{unit}", f"{name}_std{unit}"]
-        header += [f"corr_{_COLUMNS[a][0]}_{_COLUMNS[b][0]}" for a, b in combinations(self._free, 2)]
-        self._writer.writerow([*header, "chi2", "dof", "p_value", "reason"])
+        names = [named_in_degrees(parameter).rsplit("_", 1) for parameter in free]
+        header: list[object] = ["index", "time_s", "pose_time_s", "class", "accepted"]
+        for name, unit in names:
+            header += [f"{name}_{unit}", f"{name}_std_{unit}"]
+        header += [f"corr_{a}_{b}" for (a, _), (b, _) in combinations(names, 2)]
+        self._rows = [[*header, "chi2", "dof", "p_value", "reason"]]
 
-    def add(self, batch: MatchedBatch | DirectBatch) -> None:
+    def add(self, batch: MatchedBatch) -> None:
         """Add the answers of a batch.
 
         Parameters
         ----------
-        batch : MatchedBatch or DirectBatch
+        batch : MatchedBatch
         """
         times = batch.filtered.time_s
         for k, match in enumerate(batch.matches):
             index = batch.start + k
-            stamps = [
-                math.nan if times is None else float(times[k]),
-                math.nan if self._pose_time_s is None else self._pose_time_s[index],
-            ]
-            self._writer.writerow([index, *map(_cell, stamps), *self._cells(match)])
+            time_s = None if times is None else float(times[k])
+            pose_time_s = None if self._pose_time_s is None else self._pose_time_s[index]
+            named = match.class_name or "", "true" if match.accepted else "false"
+            test = match.chi2, match.dof, match.p_value, getattr(match, "reason", None)
+            self._rows.append([index, time_s, pose_time_s, *named, *self._numbers(match), *test])
 
     def to_csv(self) -> str:
         """Return the table with its header."""
-        return self._text.getvalue()
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(map(_cell, row) for row in self._rows)
+        return text.getvalue()
 
-    def _cells(self, match: Match) -> list[str | int]:
+    def _numbers(self, match: Match) -> list[float]:
+        """Return each parameter of a match with its standard deviation, and their correlations."""
         size = len(self._free)
         values, std, correlation = np.full(size, np.nan), np.full(size, np.nan), np.full((size, size), np.nan)
         if match.class_name is not None:
@@ -134,13 +129,13 @@ class EstimateTable:
                 std = np.sqrt(np.maximum(np.diag(match.covariance), 0.0))
                 scale = np.outer(std, std)
                 np.divide(match.covariance, scale, out=correlation, where=scale > 0)
-        cells: list[str | int] = [as_cell(match.class_name or ""), "true" if match.accepted else "false"]
-        for k, parameter in enumerate(self._free):
-            scale_to_unit = _COLUMNS[parameter][2]
-            cells += [_cell(scale_to_unit * values[k]), _cell(scale_to_unit * std[k])]
-        cells += [_cell(correlation[a, b]) for a, b in combinations(range(size), 2)]
-        return [*cells, _cell(match.chi2), match.dof, _cell(match.p_value), getattr(match, "reason", None) or ""]
+        unit = np.array([scale_of_degrees(name) for name in self._free])
+        pairs = np.stack([unit * values, unit * std], axis=1).ravel().tolist()
+        return [*pairs, *correlation[np.triu_indices(size, 1)].tolist()]
 
 
-def _cell(value: float) -> str:
-    return f"{value:.9g}" if math.isfinite(value) else ""
+def _cell(value: object) -> object:
+    """Return a value as a cell, empty if there is nothing to say."""
+    if isinstance(value, float):
+        return f"{value:.9g}" if math.isfinite(value) else ""
+    return "" if value is None else as_cell(value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +12,10 @@ from numpy.typing import NDArray
 from phasemark import InputFileError
 from phasemark.inputs import read_text
 from phasemark.inputs.table_cells import cells_of, finite_number
+from phasemark.matcher.match import named_in_degrees, scale_of_degrees
 from phasemark.render import Views
+from phasemark.render.view import VIEW_FIELDS
 
-_SCALE = {
-    "distance_m": 1.0, "delta_deg": math.radians(1), "bearing_deg": math.radians(1),
-    "height_m": 1.0, "pitch_deg": math.radians(1), "roll_deg": math.radians(1),
-}  # fmt: skip
 _TRUTH = "truth_"
 _TIMES = {"time_s": 1.0, "t_s": 1.0, "t_ms": 1e-3}
 _MOST_BYTES = 1 << 26
@@ -95,9 +92,9 @@ def read_pose_table(path: str | os.PathLike[str]) -> PoseTable:
         cells = ((f"{path}, line {line}", row[at]) for line, row in zip(place, rows, strict=True))
         return np.array([finite_number(cell, where, name, empty_is_nan=True) for where, cell in cells])
 
-    found = {name: column(prefix + name) for name in _SCALE}
+    found = {name: column(prefix + named_in_degrees(name)) for name in VIEW_FIELDS}
     zero = np.zeros(len(rows))
-    view = [zero if values is None else _SCALE[name] * values for name, values in found.items()]
+    view = [zero if values is None else values / scale_of_degrees(name) for name, values in found.items()]
     index = column("index")
     time_s = next((scale * values for name, scale in _TIMES.items() if (values := column(name)) is not None), None)
     accepted = np.ones(len(rows), np.bool_)
