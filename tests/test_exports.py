@@ -11,7 +11,6 @@ from PIL import Image
 from PIL.PngImagePlugin import PngImageFile
 
 from phasemark import OutputExistsError, UsageError
-from phasemark.cli import main
 from phasemark.data import FramePlan, build_frames, read_frames
 from phasemark.data.export import export_frames
 from phasemark.render import Views, preset
@@ -114,26 +113,36 @@ def test_a_point_cloud_lies_on_the_pixels_rays(frames, tmp_path):
     np.testing.assert_allclose(cloud.vertices[:, 2] / cloud.vertices[:, 0], tangent * (1 - (rows + 0.5) / 8), atol=1e-6)
 
 
+def read_json_file(path):
+    """Load JSON as bop_toolkit does: keys that are numbers become numbers."""
+
+    def with_numbers(pairs):
+        return {int(key) if key.lstrip("-").isdigit() else key: value for key, value in pairs.items()}
+
+    return json.loads(path.read_text(), object_hook=with_numbers)
+
+
+@pytest.fixture(scope="module")
+def bop(frames, tmp_path_factory):
+    return export_frames(frames, tmp_path_factory.mktemp("bop") / "bop", "bop")
+
+
 def bop_images(folder):
+    """Yield split, scene, and number, camera, truth and facts of each image."""
     for kind in ("train", "test"):
         for scene in sorted((folder / kind).iterdir()):
-            camera = json.loads((scene / "scene_camera.json").read_text())
-            truth = json.loads((scene / "scene_gt.json").read_text())
-            info = json.loads((scene / "scene_gt_info.json").read_text())
+            camera, truth, info = (read_json_file(scene / f"scene_{name}.json") for name in ("camera", "gt", "gt_info"))
+            assert set(camera) == set(truth) == set(info)
             for key in truth:
                 yield kind, scene, key, camera[key], truth[key][0], info[key][0]
 
 
-def test_bop_depth_and_masks_fit_the_projected_model(frames, tmp_path):
-    folder = exported(frames, tmp_path, "bop")
-    infos = json.loads((folder / "models" / "models_info.json").read_text())
-    models: dict[int, Any] = {
-        int(k): trimesh.load(folder / "models" / f"obj_{int(k):06d}.ply", process=False) for k in infos
-    }
+def test_bop_depth_and_masks_fit_the_projected_model(frames, bop):
+    infos = read_json_file(bop / "models" / "models_info.json")
+    models: dict[int, Any] = {k: trimesh.load(bop / "models" / f"obj_{k:06d}.ply", process=False) for k in infos}
     count = 0
-    for kind, scene, key, camera, truth, info in bop_images(folder):
-        numbers = frames.split(kind)
-        sample = frames[numbers[int(key) + 1000 * int(scene.name)]]
+    for kind, scene, key, camera, truth, info in bop_images(bop):
+        sample = frames[frames.split(kind)[key + 1000 * int(scene.name)]]
         assert frames.classes[truth["obj_id"] - 1] == sample["class_name"]
         matrix = np.reshape(camera["cam_K"], (3, 3))
         rotation, translation = np.reshape(truth["cam_R_m2c"], (3, 3)), np.array(truth["cam_t_m2c"])
@@ -149,22 +158,31 @@ def test_bop_depth_and_masks_fit_the_projected_model(frames, tmp_path):
         np.testing.assert_allclose(box[0], inside[0][0], atol=1)
         np.testing.assert_allclose(box[1], inside[0][1], atol=2)
         np.testing.assert_allclose([box[0] + box[2] - 1, box[1] + box[3] - 1], inside[1], atol=1)
-        with Image.open(scene / "depth" / f"{int(key):06d}.png") as image:
+        with Image.open(scene / "depth" / f"{key:06d}.png") as image:
+            assert image.mode == "I;16"
             depth_mm = np.asarray(image) * camera["depth_scale"]
         expected = np.nan_to_num(1000 * sample["range_m"] * SENSOR.axis_cosine())
         np.testing.assert_allclose(depth_mm, expected, atol=0.51 * camera["depth_scale"])
         for name in ("mask", "mask_visib"):
-            with Image.open(scene / name / f"{int(key):06d}_000000.png") as image:
-                assert (np.asarray(image) > 0).sum() == info["px_count_all"]
-        assert (scene / "gray" / f"{int(key):06d}.png").exists()
+            with Image.open(scene / name / f"{key:06d}_000000.png") as image:
+                assert image.mode == "L"
+                mask = np.asarray(image) > 0
+            assert mask.sum() == info["px_count_all"]
+        assert info["px_count_valid"] == (mask & (depth_mm > 0)).sum()
+        assert info["visib_fract"] == info["px_count_visib"] / info["px_count_all"] == 1
+        with Image.open(scene / "gray" / f"{key:06d}.png") as image:
+            assert (image.mode, image.size) == ("L", (16, 16))
         count += 1
     assert count == 24
-    targets = json.loads((folder / "test_targets_bop19.json").read_text())
+    targets = read_json_file(bop / "test_targets_bop19.json")
     assert len(targets) == len(frames.split("test"))
+    for target in targets:
+        truths = read_json_file(bop / "test" / f"{target['scene_id']:06d}" / "scene_gt.json")
+        assert [truth["obj_id"] for truth in truths[target["im_id"]]] == [target["obj_id"]]
 
 
-def test_a_bop_model_is_in_millimetres_about_its_centre_and_knows_its_symmetry(frames, tmp_path):
-    folder = exported(frames, tmp_path, "bop") / "models"
+def test_a_bop_model_is_in_millimetres_about_its_centre_and_knows_its_symmetry(bop):
+    folder = bop / "models"
     info = json.loads((folder / "models_info.json").read_text())["1"]
     model: Any = trimesh.load(folder / "obj_000001.ply", process=False)
     np.testing.assert_allclose(model.bounds.mean(axis=0), 0, atol=1e-3)
@@ -175,15 +193,6 @@ def test_a_bop_model_is_in_millimetres_about_its_centre_and_knows_its_symmetry(f
     turned = model.vertices @ np.reshape(turn, (4, 4))[:3, :3].T + np.reshape(turn, (4, 4))[:3, 3]
     distance = np.linalg.norm(turned[:, None] - model.vertices[None, :400], axis=2).min(axis=0)
     assert np.median(distance) < 1.0  # mm: the turned box has its corners where it had them
-
-
-def read_json_file(path):
-    """Load JSON as bop_toolkit does: keys that are numbers become numbers."""
-
-    def with_numbers(pairs):
-        return {int(key) if key.lstrip("-").isdigit() else key: value for key, value in pairs.items()}
-
-    return json.loads(path.read_text(), object_hook=with_numbers)
 
 
 def read_bop_ply(path):
@@ -210,14 +219,13 @@ def read_bop_ply(path):
     return vertices[:, :3], vertices[:, 3:], faces[:, 1:4]
 
 
-def test_bop_files_load_as_the_toolkit_loads_them(frames, tmp_path):
-    folder = exported(frames, tmp_path, "bop")
-    camera = read_json_file(folder / "camera.json")
+def test_bop_models_load_as_the_toolkit_loads_them(bop):
+    camera = read_json_file(bop / "camera.json")
     assert set(camera) >= {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}
-    infos = read_json_file(folder / "models" / "models_info.json")
+    infos = read_json_file(bop / "models" / "models_info.json")
     assert sorted(infos) == [1, 2]  # object numbers count from 1
     for number, info in infos.items():
-        points, normals, faces = read_bop_ply(folder / "models" / f"obj_{number:06d}.ply")
+        points, normals, faces = read_bop_ply(bop / "models" / f"obj_{number:06d}.ply")
         assert faces.max() < len(points)
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
         for k, axis in enumerate("xyz"):
@@ -225,35 +233,6 @@ def test_bop_files_load_as_the_toolkit_loads_them(frames, tmp_path):
             np.testing.assert_allclose(np.ptp(points[:, k]), info[f"size_{axis}"], atol=1e-3)
         for turn in info.get("symmetries_discrete", []):
             np.testing.assert_allclose(np.reshape(turn, (4, 4))[3], [0, 0, 0, 1])
-    for kind in ("train", "test"):
-        scenes = [entry for entry in (folder / kind).iterdir() if entry.name.isdigit()]
-        assert scenes
-        for scene in scenes:
-            cameras, truths, facts = (
-                read_json_file(scene / f"scene_{name}.json") for name in ("camera", "gt", "gt_info")
-            )
-            assert set(cameras) == set(truths) == set(facts)
-            for image, of_objects in truths.items():
-                assert np.array(cameras[image]["cam_K"], float).reshape(3, 3)[2].tolist() == [0, 0, 1]
-                with Image.open(scene / "depth" / f"{image:06d}.png") as picture:
-                    assert picture.mode == "I;16"
-                    depth_mm = np.asarray(picture).astype(np.float32) * float(cameras[image]["depth_scale"])
-                with Image.open(scene / "gray" / f"{image:06d}.png") as picture:
-                    assert (picture.mode, picture.size) == ("L", (camera["width"], camera["height"]))
-                for number, truth in enumerate(of_objects):
-                    np.array(truth["cam_R_m2c"], float).reshape(3, 3)
-                    np.array(truth["cam_t_m2c"], float).reshape(3, 1)
-                    assert truth["obj_id"] in infos
-                    fact = facts[image][number]
-                    for name in ("mask", "mask_visib"):
-                        with Image.open(scene / name / f"{image:06d}_{number:06d}.png") as picture:
-                            assert picture.mode == "L"
-                            mask = np.asarray(picture) > 0
-                    assert fact["px_count_valid"] == (mask & (depth_mm > 0)).sum()
-                    assert fact["visib_fract"] == fact["px_count_visib"] / fact["px_count_all"] == 1
-    for target in read_json_file(folder / "test_targets_bop19.json"):
-        truths = read_json_file(folder / "test" / f"{target['scene_id']:06d}" / "scene_gt.json")
-        assert [truth["obj_id"] for truth in truths[target["im_id"]]] == [target["obj_id"]]
 
 
 def test_the_bag_is_a_ros_2_bag_with_labelled_quantities(frames, tmp_path):
@@ -271,12 +250,8 @@ def test_the_bag_is_a_ros_2_bag_with_labelled_quantities(frames, tmp_path):
     }  # fmt: skip
     time_ns, depth = seen["/camera/depth/image_rect"][7]
     assert time_ns == round(7e9 / SENSOR.frame_rate_hz)
-    assert (depth.encoding, depth.height, depth.width, depth.header.frame_id) == (
-        "32FC1",
-        16,
-        16,
-        "camera_optical_frame",
-    )
+    shown = depth.encoding, depth.height, depth.width, depth.header.frame_id
+    assert shown == ("32FC1", 16, 16, "camera_optical_frame")
     z = frames[7]["range_m"] * SENSOR.axis_cosine()
     np.testing.assert_allclose(depth.data.view("<f4").reshape(16, 16), z, rtol=1e-6)
     info = seen["/camera/depth/camera_info"][7][1]
@@ -298,14 +273,7 @@ def test_the_bag_is_a_ros_2_bag_with_labelled_quantities(frames, tmp_path):
 
 
 def matrix_of(q):
-    x, y, z, w = q.x, q.y, q.z, q.w
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return trimesh.transformations.quaternion_matrix([q.w, q.x, q.y, q.z])[:3, :3]
 
 
 def test_an_existing_folder_needs_force_and_is_replaced_whole(frames, tmp_path):
@@ -326,23 +294,22 @@ def test_an_unknown_format_is_named(frames, tmp_path):
         exported(frames, tmp_path, "gif")
 
 
-def test_the_figure_of_a_frame_of_a_set_names_its_class_and_view(frames, tmp_path, monkeypatch):
+def test_the_figure_of_a_frame_of_a_set_names_its_class_and_view(run, frames, tmp_path, monkeypatch):
     titles = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *where, **how: titles.append(figure.get_suptitle()))
     for index in (0, 5):
-        main(["frames", "show", str(frames.path), "--index", str(index), "-o", str(tmp_path / f"{index}.png")])
+        run("frames", "show", frames.path, "--index", index, "-o", tmp_path / f"{index}.png")
         sample = frames[index]
         assert titles[-1].startswith(f"frame {index}: {sample['class_name']}, D = {sample['distance_m']:.3f} m, δ = ")
     assert titles[0] != titles[1].replace("frame 5", "frame 0")
 
 
-def test_the_commands_export_import_and_show(frames, tmp_path, capsys):
+def test_the_commands_export_import_and_show(run, frames, tmp_path):
     out = tmp_path / "set.npz"
-    assert main(["frames", "export", str(frames.path), "--to", "npz", "-o", str(out)]) == 0
-    assert main(["frames", "import", str(out), "-o", str(tmp_path / "again.npz")]) == 0
-    assert main(["frames", "show", str(out), "-o", str(tmp_path / "a.png")]) == 0
-    assert main(["frames", "show", str(frames.path), "--index", "5", "-o", str(tmp_path / "b.png")]) == 0
-    assert main(["frames", "show", str(frames.path), "--index", "24", "-o", str(tmp_path / "c.png")]) == 2
-    assert "--index must be below 24" in capsys.readouterr().err
+    assert run("frames", "export", frames.path, "--to", "npz", "-o", out).code == 0
+    assert run("frames", "import", out, "-o", tmp_path / "again.npz").code == 0
+    assert run("frames", "show", out, "-o", tmp_path / "a.png").code == 0
+    code, _, err = run("frames", "show", frames.path, "--index", 24, "-o", tmp_path / "c.png")
+    assert (code, "--index must be below 24" in err) == (2, True)
     again = read_frames(tmp_path / "again.npz", sensor=SENSOR)
     np.testing.assert_array_equal(again.range_m[0], frames[:]["range_m"].astype(float))

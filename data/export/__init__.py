@@ -94,8 +94,20 @@ def export_frames(
     write, is_folder, quantities = EXPORTS[to]
     if quantity is not None and quantity not in quantities:
         raise UsageError(f"quantity=… must be {' or '.join(quantities)} for {to}, got '{quantity}'")
-    if content is not None or to == "jsonl":
-        write, quantities = _writer_of(frames, to, content or "histogram", quantity)
+    if to == "jsonl" and content is None:
+        content = "histogram"
+    if content is not None and content not in CONTENTS.get(to, _RANGE_ALONE):
+        able = [name for name in EXPORTS if content in CONTENTS.get(name, _RANGE_ALONE)]
+        raise UsageError(f"content={content} must go to {' or '.join(able)}, which can hold it, got '{to}'")
+    if content in ("targets", "histogram"):
+        quantities = (frames.reported_quantity(),)
+        if quantity not in (None, *quantities):
+            why = f"the chip reports {quantities[0]}" if content == "targets" else "counts are neither range nor z"
+            raise UsageError(f"quantity=… must be left out of {content}: {why}, got '{quantity}'")
+    if to == "npz":
+        write = partial(write_npz, content=content)
+    elif content == "targets":
+        write = write_targets_csv
     path = Path(path)
     refuse_inputs([path], [frames.path])
     if is_folder:
@@ -107,28 +119,3 @@ def export_frames(
         with replacing(path, force=force) as temporary:
             write(frames, temporary, quantity or quantities[0])
     return path
-
-
-def _writer_of(
-    frames: FrameSet, to: str, content: Content, quantity: RangeOrZ | None
-) -> tuple[Writer, tuple[RangeOrZ, ...]]:
-    """Return the writer of one content of a frame set, and the quantity that it writes.
-
-    Raises
-    ------
-    UsageError
-        The format cannot hold it, or the frame set does not have it.
-    """
-    write, _, quantities = EXPORTS[to]
-    if content not in CONTENTS.get(to, _RANGE_ALONE):
-        able = [name for name in EXPORTS if content in CONTENTS.get(name, _RANGE_ALONE)]
-        raise UsageError(f"content={content} must go to {' or '.join(able)}, which can hold it, got '{to}'")
-    if content == "range":
-        return (partial(write_npz, content=content) if to == "npz" else write), quantities
-    reported = frames.reported_quantity()
-    if quantity is not None and quantity != reported:
-        why = f"the chip reports {reported}" if content == "targets" else "counts are neither range nor z"
-        raise UsageError(f"quantity=… must be left out of {content}: {why}, got '{quantity}'")
-    if to == "npz":
-        return partial(write_npz, content=content), (reported,)
-    return (write_targets_csv if content == "targets" else write_jsonl), (reported,)

@@ -19,11 +19,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
 from phasemark.data.export.images import scale_of, to_codes
-from phasemark.data.export.samples import CAM2OPTICAL, blocks, pinhole, quantity_m
+from phasemark.data.export.samples import CAM2OPTICAL, blocks, landmark2cam, pinhole, quantity_m
 from phasemark.data.frames.frame_set_file import FrameSet
 from phasemark.data.measured.reading import RangeOrZ
-from phasemark.render import Views
-from phasemark.render.view import VIEW_FIELDS
 
 IMAGES_PER_SCENE = 1000
 _SPLITS = ("train", "val", "test")
@@ -46,9 +44,7 @@ def write_bop(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     _write_json(
         folder / "dataset_info.json", {"quantity": "z", "classes": list(frames.classes), "seed": frames.plan.seed}
     )
-    brightest = 1.0
-    for _, sample in blocks(frames):
-        brightest = max(brightest, float(np.max(sample.get("amplitude_e", np.ones(1)))))
+    brightest = max(1.0, *(float(np.max(sample.get("amplitude_e", 1.0))) for _, sample in blocks(frames)))
     scenes: dict[str, _Scene] = {}
     counts = dict.fromkeys(frames.splits, 0)
     targets = []
@@ -146,11 +142,10 @@ def _pose(
     frames: FrameSet, sample: dict[str, Any], k: int, centre_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotation and translation from a model's frame to the optical one."""
-    view = Views.broadcast(*(sample[name][k] for name in VIEW_FIELDS))
-    rotation, translation = view.in_camera(frames.sensor).landmark2cam()
+    rotation, translation_m = landmark2cam(frames, sample, k)
     to_optical = CAM2OPTICAL @ frames.sensor.cam2level.T
-    turned = to_optical @ rotation[0]
-    return turned, to_optical @ translation[0] + turned @ centre_m
+    turned = to_optical @ rotation
+    return turned, to_optical @ translation_m + turned @ centre_m
 
 
 def _write_models(frames: FrameSet, folder: Path) -> list[NDArray[np.float64]]:

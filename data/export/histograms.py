@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.data.export.samples import blocks, truth_columns
+from phasemark.data.export.samples import blocks, truth_rows, write_lines
 from phasemark.data.frames.frame_set_file import FrameSet, Sample
 from phasemark.data.measured.reading import RangeOrZ
 from phasemark.data.measured.simulated import STATUS_NO_TARGET, STATUS_VALID
@@ -26,17 +25,10 @@ def logged(values: NDArray[Any], sensor: Sensor) -> NDArray[Any]:
     return flat[:, list(order)] if order else flat
 
 
-def times_s(frames: FrameSet, start: int, n: int) -> NDArray[np.float64]:
-    """Return when frames were taken, at the sensor's frame rate from frame 0 on, seconds."""
-    return np.asarray((start + np.arange(n)) / frames.sensor.frame_rate_hz)
-
-
 def histogram_arrays(frames: FrameSet, sample: Sample, start: int) -> dict[str, NDArray[Any]]:
     """Return the arrays of histograms in an NPZ file."""
-    return {
-        "histogram": logged(sample["histogram"], frames.sensor),
-        "t_s": times_s(frames, start, len(sample["view"])),
-    }
+    number = start + np.arange(len(sample["view"]))  # at the sensor's frame rate from frame 0 on
+    return {"histogram": logged(sample["histogram"], frames.sensor), "t_s": number / frames.sensor.frame_rate_hz}
 
 
 def target_arrays(sample: Sample) -> dict[str, NDArray[Any]]:
@@ -51,22 +43,16 @@ def write_jsonl(frames: FrameSet, path: Path, quantity: RangeOrZ) -> None:
     """
     with path.open("w", encoding="utf-8") as file:
         for start, sample in blocks(frames):
-            truth = truth_columns(frames, sample)
             arrays = histogram_arrays(frames, sample, start)
-            for k in range(len(sample["view"])):
-                told = {name: values[k].item() for name, values in truth.items()}
-                row = {
-                    "t_s": arrays["t_s"][k],
-                    "histogram": arrays["histogram"][k].tolist(),
-                    "truth": {name: None if value != value else value for name, value in told.items()},
-                }
+            for k, truth in enumerate(truth_rows(frames, sample)):
+                row = {"t_s": arrays["t_s"][k], "histogram": arrays["histogram"][k].tolist(), "truth": truth}
                 file.write(json.dumps(row, allow_nan=False) + "\n")
 
 
 def write_targets_csv(frames: FrameSet, path: Path, quantity: RangeOrZ) -> None:
     """Write a frame's targets a line, as :func:`phasemark.data.measured.histogram_logs.read_targets` reads them.
 
-    Status codes are those of ST's chips: 5 a target, 255 none. The truth is a comment in the line before.
+    Status codes are those of ST's chips: 5 a target, 255 none.
     """
     sensor = frames.sensor
     names = [
@@ -75,25 +61,16 @@ def write_targets_csv(frames: FrameSet, path: Path, quantity: RangeOrZ) -> None:
         for target in range(frames[:1]["target_status"].shape[-1])
         for kind in ("mm", "sigma_mm", "signal", "status")
     ]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        file.write(f"# targets unit=mm quantity={quantity} rows={sensor.rows} cols={sensor.cols}\n")
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(names)
-        for start, sample in blocks(frames):
-            truth = truth_columns(frames, sample)
-            found = target_arrays(sample)
-            valid = found["target_status"] == Status.VALID
-            values = np.stack(
-                [
-                    1000.0 * found["target_distance"].astype(float),
-                    1000.0 * found["target_sigma"].astype(float),
-                    np.where(valid, found["target_signal"], np.nan),
-                    np.where(valid, STATUS_VALID, STATUS_NO_TARGET),
-                ],
-                axis=-1,
-            )
-            lines = logged(values, sensor).reshape(len(values), -1)
-            for k, line in enumerate(lines):
-                told = " ".join(f"{name}={column[k]}" for name, column in truth.items())
-                file.write(f"# frame={start + k} {told}\n")
-                writer.writerow(["" if np.isnan(value) else f"{value:.9g}" for value in line])
+
+    def values_of(sample: Sample) -> NDArray[np.float64]:
+        found = target_arrays(sample)
+        valid = found["target_status"] == Status.VALID
+        columns = (
+            1000.0 * found["target_distance"].astype(float),
+            1000.0 * found["target_sigma"].astype(float),
+            np.where(valid, found["target_signal"], np.nan),
+            np.where(valid, STATUS_VALID, STATUS_NO_TARGET),
+        )
+        return logged(np.stack(columns, axis=-1), sensor).reshape(len(valid), -1)
+
+    write_lines(frames, path, f"targets unit=mm quantity={quantity}", names, values_of)

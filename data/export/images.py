@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
-from phasemark.data.export.samples import blocks, quantity_m, truth_columns
+from phasemark.data.export.samples import blocks, quantity_m, truth_rows
 from phasemark.data.frames.frame_set_file import FrameSet
 from phasemark.data.measured.reading import RangeOrZ
 
@@ -35,11 +35,8 @@ def to_codes(values_m: NDArray[np.float64], metres_per_unit: float) -> NDArray[n
 
 def scale_of(frames: FrameSet, quantity: RangeOrZ) -> float:
     """Return the metres per unit at which the largest value of all frames is full scale."""
-    largest = 0.0
-    for _, sample in blocks(frames):
-        values = quantity_m(frames, sample, quantity)
-        largest = max(largest, float(np.nanmax(values, initial=0.0)))
-    return (largest or 1.0) / FULL_SCALE
+    values = (quantity_m(frames, sample, quantity) for _, sample in blocks(frames))
+    return (max(float(np.nanmax(block, initial=0.0)) for block in values) or 1.0) / FULL_SCALE
 
 
 def write_png16(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
@@ -48,11 +45,9 @@ def write_png16(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     listed = []
     for start, sample in blocks(frames):
         values_m = quantity_m(frames, sample, quantity)
-        truth = truth_columns(frames, sample)
-        for k, image in enumerate(values_m):
-            name = f"{start + k:08d}.png"
+        for k, (image, truth) in enumerate(zip(values_m, truth_rows(frames, sample), strict=True), start):
+            name = f"{k:08d}.png"
             (folder / name).write_bytes(encode_png16(image, metres_per_unit, quantity))
-            row = {key: values[k].item() for key, values in truth.items()}
-            listed.append({"file": name, **{key: None if value != value else value for key, value in row.items()}})
+            listed.append({"file": name, **truth})
     facts = {"quantity": quantity, "unit": "m", "metres_per_unit": metres_per_unit, "invalid": 0, "frames": listed}
     (folder / "frames.json").write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from phasemark import StorageError
-from phasemark.data.export.samples import CAM2OPTICAL, blocks, pinhole, quaternion, ros_distortion
+from phasemark.data.export.samples import CAM2OPTICAL, blocks, landmark2cam, pinhole, ros_distortion
 from phasemark.data.frames.frame_set_file import FrameSet
 from phasemark.data.measured.bags import AMPLITUDE_TOPIC, INFO_TOPIC, RANGE_TOPIC, Z_TOPIC, ros_types
 from phasemark.data.measured.reading import RangeOrZ
-from phasemark.render import Views
-from phasemark.render.view import VIEW_FIELDS
 
 NAME = "frames"
 """What the file in a bag's folder is called."""
@@ -72,10 +71,8 @@ def _messages(frames: FrameSet, store: Any) -> Iterator[tuple[str, int, Any]]:
             if "amplitude_e" in sample:
                 yield AMPLITUDE_TOPIC, time_ns, _image(types, header, sample["amplitude_e"][k])
             yield INFO_TOPIC, time_ns, _camera_info(types, header, frames)
-            view = Views.broadcast(*(sample[name][k] for name in VIEW_FIELDS))
-            rotation, translation = view.in_camera(sensor).landmark2cam()
             landmark = f"{_LANDMARK}_{sample['class_name'][k]}"
-            pose = _transform(types, time_ns, _CAMERA, landmark, rotation[0], translation[0])
+            pose = _transform(types, time_ns, _CAMERA, landmark, *landmark2cam(frames, sample, k))
             yield "/tf", time_ns, types["tf2_msgs/msg/TFMessage"](transforms=[pose])
 
 
@@ -107,7 +104,7 @@ def _transform(
     types: Any, time_ns: int, parent: str, child: str, rotation: NDArray[np.float64], translation_m: NDArray[np.float64]
 ) -> Any:
     """Return the pose of the child frame in the parent's."""
-    x, y, z, w = quaternion(rotation)
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
     vector = types["geometry_msgs/msg/Vector3"](*(float(value) for value in translation_m))
     transform = types["geometry_msgs/msg/Transform"](
         translation=vector, rotation=types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)

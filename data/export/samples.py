@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+import csv
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,22 +13,16 @@ from numpy.typing import NDArray
 from phasemark.data.frames.frame_set_file import FrameSet, Sample
 from phasemark.data.measured.reading import RangeOrZ
 from phasemark.data.plans.frame_plan import TILT
-from phasemark.render import Sensor
+from phasemark.render import Sensor, Views
+from phasemark.render.view import VIEW_FIELDS
 
 BLOCK = 1024
 """Frames read at a time."""
 
-TRUTH = {
-    "distance_m": "distance_m",
-    "delta_deg": "delta_rad",
-    "bearing_deg": "bearing_rad",
-    "height_m": "height_m",
-    "pitch_deg": "pitch_rad",
-    "roll_deg": "roll_rad",
-    "albedo": "albedo",
-    "wall_m": "wall_m",
-    "floor_m": "floor_m",
-}
+TRUTH = (
+    "distance_m", "delta_deg", "bearing_deg", "height_m", "pitch_deg", "roll_deg", "albedo", "wall_m", "floor_m",
+)  # fmt: skip
+"""What is told of a frame beside its class, in the units of plans; a sample has angles in radians."""
 
 
 def blocks(frames: FrameSet) -> Iterator[tuple[int, Sample]]:
@@ -49,12 +44,52 @@ def truth_columns(frames: FrameSet, sample: Sample) -> dict[str, NDArray[Any]]:
         "class": np.asarray(sample["class_name"], dtype=str),
         "split": np.array(frames.splits)[sample["split_index"]],
     }
-    for name, key in TRUTH.items():
-        if name in TILT and getattr(frames.plan, name) is None:
-            continue
-        values = np.asarray(sample[key], float)
-        columns[name] = np.rad2deg(values) if name.endswith("_deg") else values
+    for name in TRUTH:
+        if name not in TILT or getattr(frames.plan, name) is not None:
+            values = np.asarray(sample[name.replace("_deg", "_rad")], float)
+            columns[name] = np.rad2deg(values) if name.endswith("_deg") else values
     return columns
+
+
+def truth_rows(frames: FrameSet, sample: Sample) -> list[dict[str, Any]]:
+    """Return the truth of each frame of a block as plain values, None where there is none."""
+    columns = truth_columns(frames, sample)
+    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+    return [{name: None if value != value else value for name, value in zip(columns, row, strict=True)} for row in rows]
+
+
+def landmark2cam(frames: FrameSet, sample: Sample, k: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rotation and translation of a frame of a block, from the landmark's to the camera frame."""
+    view = Views.broadcast(*(sample[name][k] for name in VIEW_FIELDS))
+    rotation, translation_m = view.in_camera(frames.sensor).landmark2cam()
+    return rotation[0], translation_m[0]
+
+
+def write_lines(
+    frames: FrameSet, path: Path, about: str, names: Sequence[str], values_of: Callable[[Sample], NDArray[Any]]
+) -> None:
+    """Write one frame a line, its truth as a comment in the line before; a cell is empty where a value is NaN.
+
+    Parameters
+    ----------
+    about : str
+        First line, a comment.
+    names : sequence of str
+        Columns.
+    values_of : callable
+        Returns the values of a block, (frames, columns).
+    """
+    with path.open("w", newline="", encoding="utf-8") as file:
+        file.write(f"# {about} rows={frames.sensor.rows} cols={frames.sensor.cols}\n")
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(names)
+        for start, sample in blocks(frames):
+            truth = truth_columns(frames, sample)
+            for k, line in enumerate(values_of(sample)):
+                told = " ".join(f"{name}={values[k]}" for name, values in truth.items())
+                file.write(f"# frame={start + k} {told}\n")
+                # nine digits bring a float32 back as it was
+                writer.writerow(["" if np.isnan(value) else f"{value:.9g}" for value in line])
 
 
 def pinhole(frames: FrameSet) -> tuple[float, float, float, float]:
@@ -81,22 +116,3 @@ def ros_distortion(sensor: Sensor) -> tuple[str, tuple[float, ...]]:
 
 CAM2OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """From x forward, y left, z up to the optical frame: z forward, x right, y down."""
-
-
-def quaternion(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Return x, y, z, w of a rotation matrix."""
-    trace = float(np.trace(rotation))
-    squares = [1 + 2 * float(rotation[k, k]) - trace for k in range(3)] + [1 + trace]
-    largest = int(np.argmax(squares))
-    out = np.empty(4)
-    out[largest] = math.sqrt(squares[largest]) / 2
-    scale = 1 / (4 * out[largest])
-    skew = [rotation[(k + 2) % 3, (k + 1) % 3] - rotation[(k + 1) % 3, (k + 2) % 3] for k in range(3)]
-    if largest == 3:
-        out[:3] = [s * scale for s in skew]
-    else:
-        out[3] = skew[largest] * scale
-        for k in range(3):
-            if k != largest:
-                out[k] = (rotation[largest, k] + rotation[k, largest]) * scale
-    return float(out[0]), float(out[1]), float(out[2]), float(out[3])

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from phasemark.data.export.histograms import histogram_arrays, target_arrays
-from phasemark.data.export.samples import blocks, quantity_m, truth_columns
+from phasemark.data.export.samples import blocks, quantity_m, truth_columns, write_lines
 from phasemark.data.frames.frame_set_file import FrameSet, Sample
 from phasemark.data.measured.reading import RangeOrZ
 
@@ -55,17 +54,10 @@ def _range_columns(frames: FrameSet, sample: Sample, quantity: RangeOrZ) -> dict
 
 
 def write_csv(frames: FrameSet, path: Path, quantity: RangeOrZ) -> None:
-    """Write one frame a line, row by row from the top left pixel, its truth as a comment in the line before."""
+    """Write one frame a line, row by row from the top left pixel."""
     rows, cols = frames.sensor.rows, frames.sensor.cols
-    with path.open("w", newline="", encoding="utf-8") as file:
-        file.write(f"# unit=m quantity={quantity} rows={rows} cols={cols}\n")
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([f"r{row}c{col}" for row in range(rows) for col in range(cols)])
-        for start, sample in blocks(frames):
-            truth = truth_columns(frames, sample)
-            # nine digits bring a float32 back as it was
-            lines = quantity_m(frames, sample, quantity).reshape(len(sample["view"]), -1)
-            for k, line in enumerate(lines):
-                told = " ".join(f"{name}={values[k]}" for name, values in truth.items())
-                file.write(f"# frame={start + k} {told}\n")
-                writer.writerow(["" if np.isnan(value) else f"{value:.9g}" for value in line])
+    names = [f"r{row}c{col}" for row in range(rows) for col in range(cols)]
+    write_lines(
+        frames, path, f"unit=m quantity={quantity}", names,
+        lambda sample: quantity_m(frames, sample, quantity).reshape(-1, rows * cols),
+    )  # fmt: skip

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import re
 import stat
 import zipfile
 from collections.abc import Collection, Mapping
@@ -17,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError
-from phasemark.data.files.guard import EXPANSION, FREE_BYTES
 from phasemark.data.measured.board_prints import JSON
 from phasemark.data.measured.boards import HEAD_BYTES
+from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, opened_npz
 from phasemark.inputs.reading import read_whole
 from phasemark.render import Sensor
 from phasemark.render.direct.histogram_frames import HistogramFrames
@@ -28,9 +29,9 @@ from phasemark.render.direct.targets import Status, Targets
 _MOST_BYTES = 1 << 28
 _MOST_VALUES = 1 << 26
 _NAMES = ("histogram", "reference_histogram", "distance_m", "sensor2world", "t_ms", "t_s")
-_SECONDS = {"t_ms": 1e-3, "t_s": 1.0}
 _MOST_LISTED = 16
-_TARGET_COLUMNS = ("mm", "sigma_mm", "signal", "status")
+_TARGET_COLUMN = re.compile(r"(mm|sigma_mm|signal|status)_([0-9]{1,9})_([0-9]{1,9})")
+"""Column of a log of targets: quantity, zone and target."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,13 +129,10 @@ def read_histograms(path: str | os.PathLike[str], *, sensor: Sensor) -> Histogra
     reference = arrays.get("reference_histogram")
     if reference is not None and (reference.ndim != 2 or len(reference) != n):
         raise InputFileError(f"{path}: 'reference_histogram' must have shape ({n}, bins), got {reference.shape}")
-    times = [arrays[name] * scale for name, scale in _SECONDS.items() if name in arrays]
-    ordered = np.empty_like(counts)
-    order = sensor.histogram.zone_order if sensor.histogram is not None else ()
-    ordered[:, list(order or range(n_zones))] = counts
+    times = [arrays[name] * scale for name, scale in SECONDS_PER_TIME_UNIT.items() if name in arrays]
     try:
         frames = HistogramFrames(
-            ordered.reshape(n, 1, sensor.rows, sensor.cols, -1),
+            _image(counts, sensor).reshape(n, 1, sensor.rows, sensor.cols, -1),
             sensor=sensor,
             reference=None if reference is None else reference[:, None],
             time_s=times[0][:, None] if times else None,
@@ -183,19 +181,18 @@ def read_targets(path: str | os.PathLike[str], *, sensor: Sensor, valid_status: 
     n_zones = sensor.rows * sensor.cols
     places: dict[tuple[str, int, int], int] = {}
     for column, name in enumerate(header):
-        kind, _, numbers = name.removeprefix("sigma_").partition("_")
-        kind = f"sigma_{kind}" if name.startswith("sigma_") else kind
-        zone, _, target = numbers.partition("_")
-        if kind in _TARGET_COLUMNS and zone.isdigit() and target.isdigit():
-            if int(zone) >= n_zones or int(target) >= _MOST_LISTED:
+        if match := _TARGET_COLUMN.fullmatch(name):
+            kind, zone, target = match[1], int(match[2]), int(match[3])
+            if zone >= n_zones or target >= _MOST_LISTED:
                 raise InputFileError(
                     f"{path}: column '{name}' is beyond {n_zones} zones of at most {_MOST_LISTED} targets"
                 )
-            places[kind, int(zone), int(target)] = column
+            places[kind, zone, target] = column
     if not any(kind == "mm" for kind, *_ in places):
         raise InputFileError(f"{path}: must have columns mm_0_0 … (zone, target), got {', '.join(header[:4])} …")
     most = 1 + max(k for _, _, k in places)
-    out = {kind: np.full((len(lines) - 1, n_zones, most), np.nan) for kind in _TARGET_COLUMNS}
+    shape = (len(lines) - 1, n_zones, most)
+    out = {kind: np.full(shape, np.nan) for kind in ("mm", "sigma_mm", "signal", "status")}
     for row, line in enumerate(lines[1:]):
         cells = line.split(",")
         if len(cells) != len(header):
@@ -205,19 +202,21 @@ def read_targets(path: str | os.PathLike[str], *, sensor: Sensor, valid_status: 
     has_status = any(kind == "status" for kind, *_ in places)
     listed = np.isin(out["status"], list(valid_status)) if has_status else np.isfinite(out["mm"])
     valid = listed & np.isfinite(out["mm"]) & (out["mm"] > 0)
-    order = (sensor.histogram.zone_order if sensor.histogram is not None else ()) or range(n_zones)
-
-    def image(values: NDArray[Any]) -> NDArray[Any]:
-        placed = np.empty_like(values)
-        placed[:, list(order)] = values
-        return placed.reshape(1, len(values), sensor.rows, sensor.cols, most)
-
-    return Targets(
-        image(np.where(valid, out["mm"] / 1000, np.nan)),
-        image(np.where(valid, out["sigma_mm"] / 1000, np.nan)),
-        image(np.where(valid, np.nan_to_num(out["signal"]), 0.0)),
-        image(np.where(valid, int(Status.VALID), int(Status.NO_TARGET)).astype(np.uint8)),
+    columns = (
+        np.where(valid, out["mm"] / 1000, np.nan),
+        np.where(valid, out["sigma_mm"] / 1000, np.nan),
+        np.where(valid, np.nan_to_num(out["signal"]), 0.0),
+        np.where(valid, int(Status.VALID), int(Status.NO_TARGET)).astype(np.uint8),
     )
+    return Targets(*(_image(values, sensor).reshape(1, -1, sensor.rows, sensor.cols, most) for values in columns))
+
+
+def _image(values: NDArray[Any], sensor: Sensor) -> NDArray[Any]:
+    """Return values in the order of a log, (frames, zones, …), in that of the image."""
+    order = sensor.histogram.zone_order if sensor.histogram is not None else ()
+    placed = np.empty_like(values)
+    placed[:, list(order or range(values.shape[1]))] = values
+    return placed
 
 
 def _cell(text: str, path: Path, row: int, column: str) -> float:
@@ -233,10 +232,7 @@ def _cell(text: str, path: Path, row: int, column: str) -> float:
 def _npz(content: bytes, path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of an NPZ file that a log has."""
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            declared = sum(member.file_size for member in archive.zip.infolist())
-            if declared > FREE_BYTES + EXPANSION * len(content):
-                raise InputFileError(f"{path}: refused: declares {declared} bytes, far more than its size can hold")
+        with opened_npz(io.BytesIO(content), len(content), path) as archive:
             of_landmark = "class" in archive  # then distance_m is that of a landmark's axis, and no plane's
             names = [name for name in _NAMES if name in archive and not (of_landmark and name == "distance_m")]
             return {name: np.asarray(archive[name]) for name in names}
@@ -255,7 +251,7 @@ def _json_lines(content: bytes, path: Path) -> dict[str, NDArray[Any]]:
         try:
             row = json.loads(line)
         except (ValueError, RecursionError):
-            raise InputFileError(f"{path}: line {number} is no JSON object") from None
+            row = None
         if not isinstance(row, dict):
             raise InputFileError(f"{path}: line {number} is no JSON object")
         rows.append(row)

@@ -205,18 +205,12 @@ def recording_format(path: Path) -> str:
     return suffix
 
 
-def _truth(recording: SimulatedRecording) -> dict[str, NDArray[np.float64]]:
-    views = recording.views
+def _truth(views: Views) -> dict[str, NDArray[np.float64]]:
+    """Return the columns of a recording that state the view of each frame."""
+    fields = {name: getattr(views, name) for name in (VIEW_FIELDS if views.are_tilted else VIEW_FIELDS[:4])}
     return {
-        "truth_distance_m": views.distance_m,
-        "truth_delta_deg": np.degrees(views.delta_rad),
-        "truth_bearing_deg": np.degrees(views.bearing_rad),
-        "truth_height_m": views.height_m,
-        **(
-            {"truth_pitch_deg": np.degrees(views.pitch_rad), "truth_roll_deg": np.degrees(views.roll_rad)}
-            if views.are_tilted
-            else {}
-        ),
+        f"truth_{name.replace('_rad', '_deg')}": np.degrees(values) if name.endswith("_rad") else values
+        for name, values in fields.items()
     }
 
 
@@ -241,7 +235,7 @@ def _arrays(recording: SimulatedRecording) -> tuple[dict[str, NDArray[Any]], str
         for name, values in (("amplitude", frames.amplitude_e), ("intensity", frames.intensity_e)):
             if values is not None:
                 arrays[name] = values[0]
-    arrays |= {**_truth(recording), "truth_class": np.array(recording.class_name)}
+    arrays |= {**_truth(recording.views), "truth_class": np.array(recording.class_name)}
     return arrays, "mm" if direct else "m", "z" if direct else "range"
 
 
@@ -257,7 +251,7 @@ def _csv(recording: SimulatedRecording, told: str) -> str:
     for prefix, (values, form) in groups.items():
         for k, pixel in enumerate(values.reshape(n, -1).T):
             columns[f"{prefix}_{k}"] = ["" if value != value else format(value, form) for value in pixel]
-    for name, values in _truth(recording).items():
+    for name, values in _truth(recording.views).items():
         columns[name] = [f"{value:.9g}" for value in values]
     columns["truth_class"] = [recording.class_name] * n
     text = io.StringIO()
