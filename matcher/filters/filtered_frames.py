@@ -23,6 +23,8 @@ from phasemark.render.sensor.range_noise import predicted_range_std
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.unwrapped_frames import unwrapped
 
+_ARRAYS = ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
+"""Fields of filtered frames with a number for each pixel."""
 _USUAL_LIMIT_RAD = 0.1
 """Phase noise where a frame does not know its own and the sensor allows no less."""
 _CHIP_ERROR_BINS = 0.03
@@ -93,7 +95,7 @@ class FilteredFrames:
 
     def __post_init__(self) -> None:
         shape = (len(self.range_m), self.sensor.rows, self.sensor.cols)
-        for name in ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective"):
+        for name in _ARRAYS:
             array = getattr(self, name)
             if array is not None and array.shape != shape:
                 raise UsageError(f"'{name}' must have shape (n, rows, cols) = {shape}, got {array.shape}")
@@ -110,17 +112,10 @@ class FilteredFrames:
     ) -> FilteredFrames:
         """Return some of the positions; one position is still a batch, of one."""
         rows = index if isinstance(index, slice) else np.atleast_1d(index)
-        return FilteredFrames(
-            self.range_m[rows],
-            self.std_m[rows],
-            None if self.amplitude_e is None else self.amplitude_e[rows],
-            None if self.intensity_e is None else self.intensity_e[rows],
-            self.state[rows],
-            self.n_effective[rows],
-            self.sensor,
-            self.std_from_scatter,
-            None if self.time_s is None else self.time_s[rows],
-            tuple(part[index] for part in self.by_frequency),
+        return self.with_arrays(
+            lambda array: array[rows],
+            time_s=None if self.time_s is None else self.time_s[rows],
+            by_frequency=tuple(part[index] for part in self.by_frequency),
         )
 
     def __iter__(self) -> Iterator[FilteredFrames]:
@@ -129,12 +124,13 @@ class FilteredFrames:
 
     def with_pixels(self, move: Callable[[NDArray[Any]], NDArray[Any]]) -> FilteredFrames:
         """Return the frames with their pixels elsewhere: mirrored or turned images of the same camera."""
-        moved: dict[str, Any] = {
-            name: np.ascontiguousarray(move(array))
-            for name in ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
-            if (array := getattr(self, name)) is not None
-        }
-        return replace(self, by_frequency=tuple(part.with_pixels(move) for part in self.by_frequency), **moved)
+        parts = tuple(part.with_pixels(move) for part in self.by_frequency)
+        return self.with_arrays(lambda array: np.ascontiguousarray(move(array)), by_frequency=parts)
+
+    def with_arrays(self, change: Callable[[NDArray[Any]], NDArray[Any]], **fields: Any) -> FilteredFrames:
+        """Return the frames with every array of pixels changed in one way, and with other fields replaced."""
+        arrays = {name: change(array) for name in _ARRAYS if (array := getattr(self, name)) is not None}
+        return replace(self, **arrays, **fields)
 
     def without_offset(self) -> FilteredFrames:
         """Return the frames with the sensor's offsets of range and zones taken off, of the same sensor without them."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, unwrap_filtered
 from phasemark.matcher.filters.loops import follow
-from phasemark.matcher.filters.pixel_sums import PixelSums, filter_each, in_time, pixels, pixels_of_frames, timed
+from phasemark.matcher.filters.pixel_sums import PixelSums, filter_each, pixels, pixels_of_frames, timed
 from phasemark.render.frames import Frames
-from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.sensor.sensor import Sensor
 
 
@@ -183,21 +181,11 @@ def kalman_filter(frames: Frames, process_var_m2: float = 0.0) -> FilteredFrames
     UsageError
         `process_var_m2` is negative or not finite, or there is no frame.
     """
-    _check_process_variance(process_var_m2)
     if len(frames.by_frequency) > 1:
         return filter_each(frames, lambda part: kalman_filter(part, process_var_m2))
-    sums = PixelSums(frames)
-    measurement_var = sums.law_variance_m2()
-    if measurement_var is None:
-        scatter = _Scatter.empty(sums.n_valid.shape, frames.sensor)
-        for range_m, valid in in_time(frames):
-            scatter.add(range_m, valid)
-        measurement_var = scatter.variance_m2()
-    measurement_var = _floored(measurement_var, process_var_m2)
-    track = _Track.empty(sums.n_valid.shape, frames.sensor)
-    track.follow(frames, process_var_m2, measurement_var)
-    filtered = sums.filtered(track.range_m, np.sqrt(track.scaled_var * measurement_var), track.n_effective())
-    return timed(filtered, frames)
+    filters = PixelKalman(frames.sensor, process_var_m2)
+    filters._take_in(frames)
+    return timed(filters.result(), frames)
 
 
 class PixelKalman:
@@ -221,13 +209,16 @@ class PixelKalman:
     """
 
     def __init__(self, sensor: Sensor, process_var_m2: float = 0.0) -> None:
-        _check_process_variance(process_var_m2)
+        if not (math.isfinite(process_var_m2) and process_var_m2 >= 0):
+            raise UsageError(f"'process_var_m2' must be zero or positive, got {process_var_m2}")
         self._sensor = sensor
         self._process_var_m2 = process_var_m2
-        self._sums: PixelSums | None = None
         self._each: tuple[PixelKalman, ...] = ()
-        self._scatter: _Scatter
-        self._track: _Track
+        self._sums: PixelSums | None = None
+        # of each pixel: the state, P / R (both NaN before the first valid frame), and R
+        self._range_m: NDArray[np.float64]
+        self._scaled_var: NDArray[np.float64]
+        self._measurement_var_m2: NDArray[np.float64]
 
     def update(self, frame: Frames) -> None:
         """Take in the next frame.
@@ -252,14 +243,25 @@ class PixelKalman:
             return
         if self._each:
             raise UsageError("the frame holds an unwrapped range alone, the ones before what each frequency measured")
+        self._take_in(frame)
+
+    def _take_in(self, frames: Frames) -> None:
+        """Take in any number of frames at each position, with the R of all of them; :meth:`update` checks them.
+
+        With Q = 0 no R enters the state: R = 0 (noise switched off) and R = ∞ (not known yet) give the running mean.
+        """
         if self._sums is None:
-            self._sums = PixelSums(frame)
-            self._scatter = _Scatter.empty(self._sums.n_valid.shape, self._sensor)
-            self._track = _Track.empty(self._sums.n_valid.shape, self._sensor)
+            self._sums = PixelSums(frames, scatter=True)
+            self._range_m = self._scaled_var = np.full(self._sums.n_valid.shape, np.nan)
         else:
-            self._sums.add(frame)
-        self._scatter.add(frame.range_m[:, 0], frame.valid[:, 0])
-        self._track.follow(frame, self._process_var_m2, self._measurement_var_m2(self._sums))
+            self._sums.add(frames)
+        # with Q/R finite for a camera without noise: an R of 1e-12 Q has a gain of one all the same
+        self._measurement_var_m2 = np.maximum(self._sums.variance_m2(), 1e-12 * self._process_var_m2)
+        self._range_m, self._scaled_var = self._range_m.copy(), self._scaled_var.copy()  # results may hold the old ones
+        follow(
+            pixels_of_frames(frames.range_m), pixels_of_frames(frames.flags), self._sensor.unambiguous_range_m,
+            self._process_var_m2, pixels(self._measurement_var_m2), pixels(self._range_m), pixels(self._scaled_var),
+        )  # fmt: skip
 
     def _update_each(self, frame: Frames) -> None:
         """Take in what each modulation frequency measured."""
@@ -282,76 +284,8 @@ class PixelKalman:
             return unwrap_filtered([one.result() for one in self._each], self._sensor)
         if self._sums is None:
             raise UsageError("no frame to filter: call update() first")
-        std_m = np.sqrt(self._track.scaled_var * self._measurement_var_m2(self._sums))
-        return self._sums.filtered(self._track.range_m, std_m, self._track.n_effective())
-
-    def _measurement_var_m2(self, sums: PixelSums) -> NDArray[np.float64]:
-        law = sums.law_variance_m2()
-        return _floored(self._scatter.variance_m2() if law is None else law, self._process_var_m2)
-
-
-@dataclass
-class _Track:
-    """State of the scalar filters, one per pixel, with P in units of R.
-
-    With Q = 0 no R enters: R = 0 (noise switched off) and R = ∞ (not known yet) still give the running mean.
-    """
-
-    range_m: NDArray[np.float64]
-    scaled_var: NDArray[np.float64]  # p = P/R; NaN before the first valid frame
-    sensor: Sensor
-
-    @classmethod
-    def empty(cls, shape: tuple[int, ...], sensor: Sensor) -> _Track:
-        return cls(np.full(shape, np.nan), np.full(shape, np.nan), sensor)
-
-    def follow(self, frames: Frames, process_var_m2: float, measurement_var_m2: NDArray[np.float64]) -> None:
-        """Take in the next frames."""
-        self.range_m, self.scaled_var = self.range_m.copy(), self.scaled_var.copy()  # results may hold the old ones
-        follow(
-            pixels_of_frames(frames.range_m), pixels_of_frames(frames.flags), self.sensor.unambiguous_range_m,
-            process_var_m2, pixels(measurement_var_m2), pixels(self.range_m), pixels(self.scaled_var),
-        )  # fmt: skip
-
-    def n_effective(self) -> NDArray[np.float64]:
-        return 1.0 / self.scaled_var
-
-
-@dataclass
-class _Scatter:
-    """Running mean and sum of squares of wrapped ranges (Welford's recurrence)."""
-
-    n: NDArray[np.int64]
-    mean_m: NDArray[np.float64]
-    squares_m2: NDArray[np.float64]
-    sensor: Sensor
-
-    @classmethod
-    def empty(cls, shape: tuple[int, ...], sensor: Sensor) -> _Scatter:
-        return cls(np.zeros(shape, dtype=np.int64), np.zeros(shape), np.zeros(shape), sensor)
-
-    def add(self, range_m: NDArray[np.float64], valid: NDArray[np.bool_]) -> None:
-        self.n = self.n + valid
-        step = wrap_difference_m(np.where(valid, range_m - self.mean_m, 0.0), self.sensor)
-        share = 1.0 / np.maximum(self.n, 1)
-        self.mean_m = self.mean_m + share * step
-        self.squares_m2 = self.squares_m2 + (1.0 - share) * step**2
-
-    def variance_m2(self) -> NDArray[np.float64]:
-        """Return the sample variance of one frame; infinite with fewer than two frames."""
-        variance = np.full(self.squares_m2.shape, np.inf)
-        np.divide(self.squares_m2, self.n - 1, out=variance, where=self.n > 1)
-        return variance
-
-
-def _floored(measurement_var_m2: NDArray[np.float64], process_var_m2: float) -> NDArray[np.float64]:
-    """Keep Q/R finite for a camera without noise: an R of 1e-12 Q has a gain of one all the same."""
-    return np.maximum(measurement_var_m2, 1e-12 * process_var_m2)
-
-
-def _check_process_variance(process_var_m2: float) -> None:
-    if not (math.isfinite(process_var_m2) and process_var_m2 >= 0):
-        raise UsageError(f"'process_var_m2' must be zero or positive, got {process_var_m2}")
+        std_m = np.sqrt(self._scaled_var * self._measurement_var_m2)
+        return self._sums.filtered(self._range_m, std_m, 1.0 / self._scaled_var)
 
 
 def _matrix(name: str, value: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:

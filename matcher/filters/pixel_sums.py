@@ -14,7 +14,7 @@ from phasemark import UsageError
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState, unwrap_filtered
 from phasemark.matcher.filters.loops import add_up, count
 from phasemark.render.frames import Frames
-from phasemark.render.phasor_images import wrap_range_m
+from phasemark.render.phasor_images import wrap_difference_m, wrap_range_m
 from phasemark.render.sensor.range_noise import measured_range_std
 
 _Number = TypeVar("_Number", bound=np.generic)
@@ -28,6 +28,8 @@ class PixelSums:
     ----------
     frames : Frames
         The first frames; :meth:`add` takes in further ones.
+    scatter : bool
+        Whether to find the scatter of the ranges where the noise law cannot be evaluated.
 
     Attributes
     ----------
@@ -40,7 +42,7 @@ class PixelSums:
         There is no frame.
     """
 
-    def __init__(self, frames: Frames) -> None:
+    def __init__(self, frames: Frames, *, scatter: bool = False) -> None:
         if frames.n_frames == 0:
             raise UsageError("there is no frame to filter")
         shape = (len(frames), *frames.range_m.shape[2:])
@@ -52,6 +54,9 @@ class PixelSums:
             for name in _SUMMED
             if getattr(frames, name) is not None
         }
+        self._has_law = len(self._sums) == len(_SUMMED) and len(self.sensor.frequencies_hz) == 1
+        self._has_scatter = scatter and not self._has_law
+        self._mean_m, self._squares_m2 = np.zeros(shape), np.zeros(shape)
         self.add(frames)
 
     def add(self, frames: Frames) -> None:
@@ -70,6 +75,8 @@ class PixelSums:
                 raise UsageError(
                     f"'{name}' must come with every frame or none: given with the {given}, not with the {missing}"
                 )
+        if self._has_scatter:
+            self._add_scatter(frames)
         flags = pixels_of_frames(frames.flags)
         count(flags, pixels(self.n_valid), pixels(self.n_usable))
         for name, sums in self._sums.items():
@@ -87,12 +94,27 @@ class PixelSums:
         number = np.where(self.n_valid > 0, self.n_valid, n_other)
         return np.asarray(np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0))
 
-    def law_variance_m2(self) -> NDArray[np.float64] | None:
-        """Return R of one frame by the noise law; None without amplitude or intensity of what the range is made of."""
+    def variance_m2(self) -> NDArray[np.float64]:
+        """Return R of one frame by the noise law.
+
+        Without amplitude or intensity of what the range is made of it is the sample variance of the ranges, infinite
+        with fewer than two frames.
+        """
         amplitude_e, intensity_e = self.mean("amplitude_e"), self.mean("intensity_e")
-        if amplitude_e is None or intensity_e is None or len(self.sensor.frequencies_hz) > 1:
-            return None
-        return measured_range_std(amplitude_e, intensity_e, self.sensor) ** 2
+        if self._has_law and amplitude_e is not None and intensity_e is not None:
+            return measured_range_std(amplitude_e, intensity_e, self.sensor) ** 2
+        variance = np.full(self._squares_m2.shape, np.inf)
+        return np.divide(self._squares_m2, self.n_valid - 1, out=variance, where=self.n_valid > 1)
+
+    def _add_scatter(self, frames: Frames) -> None:
+        """Take on mean and sum of squares of the wrapped ranges of valid frames (Welford's recurrence)."""
+        n = self.n_valid
+        for range_m, valid in in_time(frames):
+            n = n + valid
+            step = wrap_difference_m(np.where(valid, range_m - self._mean_m, 0.0), self.sensor)
+            share = 1.0 / np.maximum(n, 1)
+            self._mean_m = self._mean_m + share * step
+            self._squares_m2 = self._squares_m2 + (1.0 - share) * step**2
 
     def filtered(
         self,
@@ -116,7 +138,7 @@ class PixelSums:
             state=state.astype(np.uint8),
             n_effective=np.where(returned, n_effective, 0.0),
             sensor=self.sensor,
-            std_from_scatter=len(self._sums) < len(_SUMMED) or len(self.sensor.frequencies_hz) > 1,
+            std_from_scatter=not self._has_law,
         )
 
 

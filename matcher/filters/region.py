@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +12,6 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.render.phasor_images import wrap_range_m
 from phasemark.render.sensor.range_noise import measured_range_std
 from phasemark.render.sensor.region import Region
-from phasemark.render.sensor.sensor import Sensor
 
 
 def read_region(frames: FilteredFrames, region: Region) -> FilteredFrames:
@@ -45,7 +42,7 @@ def read_region(frames: FilteredFrames, region: Region) -> FilteredFrames:
     if frames.by_frequency:
         return unwrap_filtered([read_region(part, region) for part in frames.by_frequency], sensor)
     if region.binning == 1:
-        return _cut(frames, region, sensor)
+        return frames.with_arrays(lambda values: region.blocks(values)[..., 0], sensor=sensor)
     if frames.amplitude_e is None or frames.intensity_e is None:
         raise UsageError(
             f"'binning' of the bank is {region.binning}, and adding up pixels takes amplitudes, which the frames do not"
@@ -84,24 +81,6 @@ def read_region(frames: FilteredFrames, region: Region) -> FilteredFrames:
         sensor=sensor,
         std_from_scatter=frames.std_from_scatter,
         time_s=frames.time_s,
-    )
-
-
-def _cut(frames: FilteredFrames, region: Region, sensor: Sensor) -> FilteredFrames:
-    """Return frames cut down to a region whose pixels stay as they are."""
-
-    def cut(values: NDArray[Any]) -> NDArray[Any]:
-        return region.blocks(values)[..., 0]
-
-    return replace(
-        frames,
-        range_m=cut(frames.range_m),
-        std_m=cut(frames.std_m),
-        amplitude_e=None if frames.amplitude_e is None else cut(frames.amplitude_e),
-        intensity_e=None if frames.intensity_e is None else cut(frames.intensity_e),
-        state=cut(frames.state),
-        n_effective=cut(frames.n_effective),
-        sensor=sensor,
     )
 
 
