@@ -177,7 +177,7 @@ class _Surface:
             asked, first = np.unique(of_point, return_index=True)
             face = self._order[_FACES_OF_LEAF * leaf[first][:, None] + np.arange(_FACES_OF_LEAF)]
             distance = _squared_distance(np.repeat(points[asked], _FACES_OF_LEAF, axis=0), self.triangles[face.ravel()])
-            missing[asked] = (distance.reshape(face.shape) > self.tolerance_m**2).all(axis=1)
+            missing[asked] = ~(distance.reshape(face.shape) <= self.tolerance_m**2).any(axis=1)
             left = missing[of_point]
             left[first] = False
             of_point, leaf = of_point[left], leaf[left]
@@ -206,21 +206,10 @@ class _Surface:
 
 
 def _squared_distance(points: _Float, triangles: _Float) -> _Float:
-    """Return the squared distance of each point from its triangle; (n, 3) and (n, 3, 3)."""
-    best = np.full(len(points), math.inf)
-    for k in range(3):
-        start, along = triangles[:, k], triangles[:, (k + 1) % 3] - triangles[:, k]
-        length = np.maximum((along**2).sum(axis=1), 1e-300)
-        share = (((points - start) * along).sum(axis=1) / length).clip(0, 1)
-        best = np.minimum(best, ((points - start - share[:, None] * along) ** 2).sum(axis=1))
-    a = triangles[:, 0]
-    ab, ac, ap = triangles[:, 1] - a, triangles[:, 2] - a, points - a
-    normal = np.cross(ab, ac)
-    square = np.maximum((normal**2).sum(axis=1), 1e-300)
-    v = (np.cross(ap, ac) * normal).sum(axis=1) / square
-    w = (np.cross(ab, ap) * normal).sum(axis=1) / square
-    above = (ap * normal).sum(axis=1) ** 2 / square
-    return np.where((v >= 0) & (w >= 0) & (v + w <= 1), np.minimum(above, best), best)
+    """Return the squared distance of each point from its triangle, (n, 3) and (n, 3, 3); NaN without any area."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        nearest = trimesh.triangles.closest_point(triangles, points)
+    return np.asarray(((nearest - points) ** 2).sum(axis=1))
 
 
 def _primes(most: int) -> list[int]:

@@ -4,7 +4,9 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -37,3 +39,24 @@ def pytest_configure(config: pytest.Config) -> None:
 def one_example_of_each_method(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the report of a sweep draw one frame of each method and not four: a picture takes half a second."""
     monkeypatch.setattr("phasemark.matcher.sweep.report._MOST_EXAMPLES", 1)
+
+
+class Outcome(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., Outcome]]:
+    """Run a command in this process; return its exit code, standard output and standard error."""
+    from phasemark.cli import main  # not above: the environment is set before anything is imported
+
+    def call(*arguments: object) -> Outcome:
+        capsys.readouterr()
+        code = main([str(argument) for argument in arguments])
+        return Outcome(code, *capsys.readouterr())
+
+    before = signal.getsignal(signal.SIGTERM)
+    yield call
+    signal.signal(signal.SIGTERM, before)

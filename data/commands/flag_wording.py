@@ -4,26 +4,18 @@ from __future__ import annotations
 
 import re
 
+_NAMED_ALIKE = (
+    "amplitude_unit", "board", "content", "flip_h", "flip_v", "force", "moving", "quantity", "resume", "scheduler",
+    "to", "topic", "unit", "valid_status",
+)  # fmt: skip
 FLAGS = {
-    "amplitude_unit": "--amplitude-unit",
+    **{name: f"--{name.replace('_', '-')}" for name in _NAMED_ALIKE},
     "background": "--wall, --floor",
-    "board": "--board",
-    "content": "--content",
     "fixed": "--fix",
-    "flip_h": "--flip-h",
-    "force": "--force",
-    "moving": "--moving",
     "n": "--population",
     "part": "--shard",
     "pose_std": "--position-std, --heading-std and --delta-std",
-    "quantity": "--quantity",
-    "resume": "--resume",
-    "scheduler": "--scheduler",
-    "to": "--to",
-    "topic": "--topic",
     "trusted": "--matcher",
-    "unit": "--unit",
-    "valid_status": "--valid-status",
 }
 """Parameters that messages name, as ``name=value``, ``name=True`` or ``name=…``, and their flags."""
 PHRASES = {

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from phasemark.data import Bank, FrameSet
     from phasemark.landmarks import LandmarkSpec
     from phasemark.landmarks.mesh import Surface
-    from phasemark.render import Background, Sensor
+    from phasemark.render import Background, Renderer, Sensor
     from phasemark.render.integral.surface_mesh import SurfaceMesh
 
 
@@ -86,6 +86,14 @@ def class_surface(name: str) -> Surface:
     from phasemark.landmarks.mesh import build_surface
 
     return build_surface(_class_spec(name))
+
+
+def class_renderers(sensor: Sensor) -> dict[str, Renderer]:
+    """Return a renderer of each class of the catalogue."""
+    from phasemark.landmarks import catalog
+    from phasemark.render import Renderer
+
+    return {name: Renderer(class_surface(name), sensor, albedo=spec.albedo) for name, spec in catalog().items()}
 
 
 def _class_spec(name: str) -> LandmarkSpec:

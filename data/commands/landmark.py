@@ -13,7 +13,7 @@ from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import echo_facts, echo_json, echo_table, readable
 from phasemark.data.commands.inputs import class_mesh, read_landmark
 from phasemark.data.commands.options import ClassName, Force, Json, MeshReading, Out, a_class
-from phasemark.data.commands.outputs import refuse_existing, refuse_input_files
+from phasemark.data.commands.outputs import refuse_existing, refuse_input_files, write_file
 
 if TYPE_CHECKING:
     from phasemark.landmarks import LandmarkSpec
@@ -58,7 +58,6 @@ def landmark_show(
     out
         Folder that NAME.png and NAME.html go to.
     """
-    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.data.files.folder_marker import made_folder
     from phasemark.landmarks import mesh_figure
     from phasemark.landmarks.figures import mesh_html
@@ -68,8 +67,8 @@ def landmark_show(
     figure, page = folder / f"{name}.png", folder / f"{name}.html"
     refuse_existing([figure, page], force)
     with made_folder(folder):
-        write_atomically(figure, mesh_figure(mesh, directions=True), force=force)
-        write_atomically(page, mesh_html(mesh, readable(name)).encode(), force=force)
+        write_file(figure, mesh_figure(mesh, directions=True), force)
+        write_file(page, mesh_html(mesh, readable(name)), force)
     typer.echo(figure)
     typer.echo(page)
 
@@ -82,12 +81,11 @@ def landmark_export(name: ClassName, *, out: Out, force: Force = False) -> None:
     out
         The file; .stl, .ply, .obj or .off.
     """
-    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.landmarks import export_mesh
 
     refuse_input_files([out])
     mesh = class_mesh(name)
-    typer.echo(write_atomically(out, export_mesh(mesh, out.suffix.removeprefix(".")), force=force))
+    typer.echo(write_file(out, export_mesh(mesh, out.suffix.removeprefix(".")), force))
 
 
 def landmark_check(file: Path, *, mesh_reading: MeshReading, as_json: Json = False) -> None:

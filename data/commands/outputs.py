@@ -63,12 +63,18 @@ def refuse_other_files(path: Path, suffix: str, what: str = "the figure") -> Non
         raise UsageError(f"{what} must be a {suffix} file, got '{path}'")
 
 
+def write_file(path: Path, content: str | bytes, force: bool) -> Path:
+    """Write a whole file, text as UTF-8."""
+    from phasemark.data.files.atomic_write import write_atomically
+
+    return write_atomically(path, content.encode() if isinstance(content, str) else content, force=force)
+
+
 def write_figure(path: Path, figure: Figure, force: bool, *, dpi: float = 120) -> Path:
     """Write a figure as PNG."""
-    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.render.png import figure_png
 
-    return write_atomically(path, figure_png(figure, dpi=dpi), force=force)
+    return write_file(path, figure_png(figure, dpi=dpi), force)
 
 
 def refuse_unwritable_files(paths: Iterable[Path], force: bool) -> None:

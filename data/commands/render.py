@@ -12,7 +12,7 @@ import typer
 
 from phasemark.data.commands.inputs import ClassOrMesh, background_of, note_too_far, read_sensor
 from phasemark.data.commands.options import Floor, Force, Out, SensorName, View, Wall
-from phasemark.data.commands.outputs import refuse_existing, refuse_other_files
+from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_file
 
 if TYPE_CHECKING:
     from phasemark.render import PhasorImages
@@ -77,7 +77,6 @@ def _write_image(image: PhasorImages, histograms: HistogramImages | None, out: P
 
     import numpy as np
 
-    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.render.png import figure_png
 
     arrays = {
@@ -95,5 +94,5 @@ def _write_image(image: PhasorImages, histograms: HistogramImages | None, out: P
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     figure = figure_png((image if histograms is None else histograms).plot(), dpi=120)
-    write_atomically(data, buffer.getvalue(), force=force)
-    write_atomically(out, figure, force=force)
+    write_file(data, buffer.getvalue(), force)
+    write_file(out, figure, force)

@@ -17,7 +17,7 @@ from phasemark.data.commands.command import Shown, Without
 from phasemark.data.commands.console import echo_json, echo_table, readable, tell
 from phasemark.data.commands.inputs import note_too_far, read_sensor, read_sensor_sources
 from phasemark.data.commands.options import Force, FrameReading, Json, Metres, Out, SensorName
-from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure
+from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure, write_file
 from phasemark.inputs.numbers import in_words
 from phasemark.inputs.toml_file import toml_value
 
@@ -68,10 +68,6 @@ def which_frequency(sensor: Sensor, hz: float | None) -> int:
         got = "nothing" if hz is None else f"{hz:.12g}"
         raise UsageError(f"--frequency must be one of the sensor's {in_words(known)} Hz, got {got}")
     return known.index(hz)
-
-
-def _in_mhz(sensor: Sensor) -> str:
-    return " + ".join(f"{hz / 1e6:g}" for hz in sensor.frequencies_hz)
 
 
 def sensor_show(
@@ -186,7 +182,6 @@ def sensor_import(
     modulation
         Modulation frequency; by default that of --like.
     """
-    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.render.sensor.camera_info import read_camera_info
     from phasemark.render.sensor.lens_fields import DERIVED
     from phasemark.render.sensor.sensor_file import sensor_toml
@@ -220,7 +215,7 @@ def sensor_import(
         f"Made by phasemark from {camera_info.name} ({found.distortion_model}); all else is as in {origin}.",
         "Half angles and principal point follow from [lens]. OpenCV counts pixels from the centre of the first one.",
     ]
-    write_atomically(out, sensor_toml(sensor, comments, header=header, otherwise=assumed).encode(), force=force)
+    write_file(out, sensor_toml(sensor, comments, header=header, otherwise=assumed), force)
     echo_json({"file": str(out), **sensor.as_dict()}) if as_json else typer.echo(out)
 
 
@@ -270,7 +265,6 @@ def sensor_fit(
     amplitude_unit
         Unit of amplitude and intensity: electrons or arbitrary.
     """
-    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.render.bench.fit.fit_sensor import fit_sensor
 
     refuse_other_files(out, ".toml", "the sensor")
@@ -291,7 +285,7 @@ def sensor_fit(
         amplitude_unit=amplitude_unit,
         distance_std_m=distance_std or None,
     )
-    write_atomically(out, fit.to_toml(base_name=readable(sensor)).encode(), force=force)
+    write_file(out, fit.to_toml(base_name=readable(sensor)), force)
     if as_json:
         echo_json({"file": str(out), **fit.as_dict()})
         return

@@ -14,7 +14,7 @@ from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable, tell
 from phasemark.data.commands.inputs import read_sensor
 from phasemark.data.commands.options import Force, Json, Metres, Out, SensorName
-from phasemark.data.commands.outputs import refuse_existing, refuse_other_files
+from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_file
 
 if TYPE_CHECKING:
     from phasemark.render import Sensor
@@ -48,7 +48,6 @@ def sensor_fit_direct(
     nearest
         Distances of the plane below this are left out.
     """
-    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.data.files.same_file import refuse_inputs
     from phasemark.render.direct import fit_direct_sensor
     from phasemark.render.sensor.sensor_file import sensor_toml
@@ -63,7 +62,7 @@ def sensor_fit_direct(
         fit = fit_direct_sensor(recording, objects, base=base)
     header = [f"Fitted by phasemark to {plane.name}" + "".join(f", {one.name}" for one in objects)]
     text = sensor_toml(fit.sensor, {}, header=header, otherwise="measured or as the sensor it was fitted from")
-    write_atomically(out, text.encode(), force=force)
+    write_file(out, text, force)
     squared = (fit.plane_range_m(recording) - recording.distance_m[:, None]) ** 2
     spread_mm = (1e3 * squared.mean(axis=0) ** 0.5).tolist()
     if as_json:

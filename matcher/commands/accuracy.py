@@ -11,7 +11,7 @@ import typer
 
 from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import echo_json
-from phasemark.data.commands.inputs import ClassOrMesh, background_of, class_surface, note_too_far, read_sensor
+from phasemark.data.commands.inputs import ClassOrMesh, background_of, class_renderers, note_too_far, read_sensor
 from phasemark.data.commands.options import Count, Degrees, Floor, Json, Metres, SensorName, Wall
 
 
@@ -43,6 +43,7 @@ def accuracy_line(
     from phasemark.landmarks import catalog
     from phasemark.matcher.accuracy.expected_accuracy import accuracy_card, sides_of
     from phasemark.render import Renderer, Views
+    from phasemark.render.view import delta_period_rad
 
     landmark.check("judge")
     name, mesh = landmark.read()
@@ -51,23 +52,12 @@ def accuracy_line(
     renderer = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8))
     views = Views.broadcast(distance, math.radians(delta or 0.0))
     renderer.check_in_view(views)
-    if delta is None:
-        views = sides_of(distance, _period_rad(landmark.class_name))
-    others = {
-        other: Renderer(class_surface(other), camera, albedo=spec.albedo)
-        for other, spec in catalog().items()
-        if other != landmark.class_name
-    }
+    if delta is None:  # a mesh is seen from all around
+        symmetry = 1 if landmark.class_name is None else catalog()[landmark.class_name].symmetry
+        views = sides_of(distance, delta_period_rad(symmetry))
+    others = {other: one for other, one in class_renderers(camera).items() if other != landmark.class_name}
     card = accuracy_card(renderer, views, others=others, n_frames=n_frames, background=background_of(wall, floor))
     if as_json:
         echo_json({"landmark": name, "sensor": sensor, "wall_m": wall, "floor_m": floor, **card.as_dict()})
         return
     typer.echo(f"{name} {card.line()}")
-
-
-def _period_rad(class_name: str | None) -> float:
-    """Return the period of δ of a class of the catalogue; a mesh is seen from all around."""
-    from phasemark.landmarks import catalog
-    from phasemark.render.view import delta_period_rad
-
-    return delta_period_rad(1 if class_name is None else catalog()[class_name].symmetry)

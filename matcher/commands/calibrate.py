@@ -31,7 +31,7 @@ from phasemark.data.commands.options import (
     Workers,
     a_class,
 )
-from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure
+from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure, write_file
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -234,7 +234,6 @@ def _start(
 
 def _write_calibration(found: Calibration, out: Path, figure: Path, base_name: str, force: bool) -> None:
     """Write the sensor file and the figure of the residuals, unless the calibration cannot be trusted."""
-    from phasemark.data.files.atomic_write import write_atomically
     from phasemark.matcher.calibration.report import residual_figure
 
     if found.doubts and not force:
@@ -243,7 +242,7 @@ def _write_calibration(found: Calibration, out: Path, figure: Path, base_name: s
             f" {found.cause} (--force writes it all the same)"
         )
     write_figure(figure, residual_figure(found), force, dpi=100)
-    write_atomically(out, found.to_toml(base_name=readable(base_name)).encode(), force=force)
+    write_file(out, found.to_toml(base_name=readable(base_name)), force)
 
 
 def _names(text: str) -> list[str]:

@@ -11,7 +11,7 @@ import typer
 from phasemark import PhasemarkError
 from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo_json, readable
-from phasemark.data.commands.inputs import class_surface, read_sensor
+from phasemark.data.commands.inputs import class_renderers, read_sensor
 from phasemark.data.commands.options import Force, Json, Out, Seed, SensorName
 from phasemark.data.commands.outputs import output_folder
 from phasemark.data.commands.sensor import Frequency, which_frequency
@@ -65,18 +65,15 @@ def _bound(sensor: Sensor, distance_m: float) -> str | None:
     """
     from phasemark.landmarks import catalog
     from phasemark.matcher.accuracy.expected_accuracy import accuracy_card, sides_of
-    from phasemark.render import Renderer
     from phasemark.render.view import delta_period_rad
 
-    specs = catalog()
+    name, spec = next(iter(catalog().items()))
     try:
-        first, *others = (
-            (name, Renderer(class_surface(name), sensor, albedo=spec.albedo)) for name, spec in specs.items()
-        )
-        name, renderer = first
-        views = sides_of(distance_m, delta_period_rad(specs[name].symmetry))
+        others = class_renderers(sensor)
+        renderer = others.pop(name)
+        views = sides_of(distance_m, delta_period_rad(spec.symmetry))
         renderer.check_in_view(views)
-        card = accuracy_card(renderer, views, others=dict(others))
+        card = accuracy_card(renderer, views, others=others)
     except PhasemarkError:
         return None
     return f"{name} {card.line()}"

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from phasemark.data.commands.options import FrameReading
@@ -14,32 +13,23 @@ if TYPE_CHECKING:
     from phasemark.matcher.diagnosis.diagnose import Change, Diagnosis
 
 
-@dataclass(frozen=True)
-class Given:
-    """Options of a command on reading and matching frames that a diagnosis depends on."""
-
-    reading: FrameReading
-    nearest: bool
-    bearing_fixed: bool
+def diagnosis_text(diagnosis: Diagnosis, reading: FrameReading, nearest: bool, bearing_fixed: bool) -> str:
+    """Return a diagnosis in one line that names options, given those of a command that it depends on."""
+    return diagnosis.message(lambda change: _flags(change, reading, nearest, bearing_fixed))
 
 
-def diagnosis_text(diagnosis: Diagnosis, given: Given) -> str:
-    """Return a diagnosis in one line that names options."""
-    return diagnosis.message(lambda change: _flags(change, given))
-
-
-def _flags(change: Change, given: Given) -> str:
+def _flags(change: Change, reading: FrameReading, nearest: bool, bearing_fixed: bool) -> str:
     """Return the options that make one change."""
     from phasemark.data.measured.reading import METRES_PER_UNIT
 
     value = change.value
-    refine = "--method refine " if given.nearest else ""
-    turned = given.reading.rotate in (90, 270)  # mirrored before it is turned: left and right become top and bottom
+    refine = "--method refine " if nearest else ""
+    turned = reading.rotate in (90, 270)  # mirrored before it is turned: left and right become top and bottom
     if change.parameter == "method":
         return refine.strip()
     if change.parameter == "free":
         names = [name.removesuffix("_rad").removesuffix("_m") for name in value[2:]]
-        instead = " instead of --fix bearing" if given.bearing_fixed and "bearing" in names else ""
+        instead = " instead of --fix bearing" if bearing_fixed and "bearing" in names else ""
         return refine + " ".join(f"--free {name}" for name in names) + instead
     if change.parameter == "on":
         return f"{refine}--on {value}"
@@ -51,14 +41,14 @@ def _flags(change: Change, given: Given) -> str:
         planes = ((f"--{name}", getattr(value, f"{name}_m")) for name in ("wall", "floor"))
         return refine + " ".join(f"{option} {metres:.4f}" for option, metres in planes if metres is not None)
     if change.parameter in ("flip_h", "flip_v"):
-        return _flip((change.parameter == "flip_h") != turned, given.reading)
+        return _flip((change.parameter == "flip_h") != turned, reading)
     if change.parameter == "rotate":
-        angle = (given.reading.rotate + value) % 360
+        angle = (reading.rotate + value) % 360
         return f"--rotate {angle}" if angle else "without --rotate"
     if change.parameter == "quantity":
         return f"--quantity {value}"
     if change.parameter == "unit_factor":
-        scale = None if given.reading.unit is None else METRES_PER_UNIT[given.reading.unit] * value
+        scale = None if reading.unit is None else METRES_PER_UNIT[reading.unit] * value
         right = next((name for name, metres in METRES_PER_UNIT.items() if scale and math.isclose(metres, scale)), None)
         return f"a unit {value:g} times as large as the file states" if right is None else f"--unit {right}"
     if change.parameter == "half_angle_deg":

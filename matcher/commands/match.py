@@ -7,9 +7,9 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,17 +20,16 @@ from phasemark.data.commands.command import Shown, stated_flags
 from phasemark.data.commands.console import LongWork, Table, echo_facts, echo_json, one_line, tell
 from phasemark.data.commands.inputs import note_too_far, open_any_bank
 from phasemark.data.commands.options import FrameReading
-from phasemark.data.commands.outputs import refuse_unwritable_files, write_figure
-from phasemark.matcher.commands.diagnosis_flags import Given, diagnosis_text
+from phasemark.data.commands.outputs import refuse_unwritable_files, write_figure, write_file
+from phasemark.matcher.commands.diagnosis_flags import diagnosis_text
 from phasemark.matcher.commands.match_options import Landmark, Place, Results, Search
 from phasemark.matcher.commands.match_table import Columns, bank_ends, match_rows, summary
 
 if TYPE_CHECKING:
-    from phasemark.data import Bank
     from phasemark.data.measured.orientation import Orientation
     from phasemark.matcher import FilteredFrames, Match, Matcher
     from phasemark.matcher.position.landmark_map import LandmarkMap
-    from phasemark.matcher.recordings.direct_positions import DirectBatch, DirectPositions
+    from phasemark.matcher.recordings.direct_positions import DirectPositions
     from phasemark.matcher.recordings.estimates_table import MatchedBatch
     from phasemark.render import Frames
 
@@ -70,7 +69,7 @@ def match_frames(
     learn_orientation
         With refine: learn from up to 10 frames how the image is mirrored and turned, then match.
     """
-    from phasemark.data.files.atomic_write import write_atomically
+    from phasemark.matcher.figures import match_figure
 
     place.check()
     landmark.check(bank)
@@ -80,80 +79,69 @@ def match_frames(
     if learn_orientation:
         _refuse_to_learn(reading, search)
     if search.is_direct:
-        _match_directly(bank, frames, reading, search, place, landmarks, moving, results)
-        return
-    with landmark.opened(bank, frames, reading) as opened:
-        measured = reading.read(frames, opened.camera)
-        note_too_far(opened.camera, {"--wall": search.wall})
+        _refuse_images(reading, search, results)
+    with open_any_bank(bank) if search.is_direct else landmark.opened(bank, frames, reading) as opened:
         search = search.for_bank(opened)
         matcher = search.matcher(opened)
-        if learn_orientation:
-            reading = replace(reading, **_learnt(matcher, measured, frames))
-            measured = reading.read(frames, opened.camera)
-        positions = measured.each_a_position() if moving else measured
+        if search.is_direct:
+            positions: Frames | DirectPositions = _direct_positions(frames, matcher, reading, moving)
+        else:
+            positions, reading = _positions(frames, matcher, reading, moving, learn_orientation)
+            note_too_far(opened.camera, {"--wall": search.wall})
         plots = results.plots(len(positions))
         refuse_unwritable_files(results.files(plots), results.force)
-        if not moving:
-            _note_motion(measured, frames)
         printed = _Answers(search, place, results, landmarks, plots, moving)
         printed.match_all(matcher, positions)
         printed.note_what_is_open(matcher)
         if results.estimates is not None:
-            write_atomically(results.estimates, printed.estimated.to_csv().encode(), force=results.force)
+            write_file(results.estimates, printed.estimated.to_csv(), results.force)
         printed.diagnose(matcher, reading)
         if results.as_json:
             echo_json({"bank": str(bank), "frames": str(frames), "matches": printed.answers})
         for k, path in plots.items():
-            _save_match_figure(path, *printed.drawn[k], opened, search, results.force)
+            filtered, match = printed.drawn[k]
+            figure = match_figure(filtered, match, opened, search.background, reported=search.on == "reported")
+            write_figure(path, figure, results.force)
     if not (results.as_json or results.as_jsonl):
         for path in results.files(plots):
             typer.echo(path)
         _note_plots(plots, results.plot_index, len(positions))
 
 
-def _match_directly(
-    bank: Path,
-    frames: Path,
-    reading: FrameReading,
-    search: Search,
-    place: Place,
-    landmarks: LandmarkMap | None,
-    moving: bool,
-    results: Results,
-) -> None:
-    """Match a log of histograms or targets."""
-    from phasemark.data.files.atomic_write import write_atomically
+def _positions(
+    file: Path, matcher: Matcher, reading: FrameReading, moving: bool, learn: bool
+) -> tuple[Frames, FrameReading]:
+    """Return the frames of a file, and how they are read: as stated, or with the orientation that they tell."""
+    measured = reading.read(file, matcher.bank.camera)
+    if learn:
+        reading = replace(reading, **_learnt(matcher, measured, file))
+        measured = reading.read(file, matcher.bank.camera)
+    if moving:
+        return measured.each_a_position(), reading
+    _note_motion(measured, file)
+    return measured, reading
+
+
+def _direct_positions(file: Path, matcher: Matcher, reading: FrameReading, moving: bool) -> DirectPositions:
+    """Return the histograms or targets of a log."""
     from phasemark.data.plans.size import format_size
     from phasemark.matcher.recordings.direct_positions import read_positions
 
-    _refuse_turned(reading)
-    if results.plot is not None:
-        raise UsageError(f"--plot draws ranges: leave it out with --on {search.on}")
-    with open_any_bank(bank) as opened:
-        matcher = search.matcher(opened)
-        on, valid_status = matcher.options["on"], reading.valid_status
-        positions = read_positions(frames, opened.camera, on, moving=moving, valid_status=valid_status)
-        refuse_unwritable_files(results.files({}), results.force)
-        tell(f"note: histograms are rendered first, a table of {format_size(matcher.table_bytes)}")
-        printed = _Answers(search, place, results, landmarks, {}, moving)
-        printed.match_all(matcher, positions)
-        printed.note_what_is_open(matcher)
-        if results.as_json:
-            echo_json({"bank": str(bank), "frames": str(frames), "matches": printed.answers})
-        if results.estimates is not None:
-            write_atomically(results.estimates, printed.estimated.to_csv().encode(), force=results.force)
-    if not (results.as_json or results.as_jsonl):
-        for path in results.files({}):
-            typer.echo(path)
+    on, camera = matcher.options["on"], matcher.bank.camera
+    positions = read_positions(file, camera, on, moving=moving, valid_status=reading.valid_status)
+    tell(f"note: histograms are rendered first, a table of {format_size(matcher.table_bytes)}")
+    return positions
 
 
-def _refuse_turned(reading: FrameReading) -> None:
-    """Refuse what is said of images of ranges."""
+def _refuse_images(reading: FrameReading, search: Search, results: Results) -> None:
+    """Refuse what is said of images of ranges, where histograms or targets are matched."""
     for option in stated_flags(replace(reading, valid_status=None)):
         raise UsageError(
             f"{option} goes with images of ranges: zones of a direct sensor's log are turned by 'zone_order' in its"
             " [histogram] table, and its units are fixed"
         )
+    if results.plot is not None:
+        raise UsageError(f"--plot draws ranges: leave it out with --on {search.on}")
 
 
 def _refuse_to_learn(reading: FrameReading, search: Search) -> None:
@@ -192,140 +180,134 @@ _WIDEST = 88
 _OUTSIDE = "outside the bank"
 
 
+@dataclass
 class _Answers:
     """Matches that are printed batch by batch, and what of them is needed at the end."""
 
-    def __init__(
-        self,
-        search: Search,
-        place: Place,
-        results: Results,
-        landmarks: LandmarkMap | None,
-        plots: Mapping[int, Path],
-        moving: bool,
-    ) -> None:
-        self._search, self._place, self._results, self._landmarks = search, place, results, landmarks
-        self._plots, self._moving, self._counted = plots, moving, "frame" if moving else "position"
-        self._table: Table | None = None  # its columns are those of the first match
-        self.answers: list[dict[str, Any]] = []  # all of them only for --json, whose answers are one list
-        self.drawn: dict[int, tuple[FilteredFrames, Match]] = {}
-        self._refused: tuple[int, FilteredFrames] | None = None
-        self._pose_time_s: Sequence[float] | None = None
-        self._reasons: list[str] = []
-        self._distances_m: list[float] = []
-        self._n_mirrored = 0
+    search: Search
+    place: Place
+    results: Results
+    landmarks: LandmarkMap | None
+    plots: Mapping[int, Path]
+    moving: bool
+    answers: list[dict[str, Any]] = field(default_factory=list)
+    """All of them only for --json, whose answers are one list."""
+    drawn: dict[int, tuple[FilteredFrames, Match]] = field(default_factory=dict)
+    reasons: list[str] = field(default_factory=list)
+    distances_m: list[float] = field(default_factory=list)
+    n_mirrored: int = 0
+    pose_time_s: Sequence[float] | None = None
+    refused: tuple[int, FilteredFrames] | None = None
+    table: Table | None = None
+    """Its columns are those of the first match."""
+
+    @property
+    def counted(self) -> str:
+        """What has an answer."""
+        return "frame" if self.moving else "position"
 
     def match_all(self, matcher: Matcher, positions: Frames | DirectPositions) -> None:
         """Match all positions, and print each batch as soon as it is known."""
         from phasemark.matcher.filters.stamps import pose_times_s
-        from phasemark.matcher.recordings.direct_positions import DirectPositions, match_directly
+        from phasemark.matcher.recordings.direct_positions import DirectPositions
         from phasemark.matcher.recordings.estimates_table import EstimateTable, match_in_batches
 
-        n, averaged = len(positions), self._search.filter()
-        self._columns = Columns(
-            self._counted if self._moving or n > 1 else None,
-            matcher.free,
-            matcher.options["background"],
-            self._landmarks is not None,
-        )
+        n = len(positions)
+        counted = self.counted if self.moving or n > 1 else None
+        columns = Columns(counted, matcher.free, matcher.options["background"], self.place.is_stated)
         frames = positions.frames if isinstance(positions, DirectPositions) else positions
         stamps_s = getattr(frames, "time_s", None)
         if stamps_s is not None:
-            self._pose_time_s = pose_times_s(stamps_s, matcher.bank.sensor.delay_s).tolist()
-        self.estimated = EstimateTable(matcher.free, self._pose_time_s)
+            self.pose_time_s = pose_times_s(stamps_s, matcher.bank.sensor.delay_s).tolist()
+        self.estimated = EstimateTable(matcher.free, self.pose_time_s)
         at_once = NEAREST_AT_ONCE if matcher.method == "nearest" else REFINED_AT_ONCE
         with LongWork("matching") if n > at_once else nullcontext() as progress:
-            if isinstance(positions, DirectPositions):
-                batches: Iterator[MatchedBatch | DirectBatch] = match_directly(matcher, positions, at_once=at_once)
-            else:
-                batches = match_in_batches(matcher, positions, averaged, at_once=at_once)
-            for batch in batches:
-                self._print([self._answer(batch, k) for k in range(len(batch.matches))], batch.start)
-                if self._results.estimates is not None:
-                    self.estimated.add(batch)
+            for batch in match_in_batches(matcher, positions, self.search.filter(), at_once=at_once):
+                answers = [self._answer(batch, k) for k in range(len(batch.matches))]
+                self._print(answers, batch.start, columns)
+                self.estimated.add(batch)
                 sys.stdout.flush()
                 if progress is not None:
                     progress(batch.start + len(batch.matches), n)
 
-    def _answer(self, batch: MatchedBatch | DirectBatch, k: int) -> dict[str, Any]:
+    def _answer(self, batch: MatchedBatch, k: int) -> dict[str, Any]:
         """Return a match of a batch as plain numbers, and note what is needed of it later."""
-        from phasemark.matcher.recordings.direct_positions import DirectBatch
+        from phasemark.matcher import FilteredFrames
 
         match, index = batch.matches[k], batch.start + k
         answer = match.as_dict()
         if batch.filtered.time_s is not None:
             answer["time_s"] = float(batch.filtered.time_s[k])
-        if self._pose_time_s is not None:
-            answer["pose_time_s"] = self._pose_time_s[index]
-        if self._landmarks is not None:
-            answer["poses"] = self._place.poses(match, self._landmarks)
-        self._reasons.append("" if match.accepted else match.reason or "no landmark")
-        self._distances_m.append(match.distance_m)
-        self._n_mirrored += bool(match.may_be_mirrored)
-        if isinstance(batch, DirectBatch):
-            return answer
-        if index in self._plots:
-            self.drawn[index] = batch.filtered[k : k + 1], match
-        if self._refused is None and not match.accepted:
-            self._refused = index, batch.filtered[k : k + 1]
+        if self.pose_time_s is not None:
+            answer["pose_time_s"] = self.pose_time_s[index]
+        if self.place.is_stated:
+            answer["poses"] = self.place.poses(match, self.landmarks)
+        self.reasons.append("" if match.accepted else match.reason or "no landmark")
+        self.distances_m.append(match.distance_m)
+        self.n_mirrored += bool(match.may_be_mirrored)
+        if isinstance(batch.filtered, FilteredFrames):
+            if index in self.plots:
+                self.drawn[index] = batch.filtered[k : k + 1], match
+            if self.refused is None and not match.accepted:
+                self.refused = index, batch.filtered[k : k + 1]
         return answer
 
-    def _print(self, answers: Sequence[dict[str, Any]], start: int) -> None:
-        if self._results.as_json:
+    def _print(self, answers: Sequence[dict[str, Any]], start: int, columns: Columns) -> None:
+        if self.results.as_json:
             self.answers += answers
-        elif self._results.as_jsonl:
+        elif self.results.as_jsonl:
             for k, answer in enumerate(answers, start):
                 typer.echo(json.dumps({"index": k, **answer}, ensure_ascii=False, allow_nan=False))
         else:
-            rows = match_rows(answers, start, self._columns)
+            rows = match_rows(answers, start, columns)
             width = sum(max(len(title), len(value)) + 2 for title, value in rows[0].items())
-            if self._search.on == "reported" and self._columns.counted is None and width > _WIDEST:
+            if self.search.on == "reported" and columns.counted is None and width > _WIDEST:
                 echo_facts(rows[0])
                 return
-            self._table = self._table or Table(list(rows[0]))
-            self._table.echo([list(row.values()) for row in rows])
+            self.table = self.table or Table(list(rows[0]))
+            self.table.echo([list(row.values()) for row in rows])
 
     def note_what_is_open(self, matcher: Matcher) -> None:
         """Count what was accepted; say where the bank ends too early, and where images may be mirrored."""
-        if len(self._reasons) > 1:
-            tell(f"note: {summary(self._reasons, self._counted)}")
-        if n_outside := self._reasons.count(_OUTSIDE):
+        if len(self.reasons) > 1:
+            tell(f"note: {summary(self.reasons, self.counted)}")
+        if n_outside := self.reasons.count(_OUTSIDE):
             tell(
-                f"note: {n_outside} {self._counted}s show views outside the bank, where no other explanation was"
+                f"note: {n_outside} {self.counted}s show views outside the bank, where no other explanation was"
                 " looked for: build it over a wider range (bank info shows the range)"
             )
-        inside = [d for d, reason in zip(self._distances_m, self._reasons, strict=True) if reason != _OUTSIDE]
-        for note in bank_ends(inside, matcher.bank.distance_m.tolist(), self._counted):
+        inside = [d for d, reason in zip(self.distances_m, self.reasons, strict=True) if reason != _OUTSIDE]
+        for note in bank_ends(inside, matcher.bank.distance_m.tolist(), self.counted):
             tell(f"note: {note}")
-        if self._n_mirrored:
+        if self.n_mirrored:
             tell(
-                f"note: {self._n_mirrored} of {self._n_accepted} accepted answers may be those of images mirrored left"
+                f"note: {self.n_mirrored} of {self._n_accepted} accepted answers may be those of images mirrored left"
                 " to right, which their landmarks do not show: check it once with something held to one side (--flip-h)"
             )
 
     @property
     def _n_accepted(self) -> int:
-        return self._reasons.count("")
+        return self.reasons.count("")
 
     def diagnose(self, matcher: Matcher, reading: FrameReading) -> None:
         """Name the setting that would make the first refused position fit."""
         from phasemark.matcher import diagnose
 
-        search = self._search
+        search = self.search
         # among the frames of a moving camera some do not show the landmark: that needs no diagnosis
-        some_right = self._moving and self._n_accepted
-        if self._refused is None or self._results.no_diagnosis or some_right:
+        some_right = self.moving and self._n_accepted
+        if self.refused is None or self.results.no_diagnosis or some_right:
             return
-        index, filtered = self._refused
+        index, filtered = self.refused
         try:
             diagnosis = replace(diagnose(matcher, filtered, 0, background=search.background), index=index)
         except Exception as error:  # it only comments on answers, which must not be lost
             what = f"{type(error).__name__}: {one_line(str(error))}"
             tell(f"note: frame {index} is refused, and its diagnosis failed ({what}); --no-diagnosis leaves it out")
             return
-        message = diagnosis_text(diagnosis, Given(reading, matcher.method == "nearest", search.fix == "bearing"))
+        message = diagnosis_text(diagnosis, reading, matcher.method == "nearest", search.fix == "bearing")
         tell(f"note: {message}")
-        if self._results.as_json:
+        if self.results.as_json:
             self.answers[index]["diagnosis"] = {**diagnosis.as_dict(), "message": message}
 
 
@@ -352,13 +334,3 @@ def _note_motion(measured: Frames, file: Path) -> None:
             f"note: {file}: the camera or the scene moved during {where}, so that the mean of the frames is no single"
             " view; --moving matches every frame by itself"
         )
-
-
-def _save_match_figure(
-    path: Path, filtered: FilteredFrames, match: Match, bank: Bank, search: Search, force: bool
-) -> None:
-    """Draw one position."""
-    from phasemark.matcher.figures import match_figure
-
-    figure = match_figure(filtered, match, bank, search.background, reported=search.on == "reported")
-    write_figure(path, figure, force)

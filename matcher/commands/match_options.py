@@ -29,7 +29,6 @@ from phasemark.data.commands.options import (
     one_of,
 )
 from phasemark.data.commands.outputs import refuse_other_files
-from phasemark.matcher.commands.match_table import pose_facts
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -213,6 +212,8 @@ class Search:
 
     def for_bank(self, bank: Bank) -> Search:
         """Return the options with what is not stated: the method, and ranges as a chip reports them where one did."""
+        if self.is_direct:
+            return self
         method = self.method or ("refine" if bank.plan.model == "ray" else "nearest")
         from_mean = method == "nearest" or self.unknown_background or self.no_background
         chip = bank.sensor.histogram is not None and not from_mean
@@ -327,38 +328,46 @@ class Place:
         """Refuse options that contradict each other, or lack what they belong to."""
         if self.map_file is not None and self.landmark_xy is not None:
             raise UsageError("--map and --landmark-xy both say where the landmark stands: give one of them")
-        if self.prior is not None and self.landmark_xy is None and self.map_file is None:
+        if self.prior is not None and not self.is_stated:
             raise UsageError("--prior needs --landmark-xy or --map: without it there is no robot position")
         if self.prior_std is not None and self.prior is None:
             raise UsageError("--prior-std needs --prior, which it belongs to")
         if self.prior_std is not None and not min(self.prior_std) > 0:
             x, heading = self.prior_std
             raise UsageError(f"--prior-std must be two positive numbers, got {x:g} {heading:g}")
+        if self.landmark_xy is not None and not all(map(math.isfinite, (*self.landmark_xy, self.landmark_yaw))):
+            x, y = self.landmark_xy
+            raise UsageError(
+                f"--landmark-xy and --landmark-yaw must be finite numbers, got {x:g} {y:g} and {self.landmark_yaw:g}"
+            )
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether it is said where landmarks stand."""
+        return self.map_file is not None or self.landmark_xy is not None
 
     def landmarks(self) -> LandmarkMap | None:
-        """Return where landmarks stand; None if nothing is said of it."""
+        """Return the map of the landmarks, if one is given."""
         from phasemark.matcher.position.landmark_map import read_landmark_map
 
-        if self.map_file is not None:
-            return read_landmark_map(self.map_file)
-        return None if self.landmark_xy is None else _one_landmark(self.landmark_xy, self.landmark_yaw)
+        return None if self.map_file is None else read_landmark_map(self.map_file)
 
-    def poses(self, match: Match, landmarks: LandmarkMap) -> list[dict[str, Any]]:
+    def poses(self, match: Match, landmarks: LandmarkMap | None) -> list[dict[str, Any]]:
         """Return the robot poses of a match as plain numbers, best first; none if there is no landmark."""
-        any_class = self.map_file is None
-        return pose_facts(match, landmarks, any_class, math.radians(self.pan), self.prior, self.prior_std)
+        from phasemark.matcher import robot_poses
 
-
-def _one_landmark(xy: tuple[float, float], yaw_deg: float) -> LandmarkMap:
-    """Return the map of a landmark of any class."""
-    from phasemark.matcher.position.landmark_map import LandmarkMap, MappedLandmark
-
-    if not all(map(math.isfinite, (*xy, yaw_deg))):
-        raise UsageError(
-            f"--landmark-xy and --landmark-yaw must be finite numbers, got {xy[0]:g} {xy[1]:g} and {yaw_deg:g}"
-        )
-    only = MappedLandmark(name="landmark", class_name="any", x_m=xy[0], y_m=xy[1], yaw_deg=yaw_deg)
-    return LandmarkMap(landmark=(only,))
+        believed: dict[str, Any] = {}
+        if self.prior is not None:
+            believed["prior"] = (*self.prior[:2], math.radians(self.prior[2]))
+        if self.prior_std is not None:
+            xy, heading = self.prior_std[0] ** 2, math.radians(self.prior_std[1]) ** 2
+            believed["prior_covariance"] = [[xy, 0.0, 0.0], [0.0, xy, 0.0], [0.0, 0.0, heading]]
+        pan_rad = math.radians(self.pan)
+        if landmarks is not None:
+            placed = landmarks.poses(match, pan_rad, **believed)
+            return [{"landmark": one.landmark.name, **one.pose.as_dict()} for one in placed]
+        xy_m, yaw_rad = self.landmark_xy or (0.0, 0.0), math.radians(self.landmark_yaw)
+        return [pose.as_dict() for pose in robot_poses(match, xy_m, yaw_rad, pan_rad, **believed)]
 
 
 @dataclass(frozen=True)

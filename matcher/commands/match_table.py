@@ -11,34 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from phasemark.matcher import Match
-    from phasemark.matcher.position.landmark_map import LandmarkMap
     from phasemark.render import Background
-
-
-def pose_facts(
-    match: Match,
-    landmarks: LandmarkMap,
-    any_class: bool,
-    pan_rad: float,
-    prior: tuple[float, float, float] | None,
-    prior_std: tuple[float, float] | None,
-) -> list[dict[str, Any]]:
-    """Return the robot poses of a match as plain numbers, best first; none if there is no landmark."""
-    from phasemark.matcher import robot_poses
-
-    believed, covariance = None, None
-    if prior is not None:
-        believed = (prior[0], prior[1], math.radians(prior[2]))
-    if prior_std is not None:
-        xy, heading = prior_std[0] ** 2, math.radians(prior_std[1]) ** 2
-        covariance = [[xy, 0.0, 0.0], [0.0, xy, 0.0], [0.0, 0.0, heading]]
-    if any_class:
-        only = landmarks.landmark[0]
-        poses = robot_poses(match, only.xy_m, only.yaw_rad, pan_rad, prior=believed, prior_covariance=covariance)
-        return [pose.as_dict() for pose in poses]
-    placements = landmarks.poses(match, pan_rad, prior=believed, prior_covariance=covariance)
-    return [{"landmark": placement.landmark.name, **placement.pose.as_dict()} for placement in placements]
 
 
 def pose_text(pose: Mapping[str, Any]) -> str:

@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.view import VIEW_FIELDS
 
-_VIEW = VIEW_FIELDS
-
 PRIOR_STD = (1.0, 1.0, 1.0)
 """Standard deviations of x, y (m) and heading (rad) of a prior that comes without a covariance."""
 
@@ -89,25 +87,30 @@ class RobotPose:
 
     def __repr__(self) -> str:
         """Describe the robot's pose in one line, with standard deviations if there are any."""
-        std = ["", "", ""]
-        if self.covariance is not None:
-            x, y, heading = (math.sqrt(max(float(self.covariance[k, k]), 0.0)) for k in range(3))
-            std = [f" ± {x:.2g}", f" ± {y:.2g}", f" ± {math.degrees(heading):.2g}"]
+        std = ["", "", ""] if self._std is None else [f" ± {own:.2g}" for own in self._std]
         return (
             f"RobotPose(x {self.x_m:.4f}{std[0]} m, y {self.y_m:.4f}{std[1]} m,"
             f" heading {math.degrees(self.heading_rad):.2f}{std[2]}°)"
         )
 
+    @property
+    def _std(self) -> list[float] | None:
+        """Standard deviations of x, y and heading: metres and degrees."""
+        if self.covariance is None:
+            return None
+        x, y, heading = (math.sqrt(max(float(self.covariance[k, k]), 0.0)) for k in range(3))
+        return [x, y, math.degrees(heading)]
+
     def as_dict(self) -> dict[str, Any]:
         """Return position and heading as plain numbers, for JSON: metres and degrees, in the covariance too."""
         covariance = self.covariance
         unit = np.array([1.0, 1.0, math.degrees(1.0)])
-        std = None if covariance is None else [math.sqrt(max(float(covariance[k, k]), 0.0)) for k in range(3)]
+        std = self._std
         return {
             "x_m": self.x_m,
             "y_m": self.y_m,
             "heading_deg": math.degrees(self.heading_rad),
-            "std": None if std is None else {"x_m": std[0], "y_m": std[1], "heading_deg": math.degrees(std[2])},
+            "std": None if std is None else dict(zip(("x_m", "y_m", "heading_deg"), std, strict=True)),
             "covariance": None if covariance is None else (covariance * np.outer(unit, unit)).tolist(),
             "mahalanobis": self.mahalanobis if math.isfinite(self.mahalanobis) else None,
         }
@@ -187,7 +190,9 @@ def robot_poses(
     pan_offset = _finite("pan_offset_xy_m", pan_offset_xy_m, 2)
     lens_offset = _finite("lens_offset_xy_m", lens_offset_xy_m, 2)
     yaw, pan = _finite("landmark_yaw_rad", landmark_yaw_rad), _finite("pan_rad", pan_rad)
-    n = _symmetry(match.symmetry if symmetry is None else symmetry)
+    n = match.symmetry if symmetry is None else symmetry
+    if not isinstance(n, int | np.integer) or n < 1:
+        raise UsageError(f"'symmetry' must be a whole number of at least 1, got {n!r}")
     believed, believed_covariance = _prior(prior, prior_covariance)
     others = _covariance_of_others(landmark_covariance, pan_std_rad, mounting_covariance)
     if match.class_name is None or not (math.isfinite(match.distance_m) and math.isfinite(match.delta_rad)):
@@ -263,12 +268,12 @@ def _covariance_of_view(match: ViewEstimate) -> NDArray[np.float64] | None:
     """Return the covariance of (D, δ, b), zero where the match took a value as given; None if it has none."""
     if match.covariance is None:
         return None
-    unknown = [name for name in match.free if name not in _VIEW]
+    unknown = [name for name in match.free if name not in VIEW_FIELDS]
     if unknown or len(set(match.free)) != len(match.free):
-        raise UsageError(f"'match.free' must name each of {', '.join(_VIEW)} at most once, got {match.free!r}")
+        raise UsageError(f"'match.free' must name each of {', '.join(VIEW_FIELDS)} at most once, got {match.free!r}")
     given = _covariance("match.covariance", match.covariance, len(match.free))
-    place = [_VIEW.index(name) for name in match.free]
-    of_view = np.zeros((len(_VIEW), len(_VIEW)))
+    place = [VIEW_FIELDS.index(name) for name in match.free]
+    of_view = np.zeros((len(VIEW_FIELDS), len(VIEW_FIELDS)))
     of_view[np.ix_(place, place)] = given
     return of_view[:3, :3]  # height and tilt move nothing in the plane
 
@@ -327,12 +332,6 @@ def _wrap(angle_rad: float) -> float:
     """Bring an angle into (−π, π]."""
     wrapped = math.remainder(angle_rad, math.tau)
     return math.pi if wrapped == -math.pi else wrapped
-
-
-def _symmetry(n: int) -> int:
-    if not isinstance(n, int | np.integer) or n < 1:
-        raise UsageError(f"'symmetry' must be a whole number of at least 1, got {n!r}")
-    return int(n)
 
 
 def _finite(name: str, value: ArrayLike, *shape: int) -> NDArray[np.float64]:
