@@ -4,48 +4,27 @@ import io
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import textwrap
 import threading
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
 
 import pytest
 
-from phasemark import PhasemarkError, StorageError, __version__, cli
+from phasemark import PhasemarkError, StorageError, __version__
 from phasemark.data.commands import console
 from phasemark.render import Sensor, preset, preset_names
 
 PHASEMARK = str(Path(sys.executable).with_name("phasemark"))
 
 
-class Outcome(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., Outcome]]:
-    """Run the command line in this process."""
-    before = signal.getsignal(signal.SIGTERM)
-
-    def call(*arguments: str) -> Outcome:
-        code = cli.main(arguments)
-        return Outcome(code, *capsys.readouterr())
-
-    yield call
-    signal.signal(signal.SIGTERM, before)
-
-
-def test_version_is_printed(run: Callable[..., Outcome]) -> None:
+def test_version_is_printed(run):
     assert run("--version") == (0, f"phasemark {__version__}\n", "")
 
 
-def test_without_arguments_the_first_steps_are_printed_and_run(run: Callable[..., Outcome]) -> None:
+def test_without_arguments_the_first_steps_are_printed_and_run(run):
     code, out, err = run()
     steps = [line.split("   ")[0].split()[1:] for line in out.splitlines() if line.startswith("  phasemark ")]
     assert (code, err) == (0, "")
@@ -54,27 +33,27 @@ def test_without_arguments_the_first_steps_are_printed_and_run(run: Callable[...
         assert run(*step, "--help").code == 0
 
 
-def test_listed_sensors_are_the_shipped_ones(run: Callable[..., Outcome]) -> None:
+def test_listed_sensors_are_the_shipped_ones(run):
     assert [line.split()[0] for line in run("sensor", "list").out.splitlines()[1:]] == preset_names()
     assert [entry["name"] for entry in json.loads(run("sensor", "list", "--json").out)] == preset_names()
 
 
 @pytest.mark.parametrize("name", preset_names())
-def test_a_shown_sensor_is_a_sensor_file_again(run: Callable[..., Outcome], name: str, tmp_path: Path) -> None:
+def test_a_shown_sensor_is_a_sensor_file_again(run, name, tmp_path):
     path = tmp_path / "camera.toml"
     path.write_text(run("sensor", "show", name).out, encoding="utf-8")
     assert Sensor.from_toml(path) == preset(name)
     assert run("sensor", "show", str(path)).out == run("sensor", "show", name).out
 
 
-def test_a_direct_sensor_is_shown_without_a_modulation_of_its_own(run: Callable[..., Outcome]) -> None:
+def test_a_direct_sensor_is_shown_without_a_modulation_of_its_own(run):
     shown = run("sensor", "show", "vl53l5cx-8x8")
     assert "no modulation" in shown.out.splitlines()[0]
     assert shown.out.splitlines()[1].startswith("# modulation_hz: of the model alone")
     assert json.loads(run("sensor", "show", "vl53l5cx-8x8", "--json").out)["unambiguous_range_m"] is None
 
 
-def test_a_sensor_as_json_has_every_field(run: Callable[..., Outcome]) -> None:
+def test_a_sensor_as_json_has_every_field(run):
     shown = json.loads(run("sensor", "show", "pmd-16x16", "--json").out)
     assert set(Sensor.model_fields) - {"histogram", "lens"} < set(shown)  # tables that some sensors have
     assert shown["unambiguous_range_m"] == pytest.approx(14.9896, abs=5e-5)  # c / 2f as PHYSICS section 3 prints it
@@ -91,9 +70,7 @@ def test_a_sensor_as_json_has_every_field(run: Callable[..., Outcome]) -> None:
         (("snesor",), 2, ["snesor", "phasemark --help"]),
     ],
 )
-def test_a_mistake_is_one_line_and_its_code(
-    run: Callable[..., Outcome], arguments: tuple[str, ...], code: int, words: list[str]
-) -> None:
+def test_a_mistake_is_one_line_and_its_code(run, arguments, code, words):
     outcome = run(*arguments)
     assert (outcome.code, outcome.out) == (code, "")
     assert outcome.err.startswith("error: ")
@@ -103,31 +80,27 @@ def test_a_mistake_is_one_line_and_its_code(
 
 
 @pytest.mark.parametrize("error", [PhasemarkError, *PhasemarkError.__subclasses__()])
-def test_each_error_has_its_exit_code(
-    run: Callable[..., Outcome], monkeypatch: pytest.MonkeyPatch, error: type[PhasemarkError]
-) -> None:
+def test_each_error_has_its_exit_code(run, monkeypatch, error):
     _fail_with(monkeypatch, error("first\nsecond \x1b[2J [bold]third"))
     assert run("sensor", "show", "ideal") == (error.exit_code, "", "error: first second  [2J [bold]third\n")
 
 
-def test_the_exit_codes_are_the_documented_ones() -> None:
+def test_the_exit_codes_are_the_documented_ones():
     codes = {error.__name__: error.exit_code for error in PhasemarkError.__subclasses__()}
     assert codes == {"UsageError": 2, "InputFileError": 3, "OutputExistsError": 4, "StorageError": 5}
 
 
-def test_an_operating_system_error_is_a_storage_error(
-    run: Callable[..., Outcome], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_operating_system_error_is_a_storage_error(run, monkeypatch):
     _fail_with(monkeypatch, OSError(28, "No space left on device", "bank.h5"))
     assert run("sensor", "show", "ideal") == (5, "", "error: bank.h5: No space left on device\n")
 
 
-def test_an_interrupt_exits_with_130(run: Callable[..., Outcome], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_exits_with_130(run, monkeypatch):
     _fail_with(monkeypatch, KeyboardInterrupt())
     assert run("sensor", "show", "ideal") == (130, "", "error: interrupted\n")
 
 
-def test_a_bug_of_ours_keeps_its_traceback(run: Callable[..., Outcome], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_of_ours_keeps_its_traceback(run, monkeypatch):
     _fail_with(monkeypatch, ZeroDivisionError())
     with pytest.raises(ZeroDivisionError):
         run("sensor", "show", "ideal")
@@ -140,7 +113,7 @@ def _fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     monkeypatch.setattr("phasemark.data.commands.sensor.read_sensor", fail)
 
 
-def test_termination_unwinds_and_exits_with_143() -> None:
+def test_termination_unwinds_and_exits_with_143():
     program = """
         import sys, time
         from phasemark import cli
@@ -165,7 +138,7 @@ def test_termination_unwinds_and_exits_with_143() -> None:
     assert (process.returncode, out, err) == (143, "cleaned up\n", "")
 
 
-def test_a_reader_that_went_away_is_no_error() -> None:
+def test_a_reader_that_went_away_is_no_error():
     read_end, write_end = os.pipe()
     os.close(read_end)
     done = subprocess.run([PHASEMARK, "sensor", "list"], stdout=write_end, stderr=subprocess.PIPE, text=True)
@@ -174,7 +147,7 @@ def test_a_reader_that_went_away_is_no_error() -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
-def test_results_that_find_no_space_exit_with_5() -> None:
+def test_results_that_find_no_space_exit_with_5():
     with open("/dev/full", "w") as full:
         done = subprocess.run([PHASEMARK, "sensor", "list"], stdout=full, stderr=subprocess.PIPE, text=True)
     assert (done.returncode, done.stderr) == (5, "error: No space left on device\n")
@@ -205,7 +178,7 @@ class Clock:
         return self.seconds
 
 
-def test_a_line_of_progress_says_what_how_far_and_for_how_long(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_line_of_progress_says_what_how_far_and_for_how_long(capsys):
     clock = Clock()
     progress = console.LongWork("rendering", clock)
     with progress as report:
@@ -231,9 +204,7 @@ def test_a_line_of_progress_says_what_how_far_and_for_how_long(capsys: pytest.Ca
         (["sensor", "characterise", "ideal", "-o", "c"], "measuring"),
     ],
 )
-def test_long_work_writes_lines_where_stderr_is_no_terminal(
-    run: Callable[..., Outcome], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: list[str], what: str
-) -> None:
+def test_long_work_writes_lines_where_stderr_is_no_terminal(run, monkeypatch, tmp_path, command, what):
     # The work itself is replaced by waiting for two lines.
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(console, "PROGRESS_SECONDS", 1e-3)
@@ -297,23 +268,16 @@ def test_completion_can_be_installed(monkeypatch: pytest.MonkeyPatch, capsys: py
     assert "_PHASEMARK_COMPLETE=complete_bash" in capsys.readouterr().out
 
 
-def test_the_accuracy_of_a_class_loads_no_mesh_library_and_nothing_of_files() -> None:
-    slow = {
-        "h5py",
-        "matplotlib",
-        "phasemark.data.bank.bank_file",
-        "phasemark.render.direct",
-        "scipy.spatial",
-        "trimesh",
-    }
+def test_the_accuracy_of_a_class_loads_no_mesh_library_and_nothing_of_files():
+    heavy = {"h5py", "matplotlib", "phasemark.data.bank.bank_file", "phasemark.render.direct", "trimesh"}
     command = ["accuracy", "--class", "cone", "--distance", "1.5"]
     program = f"import sys; from phasemark import cli; code = cli.main({command}); print(*sys.modules); sys.exit(code)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert slow.isdisjoint(done.stdout.splitlines()[-1].split())
+    assert (heavy | {"scipy.spatial"}).isdisjoint(done.stdout.splitlines()[-1].split())
 
 
-def test_a_table_in_pieces_is_aligned_and_has_no_spaces_at_the_end(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_in_pieces_is_aligned_and_has_no_spaces_at_the_end(capsys):
     table = console.Table(("class", "[D]", "m"))
     table.echo([("cone", "1.0", "")])
     table.echo([("a long name", "2.0", "x " * 100 + "x")])
@@ -326,9 +290,7 @@ def test_a_table_in_pieces_is_aligned_and_has_no_spaces_at_the_end(capsys: pytes
     ]
 
 
-def test_a_table_is_folded_to_a_narrow_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_table_is_folded_to_a_narrow_terminal(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "30")
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     console.echo_table(("name", "text"), [("cone", "one two three four five six seven eight")])

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from phasemark.cli import main
-from phasemark.data.files import write_checksum
 from phasemark.inputs import verify_checksum
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Renderer, capture, preset
@@ -33,19 +32,6 @@ def folder(tmp_path_factory):
     np.savetxt(folder / "frames.csv", frames.range_m[0].reshape(20, -1), delimiter=",", fmt="%.5f")
     np.savez(folder / "frames.npz", range=np.repeat(frames.range_m, 2, axis=0))
     return folder
-
-
-@pytest.fixture
-def run(capsys):
-    """Run a command; return its exit code, standard output and standard error."""
-
-    def run(*arguments):
-        capsys.readouterr()
-        code = main([str(argument) for argument in arguments])
-        done = capsys.readouterr()
-        return code, done.out, done.err
-
-    return run
 
 
 MATCH = ["--unit", "m", "--quantity", "range", "--wall", "3"]
@@ -334,22 +320,11 @@ MISTAKES = [
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--auto-background", contains="leave --wall"),
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--free", "yaw", contains="bearing, height, pitch or roll"),
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, *NEAREST, "--free", "bearing", contains="--method refine"),
-    _case(3, "match", "none.h5", "frames.csv", *MATCH, contains="none.h5"),
-    _case(3, "match", "frames.csv", "frames.csv", *MATCH, contains="not a bank"),
     _case(2, "match", "part.STL", "frames.csv", *MATCH, contains="does not say which sensor took it: give --sensor"),
     _case(3, "match", "cut.h5", "frames.csv", *MATCH, contains="cut.h5"),
-    _case(3, "match", "bank.h5", "none.csv", *MATCH, contains="none.csv"),
-    _case(3, "match", "bank.h5", "narrow.csv", *MATCH, contains="255"),
-    _case(3, "match", "bank.h5", "wide.csv", *MATCH, contains="257"),
-    _case(3, "match", "bank.h5", "text.csv", *MATCH, contains="text.csv"),
-    _case(3, "match", "bank.h5", "mixed.csv", *MATCH, contains="mixed.csv"),
-    _case(3, "match", "bank.h5", "empty.csv", *MATCH, contains="empty.csv"),
-    _case(3, "match", "bank.h5", "small.npy", *MATCH, contains="small.npy"),
     _case(2, "match", "bank.h5", "frames.csv", "--quantity", "range", contains="--unit"),
     _case(2, "match", "bank.h5", "frames.csv", "--unit", "m", contains="--quantity"),
     _case(2, "match", "bank.h5", "frames.csv", "--unit", "yard", "--quantity", "range", contains="yard"),
-    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--method", "guess", contains="nearest"),
-    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--filter", "median", contains="kalman"),
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--prior", 1, 2, 3, contains="--landmark-xy"),
     _case(2, "match", "bank.h5", "frames.csv", *MATCH[:4], "--wall", -1, contains="wall_m"),
     _case(4, "match", "bank.h5", "frames.csv", *MATCH, "--plot", "taken.png", contains="--force"),
@@ -359,97 +334,39 @@ MISTAKES = [
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--landmark-xy", "nan", 1, contains="--landmark-xy"),
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--landmark-xy", 2, 1, "--pan", "inf", contains="pan_rad"),
     _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--rotate", 45, contains="270"),
-    _case(2, "match", "bank.h5", "frames.csv", *MATCH, "--invalid-means", "far", contains="no-return"),
     _case(3, "match", "bank.h5", "long.csv", *MATCH, contains="long.csv"),
-    _case(3, "match", "bank.h5", "header.npy", *MATCH, contains="header.npy"),
     _case(3, "match", "bank.h5", "giant.h5", *MATCH, contains="declares far more"),
-    _case(3, "match", "bank.h5", "cut.npz", *MATCH, contains="cut.npz"),
     _case(3, "match", "bank.h5", "bank.h5", *MATCH, contains="phasemark-bank"),
     _case(3, "match", "bank.h5", ".", *MATCH, contains="cannot be read"),
-    _case(3, "match", "coverage.h5", "frames.csv", *MATCH, contains="lower/coverage"),
-    _case(3, "match", "period.h5", "frames.csv", *MATCH, contains="delta_period_deg"),
-    _case(3, "match", "schema.h5", "frames.csv", *MATCH, contains="update phasemark"),
-    _case(3, "bank", "info", "nohash.h5", contains="sha256"),
     _case(2, "bank", "build", "--class", "pyramid", "-o", "x.h5", contains="pyramid"),
     _case(2, "bank", "build", "--distance", "1:2:0", "-o", "x.h5", contains="1:2:0"),
-    _case(2, "bank", "build", "--distance", "1:2:-0.1", "-o", "x.h5", contains="1:2:-0.1"),
-    _case(2, "bank", "build", "--distance", "2:1:0.1", "-o", "x.h5", contains="2:1:0.1"),
-    _case(2, "bank", "build", "--distance", "near", "-o", "x.h5", contains="near"),
-    _case(2, "bank", "build", "--distance", "0.05:0.1:0.05", "-o", "x.h5", contains="distance_m"),
-    _case(2, "bank", "build", "--sensor", "kinect", "-o", "x.h5", contains="pmd-16x16"),
-    _case(2, "bank", "build", "--model", "magic", "-o", "x.h5", contains="planar"),
     _case(2, "bank", "build", "--mesh", "part", "--unit", "mm", "-o", "x.h5", contains="NAME=FILE"),
-    _case(2, "bank", "build", "--mesh", "part=box.stl", "-o", "x.h5", contains="--unit"),
     _case(3, "bank", "build", "--mesh", "part=cut.stl", "--unit", "m", "-o", "x.h5", contains="cut.stl"),
-    _case(3, "bank", "build", "plan-that-is-not-there.toml", "-o", "x.h5", contains="plan-that-is-not-there.toml"),
     _case(2, "bank", "build", "bad.toml", "-o", "x.h5", contains="distanz"),
     _case(3, "bank", "build", "nested.toml", "-o", "x.h5", contains="nested.toml"),
-    _case(3, "bank", "build", "--sensor", "nested.toml", "-o", "x.h5", contains="nested.toml"),
     _case(2, "bank", "build", *SMALL, "-o", "", contains="not a file name"),
-    _case(2, "bank", "build", *SMALL, "-o", "..", contains=".."),
     _case(2, "bank", "build", *SMALL, "--workers", 0, "-o", "x.h5", contains="--workers"),
     _case(2, "bank", "build", *SMALL, "--class", "cone", "--class", "cone", "-o", "x.h5", contains="two landmarks"),
     _case(2, "bank", "build", *SMALL, "--mesh", "none=box.stl", "--unit", "m", "-o", "x.h5", contains="no landmark"),
-    _case(2, "bank", "build", *SMALL, "--mesh", "a/b=box.stl", "--unit", "m", "-o", "x.h5", contains="a/b"),
     _case(4, "bank", "build", *SMALL, "-o", "bank.h5", contains="bank.h5"),
-    _case(2, "bank", "build", *SMALL, "-o", "no/such/folder/x.h5", contains="folder"),
     _case(3, "bank", "info", "none.h5", contains="none.h5"),
-    _case(3, "bank", "info", "cut.h5", contains="cut.h5"),
     _case(2, "render", "--distance", 1, "-o", "x.png", contains="--class"),
-    _case(2, "render", "--class", "cone", "--mesh", "a=box.stl", "--distance", 1, "-o", "x.png", contains="--class"),
-    _case(2, "render", "--class", "pyramid", "--distance", 1, "-o", "x.png", contains="pyramid"),
-    _case(2, "render", "--class", "cone", "--distance", -1, "-o", "x.png", contains="distance_m"),
     _case(2, "render", "--class", "cone", "--distance", 0.1, "-o", "x.png", contains="distance_m"),
-    _case(2, "render", "--class", "cone", "--distance", "nan", "-o", "x.png", contains="distance_m"),
-    _case(2, "render", "--class", "cone", "--distance", 1, "--wall", 0.9, "-o", "x.png", contains="wall_m"),
-    _case(2, "render", "--class", "cone", "--distance", 1, "--floor", 0.1, "-o", "x.png", contains="floor_m"),
-    _case(2, "render", "--class", "cone", "--distance", 1, "--variant", "soft", "-o", "x.png", contains="--variant"),
     _case(2, "render", "--class", "cone", "--distance", 1, "-o", "x.jpg", contains=".png"),
     _case(4, "render", "--class", "cone", "--distance", 1, "-o", "taken.png", contains="taken.png"),
-    _case(2, "landmark", "show", "pyramid", contains="pyramid"),
     _case(2, "landmark", "export", "cone", "-o", "x.step", contains="stl"),
     _case(2, "landmark", "check", "box.stl", contains="inch"),
-    _case(2, "landmark", "check", "box.stl", "--unit", "mile", contains="mile"),
     _case(2, "landmark", "check", "box.stl", "--unit", "m", "--up", "w", contains="'--up': 'w' is not one of 'x', 'y'"),
     _case(3, "landmark", "check", "cut.stl", "--unit", "m", contains="cut off"),
-    _case(3, "landmark", "check", "none.stl", "--unit", "m", contains="none.stl"),
-    _case(3, "landmark", "check", "frames.csv", "--unit", "m", contains="csv"),
     _case(2, "landmark", "show", "cone", "-o", "box.stl", contains="is not a folder"),
     _case(2, "landmark", "export", "box.stl", "-o", "x.stl", contains="catalogue"),
-    _case(2, "demo", "-o", "new", "--seed", -1, contains="--seed"),
     _case(2, "demo", "-o", "new", "--seed", 2**64, contains="--seed"),
-    _case(2, "demo", "-o", "new", "--workers", 0, contains="--workers"),
-    _case(2, "demo", "-o", "box.stl", contains="folder"),
     _case(2, "demo", "-o", "box.stl/new", contains="folder"),
 ]
 
 
-def _cover_twice(file):
-    file["lower/coverage"][...] = 2.0
-
-
-def _drop_hash(file):
-    del file["meshes/cone"].attrs["sha256"]
-
-
-BANK_DAMAGE = {
-    "coverage.h5": _cover_twice,
-    "period.h5": lambda file: file["meshes/cone"].attrs.__setitem__("delta_period_deg", 0.0),
-    "schema.h5": lambda file: file.attrs.__setitem__("schema_version", 99),
-    "nohash.h5": _drop_hash,
-}
-
-
 @pytest.fixture(scope="module")
 def bad_files(folder):
-    rows = np.full((3, 256), "1.0")
-    np.savetxt(folder / "narrow.csv", rows[:, :255], fmt="%s", delimiter=",")
-    np.savetxt(folder / "wide.csv", np.hstack([rows, rows[:, :1]]), fmt="%s", delimiter=",")
-    rows[1, 7] = "far"
-    np.savetxt(folder / "text.csv", rows, fmt="%s", delimiter=",")
-    (folder / "mixed.csv").write_text(",".join(["1"] * 256) + "\n" + ",".join(["1"] * 64) + "\n")
-    (folder / "empty.csv").write_text("")
-    np.save(folder / "small.npy", np.ones((4, 8, 8)))
     (folder / "part.STL").write_bytes(b"solid")
     (folder / "cut.h5").write_bytes((folder / "bank.h5").read_bytes()[:5000])
     main(["landmark", "export", "post", "-o", str(folder / "box.stl")])
@@ -459,15 +376,8 @@ def bad_files(folder):
     (folder / "two-1.png").write_bytes(b"mine")
     (folder / "nested.toml").write_text("a = " + "[" * 5000)
     (folder / "long.csv").write_text("1" * 200_000 + ",1" * 255)  # one cell longer than Python's csv reads
-    (folder / "header.npy").write_bytes((folder / "small.npy").read_bytes().replace(b"), }", b"    "))
-    (folder / "cut.npz").write_bytes((folder / "frames.npz").read_bytes()[:-40])
     with h5py.File(folder / "giant.h5", "w") as file:  # 1 PB, none of it written
         file.create_dataset("range", shape=(10**12, 16, 16), dtype="f4", chunks=(1, 16, 16))
-    for name, damage in BANK_DAMAGE.items():
-        shutil.copy(folder / "bank.h5", folder / name)
-        with h5py.File(folder / name, "r+") as file:
-            damage(file)
-        write_checksum(folder / name)  # what is wrong was wrong when the file was written
     return folder
 
 

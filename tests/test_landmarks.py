@@ -7,8 +7,7 @@ import pytest
 from oracles.outline_coverage import coverage_of_hull, coverage_of_mesh, project
 
 from phasemark import UsageError
-from phasemark.landmarks import LandmarkSpec, build_mesh, catalog, mesh_figure
-from phasemark.landmarks.figures import mesh_html
+from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
 from phasemark.landmarks.mesh import LOWER, UPPER
 from phasemark.landmarks.spec import Box, Cone, Cylinder, Revolution, Sphere
 
@@ -46,34 +45,20 @@ def true_outline(name, lens):
     return np.vstack([radius * circle, top])
 
 
+@pytest.mark.parametrize("n_views", [6, pytest.param(40, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("name", ["cylinder", "cone", "sphere", "post"])
-def test_tessellation_costs_at_most_1e_4_of_the_coverage_of_any_pixel(name):
-    mesh = build_mesh(catalog()[name], part="upper")
-    worst = 0.0
-    for lens, heading in random_lenses(25, seed=17):
-        true = coverage_of_hull(project(true_outline(name, lens), lens, heading))
-        worst = max(worst, np.abs(coverage_of_mesh(mesh, lens, heading) - true).max())
-    assert worst <= 1e-4
-
-
-@pytest.mark.parametrize("name", ["cylinder", "cone", "sphere", "post"])
-def test_the_mean_silhouette_is_the_true_one(name):
+def test_tessellation_costs_at_most_1e_4_of_a_pixel_and_leaves_the_mean_silhouette(name, n_views):
     # inscribed sections would be too small from every side; the mean over views of the signed error tells
     mesh = build_mesh(catalog()[name], part="upper")
     true_radius = {"cylinder": 0.06, "cone": 0.075, "sphere": 0.075, "post": 0.035}[name]
     inscribed = mesh.copy()
     inscribed.vertices[:, :2] *= true_radius / np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max()
-    errors = np.array(
-        [
-            [
-                coverage_of_mesh(each, lens, heading).sum()
-                - coverage_of_hull(project(true_outline(name, lens), lens, heading)).sum()
-                for each in (mesh, inscribed)
-            ]
-            for lens, heading in random_lenses(12, seed=3)
-        ]
-    )
-    ours, theirs = errors.mean(axis=0)
+    errors = []
+    for lens, heading in random_lenses(n_views, seed=3):
+        true = coverage_of_hull(project(true_outline(name, lens), lens, heading))
+        errors.append([coverage_of_mesh(each, lens, heading) - true for each in (mesh, inscribed)])
+        assert np.abs(errors[-1][0]).max() <= 1e-4
+    ours, theirs = np.mean([[error.sum() for error in pair] for pair in errors], axis=0)
     assert theirs < 0
     assert abs(ours) < 0.5 * abs(theirs)
 
@@ -117,12 +102,6 @@ def test_parts_alone_are_closed_too_and_add_up_to_the_whole():
     assert lower.volume + upper.volume == pytest.approx(both.volume, rel=1e-9)
 
 
-def test_the_same_specification_gives_the_same_mesh():
-    first, second = build_mesh(catalog()["sphere"]), build_mesh(catalog()["sphere"])
-    np.testing.assert_array_equal(first.vertices, second.vertices)
-    np.testing.assert_array_equal(first.faces, second.faces)
-
-
 def test_a_finer_tolerance_takes_more_faces():
     spec = catalog()["cylinder"]
     counts = [len(build_mesh(spec, tolerance_m=tolerance).faces) for tolerance in (1e-4, 1e-5, 1e-6)]
@@ -156,13 +135,3 @@ def test_wrong_specifications_are_refused_in_one_line(fields, message):
 def test_too_fine_a_tolerance_is_refused():
     with pytest.raises(UsageError, match="faces"):
         build_mesh(catalog()["sphere"], tolerance_m=1e-12)
-
-
-def test_a_landmark_is_drawn_and_its_page_loads_nothing():
-    mesh = build_mesh(catalog()["post"])
-    assert mesh_figure(mesh).startswith(b"\x89PNG\r\n")
-    page = mesh_html(mesh, "<post> & co")
-    assert "&lt;post&gt; &amp; co" in page
-    assert "http:" not in page
-    assert "src=" not in page
-    assert "$" not in page.split("<script>")[0]

@@ -24,7 +24,7 @@ OPEN_BOX = trimesh.Trimesh(BOX.vertices, BOX.faces[2:], process=False)
 TITLES = ["</title><script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "$faces ${x}"]
 
 
-@pytest.fixture(params=[*catalog(), "open box"])
+@pytest.fixture(params=["cone", "open box"])
 def mesh(request):
     return OPEN_BOX if request.param == "open box" else build_mesh(catalog()[request.param])
 
@@ -79,13 +79,11 @@ def arrays_of(page):
     return (np.frombuffer(base64.b64decode(found[name][1]), kind).reshape(-1, 3) for name, kind in names.items())
 
 
-def test_the_picture_is_a_whole_png(mesh):
-    kinds = chunk_kinds(mesh_figure(mesh))
+def test_the_picture_is_a_whole_png_and_the_same_each_time(mesh):
+    picture = mesh_figure(mesh)
+    kinds = chunk_kinds(picture)
     assert (kinds[0], kinds[-1]) == (b"IHDR", b"IEND")
-
-
-def test_the_same_mesh_gives_the_same_picture():
-    assert mesh_figure(BOX) == mesh_figure(BOX)
+    assert picture == mesh_figure(mesh)
 
 
 def test_the_picture_shows_the_mesh_from_where_it_is_asked():
@@ -144,19 +142,16 @@ def test_axes_and_the_line_of_sight_at_delta_0_start_where_the_landmark_has_its_
     assert "[origin[0] - 1.5, origin[1], origin[2]], [origin[0] - 0.75, origin[1], origin[2]]" in page
 
 
-@pytest.mark.parametrize(
-    "title", ["</title><script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "$faces ${x}"]
-)
+@pytest.mark.parametrize("title", TITLES)
 def test_a_title_stays_text(title):
     plain, named = parse(mesh_html(BOX, "part")), parse(mesh_html(BOX, title))
     assert [tag for tag, _ in named.seen] == [tag for tag, _ in plain.seen]
     assert [attributes.keys() for _, attributes in named.seen] == [attributes.keys() for _, attributes in plain.seen]
 
 
-@pytest.mark.parametrize("name", list(catalog()))
-def test_the_page_holds_the_mesh_centred_and_scaled_to_a_unit_ball(name):
-    mesh = build_mesh(catalog()[name])
-    vertices, faces, normals = arrays_of(mesh_html(mesh, name))
+def test_the_page_holds_the_mesh_centred_and_scaled_to_a_unit_ball():
+    mesh = build_mesh(catalog()["cylinder"])
+    vertices, faces, normals = arrays_of(mesh_html(mesh, "cylinder"))
     assert faces.max() < len(vertices)
     assert len(normals) == 3 * len(faces)  # one for each corner
     assert np.linalg.norm(vertices, axis=1).max() == pytest.approx(1.0, abs=1e-6)  # float32
@@ -174,7 +169,7 @@ def test_edges_stay_sharp_in_the_page():
 
 def test_round_surfaces_are_shaded_smoothly_in_the_page():
     # on the sphere of radius 75 mm around z' = 75 mm the normal of a corner is its direction from the centre
-    mesh = build_mesh(catalog()["sphere"], part="upper")
+    mesh = build_mesh(catalog()["sphere"], part="upper", tolerance_m=1e-5)
     vertices, faces, normals = arrays_of(mesh_html(mesh, "sphere"))
     outward = vertices[faces.ravel()] / np.linalg.norm(vertices[faces.ravel()], axis=1, keepdims=True)
     # means over the faces around a vertex, whose sections turn by some degrees: off by a fraction of one section

@@ -28,21 +28,9 @@ SECONDS = 10
 BYTES = 2 << 30
 CODES = (0, 2, 3, 4, 5)
 ODD = (
-    "",
-    "0",
-    "-1",
-    "1e308",
-    "1e-320",
-    "nan",
-    "inf",
-    "9" * 400,
-    "a\tb",
-    "=1+1",
-    "$x$",
-    "x/../..",
-    "caf\udce9",
+    "", "0", "-1", "1e308", "1e-320", "nan", "inf", "9" * 400, "a\tb", "=1+1", "$x$", "x/../..", "caf\udce9",
     "/dev/null",
-)
+)  # fmt: skip
 VALUES = 2
 """Odd values that each option is tried with, some 460 runs: all of them on every option would take an hour."""
 SMALL = {
