@@ -208,7 +208,7 @@ class _Surface:
 def _squared_distance(points: _Float, triangles: _Float) -> _Float:
     """Return the squared distance of each point from its triangle, (n, 3) and (n, 3, 3); NaN without any area."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        nearest = trimesh.triangles.closest_point(triangles, points)
+        nearest: Any = trimesh.triangles.closest_point(triangles, points)  # type: ignore[no-untyped-call]
     return np.asarray(((nearest - points) ** 2).sum(axis=1))
 
 

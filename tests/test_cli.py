@@ -13,7 +13,7 @@ from typing import NoReturn
 
 import pytest
 
-from phasemark import PhasemarkError, StorageError, __version__
+from phasemark import PhasemarkError, StorageError, __version__, cli
 from phasemark.data.commands import console
 from phasemark.render import Sensor, preset, preset_names
 

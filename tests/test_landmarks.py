@@ -45,16 +45,16 @@ def true_outline(name, lens):
     return np.vstack([radius * circle, top])
 
 
-@pytest.mark.parametrize("n_views", [6, pytest.param(40, marks=pytest.mark.soak)])
+@pytest.mark.parametrize(("n_views", "seed"), [(12, 3), pytest.param(25, 17, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("name", ["cylinder", "cone", "sphere", "post"])
-def test_tessellation_costs_at_most_1e_4_of_a_pixel_and_leaves_the_mean_silhouette(name, n_views):
+def test_tessellation_costs_at_most_1e_4_of_a_pixel_and_leaves_the_mean_silhouette(name, n_views, seed):
     # inscribed sections would be too small from every side; the mean over views of the signed error tells
     mesh = build_mesh(catalog()[name], part="upper")
     true_radius = {"cylinder": 0.06, "cone": 0.075, "sphere": 0.075, "post": 0.035}[name]
     inscribed = mesh.copy()
     inscribed.vertices[:, :2] *= true_radius / np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max()
     errors = []
-    for lens, heading in random_lenses(n_views, seed=3):
+    for lens, heading in random_lenses(n_views, seed):
         true = coverage_of_hull(project(true_outline(name, lens), lens, heading))
         errors.append([coverage_of_mesh(each, lens, heading) - true for each in (mesh, inscribed)])
         assert np.abs(errors[-1][0]).max() <= 1e-4

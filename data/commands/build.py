@@ -8,10 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from phasemark import UsageError
-from phasemark.data.commands.console import LongWork, duration, echo_facts, echo_json, tell
+from phasemark.data.commands.console import LongWork, duration, echo, echo_facts, echo_json, tell
 from phasemark.data.commands.inputs import note_plan_too_far
 from phasemark.data.commands.options import Building
 from phasemark.data.commands.outputs import refuse_input_files
@@ -54,7 +52,7 @@ def build_or_estimate(build: Callable[..., Any], plan: BankPlan | FramePlan, out
     if building.as_json:
         echo_json({"path": str(out)})
     else:
-        typer.echo(out)
+        echo(out)
 
 
 def _echo_estimate(plan: BankPlan | FramePlan, size: Mapping[str, int], fits: bool, building: Building) -> None:
@@ -111,4 +109,4 @@ def merge_shards(shards: Sequence[Path], out: Path, resume: bool, force: bool) -
     refuse_input_files(outputs_of(out))
     with LongWork("merging") as progress:
         merge_parts(shards, out, resume=resume, force=force, progress=progress)
-    typer.echo(out)
+    echo(out)

@@ -83,6 +83,12 @@ def duration(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
+def echo(*lines: object) -> None:
+    """Print one thing a line."""
+    for line in lines:
+        typer.echo(line)
+
+
 def echo_facts(facts: Mapping[str, Any], *, as_json: bool = False) -> None:
     """Print one fact a line, names aligned; or all of them as JSON."""
     if as_json:

@@ -8,12 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
-
 from phasemark import UsageError
 from phasemark.data.commands.build import build_or_estimate, merge_shards
 from phasemark.data.commands.command import Shown, Without
-from phasemark.data.commands.console import LongWork, echo_facts, readable
+from phasemark.data.commands.console import LongWork, echo, echo_facts, readable
 from phasemark.data.commands.inputs import ClassOrMesh, background_of, open_frame_set, read_sensor
 from phasemark.data.commands.options import (
     Building,
@@ -140,7 +138,7 @@ def frames_export(
     with open_frame_set(frames) as opened:
         from phasemark.data.export import export_frames
 
-        typer.echo(export_frames(opened, out, to, quantity=quantity, content=content, force=force))
+        echo(export_frames(opened, out, to, quantity=quantity, content=content, force=force))
 
 
 def frames_import(
@@ -168,7 +166,7 @@ def frames_import(
     refuse_other_files(out, ".npz", "the output")
     refuse_existing([out], force)
     frames = reading.read(file, read_sensor(sensor), topic=topic)
-    typer.echo(write_measured(frames, out, force=force))
+    echo(write_measured(frames, out, force=force))
 
 
 def frames_simulate(
@@ -238,7 +236,7 @@ def frames_simulate(
     )
     described = readable(f"landmark={name} sensor={Path(sensor).name}")
     description = f"{described} seed={seed} {'moving' if moving else 'still'}"
-    typer.echo(write_recording(recording, out, description=description, force=force))
+    echo(write_recording(recording, out, description=description, force=force))
 
 
 def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
@@ -292,7 +290,7 @@ def frames_show(
         measured = reading.read(frames, read_sensor(sensor))
         _refuse_index(index, len(measured) * measured.n_frames)
         figure = measured.plot(*divmod(index, measured.n_frames))
-    typer.echo(write_figure(out, figure, force))
+    echo(write_figure(out, figure, force))
 
 
 def _title(index: int, sample: Mapping[str, Any]) -> str:

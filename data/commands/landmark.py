@@ -7,10 +7,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import echo_facts, echo_json, echo_table, readable
+from phasemark.data.commands.console import echo, echo_facts, echo_json, echo_table, readable
 from phasemark.data.commands.inputs import class_mesh, read_landmark
 from phasemark.data.commands.options import ClassName, Force, Json, MeshReading, Out, a_class
 from phasemark.data.commands.outputs import refuse_existing, refuse_input_files, write_file
@@ -69,8 +67,7 @@ def landmark_show(
     with made_folder(folder):
         write_file(figure, mesh_figure(mesh, directions=True), force)
         write_file(page, mesh_html(mesh, readable(name)), force)
-    typer.echo(figure)
-    typer.echo(page)
+    echo(figure, page)
 
 
 def landmark_export(name: ClassName, *, out: Out, force: Force = False) -> None:
@@ -85,7 +82,7 @@ def landmark_export(name: ClassName, *, out: Out, force: Force = False) -> None:
 
     refuse_input_files([out])
     mesh = class_mesh(name)
-    typer.echo(write_file(out, export_mesh(mesh, out.suffix.removeprefix(".")), force))
+    echo(write_file(out, export_mesh(mesh, out.suffix.removeprefix(".")), force))
 
 
 def landmark_check(file: Path, *, mesh_reading: MeshReading, as_json: Json = False) -> None:

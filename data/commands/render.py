@@ -8,8 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import typer
-
+from phasemark.data.commands.console import echo
 from phasemark.data.commands.inputs import ClassOrMesh, background_of, note_too_far, read_sensor
 from phasemark.data.commands.options import Floor, Force, Out, SensorName, View, Wall
 from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_file
@@ -67,8 +66,7 @@ def render_frame(
 
         near, far = landmark_limits_m(image.range_m[0], image.coverage[0])
         Console().print(terminal_figure(image.range_m[0], width=48, near_m=near, far_m=far))
-    typer.echo(out)
-    typer.echo(data)
+    echo(out, data)
 
 
 def _write_image(image: PhasorImages, histograms: HistogramImages | None, out: Path, data: Path, force: bool) -> None:

@@ -10,11 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
 from phasemark import UsageError
 from phasemark.data.commands.command import Shown, Without
-from phasemark.data.commands.console import echo_json, echo_table, readable, tell
+from phasemark.data.commands.console import echo, echo_json, echo_table, readable, tell
 from phasemark.data.commands.inputs import note_too_far, read_sensor, read_sensor_sources
 from phasemark.data.commands.options import Force, FrameReading, Json, Metres, Out, SensorName
 from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure, write_file
@@ -92,12 +90,12 @@ def sensor_show(
         return
     if sensor.kind == "direct":
         axis = "z, along the optical axis" if sensor.quantity == "z" else "the range along the ray"
-        typer.echo(f"# direct time of flight: no taps, no modulation; its own quantity is {axis}")
-        typer.echo("# modulation_hz: of the model alone, so slow that ranges in a zone are averaged by their light")
+        echo(f"# direct time of flight: no taps, no modulation; its own quantity is {axis}")
+        echo("# modulation_hz: of the model alone, so slow that ranges in a zone are averaged by their light")
     else:
         scales = ", ".join(f"{camera.metres_per_radian:.6f}" for camera in sensor.by_frequency)
-        typer.echo(f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {scales} m per radian")
-    typer.echo(f"# {_sources_counted(sources)}")
+        echo(f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {scales} m per radian")
+    echo(f"# {_sources_counted(sources)}")
     from phasemark.render.sensor.sensor_fields import DIRECT_ONLY, PHASE_ONLY, TABLES
 
     fields = sensor.model_dump(mode="json")
@@ -113,8 +111,7 @@ def sensor_show(
     for title, table in tables.items():
         own = {name.removeprefix(f"{title}."): text for name, text in sources.items() if name.startswith(f"{title}.")}
         _echo_group(f"[{title}]", table, TABLES[title], own)
-    for line in source_lines(sources):
-        typer.echo(line)
+    echo(*source_lines(sources))
 
 
 def _sources_counted(sources: Mapping[str, str]) -> str:
@@ -143,11 +140,9 @@ def _echo_group(title: str, fields: Mapping[str, object], model: type[BaseModel]
         else:
             shown.append(f"{name} = {toml_value(value)}" + (f"  # {sources[name]}" if name in sources else ""))
     named = "at their defaults" if shown or title.startswith("[") else f"{title.removeprefix('# ')}, at their defaults"
-    typer.echo("" if named != "at their defaults" else f"\n{title}")
-    for line in shown:
-        typer.echo(line)
-    for line in textwrap.wrap(f"{named}: {', '.join(rest)}", 118) if rest else ():
-        typer.echo(f"# {line}")
+    listed = f"{named}: {', '.join(rest)}" if rest else ""
+    echo("" if named != "at their defaults" else f"\n{title}", *shown)
+    echo(*(f"# {line}" for line in textwrap.wrap(listed, 118)))
 
 
 def _write_picture(sensor: Sensor, picture: Path, force: bool) -> None:
@@ -216,7 +211,7 @@ def sensor_import(
         "Half angles and principal point follow from [lens]. OpenCV counts pixels from the centre of the first one.",
     ]
     write_file(out, sensor_toml(sensor, comments, header=header, otherwise=assumed), force)
-    echo_json({"file": str(out), **sensor.as_dict()}) if as_json else typer.echo(out)
+    echo_json({"file": str(out), **sensor.as_dict()}) if as_json else echo(out)
 
 
 def _with_lens_of(found: CameraInfo, base: Sensor, modulation_hz: float | None) -> Sensor:
@@ -294,9 +289,7 @@ def sensor_fit(
         ("field", "value", "std error", "from"),
         ((name, *value_and_error_of(fields[name], one), one.note) for name, one in fit.estimates.items()),
     )
-    for note in fit.notes:
-        typer.echo(note)
-    typer.echo(out)
+    echo(*fit.notes, out)
 
 
 def value_and_error_of(value: object, estimate: FittedField) -> tuple[str, str]:

@@ -7,11 +7,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from phasemark import UsageError
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable, tell
+from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table, readable, tell
 from phasemark.data.commands.inputs import read_sensor
 from phasemark.data.commands.options import Force, Json, Metres, Out, SensorName
 from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_file
@@ -71,13 +69,13 @@ def sensor_fit_direct(
     _echo_fit(fit, spread_mm)
     if scores:
         best, second = sorted(scores, key=lambda name: scores[name])[:2]
-        typer.echo(
+        echo(
             f"Zones are logged by {best}: the centroid's error is {1e3 * scores[best]:.1f} mm, that of the next order"
             f" {1e3 * scores[second]:.1f} mm."
         )
     else:
         tell(f"without --object the directions of zones are those of {readable(sensor)}: a plane does not tell them")
-    typer.echo(out)
+    echo(out)
 
 
 def _echo_fit(fit: DirectFit, spread_mm: list[float]) -> None:

@@ -211,22 +211,16 @@ def _fast_numbers(
     """Return the numbers of plain lines; None where one is not plain."""
     if any('"' in line for line in lines):
         return None
-    if separator is None:
-        counts = {len(line.split()) for line in lines}
-    else:
-        counts = {line.count(separator) + 1 for line in lines}
+    counts = {len(line.split()) if separator is None else line.count(separator) + 1 for line in lines}
     if counts != {expected}:
         return None
     if separator == ";":
         lines = [line.replace(",", ".") for line in lines]  # decimal commas
-    for filled in (lines, None if separator is None else _with_empty_cells_as_nan(lines, separator)):
-        if filled is None:
-            continue
-        try:
-            return np.loadtxt(filled, np.float64, comments=None, delimiter=separator, usecols=list(columns), ndmin=2)
-        except ValueError:
-            continue
-    return None
+    filled = lines if separator is None else _with_empty_cells_as_nan(lines, separator)
+    try:
+        return np.loadtxt(filled, np.float64, comments=None, delimiter=separator, usecols=list(columns), ndmin=2)
+    except ValueError:
+        return None
 
 
 def _with_empty_cells_as_nan(lines: list[str], separator: str) -> Iterator[str]:

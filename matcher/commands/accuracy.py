@@ -7,10 +7,8 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-import typer
-
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import echo_json
+from phasemark.data.commands.console import echo, echo_json
 from phasemark.data.commands.inputs import ClassOrMesh, background_of, class_renderers, note_too_far, read_sensor
 from phasemark.data.commands.options import Count, Degrees, Floor, Json, Metres, SensorName, Wall
 
@@ -60,4 +58,4 @@ def accuracy_line(
     if as_json:
         echo_json({"landmark": name, "sensor": sensor, "wall_m": wall, "floor_m": floor, **card.as_dict()})
         return
-    typer.echo(f"{name} {card.line()}")
+    echo(f"{name} {card.line()}")

@@ -10,11 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import LongWork, echo_json, echo_table, readable
+from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table, readable
 from phasemark.data.commands.flag_wording import in_flags
 from phasemark.data.commands.inputs import background_of, class_mesh, note_too_far, open_any_bank, read_sensor
 from phasemark.data.commands.options import (
@@ -132,7 +130,9 @@ def calibrate_camera(
     from phasemark.matcher import calibrate
     from phasemark.matcher.calibration.known_poses import read_poses
 
-    figure = _figure_beside(out, plot)
+    figure = plot or out.with_suffix(".png")
+    refuse_other_files(out, ".toml", "the sensor")
+    refuse_other_files(figure, ".png")
     refuse_existing([out, figure], force)
     background = background_of(wall, floor)
     mesh, base, base_name = _calibration_target(bank_or_class, class_name, sensor)
@@ -140,7 +140,7 @@ def calibrate_camera(
     note_too_far(base, {f"{poses}: the landmark": max(known.distance_m.tolist(), default=None), "--wall": wall})
     filtered = _filtered([reading.read(path, base) for path in frames], known, on, moving)
     fixed = _fixed_names(fix, delay_ms, moving)
-    start = _start(base, _albedo(mesh, albedo), height, bearing, delay_ms)
+    start = _start(base, mesh, albedo, height, bearing, delay_ms)
     with LongWork("rendering poses") as progress:
         found = calibrate(
             mesh,
@@ -164,16 +164,7 @@ def calibrate_camera(
         echo_json({"file": str(out), "picture": str(figure), **found.as_dict()})
         return
     _echo_calibration(found)
-    typer.echo(out)
-    typer.echo(figure)
-
-
-def _figure_beside(out: Path, plot: Path | None) -> Path:
-    """Return where the figure of the residuals goes; refuse names of a wrong kind."""
-    refuse_other_files(out, ".toml", "the sensor")
-    figure = plot or out.with_suffix(".png")
-    refuse_other_files(figure, ".png")
-    return figure
+    echo(out, figure)
 
 
 def _pose_std(position: float | None, heading_deg: float | None, delta_deg: float | None) -> PoseStd | None:
@@ -210,20 +201,20 @@ def _fixed_names(fix: str | None, delay_ms: float | None, moving: bool) -> list[
     return [*fixed, "delay"]
 
 
-def _albedo(mesh: Trimesh, stated: float | None) -> float:
-    """Return the albedo that was stated, or that of the mesh."""
+def _start(
+    base: Sensor,
+    mesh: Trimesh,
+    stated: float | None,
+    height: float | None,
+    bearing_deg: float | None,
+    delay_ms: float | None,
+) -> Mounting:
+    """Return the initial guess of the mounting, with the albedo that was stated or that of the mesh."""
+    from phasemark.matcher.calibration.mounting_model import Mounting
+
     albedo = float(mesh.metadata.get("albedo", 0.8)) if stated is None else stated
     if not 0 < albedo <= 1:
         raise UsageError(f"--albedo must be in (0, 1], got {albedo:g}")
-    return albedo
-
-
-def _start(
-    base: Sensor, albedo: float, height: float | None, bearing_deg: float | None, delay_ms: float | None
-) -> Mounting:
-    """Return the initial guess of the mounting."""
-    from phasemark.matcher.calibration.mounting_model import Mounting
-
     start = Mounting.of_sensor(base, albedo)
     if height is not None:
         start = replace(start, height_m=height)
@@ -279,7 +270,7 @@ def _echo_calibration(found: Calibration) -> None:
         rows.append((name, shown(found, name), shown_std(found, name), parameter.unit, use))
     echo_table(("", "value", "±", "", "where it goes"), rows)
     if len(found.free) > 1:
-        typer.echo("\ncorrelation")
+        echo("\ncorrelation")
         echo_table(
             ("", *found.free),
             (
@@ -287,12 +278,10 @@ def _echo_calibration(found: Calibration) -> None:
                 for name, row in zip(found.free, found.correlation, strict=True)
             ),
         )
-    typer.echo(f"\nχ² = {found.chi2:.6g}, {found.dof} degrees of freedom, p = {found.p_value:.3g}")
-    typer.echo(f"standard deviations from {found.covariance_from}")
+    test = f"χ² = {found.chi2:.6g}, {found.dof} degrees of freedom, p = {found.p_value:.3g}"
+    echo("", test, f"standard deviations from {found.covariance_from}")
     before, after = found.held_out_m
     if math.isfinite(after):
-        typer.echo(f"residuals of held-out frames, r.m.s.: {1e3 * before:.3g} mm before, {1e3 * after:.3g} mm after")
-    for note in found.notes:
-        typer.echo(f"note: {note}")
-    for doubt in found.doubts:
-        typer.echo(f"not to be trusted: {doubt}; likely cause: {found.cause}")
+        echo(f"residuals of held-out frames, r.m.s.: {1e3 * before:.3g} mm before, {1e3 * after:.3g} mm after")
+    echo(*(f"note: {note}" for note in found.notes))
+    echo(*(f"not to be trusted: {doubt}; likely cause: {found.cause}" for doubt in found.doubts))

@@ -6,11 +6,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from phasemark import PhasemarkError
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import LongWork, echo_json, readable
+from phasemark.data.commands.console import LongWork, echo, echo_json, readable
 from phasemark.data.commands.inputs import class_renderers, read_sensor
 from phasemark.data.commands.options import Force, Json, Out, Seed, SensorName
 from phasemark.data.commands.outputs import output_folder
@@ -53,9 +51,7 @@ def sensor_characterise(
         facts = found.as_dict()
         echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
         return
-    for sentence in (*summary_sentences(found, name_or_file), *found.notes):
-        typer.echo(sentence)
-    typer.echo(report)
+    echo(*summary_sentences(found, name_or_file), *found.notes, report)
 
 
 def _bound(sensor: Sensor, distance_m: float) -> str | None:

@@ -6,9 +6,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import typer
-
-from phasemark.data.commands.console import LongWork, echo_json, echo_table
+from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table
 from phasemark.data.commands.options import Force, Json, Out, Seed, Workers
 from phasemark.data.commands.outputs import refuse_existing
 
@@ -43,8 +41,8 @@ def demo_report(
     if as_json:
         echo_json({"report": str(report), "cells": [cell.as_dict() for cell in cells]})
         return
-    typer.echo(answer(cells))
+    echo(answer(cells))
     for m, method in enumerate(trials.methods):
-        typer.echo(f"\n{method}: medians and worst over the classes")
+        echo(f"\n{method}: medians and worst over the classes")
         echo_table(VIEW_HEADER, view_rows(trials, m))
-    typer.echo(f"\n{report}")
+    echo(f"\n{report}")

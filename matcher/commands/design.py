@@ -9,10 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import LongWork, echo_json, echo_table
+from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table
 from phasemark.data.commands.options import Force, Index, Json, Out, Seed, Workers
 from phasemark.data.commands.outputs import output_folder
 
@@ -55,7 +53,7 @@ def landmark_design(
     )
 
     if example:
-        typer.echo(example_design(), nl=False)
+        echo(example_design().removesuffix("\n"))
         return
     plan = default_design() if plan_file is None else read_design_plan(plan_file)
     if seed is not None:
@@ -74,8 +72,7 @@ def landmark_design(
         echo_json({"files": [str(path) for path in files], **facts})
         return
     _echo_design(facts)
-    for path in files:
-        typer.echo(path)
+    echo(*files)
 
 
 def _echo_design(facts: Mapping[str, Any]) -> None:
@@ -106,9 +103,9 @@ def _echo_design(facts: Mapping[str, Any]) -> None:
         rows.append(("r.m.s. error / bound, all sides", *(within(one["rmse_over_bound"], 1) for one in tried)))
         rows.append(("class errors, all sides (%)", *(within(one["class_errors"], 100) for one in tried)))
     echo_table(("", "new set", "catalogue"), rows)
-    typer.echo(f"worst position bound {facts['bound_factor']:.2f} times lower than the catalogue's")
+    echo(f"worst position bound {facts['bound_factor']:.2f} times lower than the catalogue's")
     if confirmation:
-        typer.echo(f"worst r.m.s. error {within(confirmation['worst_rmse_factor'], 1)} times lower, 95 % interval")
+        echo(f"worst r.m.s. error {within(confirmation['worst_rmse_factor'], 1)} times lower, 95 % interval")
 
 
 def _number(value: float | None) -> str:

@@ -8,9 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import typer
-
-from phasemark.data.commands.console import LongWork, echo_json, echo_table
+from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table
 from phasemark.data.commands.inputs import note_plan_too_far
 from phasemark.data.commands.options import Force, Json, Out, Seed, Workers
 from phasemark.data.commands.outputs import output_folder
@@ -47,7 +45,7 @@ def drive_robot(
     )
 
     if example:
-        typer.echo(example_drive(), nl=False)
+        echo(example_drive().removesuffix("\n"))
         return
     plan = default_drive() if plan_file is None else read_drive_plan(plan_file)
     note_plan_too_far(plan)
@@ -61,8 +59,7 @@ def drive_robot(
         echo_json({"files": [str(path) for path in files], **facts})
         return
     _echo_drive(facts)
-    for path in files:
-        typer.echo(path)
+    echo(*files)
 
 
 def _echo_drive(facts: Mapping[str, Any]) -> None:
@@ -80,4 +77,4 @@ def _echo_drive(facts: Mapping[str, Any]) -> None:
             for title, key in (("dead reckoning", "dead_reckoned"), ("corrected", "corrected"))
         ),
     )
-    typer.echo(f"{facts['way_m']:.1f} m, {facts['corrections']} corrections at {facts['stops']} stops")
+    echo(f"{facts['way_m']:.1f} m, {facts['corrections']} corrections at {facts['stops']} stops")

@@ -13,11 +13,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.command import Shown, stated_flags
-from phasemark.data.commands.console import LongWork, Table, echo_facts, echo_json, one_line, tell
+from phasemark.data.commands.console import LongWork, Table, echo, echo_facts, echo_json, one_line, tell
 from phasemark.data.commands.inputs import note_too_far, open_any_bank
 from phasemark.data.commands.options import FrameReading
 from phasemark.data.commands.outputs import refuse_unwritable_files, write_figure, write_file
@@ -103,8 +101,7 @@ def match_frames(
             figure = match_figure(filtered, match, opened, search.background, reported=search.on == "reported")
             write_figure(path, figure, results.force)
     if not (results.as_json or results.as_jsonl):
-        for path in results.files(plots):
-            typer.echo(path)
+        echo(*results.files(plots))
         _note_plots(plots, results.plot_index, len(positions))
 
 
@@ -257,7 +254,7 @@ class _Answers:
             self.answers += answers
         elif self.results.as_jsonl:
             for k, answer in enumerate(answers, start):
-                typer.echo(json.dumps({"index": k, **answer}, ensure_ascii=False, allow_nan=False))
+                echo(json.dumps({"index": k, **answer}, ensure_ascii=False, allow_nan=False))
         else:
             rows = match_rows(answers, start, columns)
             width = sum(max(len(title), len(value)) + 2 for title, value in rows[0].items())

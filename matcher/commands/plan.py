@@ -7,10 +7,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
-
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import echo_json
+from phasemark.data.commands.console import echo, echo_json
 from phasemark.data.commands.inputs import note_plan_too_far
 from phasemark.data.commands.options import Json
 
@@ -23,7 +21,7 @@ def plan_example(kind: PlanKind) -> None:
     """Print a plan with comments; it can be used as it is."""
     from phasemark.matcher.plan_kinds import plan_example
 
-    typer.echo(plan_example(kind), nl=False)
+    echo(plan_example(kind).removesuffix("\n"))
 
 
 def plan_schema(kind: PlanKind) -> None:
@@ -53,4 +51,4 @@ def plan_check(file: Path, *, kind: PlanKind | None = None, as_json: Json = Fals
     if as_json:
         echo_json({"kind": found, "plan": plan.model_dump(mode="json")})
     else:
-        typer.echo(f"{file}: a plan of kind '{found}', complete and valid")
+        echo(f"{file}: a plan of kind '{found}', complete and valid")

@@ -7,11 +7,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from phasemark import UsageError
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import Table, echo_json
+from phasemark.data.commands.console import Table, echo, echo_json
 from phasemark.data.commands.options import Count, Json
 
 if TYPE_CHECKING:
@@ -70,7 +68,7 @@ def pose_report(
     lines = report.rows()
     table = Table(list(lines[0]))
     table.echo([list(line.values()) for line in lines])
-    typer.echo(f"{report.n_measured} of {report.n_poses} poses measured")
+    echo(f"{report.n_measured} of {report.n_poses} poses measured")
 
 
 def _truth_of(

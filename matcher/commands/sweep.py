@@ -8,10 +8,8 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import LongWork, echo_json, echo_table
+from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table
 from phasemark.data.commands.inputs import note_plan_too_far
 from phasemark.data.commands.options import Force, Index, Json, Out, Workers, one_of
 from phasemark.data.commands.outputs import refuse_existing, refuse_input_files
@@ -72,7 +70,7 @@ def sweep_run(
         run_sweep(changed, out, workers=workers, scheduler=scheduler, resume=resume, force=force, progress=progress)
     with LongWork("writing the report"):
         report = write_report(out)
-    typer.echo(report)
+    echo(report)
 
 
 def sweep_report(folder: Folder, *, as_json: Json = False) -> None:
@@ -87,9 +85,7 @@ def sweep_report(folder: Folder, *, as_json: Json = False) -> None:
     if as_json:
         echo_json({"report": str(report), "cells": [cell.as_dict() for cell in cells]})
         return
-    for sentence in summary(trials, cells):
-        typer.echo(sentence)
-    typer.echo(report)
+    echo(*summary(trials, cells), report)
 
 
 def sweep_frames(folder: Folder, condition: Index, trial: Index, *, out: Out, force: Force = False) -> None:
@@ -111,7 +107,7 @@ def sweep_frames(folder: Folder, condition: Index, trial: Index, *, out: Out, fo
 
     refuse_inputs([out], map(folder.joinpath, read_marker(folder)[1] or ()))
     refuse_existing([out], force)
-    typer.echo(write_measured(examples.sweep_frames(folder, condition, trial), out, force=force))
+    echo(write_measured(examples.sweep_frames(folder, condition, trial), out, force=force))
 
 
 def sweep_compare(
@@ -151,4 +147,4 @@ def sweep_compare(
             for one in shown
         ),
     )  # fmt: skip
-    typer.echo(f"{sum(one.significant for one in found)} of {len(found)} differences are significant")
+    echo(f"{sum(one.significant for one in found)} of {len(found)} differences are significant")

@@ -129,8 +129,10 @@ class FilteredFrames:
 
     def with_arrays(self, change: Callable[[NDArray[Any]], NDArray[Any]], **fields: Any) -> FilteredFrames:
         """Return the frames with every array of pixels changed in one way, and with other fields replaced."""
-        arrays = {name: change(array) for name in _ARRAYS if (array := getattr(self, name)) is not None}
-        return replace(self, **arrays, **fields)
+        for name in _ARRAYS:
+            if (array := getattr(self, name)) is not None:
+                fields[name] = change(array)
+        return replace(self, **fields)
 
     def without_offset(self) -> FilteredFrames:
         """Return the frames with the sensor's offsets of range and zones taken off, of the same sensor without them."""

@@ -104,7 +104,8 @@ class PixelSums:
         if self._has_law and amplitude_e is not None and intensity_e is not None:
             return measured_range_std(amplitude_e, intensity_e, self.sensor) ** 2
         variance = np.full(self._squares_m2.shape, np.inf)
-        return np.divide(self._squares_m2, self.n_valid - 1, out=variance, where=self.n_valid > 1)
+        np.divide(self._squares_m2, self.n_valid - 1, out=variance, where=self.n_valid > 1)
+        return variance
 
     def _add_scatter(self, frames: Frames) -> None:
         """Take on mean and sum of squares of the wrapped ranges of valid frames (Welford's recurrence)."""
