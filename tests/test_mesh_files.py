@@ -148,24 +148,21 @@ def test_materials_named_by_an_obj_are_never_opened(tmp_path):
     assert not any("canary" in path for path in opened)
 
 
-def test_an_open_mesh_is_read_with_a_warning():
-    lid = trimesh.Trimesh(BOX.vertices, BOX.faces[2:], process=False)
-    with pytest.warns(MeshWarning, match="open"):
-        mesh = read_mesh(export_mesh(lid, "off"), unit="m", file_type="off")
-    assert not check_mesh(mesh).watertight
-    assert check_mesh(mesh).volume_m3 is None
+OPEN = trimesh.Trimesh(BOX.vertices, BOX.faces[2:], process=False)
+INSIDE_OUT = trimesh.Trimesh(BOX.vertices, BOX.faces[:, ::-1], process=False)
+HUGE = BOX.copy().apply_scale(1000)
 
 
-def test_an_inverted_mesh_is_read_as_it_is_with_a_warning():
-    inside_out = trimesh.Trimesh(BOX.vertices, BOX.faces[:, ::-1], process=False)
-    with pytest.warns(MeshWarning, match="inside out"):
-        mesh = read_mesh(export_mesh(inside_out, "off"), unit="m", file_type="off")
-    assert mesh.volume < 0
-
-
-def test_a_wrong_unit_is_suspected():
-    with pytest.warns(MeshWarning, match="is the unit right"):
-        read_mesh(export_mesh(BOX.copy().apply_scale(1000), "off"), unit="m", file_type="off")
+@pytest.mark.parametrize(
+    ("mesh", "warning"),
+    [(OPEN, "open"), (INSIDE_OUT, "inside out"), (BOX.copy().apply_scale(1000), "is the unit right")],
+)
+def test_a_doubtful_mesh_is_read_as_it_is_with_a_warning(mesh, warning):
+    with pytest.warns(MeshWarning, match=warning):
+        found = read_mesh(export_mesh(mesh, "off"), unit="m", file_type="off")
+    assert found.volume == pytest.approx(mesh.volume)
+    report = check_mesh(found)
+    assert (report.watertight, report.volume_m3 is None) == (mesh is not OPEN, mesh is OPEN)
 
 
 def test_a_sound_mesh_raises_no_warning():

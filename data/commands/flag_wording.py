@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 _NAMED_ALIKE = (
-    "amplitude_unit", "board", "content", "flip_h", "flip_v", "force", "moving", "quantity", "resume", "scheduler",
+    "amplitude_unit", "board", "content", "flip_h", "force", "moving", "quantity", "resume", "scheduler",
     "to", "topic", "unit", "valid_status",
 )  # fmt: skip
 FLAGS = {

@@ -31,11 +31,19 @@ _FRAMES = (".csv", ".npz", ".npy")
 
 
 def open_any_bank(path: Path) -> Bank:
-    """Open a bank from anywhere; say of a mesh how a bank is made of it."""
+    """Open a bank from anywhere; say of a mesh how a bank is made of it, and of frames where they belong."""
     from phasemark.data import open_bank
+    from phasemark.landmarks.mesh_files import FORMATS
 
-    _refuse_mesh(path)
-    _refuse_frames(path)
+    suffix = path.suffix.lower() if path.exists() else ""
+    if suffix.removeprefix(".") in FORMATS:
+        mesh, out = shlex.quote(f"part={path}"), shlex.quote(f"{path.stem}.h5")
+        raise InputFileError(
+            f"{path}: a mesh, not a bank; if it is in millimetres, one is made of it by: phasemark bank build"
+            f" --mesh {mesh} --unit mm --out {out}"
+        )
+    if suffix in _FRAMES:
+        raise InputFileError(f"{path}: measured frames, not a bank; the bank comes first: phasemark match BANK FRAMES")
     return open_bank(path, untrusted=True)
 
 
@@ -44,24 +52,6 @@ def open_frame_set(path: Path) -> FrameSet:
     from phasemark.data import open_frames
 
     return open_frames(path, untrusted=True)
-
-
-def _refuse_mesh(path: Path) -> None:
-    """Refuse a mesh where a bank is expected, with the command that makes a bank of it."""
-    from phasemark.landmarks.mesh_files import FORMATS
-
-    if path.exists() and path.suffix.lower().removeprefix(".") in FORMATS:
-        mesh, out = shlex.quote(f"part={path}"), shlex.quote(f"{path.stem}.h5")
-        raise InputFileError(
-            f"{path}: a mesh, not a bank; if it is in millimetres, one is made of it by: phasemark bank build"
-            f" --mesh {mesh} --unit mm --out {out}"
-        )
-
-
-def _refuse_frames(path: Path) -> None:
-    """Refuse measured frames where a bank is expected, with the order of the arguments."""
-    if path.exists() and path.suffix.lower() in _FRAMES:
-        raise InputFileError(f"{path}: measured frames, not a bank; the bank comes first: phasemark match BANK FRAMES")
 
 
 def read_landmark(name_or_file: str, reading: MeshReading) -> tuple[str, Trimesh]:

@@ -65,8 +65,7 @@ def read_rosbag(path: Path, topic: str | None) -> Recording:
 def _read(path: Path, topic: str | None, store: Any) -> Recording:
     from rosbags.rosbag2 import Reader
 
-    images: list[NDArray[Any]] = []
-    amplitudes: list[NDArray[Any]] = []
+    found: dict[str, list[NDArray[Any]]] = {}
     units = set()
     with Reader(path) as reader:
         of_images = [link for link in reader.connections if link.msgtype == "sensor_msgs/msg/Image"]
@@ -79,11 +78,10 @@ def _read(path: Path, topic: str | None, store: Any) -> Recording:
         wanted = [link for link in of_images if link.topic in (chosen, AMPLITUDE_TOPIC)]
         for link, _, raw in reader.messages(connections=wanted):
             message = store.deserialize_cdr(raw, link.msgtype)
+            found.setdefault(link.topic, []).append(_pixels(message, path))
             if link.topic == chosen:
-                images.append(_pixels(message, path))
                 units.add("mm" if message.encoding == "16UC1" else "m")
-            else:
-                amplitudes.append(_pixels(message, path))
+    images, amplitudes = found.get(chosen, []), found.get(AMPLITUDE_TOPIC, [])
     if not images or len({image.shape for image in images}) > 1:
         raise InputFileError(f"{path}: '{chosen}' must hold images of one size")
     values = np.stack(images)

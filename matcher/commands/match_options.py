@@ -193,21 +193,22 @@ class Search:
     def matcher(self, bank: Bank) -> Matcher:
         """Return the matcher."""
         from phasemark.matcher import Matcher
-        from phasemark.matcher.likelihood.likelihood_matcher import TILT_STD_RAD
 
+        known: dict[str, Any] = {
+            _FREE[name].replace("_", "_std_"): math.radians(std) if _FREE[name].endswith("_rad") else std
+            for name, std in {"bearing": self.bearing_std, **self._stated_std}.items()
+            if std is not None
+        }
         return Matcher(
             bank,
             self.method or "refine",
             free=None if self.near_the_axis else self.parameters,
             background=self.behind,
-            bearing_std_rad=None if self.bearing_std is None else math.radians(self.bearing_std),
-            height_std_m=self._stated_in("height", 1.0, math.inf),
-            pitch_std_rad=self._stated_in("pitch", math.radians(1.0), TILT_STD_RAD),
-            roll_std_rad=self._stated_in("roll", math.radians(1.0), TILT_STD_RAD),
             false_alarm=self.false_alarm,
             on=self.on or "ranges",
             pixels=self.pixels,
             robust=self.robust,
+            **known,
         )
 
     def for_bank(self, bank: Bank) -> Search:
@@ -224,11 +225,6 @@ class Search:
                 " --auto-background, --no-background, --wall and --floor"
             )
         return found
-
-    def _stated_in(self, name: str, unit: float, otherwise: float) -> float:
-        """Return a prior that is stated, in the unit of the matcher, or what holds where none is."""
-        std = self._stated_std.get(name)
-        return otherwise if std is None else std * unit
 
 
 @dataclass(frozen=True)

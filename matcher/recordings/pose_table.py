@@ -83,27 +83,26 @@ def read_pose_table(path: str | os.PathLike[str]) -> PoseTable:
     for (number, _), row in zip(lines[1:], rows, strict=True):
         if len(row) != len(names):
             raise InputFileError(f"{path}, line {number}: {len(row)} values, must have {len(names)}")
-    place = [number for number, _ in lines[1:]]
+    columns: dict[str, tuple[str, ...]] = {}
+    for name, cells in zip(names, zip(*rows, strict=True), strict=True):
+        columns.setdefault(name, cells)
+    place = [f"{path}, line {number}" for number, _ in lines[1:]]
 
     def column(name: str) -> NDArray[np.float64] | None:
-        if name not in names:
+        if name not in columns:
             return None
-        at = names.index(name)
-        cells = ((f"{path}, line {line}", row[at]) for line, row in zip(place, rows, strict=True))
-        return np.array([finite_number(cell, where, name, empty_is_nan=True) for where, cell in cells])
+        cells = zip(columns[name], place, strict=True)
+        return np.array([finite_number(cell, where, name, empty_is_nan=True) for cell, where in cells])
 
     found = {name: column(prefix + named_in_degrees(name)) for name in VIEW_FIELDS}
     zero = np.zeros(len(rows))
     view = [zero if values is None else values / scale_of_degrees(name) for name, values in found.items()]
     index = column("index")
     time_s = next((scale * values for name, scale in _TIMES.items() if (values := column(name)) is not None), None)
-    accepted = np.ones(len(rows), np.bool_)
-    if "accepted" in names:
-        at = names.index("accepted")
-        accepted = np.array([row[at].strip().lower() in ("true", "1", "yes") for row in rows])
+    accepted = [cell.strip().lower() in ("true", "1", "yes") for cell in columns.get("accepted", ["true"] * len(rows))]
     return PoseTable(
         np.column_stack(view),
         None if index is None else np.nan_to_num(index, nan=-1.0).astype(np.int64),
-        accepted,
+        np.array(accepted),
         time_s,
     )
