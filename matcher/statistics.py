@@ -46,6 +46,10 @@ class Interval:
     def __str__(self) -> str:
         return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
 
+    def scaled(self, factor: float) -> Interval:
+        """Return it in another unit."""
+        return Interval(self.value * factor, self.low * factor, self.high * factor)
+
 
 def binomial_interval(successes: int, n: int, *, law: Law = "normal") -> Interval:
     """Return a share of n trials with its 95 % interval.
@@ -220,6 +224,23 @@ def wrapped_errors(error: NDArray[np.float64], parameters: Sequence[str], period
         k = list(parameters).index("delta_rad")
         error[..., k] = wrap_delta_difference_rad(error[..., k], period_rad)
     return error
+
+
+def position_error_m(
+    found_m: NDArray[np.float64], true_m: NDArray[np.float64], turn_rad: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the distance of the lens from its true place in the plane, metres: two distances at an angle.
+
+    Parameters
+    ----------
+    found_m, true_m : float64
+        Distances from the landmark.
+    turn_rad : float64
+        Error of δ.
+    """
+    across = 2 * np.sin(turn_rad / 2)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt((found_m - true_m) ** 2 + found_m * true_m * across**2))
 
 
 @dataclass(frozen=True)

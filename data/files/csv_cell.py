@@ -1,8 +1,34 @@
-"""Cells of tables that a spreadsheet program may open."""
+"""Tables that a spreadsheet program may open."""
 
 from __future__ import annotations
 
+import csv
+import io
+import math
+from collections.abc import Iterable, Sequence
 from typing import Any
+
+
+def csv_text(rows: Iterable[Sequence[Any]]) -> str:
+    """Return rows as CSV, text as :func:`as_cell` has it."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(map(as_cell, row) for row in rows)
+    return text.getvalue()
+
+
+def nine_digits(value: Any) -> Any:
+    """Return a number with nine digits, nothing where it is not finite; a truth as 0 or 1; anything else as it is.
+
+    Examples
+    --------
+    >>> nine_digits(0.1 + 0.2), nine_digits(math.inf), nine_digits(True), nine_digits("cone")
+    ('0.3', '', 1, 'cone')
+    """
+    if isinstance(value, bool):
+        return int(value)
+    if isinstance(value, float):
+        return f"{value:.9g}" if math.isfinite(value) else ""
+    return value
 
 
 def as_cell(value: Any) -> Any:

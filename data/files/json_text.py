@@ -45,5 +45,13 @@ def json_text(value: Any, *, indent: int | None = None, sort_keys: bool = False,
 
 
 def finite_or_none(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row with None for the numbers that JSON does not have."""
-    return {key: None if isinstance(one, float) and not math.isfinite(one) else one for key, one in row.items()}
+    """Return a row of plain data with None for the numbers that JSON does not have, in mappings and lists too."""
+    return {key: _plain(value) for key, value in row.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return finite_or_none(value)
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -76,10 +77,8 @@ class AccuracyCard:
         known = np.isfinite(total)
         if not known.any():
             return {}
-        return {
-            name: float(np.mean(self._position_variance(part)[known] / total[known]))
-            for name, part in self.parts.items()
-        }
+        variances = {name: self._position_variance(part)[known] for name, part in self.parts.items()}
+        return {name: float(np.mean(variance / total[known])) for name, variance in variances.items()}
 
     @property
     def dominant(self) -> str | None:
@@ -128,26 +127,23 @@ class AccuracyCard:
             for name, named in names.items()
             if name in self.free
         }
-        observed = np.isfinite(self.position_std_m)
-        return finite_or_none(
-            {
-                "distance_m": [float(self.views.distance_m.min()), float(self.views.distance_m.max())],
-                "delta_deg": [
-                    float(np.degrees(end)) for end in (self.views.delta_rad.min(), self.views.delta_rad.max())
-                ],
-                "views": len(self.views),
-                "views_observed": int(observed.sum()),
-                "n_frames": self.n_frames,
-                "free": [named_in_degrees(name) for name in self.free],
-                **std,
-                "position_std_m": _median(self.position_std_m),
-                "worst_position_std_m": float(self.position_std_m[observed].max()) if observed.any() else math.nan,
-                "class_error": _median(self.class_error),
-                "other_classes": list(self.others),
-                "dominant": self.dominant,
-                "shares": self.shares(),
-            }
-        )
+        position, distance_m, delta_deg = self.position_std_m, self.views.distance_m, np.degrees(self.views.delta_rad)
+        facts = {
+            "distance_m": [float(distance_m.min()), float(distance_m.max())],
+            "delta_deg": [float(delta_deg.min()), float(delta_deg.max())],
+            "views": len(self.views),
+            "views_observed": int(np.isfinite(position).sum()),
+            "n_frames": self.n_frames,
+            "free": [named_in_degrees(name) for name in self.free],
+            **std,
+            "position_std_m": _median(position),
+            "worst_position_std_m": float(np.fmax.reduce(position)),
+            "class_error": _median(self.class_error),
+            "other_classes": list(self.others),
+            "dominant": self.dominant,
+            "shares": self.shares(),
+        }
+        return finite_or_none(facts)
 
 
 def sides_of(distance_m: float, period_rad: float, n: int = _SIDES) -> Views:
@@ -224,33 +220,20 @@ def accuracy_card(
         raise UsageError("the sensor has no noise, so that there is no bound: set its 'shot_noise'")
     others = dict(others or {})
 
-    def bound(pixels: Any = "all", systematic: Sequence[str] = ()) -> Any:
-        return cramer_rao(
-            renderer,
-            views,
-            free=free,
-            n_frames=n_frames,
-            pixels=pixels,
-            background=background,
-            systematic=systematic,
-        )
-
+    bound = partial(cramer_rao, renderer, views, free=free, n_frames=n_frames, background=background)
     calibrated, declared = bound(systematic=("calibration",)), bound(systematic=("declared",))
     noise = covariance_of(declared.information, weak_share=_WEAK_SHARE)
     coverage = renderer.render_views(views, background=background).coverage
     edge = (coverage > _WHOLE) & (coverage < 1 - _WHOLE)
-    of_edges = noise @ bound(declared.pixels & edge).information @ noise
-    parts = {
-        EDGES: of_edges,
-        FACES: noise - of_edges,
-        CALIBRATION: calibrated.systematic,
-        DECLARED: declared.systematic,
-    }
+    of_edges = noise @ bound(pixels=declared.pixels & edge).information @ noise
+    assert calibrated.systematic is not None
+    assert declared.systematic is not None
+    every = (of_edges, noise - of_edges, calibrated.systematic, declared.systematic)
+    parts = dict(zip(SOURCES, every, strict=True))
+    error = np.full(len(views), np.nan)
     if others:
         squares = class_distances_squared(renderer, views, others, n_frames=n_frames, background=background)
         error = np.minimum(confusion_probability(squares), 1.0)
-    else:
-        error = np.full(len(views), np.nan)
     return AccuracyCard(views, tuple(free), n_frames, parts, error, tuple(others))
 
 

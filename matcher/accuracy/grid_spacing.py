@@ -19,16 +19,16 @@ from phasemark.data import Bank
 from phasemark.data.bank.build_bank import BankJob
 from phasemark.data.seeds import stream
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
+from phasemark.matcher.accuracy.trials import Trials, judged
 from phasemark.matcher.filters.filtered_frames import noise_free
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.pixel_agreement import counts
-from phasemark.matcher.statistics import error_statistics, view_errors
+from phasemark.matcher.statistics import error_statistics
 from phasemark.render import PhasorImages, Renderer, Views
 from phasemark.render.sensor.range_noise import phase_image_variance
-from phasemark.render.view import delta_period_rad
 
 N_FRAMES = 50
 """Frames that are averaged before matching (PHYSICS section 6)."""
@@ -139,7 +139,10 @@ def grid_loss(bank: Bank, n: int, *, seed: int = 0, workers: int | None = None) 
     rng = stream(seed, "population", 0)
     first, last = float(bank.delta_rad[0]), float(bank.delta_rad[-1])
     period = closing_period(bank.delta_rad)
-    parts: list[_Part] = []
+    # in a factored bank the nearest image is the lower pixels' choice; the maximum of the likelihood is that of all
+    pixels = {"nearest": "lower" if bank.lower is not None else "all", "refined": "all"}
+    parts: dict[str, list[Trials]] = {method: [] for method in methods}
+    mismatches, information = [], []
     for k, (name, images_of) in enumerate(zip(bank.classes, job.whole_images(), strict=True)):
         mesh = bank.mesh(name)
         renderer = Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"]))
@@ -151,44 +154,44 @@ def grid_loss(bank: Bank, n: int, *, seed: int = 0, workers: int | None = None) 
                 rng.uniform(bank.distance_m[0], bank.distance_m[-1], some),
                 rng.uniform(first, last if period is None else first + period, some),
             )
-            parts.append(_match_part(bank, methods, renderer, name, images_of(views), views))
-    return _summary(parts)
+            images = images_of(views)
+            frames = noise_free(images, N_FRAMES)
+            for method, matcher in methods.items():
+                matches = matcher.match(frames)
+                limit = cramer_rao(renderer, views, n_frames=N_FRAMES, pixels=pixels[method])
+                symmetry = int(mesh.metadata["symmetry"])
+                parts[method].append(judged(matches, name, views, limit.covariance, limit.free, symmetry))
+                if method == "nearest":
+                    mismatches.append(_mismatches(bank, matches, images))
+                    information.append(limit.information)
+    losses = {method: _loss(Trials.joined(own)) for method, own in parts.items()}
+    mismatch = np.concatenate(mismatches)
+    matched = mismatch[np.isfinite(mismatch)]
+    typical = np.diag(np.median(np.concatenate(information), axis=0))
+    steps = [math.sqrt(2 / one) if one > 0 else None for one in typical]
+    return GridLoss(
+        views=len(mismatch),
+        frames=N_FRAMES,
+        nearest=losses["nearest"],
+        refined=losses.get("refined"),
+        mismatch_median=float(np.median(matched)) if len(matched) else math.nan,
+        mismatch_99=float(np.percentile(matched, 99)) if len(matched) else math.nan,
+        suggested_distance_m=steps[0],
+        suggested_delta_deg=None if steps[1] is None else math.degrees(steps[1]),
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Errors and bounds (n, 2) by method at some views of one class; NaN where another class was found."""
-
-    error: dict[str, NDArray[np.float64]]
-    bound: dict[str, NDArray[np.float64]]
-    mismatch: NDArray[np.float64]
-    information: NDArray[np.float64]
-
-
-def _match_part(
-    bank: Bank, methods: dict[str, Matcher], renderer: Renderer, name: str, images: PhasorImages, views: Views
-) -> _Part:
-    frames = noise_free(images, N_FRAMES)
-    period = delta_period_rad(int(bank.mesh(name).metadata["symmetry"]))
-    # in a factored bank the nearest image is the lower pixels' choice; the maximum of the likelihood is that of all
-    pixels = {"nearest": "lower" if bank.lower is not None else "all", "refined": "all"}
-    error, bound, information = {}, {}, {}
-    for method, matcher in methods.items():
-        matches = matcher.match(frames)
-        error[method] = _errors(matches, name, views, period)
-        limit = cramer_rao(renderer, views, n_frames=N_FRAMES, pixels=pixels[method])
-        bound[method] = np.stack([limit.std(parameter) for parameter in limit.free], axis=1)
-        information[method] = limit.information
-        if method == "nearest":
-            mismatch = _mismatches(bank, matches, images)
-    return _Part(error, bound, mismatch, information["nearest"])
-
-
-def _errors(matches: Matches, name: str, views: Views, period: float) -> NDArray[np.float64]:
-    """Return estimate less truth in D and δ, (n, 2), NaN where another class was found."""
-    error = view_errors(matches, views, VIEW[:2], period)
-    error[matches.class_name != name] = np.nan
-    return error
+def _loss(trials: Trials) -> SpacingLoss:
+    """Judge the errors of a method; views that were taken for another class do not count."""
+    right = trials.class_right
+    found = error_statistics(trials.error[right], trials.free, bound_std=trials.bound_std[right])
+    return SpacingLoss(
+        class_errors=int((~right).sum()),
+        distance_rms_m=found.rmse["distance_m"].value,
+        delta_rms_deg=math.degrees(found.rmse["delta_rad"].value),
+        distance_over_bound=found.ratio["distance_m"].value,
+        delta_over_bound=found.ratio["delta_rad"].value,
+    )
 
 
 def _mismatches(bank: Bank, matches: Matches, images: PhasorImages) -> NDArray[np.float64]:
@@ -221,32 +224,3 @@ def _weights(images: PhasorImages) -> NDArray[np.float64]:
     used = counts(images.phasor, images.intensity, sensor)
     arrived_e = sensor.signal_e * images.intensity + sensor.ambient_e + sensor.dark_e
     return np.asarray(used / np.maximum(phase_image_variance(arrived_e, sensor), 1e-30))
-
-
-def _summary(parts: list[_Part]) -> GridLoss:
-    mismatch = np.concatenate([part.mismatch for part in parts])
-    matched = mismatch[np.isfinite(mismatch)]
-    losses = {}
-    for method in parts[0].error:
-        error = np.concatenate([part.error[method] for part in parts])
-        bound = np.concatenate([part.bound[method] for part in parts])
-        found = error_statistics(error, VIEW[:2], bound_std=bound)
-        losses[method] = SpacingLoss(
-            class_errors=int(np.isnan(error[:, 0]).sum()),
-            distance_rms_m=found.rmse["distance_m"].value,
-            delta_rms_deg=math.degrees(found.rmse["delta_rad"].value),
-            distance_over_bound=found.ratio["distance_m"].value,
-            delta_over_bound=found.ratio["delta_rad"].value,
-        )
-    information = np.median(np.concatenate([part.information for part in parts]), axis=0)
-    steps = [math.sqrt(2 / information[a, a]) if information[a, a] > 0 else None for a in range(2)]
-    return GridLoss(
-        views=len(mismatch),
-        frames=N_FRAMES,
-        nearest=losses["nearest"],
-        refined=losses.get("refined"),
-        mismatch_median=float(np.median(matched)) if len(matched) else math.nan,
-        mismatch_99=float(np.percentile(matched, 99)) if len(matched) else math.nan,
-        suggested_distance_m=steps[0],
-        suggested_delta_deg=None if steps[1] is None else math.degrees(steps[1]),
-    )

@@ -12,8 +12,8 @@ Every number has a 95 % interval. Those of percentiles come from order statistic
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from phasemark import UsageError
+from phasemark.data.files.json_text import finite_or_none
 from phasemark.matcher.statistics import Interval, mean_interval, rms_interval
 from phasemark.render import Views
 from phasemark.render.rigid import rigid_transforms
@@ -64,18 +65,14 @@ class ErrorSummary:
 
     def as_dict(self, scale: float) -> dict[str, Any]:
         """Return the numbers in another unit, for JSON: null where an interval has no end."""
-
-        def plain(one: Interval) -> dict[str, float | None]:
-            found = {"value": one.value, "low": one.low, "high": one.high}
-            return {name: scale * value if math.isfinite(value) else None for name, value in found.items()}
-
-        return {
+        found = {
             "n": self.n,
-            "mean": plain(self.mean),
-            "rms": plain(self.rms),
-            "percentiles": {f"{100 * share:g}": plain(one) for share, one in self.percentiles.items()},
-            "maximum": scale * self.maximum if self.n else None,
+            "mean": asdict(self.mean.scaled(scale)),
+            "rms": asdict(self.rms.scaled(scale)),
+            "percentiles": {f"{100 * share:g}": asdict(one.scaled(scale)) for share, one in self.percentiles.items()},
+            "maximum": scale * self.maximum,
         }
+        return finite_or_none(found)
 
 
 @dataclass(frozen=True)
@@ -109,12 +106,12 @@ class PoseReport:
         return {
             "poses": self.n_poses,
             "measured": self.n_measured,
-            "position_error_mm": self.position_m.as_dict(1e3),
-            "orientation_error_deg": self.orientation_rad.as_dict(math.degrees(1)),
-            "relative_position_error_mm": self.relative_position_m.as_dict(1e3),
-            "relative_orientation_error_deg": self.relative_orientation_rad.as_dict(math.degrees(1)),
+            **{
+                f"{kind.replace(' ', '_')}_error_{unit.replace('°', 'deg')}": one.as_dict(scale)
+                for kind, unit, scale, one in self._kinds()
+            },
             "position_bias_mm": {
-                axis: {"value": 1e3 * one.value, "low": 1e3 * one.low, "high": 1e3 * one.high}
+                axis: asdict(one.scaled(1e3))
                 for axis, one in zip("xyz", self.position_bias_m, strict=True)
                 if math.isfinite(one.low)
             },
@@ -122,23 +119,24 @@ class PoseReport:
 
     def rows(self) -> list[dict[str, str]]:
         """Return the report as rows of a table, one for each kind of error."""
-        kinds = (
-            ("position", "mm", 1e3, self.position_m),
-            ("orientation", "°", math.degrees(1), self.orientation_rad),
-            ("relative position", "mm", 1e3, self.relative_position_m),
-            ("relative orientation", "°", math.degrees(1), self.relative_orientation_rad),
-        )
         return [
             {
-                "error": f"{name} ({unit})",
+                "error": f"{kind} ({unit})",
                 "n": str(one.n),
-                "mean": _shown(one.mean, scale),
-                "r.m.s.": _shown(one.rms, scale),
-                **{f"{100 * share:g} %": _shown(limit, scale) for share, limit in one.percentiles.items()},
+                "mean": _shown(one.mean.scaled(scale)),
+                "r.m.s.": _shown(one.rms.scaled(scale)),
+                **{f"{100 * share:g} %": _shown(limit.scaled(scale)) for share, limit in one.percentiles.items()},
                 "maximum": f"{scale * one.maximum:.3g}" if one.n else "",
             }
-            for name, unit, scale, one in kinds
+            for kind, unit, scale, one in self._kinds()
         ]
+
+    def _kinds(self) -> Iterator[tuple[str, str, float, ErrorSummary]]:
+        """Yield name, unit, the factor to it, and the errors of each kind."""
+        yield "position", "mm", 1e3, self.position_m
+        yield "orientation", "°", math.degrees(1), self.orientation_rad
+        yield "relative position", "mm", 1e3, self.relative_position_m
+        yield "relative orientation", "°", math.degrees(1), self.relative_orientation_rad
 
 
 def pose_report(measured: ArrayLike | Views, true: ArrayLike | Views, *, symmetry: int = 1) -> PoseReport:
@@ -271,9 +269,9 @@ def _differences(
     return found[:, :3, 3] - truth[:, :3, 3], np.arctan2(np.linalg.norm(twist, axis=1), cosine)
 
 
-def _shown(one: Interval, scale: float) -> str:
+def _shown(one: Interval) -> str:
     """Return a number with its interval for a table; an end that is not known is left out."""
     if not math.isfinite(one.value):
         return ""
-    ends: Sequence[str] = [f"{scale * end:.3g}" if math.isfinite(end) else "…" for end in (one.low, one.high)]
-    return f"{scale * one.value:.3g} [{ends[0]}, {ends[1]}]"
+    low, high = (f"{end:.3g}" if math.isfinite(end) else "…" for end in (one.low, one.high))
+    return f"{one.value:.3g} [{low}, {high}]"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,7 +19,14 @@ from phasemark.matcher.filters.mean_phasor import phasor_mean
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.match import Matches
-from phasemark.matcher.statistics import Interval, binomial_interval, error_statistics, nees, view_errors
+from phasemark.matcher.statistics import (
+    Interval,
+    binomial_interval,
+    error_statistics,
+    nees,
+    position_error_m,
+    view_errors,
+)
 from phasemark.render import Background, Renderer, Sensor, Views, capture
 from phasemark.render.view import delta_period_rad
 
@@ -74,12 +80,11 @@ class TrialSetup:
             rng.uniform(0, delta_period_rad, n),
             rng.uniform(-1, 1, n) * self.bearing_rad,
             # a level camera's draws are not followed by others
-            *(rng.uniform(-1, 1, n) * width if width else 0.0 for width in self._upright),
+            *(
+                rng.uniform(-1, 1, n) * width if width else 0.0
+                for width in (self.height_m, self.pitch_rad, self.roll_rad)
+            ),
         )
-
-    @property
-    def _upright(self) -> tuple[float, float, float]:
-        return self.height_m, self.pitch_rad, self.roll_rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +137,22 @@ class Trials:
         return np.asarray(self.error / self.bound_std)
 
     @property
+    def class_right(self) -> NDArray[np.bool_]:
+        """Whether the class is the true one, (n,)."""
+        return np.asarray(self.found == self.class_name, np.bool_)
+
+    @property
+    def position_error_m(self) -> NDArray[np.float64]:
+        """Distance of the lens from its true place, (n,), of trials whose first parameters are D and δ."""
+        true_m = self.views.distance_m
+        return position_error_m(true_m + self.error[:, 0], true_m, self.error[:, 1])
+
+    @property
+    def position_bound_m(self) -> NDArray[np.float64]:
+        """Root of the trace of the bound on the lens's position in the plane, (n,)."""
+        return np.asarray(np.sqrt(self.bound[:, 0, 0] + self.views.distance_m**2 * self.bound[:, 1, 1]))
+
+    @property
     def usable(self) -> NDArray[np.bool_]:
         """Which trials found a view, and have a bound; (n,)."""
         return np.asarray(np.isfinite(self.scaled).all(axis=1))
@@ -155,13 +176,12 @@ class Trials:
     @classmethod
     def joined(cls, parts: Sequence[Trials]) -> Trials:
         """Put runs behind one another."""
-        first = parts[0]
         arrays: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in parts])
             for name in ("class_name", "error", "bound", "covariance", "found", "accepted", "p_value")
         }
-        views = Views(*(np.concatenate([getattr(part.views, name) for part in parts]) for name in VIEW))
-        return replace(first, views=views, **arrays)
+        arrays["views"] = Views(*(np.concatenate([getattr(part.views, name) for part in parts]) for name in VIEW))
+        return replace(parts[0], **arrays)
 
     def summary(self) -> TrialSummary:
         """Return the figures a matcher is judged by."""
@@ -179,7 +199,7 @@ class Trials:
             coverage=found.coverage[0.95],
             outliers=binomial_interval(int((~inner).sum()), len(self)),
             astray=binomial_interval(int(self.astray.sum()), len(self)),
-            class_errors=binomial_interval(int((self.found != self.class_name).sum()), len(self)),
+            class_errors=binomial_interval(int((~self.class_right).sum()), len(self)),
             accepted=binomial_interval(int(self.accepted.sum()), len(self)),
         )
 
@@ -199,30 +219,6 @@ class Trials:
         if found.size:
             measured[found] = views_as_poses(Views(**{name: values[found] for name, values in estimates.items()}))
         return pose_report(measured, self.views, symmetry=symmetry)
-
-    def bias_in_cell(self, step: tuple[float, float], bins: int = 10) -> NDArray[np.float64]:
-        """Return the mean scaled error by position in a cell of a bank's grid, in standard errors of that mean.
-
-        Parameters
-        ----------
-        step : (distance_m, delta_rad)
-            Steps of the grid.
-        bins : int
-            Number of bins over a cell of the grid.
-
-        Returns
-        -------
-        (2, p, bins) float64
-            By the position along D and along δ.
-        """
-        inner = ~self.outlier
-        out = np.zeros((2, len(self.free), bins))
-        for axis, (name, width) in enumerate(zip(VIEW[:2], step, strict=True)):
-            place = (getattr(self.views, name)[inner] / width % 1 * bins).astype(int)
-            for b in range(bins):
-                values = self.scaled[inner][place == b]
-                out[axis, :, b] = values.mean(axis=0) / (values.std(axis=0, ddof=1) / math.sqrt(len(values)))
-        return out
 
 
 @dataclass(frozen=True)
@@ -341,42 +337,40 @@ def run_trials(
     UsageError
         The matcher estimates other parameters than the setup says.
     """
-    period = delta_period_rad(symmetry)
-    sensor = renderer.sensor
     parts: list[Trials] = []
     done = 0
     while done < n:
-        views = setup.views(min(_VIEWS_AT_ONCE, n - done), rng, period)
+        views = setup.views(min(_VIEWS_AT_ONCE, n - done), rng, delta_period_rad(symmetry))
         bound = cramer_rao(
-            renderer,
-            views,
-            free=setup.free,
-            n_frames=setup.n_frames,
-            on=setup.on,
-            background=setup.background,
-            nuisances=setup.nuisances,
-            workers=workers,
-        ).covariance
+            renderer, views, free=setup.free, n_frames=setup.n_frames, on=setup.on, background=setup.background,
+            nuisances=setup.nuisances, workers=workers,
+        ).covariance  # fmt: skip
         if choose is not None:
             keep = np.flatnonzero(choose(bound))
             views, bound = views[keep], bound[keep]
         if not len(views):
             continue
-        matches = match(noisy_frames(renderer, sensor, views, setup, rng, workers=workers))
-        parts.append(_judged(matches, class_name, views, bound, setup.free, period))
+        matches = match(noisy_frames(renderer, renderer.sensor, views, setup, rng, workers=workers))
+        parts.append(judged(matches, class_name, views, bound, setup.free, symmetry))
         done += len(views)
     return Trials.joined(parts)
 
 
-def _judged(
+def judged(
     matches: Matches,
     class_name: str,
     views: Views,
     bound: NDArray[np.float64],
     free: tuple[str, ...],
-    period: float,
+    symmetry: int,
 ) -> Trials:
-    error = view_errors(matches, views, free, period)
+    """Compare matches of a landmark with the views that its frames were taken from.
+
+    Raises
+    ------
+    UsageError
+        The matcher estimates other parameters than `free`.
+    """
     covariance = matches.covariance
     if covariance is not None and matches.free != free:
         raise UsageError(f"the matcher estimates {', '.join(matches.free)}, and 'free' of the setup is {free!r}")
@@ -384,7 +378,7 @@ def _judged(
         class_name=np.full(len(views), class_name, object),
         views=views,
         free=free,
-        error=error,
+        error=view_errors(matches, views, free, delta_period_rad(symmetry)),
         bound=bound,
         covariance=np.full(bound.shape, np.nan) if covariance is None else covariance,
         found=matches.class_name,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,12 +22,12 @@ from phasemark.data.progress import Progress, counter
 from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
-from phasemark.matcher.accuracy.trials import TrialSetup, noisy_frames
+from phasemark.matcher.accuracy.trials import Trials, TrialSetup, judged, noisy_frames
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.search import Design, Scored
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.matcher import Matcher
-from phasemark.matcher.statistics import ErrorStatistics, Interval, binomial_interval, error_statistics, view_errors
+from phasemark.matcher.statistics import Interval, binomial_interval, rms_interval
 from phasemark.render import Renderer, Sensor, Views
 
 SIDE_STEP_DEG = 3.75
@@ -60,6 +60,18 @@ class Trial:
     error_m: NDArray[np.float64]
     class_right: NDArray[np.bool_]
 
+    @classmethod
+    def of(cls, classes: Sequence[Trials], k: int) -> Trial:
+        """Put the trials of several classes side by side, the frames of each of k sides into one row."""
+        columns = zip(
+            *(
+                (one.views.distance_m, one.views.delta_rad, one.position_bound_m, one.position_error_m, one.class_right)
+                for one in classes
+            ),
+            strict=True,
+        )
+        return cls(*(np.concatenate([part.reshape(k, -1) for part in column], axis=1) for column in columns))
+
     @property
     def class_errors(self) -> Interval:
         """Share of frames whose class was not found."""
@@ -73,16 +85,16 @@ class Trial:
     @property
     def efficiency(self) -> Interval:
         """√mean(error² / bound²), 1 at the bound."""
-        return _position_statistics(self.error_m, self.bound_m).ratio["position_m"]
+        return _rms(self.error_m / self.bound_m)
 
     def rmse(self, k: int) -> Interval:
         """Return the root mean square error at one place, metres."""
-        return _position_statistics(self.error_m[k], self.bound_m[k]).rmse["position_m"]
+        return _rms(self.error_m[k])
 
 
-def _position_statistics(error_m: NDArray[np.float64], bound_m: NDArray[np.float64]) -> ErrorStatistics:
-    """Judge distances of the lens from where it is; those without a landmark do not count."""
-    return error_statistics(error_m.reshape(-1, 1), ["position_m"], bound_std=bound_m.reshape(-1, 1), law="normal")
+def _rms(errors: NDArray[np.float64]) -> Interval:
+    """Return the root mean square of errors; those without a landmark do not count."""
+    return rms_interval(errors[np.isfinite(errors)], law="normal")
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,13 +166,19 @@ def confirm(
     each = max(1, math.ceil(n / len(scored.specs)))
     renderers = {s.name: Renderer(build_mesh(s), sensor, albedo=s.albedo) for s in scored.specs}
 
-    def tried(part: str, k: int, views: Callable[[np.random.Generator], Views]) -> Trial:
-        trials = []
+    def tried(part: str, k: int, drawn: Callable[[np.random.Generator], Views]) -> Trial:
+        setup, found = TrialSetup(n_frames=plan.n_frames), []
         for index, (name, renderer) in enumerate(renderers.items()):
-            places, frames = (stream(plan.seed, f"{purpose} {part} {what}", index) for what in ("places", "frames"))
-            trials.append(_matched(matcher, renderer, name, views(places), plan, period, frames, workers))
+            places, rng = (stream(plan.seed, f"{purpose} {part} {what}", index) for what in ("places", "frames"))
+            views, parts = drawn(places), []
+            for start in range(0, len(views), _FRAMES_AT_ONCE):
+                some = views[start : start + _FRAMES_AT_ONCE]
+                bound = cramer_rao(renderer, some, n_frames=plan.n_frames, pixels="lower", workers=workers).covariance
+                matches = matcher.match(noisy_frames(renderer, sensor, some, setup, rng, workers=workers))
+                parts.append(judged(matches, name, some, bound, VIEW[:2], scored.symmetry))
+            found.append(Trials.joined(parts))
             progress()
-        return _joined([_shaped(trial, k) for trial in trials])
+        return Trial.of(found, k)
 
     first = tried("sides", len(sides), lambda _: Views.broadcast(distance, np.repeat(sides, each)))
     contenders = np.argsort(-_mean_square(first.error_m), kind="stable")[:_CONTENDERS]
@@ -185,49 +203,6 @@ def _mean_square(error: NDArray[np.float64]) -> NDArray[np.float64]:
     seen = np.isfinite(error)
     squares = np.where(seen, error, 0.0) ** 2
     return np.asarray(squares.sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
-
-
-def _matched(
-    matcher: Matcher,
-    renderer: Renderer,
-    name: str,
-    views: Views,
-    plan: DesignPlan,
-    period: float,
-    rng: np.random.Generator,
-    workers: int,
-) -> Trial:
-    setup = TrialSetup(n_frames=plan.n_frames)
-    error, right = np.empty(len(views)), np.empty(len(views), np.bool_)
-    for start in range(0, len(views), _FRAMES_AT_ONCE):
-        part = slice(start, min(start + _FRAMES_AT_ONCE, len(views)))
-        some = views[part]
-        matches = matcher.match(noisy_frames(renderer, renderer.sensor, some, setup, rng, workers=workers))
-        shift, turn = np.ascontiguousarray(view_errors(matches, some, VIEW[:2], period).T)
-        # the lens from where it is: D and D' at an angle of the error in δ
-        across = 2 * np.sqrt(matches.distance_m * some.distance_m) * np.sin(turn / 2)
-        error[part] = np.hypot(shift, across)
-        right[part] = matches.class_name == name
-    covariance = cramer_rao(renderer, views, n_frames=plan.n_frames, pixels="lower", workers=workers).covariance
-    bound = np.sqrt(covariance[:, 0, 0] + views.distance_m**2 * covariance[:, 1, 1])
-    return Trial(views.distance_m, views.delta_rad, bound, error, right)
-
-
-def _shaped(trial: Trial, k: int) -> Trial:
-    """Put the frames of a side into one row."""
-    return Trial(
-        trial.distance_m.reshape(k, -1),
-        trial.delta_rad.reshape(k, -1),
-        trial.bound_m.reshape(k, -1),
-        trial.error_m.reshape(k, -1),
-        trial.class_right.reshape(k, -1),
-    )
-
-
-def _joined(trials: list[Trial]) -> Trial:
-    """Put the classes side by side."""
-    names = ("distance_m", "delta_rad", "bound_m", "error_m", "class_right")
-    return Trial(*(np.concatenate([getattr(trial, name) for trial in trials], axis=1) for name in names))
 
 
 def confirm_design(

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import trimesh
 
 from phasemark.data.files.atomic_write import write_atomically
+from phasemark.data.files.csv_cell import csv_text, nine_digits
+from phasemark.data.files.json_text import finite_or_none, json_text
 from phasemark.data.pages.page import figure_png
 from phasemark.inputs.toml_file import toml_value
 from phasemark.landmarks import LandmarkSpec, build_mesh, export_mesh
+from phasemark.landmarks.spec import Box
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability
 from phasemark.matcher.design.confirm import Confirmation
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.matcher.design.position_bound import RangeBound
-from phasemark.matcher.design.search import Design, Scored
-from phasemark.matcher.statistics import Interval, ratio_interval
+from phasemark.matcher.design.rules import Check
+from phasemark.matcher.design.search import Candidate, Design, Scored
+from phasemark.matcher.statistics import ratio_interval
 
 Confirmed = tuple[Confirmation, Confirmation]
 """Of the result and of the catalogue."""
@@ -70,33 +73,27 @@ def pareto_rows(design: Design) -> list[dict[str, Any]]:
     front = set(map(id, design.front()))
     rows = []
     for candidate in sorted(design.candidates, key=lambda c: (not c.feasible, c.bound.worst_m)):
-        rows.append(
-            {
-                "box": "chosen" if candidate is design.chosen else "refined" if candidate.refined else "tried",
-                **_box_row(candidate.box.model_dump(), candidate.symmetry, candidate.bound),
-                "class_distance": candidate.class_distance,
-                "turn_distance": candidate.turn_distance,
-                "on_front": id(candidate) in front,
-                "broken_rules": "; ".join(check.rule for check in candidate.checks if not check.passes),
-            }
-        )
+        kind = "chosen" if candidate is design.chosen else "refined" if candidate.refined else "tried"
+        rows.append(_row(kind, candidate.box, candidate, candidate.bound, id(candidate) in front, candidate.checks))
     known = design.catalogue
-    broken = dict.fromkeys(c.rule for checks in known.checks.values() for c in checks if not c.passes)
-    rows.append(
-        {
-            "box": "catalogue",
-            **_box_row(known.specs[0].box.model_dump(), known.symmetry, design.search.bound(known.specs[0].box)),
-            "class_distance": known.class_distance,
-            "turn_distance": known.turn_distance,
-            "on_front": False,
-            "broken_rules": "; ".join(broken),
-        }
-    )
-    return rows
+    box, checks = known.specs[0].box, itertools.chain(*known.checks.values())
+    return [*rows, _row("catalogue", box, known, design.search.bound(box), False, checks)]
 
 
-def _box_row(box: Mapping[str, float], symmetry: int, bound: RangeBound) -> dict[str, Any]:
-    return {**box, "symmetry": symmetry, **_bound_facts(bound)}
+def _row(
+    kind: str, box: Box, of: Candidate | Scored, bound: RangeBound, on_front: bool, checks: Iterable[Check]
+) -> dict[str, Any]:
+    broken = dict.fromkeys(check.rule for check in checks if not check.passes)
+    return {
+        "box": kind,
+        **box.model_dump(),
+        "symmetry": of.symmetry,
+        **_bound_facts(bound),
+        "class_distance": of.class_distance,
+        "turn_distance": of.turn_distance,
+        "on_front": on_front,
+        "broken_rules": "; ".join(broken),
+    }
 
 
 def _bound_facts(bound: RangeBound) -> dict[str, float]:
@@ -113,19 +110,7 @@ def _bound_facts(bound: RangeBound) -> dict[str, float]:
 def pareto_csv(design: Design) -> str:
     """Return :func:`pareto_rows` as a table; what is infinite is left empty."""
     rows = pareto_rows(design)
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
-    return buffer.getvalue()
-
-
-def _cell(value: object) -> object:
-    if isinstance(value, bool):
-        return int(value)
-    if isinstance(value, float):
-        return f"{value:.9g}" if math.isfinite(value) else ""
-    return value
+    return csv_text([list(rows[0]), *(list(map(nine_digits, row.values())) for row in rows)])
 
 
 def summary(design: Design, confirmed: Confirmed | None) -> dict[str, Any]:
@@ -145,10 +130,10 @@ def summary(design: Design, confirmed: Confirmed | None) -> dict[str, Any]:
             "frames_averaged": design.plan.n_frames,
             "result": _confirmation_facts(new),
             "catalogue": _confirmation_facts(known),
-            "worst_rmse_factor": _interval(ratio_interval(known.worst.rmse(0), new.worst.rmse(0))),
-            "rmse_factor_at_the_worst_bounds": _interval(ratio_interval(known.sides.rmse(-1), new.sides.rmse(-1))),
+            "worst_rmse_factor": asdict(ratio_interval(known.worst.rmse(0), new.worst.rmse(0))),
+            "rmse_factor_at_the_worst_bounds": asdict(ratio_interval(known.sides.rmse(-1), new.sides.rmse(-1))),
         }
-    return facts
+    return finite_or_none(facts)
 
 
 def _scored_facts(scored: Scored) -> dict[str, Any]:
@@ -158,18 +143,18 @@ def _scored_facts(scored: Scored) -> dict[str, Any]:
         "landmarks": [spec.model_dump(mode="json") for spec in scored.specs],
         "symmetry": scored.symmetry,
         **_bound_facts(scored.bound),
-        "least_class_distance": _finite(scored.class_distance),
-        "class_distances": {a: {b: _finite(rows[i, j]) for j, b in enumerate(names)} for i, a in enumerate(names)},
+        "least_class_distance": scored.class_distance,
+        "class_distances": {a: {b: float(rows[i, j]) for j, b in enumerate(names)} for i, a in enumerate(names)},
         "confusion_bound": {
             a: float(confusion_probability([rows[i, j] ** 2 for j in range(len(names)) if j != i]))
             for i, a in enumerate(names)
         },
-        "turn_distance": _finite(scored.turn_distance),
+        "turn_distance": scored.turn_distance,
         "rules": {
             name: [
                 {
                     "rule": check.rule,
-                    "value": _finite(check.value),
+                    "value": check.value,
                     "at_most" if check.at_most else "at_least": check.limit,
                     "unit": check.unit,
                     "kept": check.passes,
@@ -189,7 +174,7 @@ def _confirmation_facts(confirmation: Confirmation) -> dict[str, Any]:
             {
                 "delta_deg": math.degrees(float(sides.delta_rad[k, 0])),
                 "bound_m": float(sides.bound_m[k, 0]),
-                "rmse_m": _interval(sides.rmse(k)),
+                "rmse_m": asdict(sides.rmse(k)),
             }
             for k in range(len(sides.error_m))
         ],
@@ -198,31 +183,18 @@ def _confirmation_facts(confirmation: Confirmation) -> dict[str, Any]:
             "delta_deg": math.degrees(float(worst.delta_rad[0, 0])),
             "n": worst.error_m.size,
             "bound_m": float(worst.bound_m[0, 0]),
-            "rmse_m": _interval(worst.rmse(0)),
+            "rmse_m": asdict(worst.rmse(0)),
         },
         "anywhere": {
             "n": anywhere.error_m.size,
-            "rmse_m": _interval(anywhere.rmse(0)),
-            "rmse_over_bound": _interval(anywhere.efficiency),
-            "class_errors": _interval(anywhere.class_errors),
+            "rmse_m": asdict(anywhere.rmse(0)),
+            "rmse_over_bound": asdict(anywhere.efficiency),
+            "class_errors": asdict(anywhere.class_errors),
         },
-        "rmse_over_bound": _interval(sides.efficiency),
-        "class_errors": _interval(sides.class_errors),
-        "missed": _interval(sides.missed),
+        "rmse_over_bound": asdict(sides.efficiency),
+        "class_errors": asdict(sides.class_errors),
+        "missed": asdict(sides.missed),
     }
-
-
-def _interval(estimate: Interval) -> dict[str, float | None]:
-    return {"value": _finite(estimate.value), "low": _finite(estimate.low), "high": _finite(estimate.high)}
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _plain(value: object) -> object:
-    """Return None for a number that JSON does not have."""
-    return _finite(value) if isinstance(value, float) else value
 
 
 def mesh_stl(spec: LandmarkSpec) -> bytes:
@@ -256,13 +228,11 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
     """
     from phasemark.matcher.design.figures import bound_figure, pareto_figure  # matplotlib is slow to import
 
-    table = [{key: _plain(value) for key, value in row.items()} for row in pareto_rows(design)]
-    facts = {**summary(design, confirmed), "pareto": table}
-    text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    facts = {**summary(design, confirmed), "pareto": [finite_or_none(row) for row in pareto_rows(design)]}
     contents = [
         landmarks_toml(design).encode(),
         pareto_csv(design).encode(),
-        text.encode(),
+        (json_text(facts, indent=2, allow_nan=False) + "\n").encode(),
         figure_png(pareto_figure(design)),
         figure_png(bound_figure(design, confirmed)),
         *map(mesh_stl, design.result.specs),

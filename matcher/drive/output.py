@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import io
-import json
 import math
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data.files.atomic_write import write_atomically
-from phasemark.data.files.csv_cell import as_cell
+from phasemark.data.files.csv_cell import csv_text, nine_digits
+from phasemark.data.files.json_text import json_text
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
 
 OUTPUTS = ("path.csv", "stops.csv", "summary.json", "drive.png")
@@ -33,7 +31,7 @@ def path_csv(drive: Drive) -> str:
     poses = (drive.true, drive.dead_reckoned, drive.corrected)
     columns = [drive.time_s[:, None], drive.way_m[:, None], *(pose * _DEGREES for pose in poses)]
     rows = np.concatenate([*columns, _flat(drive.covariance)], axis=1)
-    return _csv(header, ([f"{value:.9g}" for value in row] for row in rows))
+    return csv_text([header, *(list(map(nine_digits, row)) for row in rows.tolist())])
 
 
 def stops_csv(drive: Drive) -> str:
@@ -47,7 +45,7 @@ def stops_csv(drive: Drive) -> str:
         *(f"{when}_error_{name}" for when in ("before", "after") for name in ("x_m", "y_m", "heading_deg")),
         *(f"{when}_covariance_{name}" for when in ("before", "after") for name in _COVARIANCE),
     ]
-    return _csv(header, (_stop_row(stop) for stop in drive.stops))
+    return csv_text([header, *map(_stop_row, drive.stops)])
 
 
 def _stop_row(stop: Stop) -> list[object]:
@@ -55,17 +53,14 @@ def _stop_row(stop: Stop) -> list[object]:
     measured = [math.nan] * 3 if stop.measured is None else (stop.measured * _DEGREES).tolist()
     errors = [pose_error(pose, stop.true) * _DEGREES for pose in (stop.before, stop.after)]
     covariances = _flat(np.stack([stop.covariance_before, stop.covariance_after]))
-    numbers = [
-        *(match.p_value, match.distance_m, math.degrees(match.delta_rad), math.degrees(match.bearing_rad)),
-        *(stop.distance_squared, *measured, *(stop.true * _DEGREES), *errors[0], *errors[1], *covariances.ravel()),
+    values = [
+        *(stop.time_s, stop.way_m, stop.landmark.name, stop.landmark.class_name, stop.used),
+        *(stop.predicted_across_std_m, stop.view[0], math.degrees(stop.view[1]), math.degrees(stop.view[2])),
+        *(math.degrees(stop.pan_rad), match.class_name or "none", bool(match.accepted), match.p_value),
+        *(match.distance_m, math.degrees(match.delta_rad), math.degrees(match.bearing_rad), stop.distance_squared),
+        *(*measured, *(stop.true * _DEGREES), *errors[0], *errors[1], *covariances.ravel()),
     ]
-    view = [stop.view[0], math.degrees(stop.view[1]), math.degrees(stop.view[2]), math.degrees(stop.pan_rad)]
-    return [
-        *(f"{stop.time_s:.9g}", f"{stop.way_m:.9g}", stop.landmark.name, stop.landmark.class_name, int(stop.used)),
-        *(f"{value:.9g}" for value in (stop.predicted_across_std_m, *view)),
-        *(match.class_name or "none", int(match.accepted)),
-        *(f"{value:.9g}" if math.isfinite(value) else "" for value in numbers),
-    ]
+    return list(map(nine_digits, values))
 
 
 def write_drive(drive: Drive, folder: Path, *, force: bool = False) -> list[Path]:
@@ -93,7 +88,7 @@ def write_drive(drive: Drive, folder: Path, *, force: bool = False) -> list[Path
 
     figure = io.BytesIO()
     drive_figure(drive).savefig(figure, format="png", dpi=130)
-    text = json.dumps(drive.as_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json_text(drive.as_dict(), indent=2, allow_nan=False) + "\n"
     contents = (path_csv(drive).encode(), stops_csv(drive).encode(), text.encode(), figure.getvalue())
     return [
         write_atomically(folder / name, content, force=force) for name, content in zip(OUTPUTS, contents, strict=True)
@@ -104,11 +99,3 @@ def _flat(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the upper triangle of covariances of (x, y, heading), headings in degrees, (n, 6)."""
     scaled = covariance * np.outer(_DEGREES, _DEGREES)
     return np.stack([scaled[:, i, j] for i, j in _UPPER], axis=1)
-
-
-def _csv(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(map(as_cell, row) for row in rows)
-    return buffer.getvalue()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
 from scipy import special
 
 from phasemark import UsageError
@@ -104,13 +105,8 @@ def _difference(cell: Cell, quantity: str, first: float, second: float, z: float
 
 def _marked(found: list[Difference]) -> tuple[Difference, ...]:
     """Mark what stays significant by Holm's step-down procedure."""
-    order = sorted(range(len(found)), key=lambda k: found[k].p_value)
-    marked = set()
-    for rank, k in enumerate(order):
-        if found[k].p_value > FAMILY_LEVEL / (len(found) - rank):
-            break
-        marked.add(k)
-    return tuple(
-        Difference(d.condition, d.method, d.quantity, d.first, d.second, d.p_value, k in marked)
-        for k, d in enumerate(found)
-    )
+    p_values = np.array([one.p_value for one in found])
+    order = np.argsort(p_values, kind="stable")
+    significant = np.zeros(len(found), bool)
+    significant[order] = np.logical_and.accumulate(p_values[order] <= FAMILY_LEVEL / np.arange(len(found), 0, -1))
+    return tuple(replace(one, significant=bool(mark)) for one, mark in zip(found, significant, strict=True))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.data.files.csv_cell import as_cell
+from phasemark.data.files.csv_cell import csv_text
 from phasemark.data.files.json_text import finite_or_none
 from phasemark.matcher.information import weak_direction
 from phasemark.matcher.likelihood.images import LEVEL_VIEW, VIEW
@@ -20,6 +18,7 @@ from phasemark.matcher.statistics import (
     Interval,
     binomial_interval,
     error_statistics,
+    position_error_m,
     rms_interval,
     wrapped_errors,
 )
@@ -140,9 +139,7 @@ class SweepTrials:
 
     def position_error_of(self, rows: slice) -> NDArray[np.float64]:
         """Return the distance of the lens from its true place, the landmark's symmetry allowed for; (n, m), metres."""
-        found, true = self.estimate[rows, :, 0], self.truth[rows, None, 0]
-        across = 2 * np.sin(self.error_of(rows)[:, :, 1] / 2)
-        return _root((found - true) ** 2 + found * true * across**2)
+        return position_error_m(self.estimate[rows, :, 0], self.truth[rows, None, 0], self.error_of(rows)[:, :, 1])
 
     def rows_of(self, condition: int) -> slice:
         """Return where the trials of a condition lie."""
@@ -165,7 +162,7 @@ class SweepTrials:
             **{name: self.estimate[rows, :, i] for i, name in enumerate(names_of_view)},
             **{f"error_{name}": error[:, :, i] for i, name in enumerate(names_of_view)},
             "error_position_m": self.position_error_of(rows),
-            **{f"bound_{name}": _root(self.bound[rows, :, i, i]) for i, name in enumerate(names_of_view)},
+            **{f"bound_{name}": np.sqrt(self.bound[rows, :, i, i]) for i, name in enumerate(names_of_view)},
             **{
                 f"cov_{_SHORT[i]}_{_SHORT[j]}": self.covariance[rows, :, i, j]
                 for i in range(len(names_of_view))
@@ -232,17 +229,12 @@ class SweepTrials:
             stranger=stranger,
             class_right=binomial_interval(int(right.sum()), n, law="student"),
             confusion_bound=float(confusion.mean()) if len(confusion) else math.nan,
-            found={
-                name: int((found == k).sum()) for k, name in [*enumerate(self.classes), (-1, "none")]
-            },
+            found={name: int((found == k).sum()) for k, name in [*enumerate(self.classes), (-1, "none")]},
             bias=dict(kept.bias),
             rmse=dict(kept.rmse),
             position=rms_interval(self.position_error_of(rows)[inner, m]),
             rmse_with_outliers=dict(error_statistics(error[answered], self.free[m]).rmse),
-            bound={
-                name: float(np.sqrt(np.mean(std[bounded, k] ** 2))) if bounded.any() else math.nan
-                for k, name in enumerate(self.free[m])
-            },
+            bound={name: rms_interval(std[bounded, k]).value for k, name in enumerate(self.free[m])},
             ratio=dict(kept.ratio),
             nees=kept.nees,
             coverage=dict(kept.coverage),
@@ -376,12 +368,8 @@ _UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
 def csv_bytes(table: Mapping[str, Sequence[Any]], *, header: bool = True) -> bytes:
     """Return columns as CSV; numbers as short as they can be read back exactly, nothing for NaN."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    if header:
-        writer.writerow(table)
-    writer.writerows(zip(*(["" if v != v else as_cell(v) for v in column] for column in table.values()), strict=True))
-    return text.getvalue().encode()
+    rows = zip(*(["" if v != v else v for v in column] for column in table.values()), strict=True)
+    return csv_text([list(table)] * header + list(rows)).encode()
 
 
 def trials_csv(trials: SweepTrials) -> Iterator[bytes]:
@@ -397,8 +385,3 @@ def condition_axes(conditions: Sequence[Condition]) -> tuple[str, ...]:
 
 def _flat(name: str, value: Interval) -> dict[str, float]:
     return {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
-
-
-def _root(variance: NDArray[np.float64]) -> NDArray[np.float64]:
-    with np.errstate(invalid="ignore"):
-        return np.sqrt(variance)
